@@ -1,0 +1,116 @@
+"""Pinhole cameras, and the only place where camera conventions are converted.
+
+Convention everywhere else: OpenCV axes (x right, y down, z forward), ``viewmat`` maps world to camera,
+``K`` is in pixels, and the centre of the top-left pixel is at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Flips the y and z axes of the camera: OpenGL looks along -z with y up, OpenCV along +z with y down."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Args:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        K: Intrinsics ``[3, 3]`` in pixels, float64.
+        viewmat: World to camera ``[4, 4]``, OpenCV axes, float64.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, or a size or focal length is not positive.
+    """
+
+    width: int
+    height: int
+    K: NDArray[np.float64]
+    viewmat: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
+        object.__setattr__(self, "viewmat", np.asarray(self.viewmat, dtype=np.float64))
+        if self.K.shape != (3, 3):
+            raise ValueError(f"K must be [3, 3], got {list(self.K.shape)}")
+        if self.viewmat.shape != (4, 4):
+            raise ValueError(f"viewmat must be [4, 4], got {list(self.viewmat.shape)}")
+        if not (np.isfinite(self.K).all() and np.isfinite(self.viewmat).all()):
+            raise ValueError("camera has a number that is not finite")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
+        if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
+            raise ValueError(f"focal lengths must be positive, got {self.K[0, 0]:g}, {self.K[1, 1]:g}")
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Centre of projection in world coordinates ``[3]``."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    @property
+    def forward(self) -> NDArray[np.float64]:
+        """Viewing direction in world coordinates ``[3]``, unit length."""
+        return self.viewmat[2, :3] / np.linalg.norm(self.viewmat[2, :3])
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for an image of another size (the field of view stays)."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return Camera(width, height, scale @ self.K, self.viewmat)
+
+    def downscaled(self, factor: float) -> Camera:
+        """The same camera for an image ``factor`` times smaller, sizes rounded, at least one pixel."""
+        if not factor > 0:
+            raise ValueError(f"downscale must be positive, got {factor:g}")
+        return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
+
+
+def camera_from_opengl(width: int, height: int, K: NDArray, camera_to_world: NDArray) -> Camera:
+    """A camera from a NeRF-style pose: camera to world ``[4, 4]``, OpenGL axes."""
+    pose = np.asarray(camera_to_world, dtype=np.float64) @ OPENGL_TO_OPENCV
+    return Camera(width, height, K, invert_pose(pose))
+
+
+def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of a rigid or similarity transform ``[4, 4]``."""
+    return np.linalg.inv(pose)
+
+
+def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height: int, fov_y: float) -> Camera:
+    """A camera at ``position`` that looks at ``target``.
+
+    Args:
+        position: Centre of projection ``[3]``, world.
+        target: Point in the middle of the image ``[3]``, world.
+        up: World direction that appears upwards ``[3]``; not parallel to the view.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        fov_y: Vertical field of view in radians.
+    """
+    forward = np.asarray(target, float) - np.asarray(position, float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, float))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ np.asarray(position, float)
+    focal = 0.5 * height / np.tan(0.5 * fov_y)
+    K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(width, height, K, viewmat)
+
+
+def camera_extent(cameras: Iterable[Camera]) -> float:
+    """Radius of the cameras' positions around their mean times 1.1: the scene scale of 3DGS.
+
+    A single camera, or cameras at one point, have extent 1.
+    """
+    positions = np.stack([camera.position for camera in cameras])
+    radius = float(np.linalg.norm(positions - positions.mean(0), axis=1).max()) * 1.1
+    return radius if radius > 1e-6 else 1.0

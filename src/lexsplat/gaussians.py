@@ -1,0 +1,150 @@
+"""The 3D Gaussians: stored (unconstrained) and activated forms, and how they start from points.
+
+Dimension letters used across the project: N Gaussians, K codes of the codebook (the paper calls this number N),
+S = 8 semantic channels, D feature dimensions, H and W image size, C rendered channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+@dataclass
+class Gaussians:
+    """Geometry and appearance of a scene. All tensors are float32 on one device.
+
+    Args:
+        means: Centres ``[N, 3]``, world units.
+        quats: Rotations ``[N, 4]``, wxyz, not necessarily of unit length.
+        log_scales: Natural logarithm of the standard deviations along the axes ``[N, 3]``.
+        opacity_logits: Inverse sigmoid of the opacities ``[N]``.
+        sh0: Constant colour coefficient ``[N, 1, 3]``.
+        shN: Higher spherical-harmonic coefficients ``[N, (degree + 1)^2 - 1, 3]``.
+        antialiased: Whether they were trained with the mip filter and must be rendered with it.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh0: Tensor
+    shN: Tensor
+    antialiased: bool = False
+
+    def __post_init__(self) -> None:
+        count = self.means.shape[0]
+        shapes = {
+            "means": (count, 3),
+            "quats": (count, 4),
+            "log_scales": (count, 3),
+            "opacity_logits": (count,),
+            "sh0": (count, 1, 3),
+        }
+        for name, shape in shapes.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"{name} must be {list(shape)}, got {list(found)}")
+        if self.shN.ndim != 3 or self.shN.shape[0] != count or self.shN.shape[1] not in (0, 3, 8, 15, 24):
+            raise ValueError(f"shN must be [{count}, 0 | 3 | 8 | 15 | 24, 3], got {list(self.shN.shape)}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.means.device
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of spherical harmonics that is stored."""
+        return round((self.shN.shape[1] + 1) ** 0.5) - 1
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations along the axes ``[N, 3]``, positive, world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities ``[N]`` in 0..1."""
+        return self.opacity_logits.sigmoid()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The stored tensors by name, in the order of the fields."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "antialiased"}
+
+    def map(self, function: object) -> Gaussians:
+        """A copy with ``function`` applied to every tensor."""
+        return replace(self, **{name: function(value) for name, value in self.tensors().items()})  # type: ignore[operator]
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        """A copy on another device."""
+        return self.map(lambda tensor: tensor.to(device))
+
+    def detach(self) -> Gaussians:
+        """The same values without their gradient history."""
+        return self.map(lambda tensor: tensor.detach())
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians named by a boolean mask or an index tensor ``[M]``."""
+        return self.map(lambda tensor: tensor[index])
+
+
+def gaussians_from_points(
+    points: np.ndarray,
+    colors: np.ndarray,
+    *,
+    sh_degree: int = 3,
+    opacity: float = 0.1,
+    antialiased: bool = False,
+    device: torch.device | str = "cpu",
+) -> Gaussians:
+    """One round Gaussian per point, as large as the mean distance to its three nearest neighbours (3DGS).
+
+    Args:
+        points: Positions ``[N, 3]``, world units.
+        colors: RGB ``[N, 3]`` in 0..1.
+        sh_degree: Degree up to which coefficients are stored; all but the constant start at zero.
+        opacity: Initial opacity in 0..1.
+        antialiased: See `Gaussians`.
+        device: Where the tensors go.
+
+    Raises:
+        ValueError: If there are no points or a coordinate is not finite.
+    """
+    points = np.asarray(points, dtype=np.float32)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"points must be [N, 3] with N > 0, got {list(points.shape)}")
+    if not np.isfinite(points).all():
+        raise ValueError("points have a coordinate that is not finite")
+    count = len(points)
+    if count > 1:
+        neighbours = min(4, count)
+        distances, _ = cKDTree(points).query(points, k=neighbours, workers=-1)
+        spacing = distances[:, 1:].mean(1)
+        typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
+        spacing = np.clip(spacing, 1e-3 * typical, 1e2 * typical)
+    else:
+        spacing = np.ones(1)
+    log_scales = torch.from_numpy(np.log(spacing).astype(np.float32))[:, None].repeat(1, 3)
+    rgb = torch.from_numpy(np.asarray(colors, dtype=np.float32))
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    return Gaussians(
+        means=torch.from_numpy(points),
+        quats=quats,
+        log_scales=log_scales,
+        opacity_logits=torch.full((count,), float(np.log(opacity / (1 - opacity)))),
+        sh0=((rgb - 0.5) / SH_C0)[:, None, :],
+        shN=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        antialiased=antialiased,
+    ).to(device)
