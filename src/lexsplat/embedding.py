@@ -1,0 +1,406 @@
+"""Training the language field (section 3.4): Eq. 8 to 15, one random training view a step, geometry frozen.
+
+A code map may be coarser than the image: cell j of w covers the pixels whose centres lie in [j W / w, (j + 1)
+W / w).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lexsplat.cameras import Camera
+from lexsplat.codebook import Codebook
+from lexsplat.errors import TrainingError
+from lexsplat.gaussians import Gaussians
+from lexsplat.language_field import TrainedField
+from lexsplat.losses import (
+    SmoothingWeight,
+    UncertaintyForm,
+    cross_entropy_loss,
+    semantic_loss,
+    smoothing_loss,
+    total_loss,
+    uncertainty_loss,
+)
+from lexsplat.progress import Event, Listener, silent
+
+REPORT_EVERY = 25
+"""Steps between two events, which is also how often the loss is checked."""
+
+
+@dataclass(frozen=True)
+class EmbeddingConfig:
+    """Settings of the language training. Defaults suit a CPU; `as_in_paper` and `as_released` give the
+    others.
+
+    Args:
+        iterations: Steps, one view each (paper: 30,000).
+        pixel_sample: Pixels of a step that enter the cross-entropy, drawn at random; 0 takes the full map
+            (paper).
+        render_downscale: Views are rendered this many times smaller than their cameras.
+        semantics_lr: Learning rate of s_G (paper: 0.001).
+        uncertainty_lr: Of the logits of u (paper: 0.001; authors' code: 0.05).
+        decoder_lr: Of D_MLP (paper: 0.001).
+        smoothing_lr: Of the smoothing MLP (paper: 0.001).
+        decoder_weight_decay: Of D_MLP (paper: 0; authors' code: 1e-5).
+        final_lr_factor: Learning rates fall exponentially to this share of themselves (paper: 1, constant).
+        lambda_ce: Of Eq. 12.
+        lambda_u: Of Eq. 12.
+        lambda_s: Of Eq. 15.
+        lambda_smo: Of Eq. 15.
+        min_smoothing_weight: w_s of Eq. 14.
+        use_uncertainty: Off is the paper's ablation "w/o u_G": Eq. 9 in place of Eq. 10 to 12.
+        use_smoothing: Off is the paper's ablation "w/o MLP".
+        uncertainty_form: "linear" is Eq. 11, "log" the authors' code.
+        smoothing_weight: "max" is Eq. 14, "linear" the authors' code.
+        smoothing_squared: Squared norms in Eq. 14, as in the authors' code.
+        smoothing_every: Steps from one smoothing to the next (paper: 1; authors' code: 10).
+        smoothing_sample: Gaussians of a step that enter Eq. 14, drawn at random; 0 takes all (paper).
+        num_frequencies: Of the positional encoding in Eq. 13 (paper's table: 0).
+        normalise_rendering: Scale the rendered s to unit length before decoding (authors' code).
+        clip_decoder_grad: Largest norm of the decoder's gradient, which keeps a bad batch from ruining it;
+            None is off (paper).
+    """
+
+    iterations: int = 1500
+    pixel_sample: int = 4096
+    render_downscale: float = 1.0
+    semantics_lr: float = 0.02
+    uncertainty_lr: float = 0.02
+    decoder_lr: float = 2e-3
+    smoothing_lr: float = 1e-3
+    decoder_weight_decay: float = 0.0
+    final_lr_factor: float = 0.1
+    lambda_ce: float = 1.0
+    lambda_u: float = 1.0
+    lambda_s: float = 1.0
+    lambda_smo: float = 1.0
+    min_smoothing_weight: float = 0.1
+    use_uncertainty: bool = True
+    use_smoothing: bool = True
+    uncertainty_form: UncertaintyForm = "linear"
+    smoothing_weight: SmoothingWeight = "max"
+    smoothing_squared: bool = False
+    smoothing_every: int = 1
+    smoothing_sample: int = 4096
+    num_frequencies: int = 0
+    normalise_rendering: bool = False
+    clip_decoder_grad: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        if (
+            self.iterations < 0
+            or self.pixel_sample < 0
+            or self.smoothing_sample < 0
+            or self.smoothing_every < 1
+        ):
+            raise ValueError("iterations and samples must not be negative, smoothing_every must be positive")
+        if not self.render_downscale > 0 or not self.final_lr_factor > 0:
+            raise ValueError("render_downscale and final_lr_factor must be positive")
+
+    def as_in_paper(self) -> EmbeddingConfig:
+        """30,000 iterations over full maps with a constant learning rate of 0.001."""
+        return replace(
+            self,
+            iterations=30_000,
+            pixel_sample=0,
+            render_downscale=1.0,
+            semantics_lr=1e-3,
+            uncertainty_lr=1e-3,
+            decoder_lr=1e-3,
+            smoothing_lr=1e-3,
+            decoder_weight_decay=0.0,
+            final_lr_factor=1.0,
+            smoothing_every=1,
+            smoothing_sample=0,
+            clip_decoder_grad=None,
+        )
+
+    def as_released(self) -> EmbeddingConfig:
+        """What the authors' released code does where it differs from the paper."""
+        return replace(
+            self.as_in_paper(),
+            uncertainty_lr=0.05,
+            decoder_weight_decay=1e-5,
+            uncertainty_form="log",
+            smoothing_weight="linear",
+            smoothing_squared=True,
+            smoothing_every=10,
+            normalise_rendering=True,
+        )
+
+
+class EmbeddingTrainer:
+    """The language training as single steps, so that it can also run beside a reconstruction.
+
+    Args:
+        gaussians: The geometry, which is read and never changed.
+        codebook: The discrete feature space S.
+        config: Settings.
+        seed: Of the initial field and of all samples.
+        field: A field to go on from; default is `TrainedField.initial`.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        codebook: Codebook,
+        config: EmbeddingConfig,
+        *,
+        seed: int = 0,
+        field: TrainedField | None = None,
+    ) -> None:
+        self.config = config
+        self.seed = seed
+        self.iteration = 0
+        self.generator = torch.Generator().manual_seed(seed)
+        self.gaussians = gaussians.detach()
+        self.field = field or TrainedField.initial(
+            gaussians,
+            codebook,
+            generator=self.generator,
+            num_frequencies=config.num_frequencies,
+            normalise_rendering=config.normalise_rendering,
+        )
+        if len(self.field.semantics) != len(gaussians):
+            raise ValueError(f"{len(gaussians)} Gaussians, but the field has {len(self.field.semantics)}")
+        self.optimizer = self._make_optimizer()
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        config, field = self.config, self.field
+        rates: list[tuple[Any, float, float]] = [
+            ([field.semantics], config.semantics_lr, 0.0),
+            ([field.uncertainty_logits], config.uncertainty_lr, 0.0),
+            (list(field.decoder.parameters()), config.decoder_lr, config.decoder_weight_decay),
+            (list(field.smoother.parameters()), config.smoothing_lr, 0.0),
+        ]
+        groups = [
+            {"params": parameters, "lr": rate, "base_lr": rate, "weight_decay": decay}
+            for parameters, rate, decay in rates
+        ]
+        # AdamW without weight decay is Adam, the paper's optimizer.
+        return torch.optim.AdamW(groups, betas=(0.9, 0.999))
+
+    def step(self, camera: Camera, code_map: NDArray[np.uint8] | Tensor) -> dict[str, Tensor]:
+        """One step on one view.
+
+        Args:
+            camera: The view, at the resolution of the reconstruction.
+            code_map: Its index map ``[h, w]``; cells with an index of K or above are ignored.
+
+        Returns:
+            Losses by name, without gradient history.
+        """
+        config, field = self.config, self.field
+        for group in self.optimizer.param_groups:
+            progress = self.iteration / max(config.iterations, 1)
+            group["lr"] = group["base_lr"] * config.final_lr_factor ** min(progress, 1.0)
+        self.optimizer.zero_grad(set_to_none=True)
+        semantics, uncertainty = field.render_semantics(
+            self.gaussians, camera.downscaled(config.render_downscale)
+        )
+        losses = self._semantic_terms(semantics, uncertainty, code_map)
+        smoothing = semantics.new_zeros(())
+        if config.use_smoothing and self.iteration % config.smoothing_every == 0:
+            smoothing = losses["smoothing"] = self._smoothing_term()
+        loss = losses["loss"] = total_loss(losses["semantic"], smoothing, config.lambda_s, config.lambda_smo)
+        loss.backward()
+        if config.clip_decoder_grad is not None:
+            nn.utils.clip_grad_norm_(field.decoder.parameters(), config.clip_decoder_grad)
+        self.optimizer.step()
+        self.iteration += 1
+        return {name: value.detach() for name, value in losses.items()}
+
+    def _semantic_terms(self, semantics: Tensor, uncertainty: Tensor, code_map: Any) -> dict[str, Tensor]:
+        """Eq. 8 to 12 for rendered maps ``[H, W, 8]`` and ``[H, W]``."""
+        config = self.config
+        pixels, codes = self._sample_pixels(semantics.shape[0], semantics.shape[1], code_map)
+        logits = self.field.decode(semantics.flatten(0, 1)[pixels])
+        if len(pixels) == 0:  # a view whose cells are all ignored teaches nothing
+            nothing = semantics.sum() * 0
+            return {"cross_entropy": nothing, "semantic": nothing}
+        if not config.use_uncertainty:
+            cross_entropy = cross_entropy_loss(logits, codes)
+            return {"cross_entropy": cross_entropy, "semantic": config.lambda_ce * cross_entropy}
+        cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten()[pixels])
+        regulariser = uncertainty_loss(uncertainty, config.uncertainty_form)
+        semantic = semantic_loss(cross_entropy, regulariser, config.lambda_ce, config.lambda_u)
+        return {"cross_entropy": cross_entropy, "uncertainty": regulariser, "semantic": semantic}
+
+    def _sample_pixels(self, height: int, width: int, code_map: Any) -> tuple[Tensor, Tensor]:
+        """Flat pixel indices and their codes, without ignored cells."""
+        count = height * width
+        if self.config.pixel_sample and self.config.pixel_sample < count:
+            pixels = torch.randint(count, (self.config.pixel_sample,), generator=self.generator)
+        else:
+            pixels = torch.arange(count)
+        codes = codes_at_pixels(torch.as_tensor(code_map).cpu(), height, width, pixels)
+        known = codes < self.field.codebook.num_codes
+        device = self.gaussians.device
+        return pixels[known].to(device), codes[known].to(device)
+
+    def _smoothing_term(self) -> Tensor:
+        """Eq. 13 and 14 for all Gaussians or a sample of them."""
+        config, field = self.config, self.field
+        count = len(field.semantics)
+        means: Tensor = self.gaussians.means
+        semantics: Tensor = field.semantics
+        logits: Tensor = field.uncertainty_logits
+        if config.smoothing_sample and config.smoothing_sample < count:
+            rows = torch.randint(count, (config.smoothing_sample,), generator=self.generator).to(means.device)
+            means, semantics, logits = means[rows], semantics[rows], logits[rows]
+        uncertainties = logits.sigmoid() if config.use_uncertainty else torch.zeros_like(logits)
+        return smoothing_loss(
+            field.smoother(means),
+            semantics,
+            uncertainties,
+            config.min_smoothing_weight,
+            weight=config.smoothing_weight,
+            squared=config.smoothing_squared,
+        )
+
+    def replace_gaussians(self, gaussians: Gaussians, parents: Tensor) -> None:
+        """Follow density control: Gaussian n of the new geometry goes on with the language of ``parents[n]``.
+
+        Args:
+            gaussians: The new geometry, M Gaussians.
+            parents: Integers ``[M]`` into the old ones.
+        """
+        if len(parents) != len(gaussians):
+            raise ValueError(f"{len(gaussians)} Gaussians, but {len(parents)} parents")
+        self.gaussians = gaussians.detach()
+        for name, group in zip(("semantics", "uncertainty_logits"), self.optimizer.param_groups):
+            old = getattr(self.field, name)
+            new = nn.Parameter(old.detach()[parents].clone())
+            moments = self.optimizer.state.pop(old, {})
+            self.optimizer.state[new] = {
+                key: value[parents].clone() if value.ndim else value for key, value in moments.items()
+            }
+            group["params"] = [new]
+            setattr(self.field, name, new)
+
+    def view_of_step(self, names: list[str]) -> str:
+        """The view whose turn it is: every view once in a random order, then again in another."""
+        epoch, place = divmod(self.iteration, len(names))
+        order = torch.Generator().manual_seed(self.seed * 1_000_003 + epoch)
+        return names[int(torch.randperm(len(names), generator=order)[place])]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that is needed to go on as if never stopped, as named tensors."""
+        state = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        for name, parameter in self.field.named_parameters():
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                state[f"optimizer.{name}.{key}"] = value
+        state["generator"] = self.generator.get_state()
+        state["iteration"] = torch.tensor(self.iteration)
+        return {name: value.detach().clone() for name, value in state.items()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """The inverse of `state_dict`, for a trainer made with the same geometry and settings.
+
+        Raises:
+            ValueError: If the state is of another scene or lacks something.
+        """
+        prefix = "field."
+        own = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+        try:
+            self.field.load_state_dict(own)
+            self.generator.set_state(state["generator"].cpu())
+            self.iteration = int(state["iteration"])
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(f"the training state does not fit: {error}") from error
+        for name, parameter in self.field.named_parameters():
+            prefix = f"optimizer.{name}."
+            moments = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+            if moments:
+                self.optimizer.state[parameter] = {key: value.clone() for key, value in moments.items()}
+
+
+def train_field(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Camera],
+    code_maps: Mapping[str, NDArray[np.uint8]],
+    codebook: Codebook,
+    config: EmbeddingConfig,
+    *,
+    seed: int = 0,
+    listener: Listener = silent,
+    trainer: EmbeddingTrainer | None = None,
+    checkpoint: Callable[[EmbeddingTrainer], None] | None = None,
+    checkpoint_every: int = 500,
+) -> TrainedField:
+    """Train the paper's language field on frozen Gaussians.
+
+    Args:
+        gaussians: The geometry; it comes out bit for bit as it went in.
+        cameras: The training views by name, and only these.
+        code_maps: Index maps by view name; further views are not looked at.
+        codebook: The discrete feature space S.
+        config: Settings.
+        seed: Of the initial field, the order of views and the samples.
+        listener: Hears of stage "embed" with the losses.
+        trainer: One that was stopped, to go on with.
+        checkpoint: Called every ``checkpoint_every`` steps, to save ``trainer.state_dict()``.
+        checkpoint_every: See there.
+
+    Raises:
+        ValueError: If there is no view, or a view has no index map.
+        TrainingError: If the loss stops being finite.
+    """
+    names = sorted(cameras)
+    check_views(names, code_maps)
+    trainer = trainer or EmbeddingTrainer(gaussians, codebook, config, seed=seed)
+    while trainer.iteration < config.iterations:
+        name = trainer.view_of_step(names)
+        losses = trainer.step(cameras[name], code_maps[name])
+        done = trainer.iteration
+        if done % REPORT_EVERY == 0 or done == config.iterations:
+            metrics = {key: float(value) for key, value in losses.items()}
+            if not np.isfinite(metrics["loss"]):
+                raise TrainingError(
+                    "language field",
+                    expected="a finite loss",
+                    found=f"{metrics['loss']} at step {done}",
+                    remedy="lower the learning rates or set clip_decoder_grad",
+                )
+            listener(Event("embed", done, config.iterations, metrics))
+        if checkpoint is not None and done % checkpoint_every == 0:
+            checkpoint(trainer)
+    return trainer.field
+
+
+def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -> Tensor:
+    """Codes of the cells in which the centres of pixels lie.
+
+    Args:
+        code_map: Index map ``[h, w]``.
+        height: Of the image the pixels belong to.
+        width: Of that image.
+        pixels: Flat indices into it, row by row ``[M]``.
+
+    Returns:
+        Codes ``[M]`` int64.
+    """
+    rows, columns = code_map.shape
+    # (p + 1/2) h / H in integers, so that no rounding moves a pixel to the neighbouring cell.
+    row = (2 * (pixels // width) + 1) * rows // (2 * height)
+    column = (2 * (pixels % width) + 1) * columns // (2 * width)
+    return code_map[row, column].long()
+
+
+def check_views(names: list[str], code_maps: Mapping[str, object]) -> None:
+    """Raises ValueError if there is no view or one has no index map."""
+    if not names:
+        raise ValueError("no training view")
+    missing = [name for name in names if name not in code_maps]
+    if missing:
+        raise ValueError(
+            f"no index map for {', '.join(missing[:5])}{' and more' if len(missing) > 5 else ''}"
+        )

@@ -1,0 +1,108 @@
+"""Losses of the language field: Eq. 9 to 12, 14 and 15 of the paper (image losses are in
+``image_losses.py``).
+
+All are means over pixels or Gaussians, so that a random sample of them estimates the full loss without bias.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+UncertaintyForm = Literal["linear", "log"]
+SmoothingWeight = Literal["max", "linear"]
+
+LOG_MARGIN = 1e-4
+"""-log(1 - U) is infinite at U = 1, which float32 rendering can reach; U is clamped this far below it."""
+
+
+def cross_entropy_loss(logits: Tensor, codes: Tensor, uncertainties: Tensor | None = None) -> Tensor:
+    """Eq. 9, or Eq. 10 with uncertainties: mean of CE(M_hat, M) (1 - R_u).
+
+    The softmax of Eq. 8 is inside. The gradient of Eq. 10 reaches the uncertainties: where the codes of
+    several views disagree, CE stays high and u grows.
+
+    Args:
+        logits: Decoder outputs before the softmax ``[M, K]``.
+        codes: Code index of each pixel, integers ``[M]`` in 0 to K - 1.
+        uncertainties: Rendered uncertainty R_u at each pixel ``[M]`` in 0..1; None gives Eq. 9.
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    if logits.ndim != 2 or codes.shape != logits.shape[:1]:
+        raise ValueError(
+            f"logits [M, K] and codes [M] expected, got {list(logits.shape)}, {list(codes.shape)}"
+        )
+    if uncertainties is None:
+        return functional.cross_entropy(logits, codes.long())
+    if uncertainties.shape != codes.shape:
+        raise ValueError(f"uncertainties must be {list(codes.shape)}, got {list(uncertainties.shape)}")
+    return (functional.cross_entropy(logits, codes.long(), reduction="none") * (1 - uncertainties)).mean()
+
+
+def uncertainty_loss(uncertainties: Tensor, form: UncertaintyForm = "linear") -> Tensor:
+    """Eq. 11: mean of the rendered uncertainty R_u, which keeps u from growing everywhere.
+
+    Args:
+        uncertainties: R_u ``[...]`` in 0..1.
+        form: "linear" is the paper's. "log" is the authors' code, mean of -log(1 - R_u): together with Eq. 10
+            it has the stationary point U = 1 - 1 / CE, where the linear form drives U to 0 or 1.
+    """
+    if form == "linear":
+        return uncertainties.mean()
+    if form == "log":
+        return -torch.log1p(-uncertainties.clamp(max=1 - LOG_MARGIN)).mean()
+    raise ValueError(f'form must be "linear" or "log", got {form!r}')
+
+
+def semantic_loss(
+    cross_entropy: Tensor, uncertainty: Tensor, lambda_ce: float = 1, lambda_u: float = 1
+) -> Tensor:
+    """Eq. 12: lambda_CE L_CE + lambda_u L_u."""
+    return lambda_ce * cross_entropy + lambda_u * uncertainty
+
+
+def smoothing_loss(
+    smoothed: Tensor,
+    semantics: Tensor,
+    uncertainties: Tensor,
+    min_weight: float = 0.1,
+    *,
+    weight: SmoothingWeight = "max",
+    squared: bool = False,
+) -> Tensor:
+    """Eq. 14: ||s_MLP - s_G*|| + max(u_G*, w_s) ||s_MLP* - s_G||, averaged over the Gaussians; * stops the
+    gradient.
+
+    The first term teaches the MLP what the Gaussians carry, the second pulls the Gaussians to it, uncertain
+    ones more. The uncertainties get no gradient.
+
+    Args:
+        smoothed: Output of the MLP, s_MLP ``[N, S]`` (Eq. 13).
+        semantics: s_G ``[N, S]``.
+        uncertainties: u_G ``[N]`` in 0..1.
+        min_weight: w_s, the least weight of the second term.
+        weight: "max" is the paper's; "linear" is the authors' code, (1 - u) w_s + u.
+        squared: Squared norms, as in the authors' code.
+    """
+    fixed = uncertainties.detach()
+    if weight == "max":
+        pull = fixed.clamp(min=min_weight)
+    elif weight == "linear":
+        pull = (1 - fixed) * min_weight + fixed
+    else:
+        raise ValueError(f'weight must be "max" or "linear", got {weight!r}')
+    teach = torch.linalg.vector_norm(smoothed - semantics.detach(), dim=-1)
+    follow = torch.linalg.vector_norm(smoothed.detach() - semantics, dim=-1)
+    if squared:
+        teach, follow = teach.square(), follow.square()
+    return (teach + pull * follow).mean()
+
+
+def total_loss(semantic: Tensor, smoothing: Tensor, lambda_s: float = 1, lambda_smo: float = 1) -> Tensor:
+    """Eq. 15: lambda_s L_s + lambda_smo L_smo."""
+    return lambda_s * semantic + lambda_smo * smoothing
