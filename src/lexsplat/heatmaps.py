@@ -1,0 +1,148 @@
+"""Relevancy in colour: a perceptually uniform scale, overlays on pictures, and a legend.
+
+The scale is computed, not copied: a path through the Oklab space whose lightness rises in equal steps from
+near black over violet and orange to pale yellow, as saturated as the screen allows. Equal differences in
+relevancy look about equally large, and the order survives grey printing and colour blindness.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+_LIGHTNESS = (0.16, 0.96)
+_HUES = (285.0, 465.0)
+_SATURATION = 0.92
+
+_OKLAB_TO_LMS = np.array(
+    [
+        [1.0, 0.3963377774, 0.2158037573],
+        [1.0, -0.1055613458, -0.0638541728],
+        [1.0, -0.0894841775, -1.2914855480],
+    ]
+)
+_LMS_TO_RGB = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+"""Oklab to linear sRGB, constants of its definition (Ottosson 2020)."""
+
+
+@lru_cache(maxsize=1)
+def color_scale() -> NDArray[np.uint8]:
+    """The scale ``[256, 3]`` as sRGB bytes, from the lowest to the highest value."""
+    steps = np.linspace(0, 1, 256)
+    lightness = _LIGHTNESS[0] + (_LIGHTNESS[1] - _LIGHTNESS[0]) * steps
+    hue = np.radians(_HUES[0] + (_HUES[1] - _HUES[0]) * steps)
+    direction = np.stack([np.cos(hue), np.sin(hue)], axis=1)
+    # The largest chroma inside the screen's gamut, by bisection; then smoothed, so that colour has no kinks.
+    low, high = np.zeros(256), np.full(256, 0.4)
+    for _ in range(30):
+        middle = (low + high) / 2
+        linear = _linear_rgb(lightness, direction * middle[:, None])
+        inside = ((linear >= 0) & (linear <= 1)).all(axis=1)
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    kernel = np.hanning(51) / np.hanning(51).sum()
+    smooth = np.convolve(np.pad(low, 25, mode="edge"), kernel, mode="valid")
+    chroma = np.minimum(low, smooth * _SATURATION)
+    linear = np.clip(_linear_rgb(lightness, direction * chroma[:, None]), 0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return (encoded * 255).round().astype(np.uint8)
+
+
+def colorize(values: ArrayLike, low: float = 0.0, high: float = 1.0) -> NDArray[np.uint8]:
+    """Numbers ``[...]`` as colours ``[..., 3]``; ``low`` and below is darkest, ``high`` and above brightest.
+
+    Raises:
+        ValueError: If ``low`` is not below ``high``.
+    """
+    return color_scale()[(_unit(values, low, high) * 255).round().astype(np.uint8)]
+
+
+def overlay_heatmap(
+    image: ArrayLike,
+    relevancy: ArrayLike,
+    low: float = 0.0,
+    high: float | None = None,
+    strength: float = 0.85,
+) -> NDArray[np.uint8]:
+    """A picture that recedes into grey, with relevancy glowing over it.
+
+    Args:
+        image: ``[H, W, 3]``, bytes or floats in 0..1.
+        relevancy: ``[H, W]`` in 0..1.
+        low: Relevancy that is not marked at all.
+        high: Relevancy in full colour. None takes the map's own peak, but at least `PEAK_FLOOR` above
+            ``low``, so that a map in which nothing is relevant stays dark.
+        strength: Opacity of the full colour in 0..1.
+
+    Returns:
+        ``[H, W, 3]`` bytes.
+
+    Raises:
+        ValueError: If the sizes disagree or ``low`` is not below ``high``.
+    """
+    picture, values = np.asarray(image), np.asarray(relevancy, dtype=np.float32)
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.shape[:2] != values.shape:
+        raise ValueError(f"picture {list(picture.shape)} and relevancy {list(values.shape)} do not fit")
+    scale = 1 / 255 if picture.dtype == np.uint8 else 1.0
+    colors = np.clip(picture.astype(np.float32) * scale, 0, 1)
+    if high is None:
+        high = max(float(values.max()), low + PEAK_FLOOR)
+    amount = _unit(values, low, high)
+    grey = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    backdrop = 0.55 * (0.65 * grey[..., None] + 0.35 * colors) + 0.06
+    weight = (strength * amount**0.8)[..., None]
+    blended = (1 - weight) * backdrop + weight * (colorize(amount).astype(np.float32) / 255)
+    return (np.clip(blended, 0, 1) * 255).round().astype(np.uint8)
+
+
+PEAK_FLOOR = 0.1
+"""Least span of relevancy that an overlay stretches over its colours."""
+
+
+def overlay_mask(
+    image: ArrayLike, mask: ArrayLike, color: tuple[int, int, int] = (255, 176, 32)
+) -> NDArray[np.uint8]:
+    """A picture with a mask tinted and outlined, the rest dimmed: ``[H, W, 3]`` bytes."""
+    picture, inside = np.asarray(image), np.asarray(mask, dtype=bool)
+    if picture.shape[:2] != inside.shape:
+        raise ValueError(f"picture {list(picture.shape)} and mask {list(inside.shape)} do not fit")
+    colors = picture.astype(np.float32) * (1.0 if picture.dtype == np.uint8 else 255.0)
+    tint = np.array(color, dtype=np.float32)
+    result = np.where(inside[..., None], 0.55 * colors + 0.45 * tint, 0.45 * colors)
+    padded = np.pad(inside, 1, mode="edge")
+    eroded = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    result[inside & ~eroded] = tint
+    return np.clip(result, 0, 255).round().astype(np.uint8)
+
+
+def legend(
+    low: float = 0.0, high: float = 1.0, width: int = 256, label: str = "relevancy"
+) -> NDArray[np.uint8]:
+    """A bar of the scale with its ends and a label under it: ``[34, width, 3]`` bytes, dark ground."""
+    bar = color_scale()[np.linspace(0, 255, width).round().astype(int)]
+    picture = Image.new("RGB", (width, 34), (18, 18, 22))
+    picture.paste(Image.fromarray(np.repeat(bar[None], 14, axis=0)), (0, 0))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default()
+    for text, x, anchor in ((f"{low:.2f}", 3, 0.0), (label, width / 2, 0.5), (f"{high:.2f}", width - 3, 1.0)):
+        draw.text((x - anchor * draw.textlength(text, font=font), 18), text, fill=(220, 220, 226), font=font)
+    return np.asarray(picture)
+
+
+def _unit(values: ArrayLike, low: float, high: float) -> NDArray[np.float32]:
+    if not low < high:
+        raise ValueError(f"low must be below high, got {low}, {high}")
+    numbers = np.nan_to_num(np.asarray(values, dtype=np.float32), nan=low)
+    return np.clip((numbers - low) / (high - low), 0, 1)
+
+
+def _linear_rgb(lightness: NDArray, ab: NDArray) -> NDArray:
+    lab = np.concatenate([lightness[:, None], ab], axis=1)
+    return (lab @ _OKLAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T

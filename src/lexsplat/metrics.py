@@ -1,0 +1,327 @@
+"""Numbers: how good the pictures are and how well words are found. Arrays in, floats out, never a disk.
+
+Two protocols for language, by name:
+
+- **strict**: truth is binary and never resized; where sizes differ, the relevancy is (`resize_scores`).
+  Average precision takes every distinct score as a threshold and is the mean over the recalls 0, 0.01, ..., 1
+  of the interpolated precision (COCO's), so it lies in 0..1.
+- **official**: what the authors' released evaluation computes, as far as its description goes
+  (`official_scores` lists it), quirks included, to be comparable with numbers made by it.
+
+In both, prompts are averaged within an image, then images (`mean_over_images`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+RECALLS: NDArray[np.float64] = np.arange(101) / 100
+"""The 101 recall points. Divided, not accumulated, so that a recall of exactly 29 in 100 reaches point 29."""
+
+THRESHOLDS: NDArray[np.float64] = np.arange(1001) / 1000
+"""Where `ThresholdCounts` counts."""
+
+# Pictures
+
+
+def psnr(image: ArrayLike, target: ArrayLike) -> float:
+    """Peak signal-to-noise ratio in dB of images in 0..1; infinite when they are equal."""
+    first, second = _same_shape(image, target)
+    error = float(np.mean((first - second) ** 2))
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def ssim(image: ArrayLike, target: ArrayLike) -> float:
+    """Structural similarity of images ``[H, W, 3]`` in 0..1 as in Wang et al. 2004.
+
+    Gaussian window of 11 pixels, sigma 1.5, biased moments, mean over pixels whose window lies inside: what
+    torchmetrics computes by default. The zero-padded variant of splatting papers differs a little.
+
+    Raises:
+        ValueError: If shapes differ or a side is shorter than 11 pixels.
+    """
+    from skimage.metrics import structural_similarity
+
+    first, second = _same_shape(image, target)
+    if min(first.shape[:2]) < 11:
+        raise ValueError(f"ssim needs images of at least 11x11, got {first.shape[1]}x{first.shape[0]}")
+    value = structural_similarity(
+        first,
+        second,
+        data_range=1.0,
+        channel_axis=2 if first.ndim == 3 else None,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    return float(value)
+
+
+Perceptual = Callable[[ArrayLike, ArrayLike], float]
+
+
+def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
+    """LPIPS (VGG) by torchmetrics: the function and no reason, or nothing and the reason why there is none.
+
+    The metric needs the extra ``lexsplat[lpips]`` and the weights of VGG-16, which are downloaded once.
+    """
+    try:
+        import torch
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device).eval()
+    except ImportError as error:
+        return None, f"not installed: pip install 'lexsplat[lpips]' ({_first_line(error)})"
+    except (OSError, RuntimeError) as error:
+        return None, f"no weights of VGG-16: {_first_line(error)}"
+
+    def distance(image: ArrayLike, target: ArrayLike) -> float:
+        first, second = _same_shape(image, target)
+        with torch.no_grad():
+            pair = [
+                torch.from_numpy(np.clip(side, 0, 1)).float().permute(2, 0, 1)[None].to(device)
+                for side in (first, second)
+            ]
+            value = float(network(*pair))
+            network.reset()
+        return value
+
+    return distance, None
+
+
+# Masks, strict
+
+
+def iou(prediction: ArrayLike, truth: ArrayLike) -> float:
+    """Intersection over union of two boolean masks; 1 when both are empty."""
+    first, second = _masks(prediction, truth)
+    union = np.count_nonzero(first | second)
+    return np.count_nonzero(first & second) / union if union else 1.0
+
+
+def pixel_accuracy(prediction: ArrayLike, truth: ArrayLike) -> float:
+    """Share of pixels on which two boolean masks agree."""
+    first, second = _masks(prediction, truth)
+    return float(np.mean(first == second))
+
+
+def precision(prediction: ArrayLike, truth: ArrayLike) -> float:
+    """Share of predicted pixels that are true; for an empty prediction 0, or 1 if the truth is empty too."""
+    first, second = _masks(prediction, truth)
+    found = np.count_nonzero(first)
+    if not found:
+        return 0.0 if second.any() else 1.0
+    return np.count_nonzero(first & second) / found
+
+
+def precision_recall(scores: ArrayLike, truth: ArrayLike) -> tuple[NDArray, NDArray, NDArray]:
+    """Precision and recall at every distinct score, from the highest threshold to the lowest.
+
+    Returns:
+        ``(precisions, recalls, thresholds)``, each ``[T]``; a pixel is predicted when its score is
+        at least the threshold.
+
+    Raises:
+        ValueError: If shapes differ, a score is not a number, or nothing is true.
+    """
+    values, mask = _scores(scores, truth)
+    positives = np.count_nonzero(mask)
+    if not positives:
+        raise ValueError("precision and recall need at least one true pixel")
+    order = np.argsort(-values, kind="stable")
+    ranked = values[order]
+    last = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
+    hits = np.cumsum(mask[order])[last]
+    return hits / (last + 1), hits / positives, ranked[last]
+
+
+def average_precision(scores: ArrayLike, truth: ArrayLike) -> float:
+    """Strict average precision: mean over 101 recalls of the best precision at that recall or a higher one.
+
+    Returns:
+        A number in 0..1; NaN when nothing is true, for such an image cannot be ranked.
+    """
+    if not np.asarray(truth).any():
+        return math.nan
+    precisions, recalls, _ = precision_recall(scores, truth)
+    return float(interpolated_precision(precisions, recalls).mean())
+
+
+def interpolated_precision(precisions: NDArray, recalls: NDArray) -> NDArray:
+    """Best precision at each of `RECALLS` or beyond ``[101]``, 0 where none is; recalls must not fall."""
+    best = np.append(np.maximum.accumulate(precisions[::-1])[::-1], 0.0)
+    return best[np.searchsorted(recalls, RECALLS, side="left")]
+
+
+def localization(scores: ArrayLike, truth: ArrayLike) -> float:
+    """Whether the highest score lies on the object: 1 or 0; NaN when nothing is true.
+
+    Where several pixels share the highest score, the share of them that lies on the object, which is what
+    picking one at random hits on average: a flat map is worth no more than the object's area.
+    """
+    values, mask = _scores(scores, truth)
+    return float(mask[values == values.max()].mean()) if mask.any() else math.nan
+
+
+def resize_scores(scores: ArrayLike, width: int, height: int) -> NDArray[np.float32]:
+    """A relevancy map ``[H, W]`` at another size, bilinear, centres kept; unchanged when sizes agree."""
+    values = np.asarray(scores, dtype=np.float32)
+    if values.shape == (height, width):
+        return values
+    resized = Image.fromarray(values, mode="F").resize((width, height), Image.Resampling.BILINEAR)
+    return np.asarray(resized, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class ThresholdCounts:
+    """What a map finds at each of `THRESHOLDS`, small enough to keep for every view and prompt.
+
+    Args:
+        hits: True pixels with a score at or above the threshold ``[1001]``.
+        false_alarms: Other pixels with a score at or above the threshold ``[1001]``.
+    """
+
+    hits: NDArray[np.int64]
+    false_alarms: NDArray[np.int64]
+
+    def __add__(self, other: ThresholdCounts) -> ThresholdCounts:
+        return ThresholdCounts(self.hits + other.hits, self.false_alarms + other.false_alarms)
+
+    @property
+    def iou(self) -> NDArray[np.float64]:
+        """Intersection over union at each threshold ``[1001]``."""
+        union = self.hits[0] + self.false_alarms
+        return np.where(union > 0, self.hits / np.maximum(union, 1), 1.0)
+
+    @property
+    def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Precision and recall ``[T]`` from the highest threshold that finds something to the lowest."""
+        found = self.hits + self.false_alarms
+        keep = np.flatnonzero(found)[::-1]
+        return self.hits[keep] / found[keep], self.hits[keep] / max(int(self.hits[0]), 1)
+
+
+def threshold_counts(scores: ArrayLike, truth: ArrayLike) -> ThresholdCounts:
+    """Counts at 1001 thresholds in 0..1; scores outside are clipped."""
+    values, mask = _scores(scores, truth)
+    bins = np.floor(np.clip(values, 0, 1) * 1000 + 1e-9).astype(np.int64)
+    counts = [np.bincount(bins[side], minlength=1001)[::-1].cumsum()[::-1] for side in (mask, ~mask)]
+    return ThresholdCounts(*counts)
+
+
+# Masks, official
+
+
+@dataclass(frozen=True)
+class OfficialScores:
+    """Numbers of one image and prompt under the official protocol."""
+
+    iou: float
+    accuracy: float
+    precision: float
+    average_precision: float
+
+
+def official_truth(mask: ArrayLike, width: int, height: int) -> NDArray[np.float32]:
+    """A mask resized by a bicubic filter and not made binary again: ``[H, W]`` in 0..1, edges soft."""
+    picture = Image.fromarray(np.asarray(mask, dtype=bool).astype(np.uint8) * 255)
+    if picture.size != (width, height):
+        picture = picture.resize((width, height), Image.Resampling.BICUBIC)
+    return np.asarray(picture, dtype=np.float32) / np.float32(255)
+
+
+def official_scores(relevancy: ArrayLike, mask: ArrayLike, threshold: float = 0.5) -> OfficialScores:
+    """The authors' evaluation of one map, quirks included.
+
+    - Truth is resized to the map (`official_truth`); pixels of its soft edge equal neither 0 nor 1, so the
+      accuracy, which compares floats, counts them as wrong whatever is predicted.
+    - The mask is relevancy >= threshold; precision is TP / (TP + FP + 1e-6), 0 for an empty mask.
+    - Average precision: thresholds 0, 0.01, ..., 1 with >, interpolated at 101 recalls, divided by **100**.
+    - Left open by the description and chosen here: a soft pixel counts as true for TP, FP and IoU; IoU is 0
+      when both masks are empty; recall is 0 when nothing is true.
+
+    Args:
+        relevancy: ``[H, W]`` in 0..1, at the size of the rendered image.
+        mask: Boolean truth at its own size.
+        threshold: For everything but the average precision.
+    """
+    values = np.asarray(relevancy, dtype=np.float32)
+    truth = official_truth(mask, values.shape[1], values.shape[0])
+    predicted = values >= np.float32(threshold)
+    true = truth != 0
+    hits = np.count_nonzero(predicted & true)
+    union = np.count_nonzero(predicted | true)
+    return OfficialScores(
+        iou=hits / union if union else 0.0,
+        accuracy=float(np.mean(predicted.astype(np.float32) == truth)),
+        precision=hits / (np.count_nonzero(predicted) + 1e-6),
+        average_precision=_official_average_precision(values, true),
+    )
+
+
+def _official_average_precision(values: NDArray[np.float32], true: NDArray[np.bool_]) -> float:
+    positives = np.count_nonzero(true)
+    limits = RECALLS.astype(np.float32)
+    # Pixel v is found by thresholds below v: the first `n` of them, with n = how many limits are < v.
+    found_by = np.searchsorted(limits, values.ravel(), side="left")
+    hits, found = (
+        np.bincount(found_by[side], minlength=102)[::-1].cumsum()[::-1][1:]
+        for side in (true.ravel(), slice(None))
+    )
+    precisions = hits / (found + 1e-6)
+    recalls = hits / positives if positives else np.zeros(len(hits))
+    return float(interpolated_precision(precisions[::-1], recalls[::-1]).sum() / 100)
+
+
+# Averages
+
+
+def mean_over_images(values: Mapping[str, Mapping[str, float]]) -> float | None:
+    """Mean over images of the mean over an image's prompts; NaN is left out, None when nothing is left.
+
+    Args:
+        values: ``{image: {prompt: value}}``.
+    """
+    per_image = [
+        [value for value in prompts.values() if not math.isnan(value)] for prompts in values.values()
+    ]
+    means = [float(np.mean(numbers)) for numbers in per_image if numbers]
+    return float(np.mean(means)) if means else None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _same_shape(image: ArrayLike, target: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    first, second = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if first.shape != second.shape or not first.size:
+        raise ValueError(f"images must have one shape, got {list(first.shape)} and {list(second.shape)}")
+    return first, second
+
+
+def _masks(prediction: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    first, second = np.asarray(prediction), np.asarray(truth)
+    if first.dtype != bool or second.dtype != bool:
+        raise ValueError(f"masks must be boolean, got {first.dtype} and {second.dtype}")
+    if first.shape != second.shape or not first.size:
+        raise ValueError(f"masks must have one shape, got {list(first.shape)} and {list(second.shape)}")
+    return first, second
+
+
+def _scores(scores: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    values, mask = np.asarray(scores), np.asarray(truth)
+    if mask.dtype != bool or values.shape != mask.shape or not values.size:
+        raise ValueError(
+            f"scores {list(values.shape)} need a boolean mask as large, got {mask.dtype} {list(mask.shape)}"
+        )
+    values = values.astype(np.float64).ravel()
+    if not np.isfinite(values).all():
+        raise ValueError("a score is not finite")
+    return values, mask.ravel()
