@@ -1,0 +1,154 @@
+"""Where the weights of a model come from: the package, a folder, the hub's cache, or the hub.
+
+Only safetensors are ever loaded. Everything after this file works on a plain local folder, so the code that
+builds an encoder is the same with and without internet.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from lexsplat.errors import ModelError
+
+log = logging.getLogger("lexsplat")
+
+EMBEDDED_ENCODERS = Path(__file__).resolve().parent.parent / "demo" / "encoders"
+"""Folder of the encoders that ship with the package."""
+
+_WANTED_FILES = ["*.json", "*.txt", "*.model", "model*.safetensors"]
+_HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first answer; without a network it fails at once
+_CONVERSION_BOT = "SFconvertbot"  # opens a pull request with safetensors on repositories that lack them
+
+
+def model_folder(name: str, embedded: str) -> Path:
+    """The local folder of a model, downloaded if need be.
+
+    Args:
+        name: A folder, a name on the Hugging Face Hub, or "embedded".
+        embedded: Subfolder of the package's own encoders that "embedded" stands for: "clip" or "dino".
+
+    Returns:
+        A folder with ``config.json`` and safetensors.
+
+    Raises:
+        ModelError: If there is no such model here and none can be fetched.
+    """
+    if name == "embedded":
+        return EMBEDDED_ENCODERS / embedded
+    folder = Path(name).expanduser()
+    if folder.is_dir():
+        if not is_model_folder(folder):
+            raise ModelError(
+                name,
+                expected="a Hugging Face model folder (config.json and model.safetensors)",
+                found=_contents(folder),
+                remedy=f"give a folder saved with save_pretrained, a model name, or `--{embedded} embedded`",
+            )
+        return folder
+    cached = _cached_folder(name)
+    return cached if cached is not None else _download(name, embedded)
+
+
+def is_model_folder(folder: Path) -> bool:
+    """Whether a folder holds a configuration and all its safetensors shards."""
+    if not (folder / "config.json").is_file():
+        return False
+    index = folder / "model.safetensors.index.json"
+    if index.is_file():
+        shards = set(read_json(index).get("weight_map", {}).values())
+        return bool(shards) and all((folder / shard).is_file() for shard in shards)
+    return (folder / "model.safetensors").is_file()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a model folder.
+
+    Raises:
+        ModelError: If the file is not a JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ModelError(path, expected="JSON", found=str(error), remedy="fetch the model again") from error
+    if not isinstance(content, dict):
+        raise ModelError(path, expected="a JSON object", found=type(content).__name__)
+    return content
+
+
+def content_hash(folder: Path) -> str:
+    """Hash of everything that decides a model's output: weights, configuration, tokenizer. 32 hex digits."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(folder.glob("*")):
+        # Every weight file that is not loaded (other formats) is left out; so is prose such as a model card.
+        if path.suffix in (".json", ".txt", ".model") or path.match("model*.safetensors"):
+            digest.update(path.name.encode())
+            with path.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+    return digest.hexdigest()
+
+
+def _contents(folder: Path) -> str:
+    names = sorted(path.name for path in folder.iterdir())
+    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "") if names else "an empty folder"
+
+
+def _cached_folder(name: str) -> Path | None:
+    """Folder of a model that an earlier download left in the hub's cache, without touching the network."""
+    from huggingface_hub import constants, snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    refs = Path(constants.HF_HUB_CACHE) / ("models--" + name.replace("/", "--")) / "refs" / "pr"
+    revisions = ["main", *(f"refs/pr/{path.name}" for path in sorted(refs.glob("*")))]
+    for revision in revisions:
+        try:
+            folder = Path(snapshot_download(name, revision=revision, local_files_only=True))
+        except (OSError, HFValidationError):
+            continue
+        if is_model_folder(folder):
+            return folder
+    return None
+
+
+def _download(name: str, embedded: str) -> Path:
+    """Fetch a model from the hub; safetensors from the conversion bot's pull request where main has none."""
+    from huggingface_hub import HfApi, snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+    fetch: dict[str, Any] = {"allow_patterns": _WANTED_FILES, "etag_timeout": _HUB_TIMEOUT}
+    try:
+        folder = Path(snapshot_download(name, **fetch))
+        if is_model_folder(folder):
+            return folder
+        for discussion in HfApi().get_repo_discussions(
+            name, discussion_type="pull_request", author=_CONVERSION_BOT
+        ):
+            folder = Path(snapshot_download(name, revision=discussion.git_reference, **fetch))
+            if is_model_folder(folder):
+                log.info("%s: safetensors taken from %s", name, discussion.git_reference)
+                return folder
+    except HFValidationError as error:
+        raise _missing(name, embedded, "neither a folder nor a valid model name") from error
+    except HfHubHTTPError as error:
+        status = getattr(getattr(error, "response", None), "status_code", None)
+        raise _missing(name, embedded, f"the hub answered {status or 'with an error'}") from error
+    except Exception as error:  # no network shows as many types, depending on the HTTP library and the proxy
+        raise _missing(
+            name, embedded, f"no copy here and the hub cannot be reached ({type(error).__name__})"
+        ) from error
+    raise _missing(name, embedded, "no safetensors in its repository")
+
+
+def _missing(name: str, embedded: str, found: str) -> ModelError:
+    return ModelError(
+        f"model {name}",
+        expected="a downloaded model",
+        found=found,
+        remedy=f"either connect to the internet and run again (it is downloaded once), or give a folder "
+        f"that holds it (`--{embedded} FOLDER`), or use the small encoder that ships with lexsplat "
+        f"(`--{embedded} embedded`)",
+    )

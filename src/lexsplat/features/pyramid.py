@@ -1,0 +1,305 @@
+"""Crops of many sizes to a dense map of image-text features (section 3.2 of the paper).
+
+CLIP gives one vector for a whole image. Cropping the image at many places and sizes and embedding each crop
+gives vectors for places; averaging the crops that speak for a place gives a dense map. Two ways to choose the
+crops:
+
+- a regular grid for each size (as in LERF), whose embeddings are interpolated between the crops' centres;
+- random crops for each size, averaged over the crops that cover a place, nearer centres counting more.
+
+Both put each embedding where its crop really is: crop centres are pixel positions, never cells of a resized
+grid. Crops keep inside the image; beyond the outermost centres the nearest ones count.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.features.encoders import ImageTextEncoder, resize_images
+
+Key = TypeVar("Key")
+
+
+@dataclass(frozen=True)
+class CropLevel:
+    """Square crops of one size.
+
+    Args:
+        size: Side in pixels.
+        lefts: Left edges in pixels: ``[nx]`` of the columns of a grid, or ``[n]`` of the random crops.
+        tops: Top edges in pixels: ``[ny]`` of the rows of a grid, or ``[n]`` of the random crops.
+        grid: Whether the crops are all pairs of rows and columns (row-major) or single ones.
+    """
+
+    size: int
+    lefts: NDArray[np.int32]
+    tops: NDArray[np.int32]
+    grid: bool
+
+    @property
+    def boxes(self) -> NDArray[np.int32]:
+        """Crops ``[n, 3]``: left, top, size."""
+        lefts, tops = self.lefts, self.tops
+        if self.grid:
+            tops, lefts = (axis.ravel() for axis in np.meshgrid(tops, lefts, indexing="ij"))
+        return np.stack([lefts, tops, np.full(len(lefts), self.size)], axis=1).astype(np.int32)
+
+    def __len__(self) -> int:
+        return len(self.lefts) * len(self.tops) if self.grid else len(self.lefts)
+
+
+def grid_levels(
+    width: int, height: int, sizes: Sequence[float], strides: Sequence[float]
+) -> tuple[CropLevel, ...]:
+    """A regular grid of crops for each size, from edge to edge.
+
+    Args:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        sizes: Sides as fractions of the image's short side.
+        strides: Largest distance between neighbours for each size, as a fraction of the crop's side.
+
+    Raises:
+        ValueError: If there is no size, the numbers of sizes and strides differ, or one is not positive.
+    """
+    if not sizes or len(sizes) != len(strides):
+        raise ValueError(
+            f"needs one stride for each crop size, got {len(sizes)} sizes and {len(strides)} strides"
+        )
+    if min(sizes) <= 0 or min(strides) <= 0:
+        raise ValueError("crop sizes and strides must be positive")
+    levels = []
+    for fraction, stride in zip(sizes, strides):
+        size = _crop_side(fraction, width, height)
+        axes = []
+        for length in (width, height):
+            count = -(-(length - size) // max(1.0, stride * size)) + 1
+            axes.append(np.round(np.linspace(0, length - size, int(count))).astype(np.int32))
+        levels.append(CropLevel(size, axes[0], axes[1], grid=True))
+    return tuple(levels)
+
+
+def random_levels(
+    width: int,
+    height: int,
+    *,
+    crops: int,
+    levels: int,
+    smallest: float,
+    largest: float,
+    rng: np.random.Generator,
+) -> tuple[CropLevel, ...]:
+    """Random crops, the same number for each of several sizes.
+
+    Args:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        crops: Crops in all; shared out evenly, at least one for each size.
+        levels: Number of sizes, evenly spaced.
+        smallest: Smallest side as a fraction of the image's short side.
+        largest: Largest side as a fraction of the image's short side.
+        rng: Source of the positions.
+
+    Raises:
+        ValueError: If a number is not positive or the sizes are in the wrong order.
+    """
+    if crops < 1 or levels < 1 or not 0 < smallest <= largest:
+        raise ValueError(
+            f"bad random crops: {crops} crops, {levels} levels, sizes {smallest:g} to {largest:g}"
+        )
+    found = []
+    for index, fraction in enumerate(np.linspace(smallest, largest, levels)):
+        size = _crop_side(float(fraction), width, height)
+        count = max(1, crops * (index + 1) // levels - crops * index // levels)
+        lefts = rng.integers(0, width - size + 1, count).astype(np.int32)
+        tops = rng.integers(0, height - size + 1, count).astype(np.int32)
+        found.append(CropLevel(size, lefts, tops, grid=False))
+    return tuple(found)
+
+
+def _crop_side(fraction: float, width: int, height: int) -> int:
+    return min(max(1, round(fraction * min(width, height))), width, height)
+
+
+def dense_map(
+    levels: Sequence[CropLevel], embeddings: Tensor, width: int, height: int, cols: int, rows: int
+) -> Tensor:
+    """Average the crops' embeddings at their true positions: the dense map of section 3.2.
+
+    Each level gives a map; the maps are averaged over the levels that reach a cell, then normalised.
+
+    Args:
+        levels: Crops by size.
+        embeddings: One unit vector a crop ``[n, D]``, levels in order.
+        width: Width in pixels of the image the crops were taken from.
+        height: Its height.
+        cols: Width of the map in cells.
+        rows: Height of the map in cells.
+
+    Returns:
+        Unit vectors ``[rows, cols, D]``; cell (i, j) is the pixel ((j + .5) width / cols, (i + .5) height /
+        rows).
+
+    Raises:
+        ValueError: If the number of embeddings is not the number of crops.
+    """
+    if len(embeddings) != sum(len(level) for level in levels):
+        raise ValueError(f"{len(embeddings)} embeddings for {sum(len(level) for level in levels)} crops")
+    xs = (np.arange(cols) + 0.5) * width / cols
+    ys = (np.arange(rows) + 0.5) * height / rows
+    dim = embeddings.shape[-1]
+    total = torch.zeros(rows, cols, dim)
+    count = torch.zeros(rows, cols, 1)
+    start = 0
+    for level in levels:
+        vectors = embeddings[start : start + len(level)].float()
+        start += len(level)
+        if level.grid:
+            across = _linear_weights(xs, level.lefts + level.size / 2)
+            down = _linear_weights(ys, level.tops + level.size / 2)
+            mixed = across @ vectors.reshape(len(level.tops), len(level.lefts), dim)
+            total += (down @ mixed.reshape(len(level.tops), -1)).reshape(rows, cols, dim)
+            count += 1
+        else:
+            weights = _tent_weights(level, xs, ys)
+            reached = weights.sum(-1, keepdim=True)
+            mean = (weights @ vectors) / reached.clamp_min(1e-12)
+            total += mean.reshape(rows, cols, dim)
+            count += (reached > 0).float().reshape(rows, cols, 1)
+    if bool((count == 0).any()):  # random crops need not reach every corner: the nearest crop speaks for it
+        empty = (count == 0).squeeze(-1)
+        total[empty] = embeddings[_nearest_crops(levels, xs, ys)[empty]].float()
+    return F.normalize(total, dim=-1)
+
+
+def _linear_weights(positions: NDArray, centres: NDArray) -> Tensor:
+    """Weights ``[m, n]`` of linear interpolation between sorted centres, clamped at the ends."""
+    weights = np.zeros((len(positions), len(centres)), dtype=np.float32)
+    upper = np.clip(np.searchsorted(centres, positions), 1, max(1, len(centres) - 1))
+    lower = upper - 1
+    row = np.arange(len(positions))
+    if len(centres) == 1:
+        weights[:, 0] = 1
+    else:
+        part = np.clip((positions - centres[lower]) / (centres[upper] - centres[lower]), 0, 1)
+        weights[row, lower] = 1 - part
+        weights[row, upper] = part
+    return torch.from_numpy(weights)
+
+
+def _tent_weights(level: CropLevel, xs: NDArray, ys: NDArray) -> Tensor:
+    """Weights ``[rows * cols, n]``: 1 at a crop's centre, falling to 0 at its edges."""
+    half = level.size / 2
+    across = np.maximum(0, 1 - np.abs(xs[:, None] - (level.lefts + half)) / half)
+    down = np.maximum(0, 1 - np.abs(ys[:, None] - (level.tops + half)) / half)
+    weights = (down[:, None] * across[None]).reshape(len(ys) * len(xs), -1)
+    return torch.from_numpy(weights.astype(np.float32))
+
+
+def _nearest_crops(levels: Sequence[CropLevel], xs: NDArray, ys: NDArray) -> Tensor:
+    """Index of the crop with the nearest centre for every cell ``[rows, cols]``."""
+    boxes = np.concatenate([level.boxes for level in levels])
+    centres = torch.from_numpy((boxes[:, :2] + boxes[:, 2:] / 2).astype(np.float32))
+    grid = torch.stack(torch.meshgrid(torch.from_numpy(ys), torch.from_numpy(xs), indexing="ij"), -1).flip(-1)
+    return torch.cdist(grid.reshape(-1, 2).float(), centres).argmin(1).reshape(len(ys), len(xs))
+
+
+def unique_boxes(levels: Sequence[CropLevel]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """The different crops of all levels ``[m, 3]``, and for each crop its place among them ``[n]``."""
+    boxes = np.concatenate([level.boxes for level in levels])
+    unique, places = np.unique(boxes, axis=0, return_inverse=True)
+    return unique, places.reshape(-1)
+
+
+def cut_crops(image: Tensor, boxes: NDArray[np.int32], image_size: int, chunk: int) -> Iterator[Tensor]:
+    """Crops of an image, resized for an encoder.
+
+    Args:
+        image: ``[3, h, w]`` in 0..1.
+        boxes: Crops ``[n, 3]``: left, top, size in pixels, within the image.
+        image_size: Side in pixels of the resized crops.
+        chunk: Most crops at once.
+
+    Yields:
+        Crops ``[b, 3, image_size, image_size]``, in the order of the boxes, b at most ``chunk``.
+    """
+    start = 0
+    while start < len(boxes):
+        size = int(boxes[start, 2])
+        stop = start
+        while stop < min(len(boxes), start + chunk) and boxes[stop, 2] == size:
+            stop += 1
+        crops = [
+            image[:, top : top + size, left : left + size] for left, top, _ in boxes[start:stop].tolist()
+        ]
+        yield resize_images(torch.stack(crops), image_size, image_size)
+        start = stop
+
+
+def encode_stream(
+    encoder: ImageTextEncoder, jobs: Iterable[tuple[Key, Iterable[Tensor]]], batch_size: int
+) -> Iterator[tuple[Key, Tensor]]:
+    """Encode the crops of many images in full batches that run across sizes and images.
+
+    Args:
+        encoder: What embeds the crops.
+        jobs: For each image a key and its crops in chunks ``[b, 3, s, s]``; read only as far as needed.
+        batch_size: Crops encoded at once.
+
+    Yields:
+        Each key with its embeddings ``[n, D]``, in the order of the jobs.
+    """
+    waiting: deque[tuple[Key, list[Tensor]]] = deque()  # images whose crops are not all encoded yet
+    owners: deque[tuple[list[Tensor], int]] = deque()  # whose the buffered crops are, in order
+    buffer: list[Tensor] = []
+    buffered = 0
+
+    def flush(limit: int) -> None:
+        nonlocal buffered
+        crops = torch.cat(buffer)
+        embeddings = encoder.encode_images(crops[:limit])
+        buffer[:] = [crops[limit:]] if len(crops) > limit else []
+        buffered = len(crops) - len(embeddings)
+        while len(embeddings):
+            parts, count = owners.popleft()
+            parts.append(embeddings[:count])
+            if count > len(embeddings):
+                owners.appendleft((parts, count - len(embeddings)))
+            embeddings = embeddings[count:]
+
+    for key, chunks in jobs:
+        parts: list[Tensor] = []
+        waiting.append((key, parts))
+        for chunk in chunks:
+            buffer.append(chunk)
+            buffered += len(chunk)
+            owners.append((parts, len(chunk)))
+            while buffered >= batch_size:
+                flush(batch_size)
+        pending = {id(owner) for owner, _ in owners}
+        while waiting and id(waiting[0][1]) not in pending:
+            done, finished = waiting.popleft()
+            yield done, torch.cat(finished)
+    if buffered:
+        flush(batch_size)
+    while waiting:
+        done, finished = waiting.popleft()
+        yield done, torch.cat(finished)
+
+
+def batch_size_for(memory: int, image_size: int) -> int:
+    """Crops to encode at once within ``memory`` bytes.
+
+    A transformer layer holds about twenty tensors of the input's size (in ViT-B/16 a token has as many
+    numbers as a patch has values); a quarter of the memory is given to it.
+    """
+    return int(min(256, max(1, memory // 4 // (24 * 12 * image_size**2))))

@@ -1,0 +1,78 @@
+"""Text embeddings kept on disk, so that a question asked twice needs no encoder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lexsplat.features.cache import replacing
+from lexsplat.features.encoders import ImageTextEncoder
+
+
+class TextCache:
+    """Embeddings of prompts by model and prompt.
+
+    One file a model, ``text-HASH.safetensors``, read once. A file that cannot be read is made anew.
+
+    Args:
+        folder: Where the files lie; made when first written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = Path(folder)
+        self._known: dict[str, dict[str, Tensor]] = {}
+
+    def encode(
+        self, content_hash: str, prompts: Sequence[str], encoder: Callable[[], ImageTextEncoder]
+    ) -> Tensor:
+        """Embeddings ``[P, D]`` of prompts, float32, unit length.
+
+        Args:
+            content_hash: The model's hash, as recorded with the features.
+            prompts: Texts; repeated ones are embedded once.
+            encoder: Gives the model; called only if a prompt is new.
+
+        Raises:
+            ValueError: If there is no prompt, one is empty, or the model given is not the one of the hash.
+        """
+        if not prompts or any(not prompt.strip() for prompt in prompts):
+            raise ValueError("prompts must be one or more texts that are not empty")
+        known = self._read(content_hash)
+        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in known]
+        if new:
+            model = encoder()
+            if model.content_hash != content_hash:
+                raise ValueError(f"{model.name} is not the model that was asked for ({content_hash})")
+            known.update(zip(new, model.encode_text(new)))
+            self._write(content_hash, known)
+        return torch.stack([known[prompt] for prompt in prompts])
+
+    def _path(self, content_hash: str) -> Path:
+        return self._folder / f"text-{content_hash}.safetensors"
+
+    def _read(self, content_hash: str) -> dict[str, Tensor]:
+        from safetensors import SafetensorError, safe_open
+
+        if content_hash not in self._known:
+            found: dict[str, Tensor] = {}
+            try:
+                with safe_open(self._path(content_hash), framework="pt") as file:
+                    prompts = file.metadata() or {}
+                    found = {prompts[key]: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+            except (OSError, SafetensorError, KeyError):
+                pass  # a cache that cannot be read is an empty one
+            self._known[content_hash] = found
+        return self._known[content_hash]
+
+    def _write(self, content_hash: str, known: dict[str, Tensor]) -> None:
+        from safetensors.torch import save_file
+
+        # Prompts may hold any character, and "__metadata__" is no name for a tensor: names are hashes of
+        # prompts.
+        keys = {hashlib.blake2b(prompt.encode(), digest_size=16).hexdigest(): prompt for prompt in known}
+        with replacing(self._path(content_hash)) as temporary:
+            save_file({key: known[prompt].clone() for key, prompt in keys.items()}, temporary, keys)
