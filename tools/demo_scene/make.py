@@ -1,0 +1,62 @@
+"""Remakes the demo scenes from nothing: see README.md."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from layouts import LAYOUTS
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SCENES = REPOSITORY / "src" / "lexsplat" / "demo" / "scenes"
+
+
+def quiet_output() -> Callable[[str], None]:
+    """Sends standard output, Blender's flood, to nowhere; returns what still prints a line to the user."""
+    user = os.fdopen(os.dup(1), "w")
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+
+    def say(line: str) -> None:
+        user.write(line + "\n")
+        user.flush()
+
+    return say
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
+    parser.add_argument("--steps", nargs="+", choices=("render", "pack"), default=["render", "pack"])
+    parser.add_argument("--work", type=Path, default=REPOSITORY / "output" / "demo_scene", help="work folder")
+    parser.add_argument("--output", type=Path, default=SCENES, help="folder that gets one folder a scene")
+    parser.add_argument("--samples", type=int, default=16, help="paths a pixel at most")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument(
+        "--every", type=int, default=1, help="render only every so many views, to have a look"
+    )
+    parser.add_argument(
+        "--truth", action="store_true", help="also write OUTPUT/SCENE/truth: depths and indices of all views"
+    )
+    options = parser.parse_args()
+    say = quiet_output()
+    for name in options.scenes:
+        layout, work = LAYOUTS[name], options.work / name
+        if "render" in options.steps:
+            from render import render  # needs Blender
+
+            render(
+                layout, work, samples=options.samples, threads=options.threads, say=say, every=options.every
+            )
+        if "pack" in options.steps:
+            from pack import pack  # needs pycolmap and Pillow
+
+            pack(layout, work, options.output / name, truth=options.truth, say=say)
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
