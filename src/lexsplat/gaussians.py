@@ -1,12 +1,15 @@
 """The 3D Gaussians: stored (unconstrained) and activated forms, and how they start from points.
 
-Dimension letters used across the project: N Gaussians, K codes of the codebook (the paper calls this number N),
+Dimension letters used across the project: N Gaussians, K codes of the codebook (the paper calls this number
+    N),
 S = 8 semantic channels, D feature dimensions, H and W image size, C rendered channels.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,9 +85,10 @@ class Gaussians:
         """The stored tensors by name, in the order of the fields."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "antialiased"}
 
-    def map(self, function: object) -> Gaussians:
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """A copy with ``function`` applied to every tensor."""
-        return replace(self, **{name: function(value) for name, value in self.tensors().items()})  # type: ignore[operator]
+        tensors: dict[str, Any] = {name: function(value) for name, value in self.tensors().items()}
+        return replace(self, **tensors)
 
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
@@ -119,13 +123,18 @@ def gaussians_from_points(
         device: Where the tensors go.
 
     Raises:
-        ValueError: If there are no points or a coordinate is not finite.
+        ValueError: If there are no points, a coordinate is not finite, colours do not match, or the opacity
+            is not between 0 and 1.
     """
     points = np.asarray(points, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"points must be [N, 3] with N > 0, got {list(points.shape)}")
     if not np.isfinite(points).all():
         raise ValueError("points have a coordinate that is not finite")
+    if np.shape(colors) != points.shape:
+        raise ValueError(f"colors must be {list(points.shape)}, got {list(np.shape(colors))}")
+    if not 0 < opacity < 1:
+        raise ValueError(f"opacity must be between 0 and 1, got {opacity:g}")
     count = len(points)
     if count > 1:
         neighbours = min(4, count)

@@ -1,0 +1,489 @@
+"""Reconstruction (section 3.1): 3D Gaussians from photos with cameras, by gradient descent on the
+photometric loss.
+
+Learning rates, schedules and density control are those of 3DGS; every step number refers to a training of
+30,000 iterations and is stretched to the number that is run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from lexsplat.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
+from lexsplat.errors import TrainingError
+from lexsplat.gaussians import Gaussians, gaussians_from_points
+from lexsplat.progress import Event, Listener, silent
+
+if TYPE_CHECKING:
+    from lexsplat.scenes import Scene, View
+
+STAGE = "reconstruct"
+"""Name of the stage in events."""
+EVENT_EVERY = 10
+"""Iterations between two events."""
+GSPLAT_NAMES = {
+    "means": "means",
+    "quats": "quats",
+    "log_scales": "scales",
+    "opacity_logits": "opacities",
+    "sh0": "sh0",
+    "shN": "shN",
+}
+"""Our names of the parameters, and those gsplat's strategies look for."""
+
+
+@dataclass(frozen=True)
+class ReconstructionConfig:
+    """Settings of the reconstruction; numbers of steps refer to a training of 30,000.
+
+    Args:
+        iterations: Optimisation steps, one view each.
+        ssim_weight: Weight of 1 - SSIM against L1, in 0..1.
+        sh_degree: Highest degree of spherical harmonics, 0..3 (4 where the backend can).
+        sh_degree_every: Steps after which the next degree joins.
+        strategy: Density control: "default" (3DGS) or "mcmc".
+        max_gaussians: Never more than this many.
+        densify_every: Steps between two rounds of density control.
+        densify_min_every: Rounds are never closer than this many actual steps.
+        grow_gradient: Mean gradient of projected centres above which "default" adds Gaussians.
+        min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
+        reset_opacities: Whether "default" lowers all opacities every 3,000 steps.
+        noise: Strength of the noise of "mcmc".
+        opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
+        scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as
+            above.
+        antialiased: Train and render with the mip filter.
+        initial_opacity: Opacity of the first Gaussians.
+        warm_up: Share of the iterations that run at half resolution, at the start.
+        exposure: Fit an affine colour change per training photo, for captures whose exposure varies.
+        means_rate: Learning rate of the centres at the start, relative to the extent of the scene.
+        means_rate_final: The same at the end; it decays exponentially.
+        scales_rate: Learning rate of the logarithms of the scales.
+        quats_rate: Learning rate of the rotations.
+        opacities_rate: Learning rate of the opacity logits.
+        sh0_rate: Learning rate of the constant colour.
+        shN_rate: Learning rate of the other colour coefficients.
+        exposure_rate: Learning rate of the colour change.
+        image_memory: Bytes for photos kept in memory.
+    """
+
+    iterations: int = 30_000
+    ssim_weight: float = 0.2
+    sh_degree: int = 3
+    sh_degree_every: int = 1_000
+    strategy: Literal["default", "mcmc"] = "default"
+    max_gaussians: int = 3_000_000
+    densify_every: int = 100
+    densify_min_every: int = 1
+    grow_gradient: float = 2e-4
+    min_opacity: float = 0.005
+    reset_opacities: bool = True
+    noise: float = 5e5
+    opacity_weight: float | None = None
+    scale_weight: float | None = None
+    antialiased: bool = True
+    initial_opacity: float = 0.1
+    warm_up: float = 0.0
+    exposure: bool = False
+    means_rate: float = 1.6e-4
+    means_rate_final: float = 1.6e-6
+    scales_rate: float = 5e-3
+    quats_rate: float = 1e-3
+    opacities_rate: float = 5e-2
+    sh0_rate: float = 2.5e-3
+    shN_rate: float = 1.25e-4
+    exposure_rate: float = 1e-3
+    image_memory: int = 1 << 30
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations must be positive, got {self.iterations}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"ssim_weight must be in 0..1, got {self.ssim_weight:g}")
+        if not 0 <= self.sh_degree <= 4:
+            raise ValueError(f"sh_degree must be in 0..4, got {self.sh_degree}")
+        if not 0 <= self.warm_up <= 1:
+            raise ValueError(f"warm_up must be in 0..1, got {self.warm_up:g}")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"initial_opacity must be between 0 and 1, got {self.initial_opacity:g}")
+
+    def rates(self, extent: float) -> dict[str, float]:
+        """Learning rates at the start by parameter (our names)."""
+        return {
+            "means": self.means_rate * extent,
+            "quats": self.quats_rate,
+            "log_scales": self.scales_rate,
+            "opacity_logits": self.opacities_rate,
+            "sh0": self.sh0_rate,
+            "shN": self.shN_rate,
+        }
+
+
+def reconstruct(
+    scene: Scene,
+    config: ReconstructionConfig,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    listener: Listener = silent,
+) -> Gaussians:
+    """Train Gaussians on the training views of a scene.
+
+    Args:
+        scene: Views, split and points to start from.
+        config: Settings.
+        device: Where to train.
+        seed: Of the order of views and of density control.
+        listener: Hears an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
+            views) and "gaussians".
+
+    Raises:
+        TrainingError: If there is nothing to train on or the optimisation diverges.
+        CaptureError: If a photo cannot be read.
+    """
+    trainer = Reconstructor(scene, config, device=device, seed=seed)
+    trainer.run(listener)
+    return trainer.gaussians()
+
+
+class Reconstructor:
+    """A training that can be stepped, saved and resumed bit for bit.
+
+    Args:
+        scene: Views, split and points to start from.
+        config: Settings.
+        device: Where to train.
+        seed: Of the order of views and of density control.
+
+    Raises:
+        TrainingError: If there is no training view or no point.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: ReconstructionConfig,
+        *,
+        device: torch.device | str = "cpu",
+        seed: int = 0,
+    ) -> None:
+        self.config = config
+        self.device = torch.device(device)
+        self.steps_done = 0
+        self._extent = scene.extent
+        self._views = {view.name: view for view in scene.train_views}
+        self._names = sorted(self._views)
+        if not self._names:
+            raise TrainingError(
+                scene.root, expected="at least one training view", found="none", remedy="hold out fewer views"
+            )
+        self._background = torch.tensor(scene.background, dtype=torch.float32, device=self.device)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._order = torch.empty(0, dtype=torch.int64)
+        self._recent_error = float("nan")
+        self._parameters = self._initial_parameters(scene)
+        self._optimizers = self._new_optimizers()
+        self._exposures = _Exposures(len(self._names), config, self.device)
+        self._density = DensityControl(
+            config.strategy,
+            density_schedule(
+                config.strategy,
+                config.iterations,
+                every=config.densify_every,
+                minimum_every=config.densify_min_every,
+            ),
+            extent=self._extent,
+            max_gaussians=config.max_gaussians,
+            grow_gradient=config.grow_gradient,
+            min_opacity=config.min_opacity,
+            reset_opacities=config.reset_opacities,
+            noise=config.noise,
+            seed=seed,
+            device=self.device,
+        )
+        self._images: Any = None
+        self._images_shrink = 0.0
+
+    @property
+    def done(self) -> bool:
+        """Whether all iterations have run."""
+        return self.steps_done >= self.config.iterations
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Numbers for progress: PSNR of recent training views and the count of Gaussians."""
+        psnr = -10.0 * math.log10(max(self._recent_error, 1e-12)) if self.steps_done else float("nan")
+        return {"psnr": psnr, "gaussians": float(len(self._parameters["means"]))}
+
+    def run(self, listener: Listener = silent) -> None:
+        """Run the iterations that are left."""
+        total = self.config.iterations
+        while not self.done:
+            self.step()
+            if self.steps_done % EVENT_EVERY == 0 or self.done:
+                listener(Event(STAGE, self.steps_done, total, self.metrics))
+
+    def gaussians(self) -> Gaussians:
+        """The present Gaussians, without gradient history; they share memory with the training."""
+        return self._as_gaussians().detach()
+
+    def step(self) -> float:
+        """One iteration on one view; returns its loss.
+
+        Raises:
+            TrainingError: If the loss is no longer finite.
+        """
+        from lexsplat.image_losses import photometric_loss
+        from lexsplat.rendering import render
+
+        index = self._next_view()
+        images = self._training_images()
+        camera = images.camera(self._names[index])
+        target = images.target(self._names[index])
+        rendering = render(
+            self._as_gaussians(), camera, sh_degree=self._active_sh_degree(), background=self._background
+        )
+        image = self._exposures.apply(rendering.image, index)
+        loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularisation()
+        loss.backward()
+        value = loss.item() if self._checks_now() else 0.0
+        if not math.isfinite(value):
+            raise TrainingError(
+                "reconstruction",
+                expected="a finite loss",
+                found=f"{value} at iteration {self.steps_done + 1}",
+                remedy="check the cameras, or lower the learning rates",
+            )
+        self._follow(image, target.image)
+        self._optimize()
+        self._density.step(
+            self._parameters,
+            self._optimizers,  # type: ignore[arg-type]
+            self.steps_done,
+            means2d=rendering.means2d,
+            radii=rendering.radii,
+            image_size=(camera.width, camera.height),
+            means_learning_rate=self._means_rate(),
+        )
+        if len(self._parameters["means"]) == 0:
+            raise TrainingError(
+                "reconstruction",
+                expected="Gaussians",
+                found=f"none left at iteration {self.steps_done + 1}",
+                remedy="check the cameras and points, or lower min_opacity",
+            )
+        self.steps_done += 1
+        return value
+
+    @torch.no_grad()
+    def evaluate(self, views: Iterable[View]) -> float:
+        """Mean PSNR in dB over views, at the size of their cameras.
+
+        Raises:
+            ValueError: If there is no view.
+        """
+        from lexsplat.image_losses import psnr
+        from lexsplat.rendering import render
+
+        scores = []
+        gaussians = self.gaussians()
+        for view in views:
+            image = render(gaussians, view.camera, background=self._background).image
+            scores.append(psnr(image, torch.from_numpy(view.load_image()).to(self.device)))
+        if not scores:
+            raise ValueError("no views to evaluate on")
+        return sum(scores) / len(scores)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything needed to go on bit for bit, as named tensors."""
+        tensors = {
+            "steps_done": torch.tensor(self.steps_done),
+            "recent_error": torch.tensor(self._recent_error, dtype=torch.float64),
+            "views/order": self._order.clone(),
+            "views/generator": self._generator.get_state(),
+        }
+        for ours, theirs in GSPLAT_NAMES.items():
+            tensors[f"parameters/{ours}"] = self._parameters[theirs].detach().clone()
+            tensors.update(_optimizer_state(f"optimizers/{ours}/", self._optimizers[theirs]))
+        tensors.update({f"density/{name}": value for name, value in self._density.state_tensors().items()})
+        tensors.update(
+            {f"exposures/{name}": value for name, value in self._exposures.state_tensors().items()}
+        )
+        return tensors
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Go on where `state_dict` was called; scene, config and device must be the same.
+
+        Raises:
+            ValueError: If an entry is missing.
+        """
+        expected = {"steps_done", "recent_error", "views/order", "views/generator", "density/random_state"}
+        missing = (expected | {f"parameters/{name}" for name in GSPLAT_NAMES}) - tensors.keys()
+        if missing:
+            raise ValueError(f"checkpoint lacks {', '.join(sorted(missing))}")
+        self.steps_done = int(tensors["steps_done"])
+        self._recent_error = float(tensors["recent_error"])
+        self._order = tensors["views/order"].clone()
+        self._generator.set_state(tensors["views/generator"])
+        for ours, theirs in GSPLAT_NAMES.items():
+            value = tensors[f"parameters/{ours}"].to(self.device, copy=True)
+            self._parameters[theirs] = torch.nn.Parameter(value)
+        self._optimizers = self._new_optimizers()
+        for ours, theirs in GSPLAT_NAMES.items():
+            _load_optimizer_state(f"optimizers/{ours}/", self._optimizers[theirs], tensors)
+        self._density.load_state_tensors(_below("density/", tensors))
+        self._exposures.load_state_tensors(_below("exposures/", tensors))
+
+    def _initial_parameters(self, scene: Scene) -> dict[str, torch.nn.Parameter]:
+        points, colors = scene.points, scene.point_colors
+        if len(points) == 0:
+            raise TrainingError(
+                scene.root, expected="points to start from", found="none", remedy="check the cameras"
+            )
+        if len(points) > self.config.max_gaussians:
+            chosen = torch.randperm(len(points), generator=self._generator)[: self.config.max_gaussians]
+            points, colors = points[chosen.numpy()], colors[chosen.numpy()]
+        start = gaussians_from_points(
+            points,
+            colors,
+            sh_degree=self.config.sh_degree,
+            opacity=self.config.initial_opacity,
+            device=self.device,
+        )
+        tensors = start.tensors()
+        return {theirs: torch.nn.Parameter(tensors[ours]) for ours, theirs in GSPLAT_NAMES.items()}
+
+    def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
+        rates = self.config.rates(self._extent)
+        return {
+            theirs: torch.optim.Adam([self._parameters[theirs]], lr=rates[ours], eps=1e-15, fused=True)
+            for ours, theirs in GSPLAT_NAMES.items()
+        }
+
+    def _as_gaussians(self) -> Gaussians:
+        tensors = {ours: self._parameters[theirs] for ours, theirs in GSPLAT_NAMES.items()}
+        return Gaussians(**tensors, antialiased=self.config.antialiased)
+
+    def _active_sh_degree(self) -> int:
+        every = self.config.sh_degree_every * self.config.iterations / REFERENCE_ITERATIONS
+        return min(self.config.sh_degree, int(self.steps_done / every))
+
+    def _means_rate(self) -> float:
+        config = self.config
+        progress = self.steps_done / config.iterations
+        decay = (config.means_rate_final / config.means_rate) ** progress
+        return config.means_rate * self._extent * decay
+
+    def _next_view(self) -> int:
+        """Views come in random permutations, so each is seen equally often."""
+        place = self.steps_done % len(self._names)
+        if place == 0:
+            self._order = torch.randperm(len(self._names), generator=self._generator)
+        return int(self._order[place])
+
+    def _training_images(self) -> Any:
+        """The photos at the present resolution; those of the warm-up are dropped after it."""
+        from lexsplat.training_images import TrainingImages
+
+        shrink = 2.0 if self.steps_done < self.config.warm_up * self.config.iterations else 1.0
+        if shrink != self._images_shrink:
+            self._images = TrainingImages(
+                self._views.values(), memory=self.config.image_memory, shrink=shrink, device=self.device
+            )
+            self._images_shrink = shrink
+        return self._images
+
+    def _regularisation(self) -> Tensor | float:
+        default = 0.01 if self.config.strategy == "mcmc" else 0.0
+        opacity_weight = default if self.config.opacity_weight is None else self.config.opacity_weight
+        scale_weight = default if self.config.scale_weight is None else self.config.scale_weight
+        total: Tensor | float = 0.0
+        if opacity_weight > 0:
+            total = total + opacity_weight * self._parameters["opacities"].sigmoid().mean()
+        if scale_weight > 0:
+            total = total + scale_weight * self._parameters["scales"].exp().mean() / self._extent
+        return total
+
+    def _checks_now(self) -> bool:
+        """Reading the loss is free on a CPU; on CUDA it waits for the device, so only now and then."""
+        return self.device.type == "cpu" or self.steps_done % EVENT_EVERY == EVENT_EVERY - 1
+
+    def _follow(self, image: Tensor, target: Tensor) -> None:
+        if self._checks_now():
+            error = float(torch.mean((image.detach() - target) ** 2))
+            old = self._recent_error
+            self._recent_error = error if math.isnan(old) else 0.95 * old + 0.05 * error
+
+    def _optimize(self) -> None:
+        self._optimizers["means"].param_groups[0]["lr"] = self._means_rate()
+        if self._active_sh_degree() == 0:
+            self._parameters["shN"].grad = None
+        for optimizer in self._optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self._exposures.optimize()
+
+
+class _Exposures:
+    """An affine colour change ``[3, 4]`` per training photo, the identity at the start; off unless
+    configured."""
+
+    def __init__(self, count: int, config: ReconstructionConfig, device: torch.device) -> None:
+        self._matrices: torch.nn.Parameter | None = None
+        if config.exposure:
+            self._matrices = torch.nn.Parameter(torch.eye(3, 4, device=device).repeat(count, 1, 1))
+            self._optimizer = torch.optim.Adam([self._matrices], lr=config.exposure_rate)
+
+    def apply(self, image: Tensor, index: int) -> Tensor:
+        """``[H, W, 3]`` as photo ``index`` would show it."""
+        if self._matrices is None:
+            return image
+        matrix = self._matrices[index]
+        return image @ matrix[:, :3].T + matrix[:, 3]
+
+    def optimize(self) -> None:
+        """Step, then take the mean change out: the scene keeps the average exposure of all photos."""
+        if self._matrices is None:
+            return
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            identity = torch.eye(3, 4, device=self._matrices.device)
+            self._matrices.add_(identity - self._matrices.mean(0))
+
+    def state_tensors(self) -> dict[str, Tensor]:
+        if self._matrices is None:
+            return {}
+        return {
+            "matrices": self._matrices.detach().clone(),
+            **_optimizer_state("optimizer/", self._optimizer),
+        }
+
+    def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
+        if self._matrices is None:
+            return
+        with torch.no_grad():
+            self._matrices.copy_(tensors["matrices"])
+        _load_optimizer_state("optimizer/", self._optimizer, tensors)
+
+
+def _optimizer_state(prefix: str, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    (parameter,) = optimizer.param_groups[0]["params"]
+    return {f"{prefix}{name}": value.clone() for name, value in optimizer.state[parameter].items()}
+
+
+def _load_optimizer_state(prefix: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
+    (parameter,) = optimizer.param_groups[0]["params"]
+    state = {name: value.to(parameter.device, copy=True) for name, value in _below(prefix, tensors).items()}
+    if state:
+        optimizer.state[parameter] = state
+
+
+def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
