@@ -1,0 +1,226 @@
+"""The CPU rasterizer behind autograd: projection, shading, pairs and blending with their gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lexsplat.cameras import Camera
+from lexsplat.gaussians import Gaussians
+from lexsplat.rendering.kernels import blending, code_weights, projection, spherical_harmonics
+from lexsplat.rendering.kernels.jit import announce_compilation, parallel
+from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs
+
+TILE_GRAIN = 8
+"""Tiles a thread takes at a time."""
+ENTRY_LIMIT = 1 << 24
+"""Numbers that `accumulate_codes` keeps between its two passes (64 MiB)."""
+
+
+def camera_vector(camera: Camera, near: float) -> NDArray[np.float64]:
+    """The camera as the projection kernels read it."""
+    K, viewmat = camera.K, camera.viewmat
+    intrinsics = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height, near]
+    return np.concatenate([viewmat[:3, :3].ravel(), viewmat[:3, 3], intrinsics])
+
+
+def _array(tensor: Tensor) -> NDArray[Any]:
+    return tensor.detach().contiguous().numpy()
+
+
+class _Project(torch.autograd.Function):
+    """(means, quats, log_scales, opacity_logits) -> (means2d, conics, opacities, depths, radii, extents)."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
+        *tensors, camera, antialiased = inputs
+        count = len(tensors[0])
+        shapes = ((count, 2), (count, 3), (count,), (count,), (count,), (count, 2))
+        outputs = [
+            torch.empty(s, dtype=torch.int32 if i == 4 else torch.float32) for i, s in enumerate(shapes)
+        ]
+        arrays = [_array(t) for t in (*tensors, *outputs)]
+        parallel(projection.project, count, GRAIN, *arrays[:4], camera, antialiased, *arrays[4:])
+        ctx.camera, ctx.antialiased = camera, antialiased
+        ctx.save_for_backward(*tensors, outputs[4])
+        ctx.mark_non_differentiable(*outputs[3:])
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Any) -> tuple[Any, ...]:
+        *tensors, radii = ctx.saved_tensors
+        outputs = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
+        parallel(
+            projection.project_backward, len(radii), GRAIN,
+            *[_array(t) for t in tensors], ctx.camera, ctx.antialiased, _array(radii),
+            *[_array(g) for g in grads[:3]], *[_array(t) for t in outputs],
+        )  # fmt: skip
+        return (*outputs, None, None)
+
+
+class _Shade(torch.autograd.Function):
+    """(means, sh0, shN) -> colours of the visible Gaussians."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, sh0: Tensor, shN: Tensor, *constants: Any) -> Tensor:
+        radii, eye, degree = constants
+        colors = torch.empty(len(means), 3)
+        arrays = [_array(t) for t in (means, sh0, shN, radii, colors)]
+        parallel(spherical_harmonics.shade, len(means), GRAIN, degree, arrays[0], eye, *arrays[1:])
+        ctx.eye, ctx.degree = eye, degree
+        ctx.save_for_backward(means, shN, radii, colors)
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
+        means, shN, radii, colors = ctx.saved_tensors
+        outputs = torch.empty_like(means), torch.empty(len(means), 1, 3), torch.empty(shN.shape)
+        arrays = [_array(t) for t in (means, shN, radii, colors, grads[0], *outputs)]
+        parallel(
+            spherical_harmonics.shade_backward, len(means), GRAIN, ctx.degree, arrays[0], ctx.eye, *arrays[1:]
+        )
+        return (*outputs, None, None, None)
+
+
+class _Blend(torch.autograd.Function):
+    """(means2d, conics, opacities, colors, features, background) -> (channels [H, W, C], alpha [H, W]).
+
+    The geometry is read from the pairs; the first three tensors only tell autograd where its gradients go.
+    Colours and alpha have a say in the geometry, features do not.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
+        *tensors, pairs = inputs
+        colors, features, background = tensors[3:]
+        image = torch.empty(pairs.height, pairs.width, _channels(colors) + _channels(features))
+        alpha = torch.empty(pairs.height, pairs.width)
+        behind = np.zeros(0, np.float32) if background is None else _array(background)
+        values = _gather(pairs, colors, features)
+        parallel(
+            blending.blend, pairs.tiles, TILE_GRAIN,
+            pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members, values, behind, pairs.tiles_x,
+            _array(image), _array(alpha),
+        )  # fmt: skip
+        ctx.pairs, ctx.has_colors, ctx.has_features = pairs, colors is not None, features is not None
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(image, alpha, colors, features)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Any) -> tuple[Any, ...]:
+        grad_image, grad_alpha = grads
+        image, alpha, colors, features = ctx.saved_tensors
+        pairs: TilePairs = ctx.pairs
+        visible, color_channels = len(pairs.order), _channels(colors)
+        geometry = any(ctx.needs_input_grad[:3])
+        grad_image = torch.zeros_like(image) if grad_image is None else grad_image
+        grad_alpha = torch.zeros_like(alpha) if grad_alpha is None else grad_alpha
+        values = _gather(pairs, colors, features)
+        rows = np.empty((len(pairs.members), blending.GEOMETRY_FIELDS + image.shape[2]), np.float32)
+        parallel(
+            blending.blend_backward, pairs.tiles, TILE_GRAIN,
+            pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members, pairs.pairs, values, pairs.tiles_x,
+            color_channels, geometry, *[_array(t) for t in (image, alpha, grad_image, grad_alpha)], rows,
+        )  # fmt: skip
+        count = pairs.count if geometry else 0
+        outputs = [torch.zeros(count, 2), torch.zeros(count, 3), torch.zeros(count)]
+        outputs += [torch.zeros(pairs.count, color_channels), torch.zeros(pairs.count, _channels(features))]
+        parallel(
+            blending.sum_pairs, visible, GRAIN,
+            pairs.order, pairs.ellipses, pairs.pair_offsets, rows, geometry, color_channels,
+            *[_array(t) for t in outputs],
+        )  # fmt: skip
+        background = None
+        if ctx.needs_input_grad[5]:
+            background = torch.einsum("hwc,hw->c", grad_image[..., :color_channels], 1 - alpha)
+        wanted = [g if ctx.needs_input_grad[i] else None for i, g in enumerate(outputs)]
+        return (*wanted, background, None)
+
+
+def _channels(values: Tensor | None) -> int:
+    return 0 if values is None else values.shape[1]
+
+
+def _gather(pairs: TilePairs, *sources: Tensor | None) -> NDArray[np.float32]:
+    visible = len(pairs.order)
+    values = np.empty((visible, sum(_channels(s) for s in sources)), np.float32)
+    column = 0
+    for source in sources:
+        if source is not None:
+            parallel(blending.gather, visible, GRAIN, pairs.order, _array(source), column, values)
+            column += source.shape[1]
+    return values
+
+
+def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
+    """Means2d, conics, opacities, depths, radii and extents of every Gaussian; the first three have gradients."""
+    announce_compilation()
+    g = gaussians
+    tensors = (g.means, g.quats, g.log_scales, g.opacity_logits)
+    return _Project.apply(*tensors, camera_vector(camera, near), g.antialiased)
+
+
+def pairs_of(projected: tuple[Tensor, ...], camera: Camera) -> TilePairs:
+    """The pairs of a projection."""
+    means2d, conics, opacities, depths, radii, extents = (_array(t) for t in projected)
+    return find_pairs(means2d, conics, opacities, extents, depths, radii, camera.width, camera.height)
+
+
+def shade(gaussians: Gaussians, camera: Camera, radii: Tensor, degree: int) -> Tensor:
+    """RGB ``[N, 3]`` of the visible Gaussians seen from the camera."""
+    eye = np.ascontiguousarray(camera.position)
+    return _Shade.apply(gaussians.means, gaussians.sh0, gaussians.shN, radii, eye, degree)
+
+
+def blend(
+    projected: tuple[Tensor, ...],
+    pairs: TilePairs,
+    colors: Tensor | None,
+    features: Tensor | None,
+    background: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Channels ``[H, W, C]`` and alpha ``[H, W]``."""
+    return _Blend.apply(*projected[:3], colors, features, background, pairs)
+
+
+def accumulate_codes(
+    projected: tuple[Tensor, ...], pairs: TilePairs, codes: NDArray[np.int32], num_codes: int, totals: Tensor
+) -> None:
+    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``; negative codes are left out."""
+    tiles = pairs.tiles
+    local = np.empty_like(codes)
+    listed = np.empty((tiles, min(num_codes, blending.PIXELS)), np.int32)
+    counts = np.empty(tiles, np.int64)
+    parallel(
+        code_weights.list_codes, tiles, 4 * TILE_GRAIN,
+        codes, num_codes, pairs.tiles_x, local, listed, counts,
+    )  # fmt: skip
+    sizes = np.diff(pairs.tile_offsets) * counts
+    ends = np.cumsum(sizes)
+    lists = pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members
+    parts = max(1, torch.get_num_threads())
+    first = 0
+    while first < tiles:
+        base = int(ends[first] - sizes[first])
+        last = max(first + 1, int(np.searchsorted(ends, base + ENTRY_LIMIT, side="right")))
+        entries = np.zeros(int(ends[last - 1]) - base, np.float32)
+        offsets = ends[first:last] - sizes[first:last] - base
+        parallel(
+            code_weights.weigh_codes, last - first, TILE_GRAIN,
+            first, *lists, pairs.tiles_x, local, counts, offsets, entries,
+        )  # fmt: skip
+        parallel(
+            code_weights.scatter_codes, parts, 1,
+            parts, first, last, pairs.order, pairs.tile_offsets, pairs.members, listed, counts, entries,
+            totals.numpy(),
+        )  # fmt: skip
+        first = last

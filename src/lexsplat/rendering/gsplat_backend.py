@@ -1,0 +1,166 @@
+"""The CUDA rasterizer: gsplat's kernels behind the same functions as `cpu_backend`.
+
+gsplat's parts are called one by one instead of its `rasterization`, so that projection and sorting are shared by
+the pass for colour and the pass for features. The second one sees the geometry detached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.cameras import Camera
+from lexsplat.errors import BackendError
+from lexsplat.gaussians import Gaussians
+
+TILE = 16
+CODE_CHANNELS = 32
+"""Codes that `accumulate_codes` handles at a time: bounds its memory to [N, 32] and [H, W, 32]."""
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Who touches which tile, as gsplat keeps it.
+
+    Args:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        offsets: First entry of each tile ``[1, tile rows, tile columns]``.
+        members: Gaussian of each entry ``[M]``.
+    """
+
+    width: int
+    height: int
+    offsets: Tensor
+    members: Tensor
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by the lists."""
+        return sum(t.numel() * t.element_size() for t in (self.offsets, self.members))
+
+
+def _require_gsplat() -> None:
+    try:
+        from gsplat.cuda._backend import _C
+    except ImportError as error:
+        raise BackendError("gsplat", found=str(error), remedy="pip install gsplat==1.5.3") from error
+    if _C is None:
+        raise BackendError(
+            "gsplat",
+            expected="its CUDA extension",
+            found="an installation without one",
+            remedy="install a wheel built for this torch and CUDA, or put nvcc on the PATH",
+        )
+
+
+def _matrix(matrix: NDArray[np.float64], device: torch.device) -> Tensor:
+    return torch.as_tensor(matrix, dtype=torch.float32, device=device)[None]
+
+
+def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
+    """Means2d, conics, opacities, depths and radii ``[N, 2]`` of every Gaussian; the first three have gradients."""
+    _require_gsplat()
+    from gsplat.cuda._wrapper import fully_fused_projection
+
+    g = gaussians
+    opacities = g.opacities
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        g.means, None, g.quats, g.scales,
+        _matrix(camera.viewmat, g.device), _matrix(camera.K, g.device), camera.width, camera.height,
+        near_plane=near, calc_compensations=g.antialiased, opacities=opacities.detach(),
+    )  # fmt: skip
+    if compensations is not None:
+        opacities = opacities * compensations[0]
+    return means2d[0], conics[0], opacities, depths[0].detach(), radii[0]
+
+
+def pairs_of(projected: tuple[Tensor, ...], camera: Camera) -> TileLists:
+    """Tiles of each Gaussian, sorted by tile and depth."""
+    from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
+
+    means2d, _, _, depths, radii = projected
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    with torch.no_grad():
+        _, keys, members = isect_tiles(means2d.detach()[None], radii[None], depths[None], TILE, columns, rows)
+        offsets = isect_offset_encode(keys, 1, columns, rows)
+    return TileLists(camera.width, camera.height, offsets, members)
+
+
+def shade(gaussians: Gaussians, camera: Camera, radii: Tensor, degree: int) -> Tensor:
+    """RGB ``[N, 3]`` of the visible Gaussians seen from the camera: max(0, SH + 0.5)."""
+    from gsplat.cuda._wrapper import spherical_harmonics
+
+    eye = torch.as_tensor(camera.position, dtype=torch.float32, device=gaussians.device)
+    coefficients = torch.cat([gaussians.sh0, gaussians.shN[:, : (degree + 1) ** 2 - 1]], 1)
+    colors = spherical_harmonics(degree, gaussians.means - eye, coefficients, masks=(radii > 0).all(-1))
+    return torch.clamp_min(colors + 0.5, 0.0)
+
+
+def _rasterize(
+    geometry: tuple[Tensor, ...], lists: TileLists, values: Tensor, background: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    from gsplat.cuda._wrapper import rasterize_to_pixels
+
+    means2d, conics, opacities = geometry
+    image, alpha = rasterize_to_pixels(
+        means2d[None], conics[None], values[None], opacities[None],
+        lists.width, lists.height, TILE, lists.offsets, lists.members,
+        backgrounds=None if background is None else background[None],
+    )  # fmt: skip
+    return image[0], alpha[0, ..., 0]
+
+
+def blend(
+    projected: tuple[Tensor, ...],
+    pairs: TileLists,
+    colors: Tensor | None,
+    features: Tensor | None,
+    background: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Channels ``[H, W, C]`` and alpha ``[H, W]``; colours (or alpha alone) first, features over deaf geometry."""
+    geometry = projected[:3]
+    deaf = tuple(t.detach() for t in geometry)
+    alone = not any(t.requires_grad for t in geometry)
+    images = []
+    alpha = None
+    if colors is not None:
+        image, alpha = _rasterize(geometry, pairs, colors, background)
+        images.append(image)
+    if features is not None and features.shape[1] > 0:
+        image, deaf_alpha = _rasterize(deaf, pairs, features, None)
+        images.append(image)
+        if alpha is None and alone:
+            alpha = deaf_alpha
+    if alpha is None:
+        _, alpha = _rasterize(geometry, pairs, geometry[2].detach()[:, None], None)
+    if not images:
+        return alpha.new_empty(pairs.height, pairs.width, 0), alpha
+    return (images[0] if len(images) == 1 else torch.cat(images, -1)), alpha
+
+
+def accumulate_codes(
+    projected: tuple[Tensor, ...], pairs: TileLists, codes: NDArray[np.int32], num_codes: int, totals: Tensor
+) -> None:
+    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``.
+
+    It is the gradient of rendered features under one-hot codes, taken for a few channels at a time.
+    """
+    deaf = tuple(t.detach() for t in projected[:3])
+    wanted = torch.as_tensor(codes, device=totals.device).long()
+    for first in range(0, num_codes, CODE_CHANNELS):
+        channels = min(CODE_CHANNELS, num_codes - first)
+        inside = (wanted >= first) & (wanted < first + channels)
+        if not bool(inside.any()):
+            continue
+        one_hot = torch.zeros(*codes.shape, channels, device=totals.device)
+        one_hot.scatter_(2, (wanted - first).clamp(0, channels - 1)[..., None], inside[..., None].float())
+        with torch.enable_grad():
+            features = torch.zeros(len(totals), channels, device=totals.device, requires_grad=True)
+            image, _ = _rasterize(deaf, pairs, features, None)
+            (gradient,) = torch.autograd.grad(image, features, one_hot)
+        totals[:, first : first + channels] += gradient

@@ -1,0 +1,166 @@
+"""Which Gaussians touch which tile, nearest first.
+
+A pair is one Gaussian in one tile. Pairs are listed twice: by tile (what blending reads) and by Gaussian (where
+gradients are summed); ``pairs`` links the first list to the second.
+
+Bounding boxes become integers in one place, `find_boxes`. Counting and filling only ever see those integers:
+computing a span twice in floating point can disagree by one pixel and would write outside the list.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.rendering.kernels.jit import kernel
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+TILE = 16
+"""Width and height of a tile in pixels."""
+SLACK = 1e-3
+"""Pixels added to every side of a box, so that rounding never cuts a contribution off."""
+RADIX_BITS = 11
+
+# Columns of the table of ellipses: centre, half conic, opacity (padded to 32 bytes).
+CENTRE_X, CENTRE_Y, HALF_A, CONIC_B, HALF_C, OPACITY, ELLIPSE_FIELDS = 0, 1, 2, 3, 4, 5, 8
+# Columns of the table of boxes: tile columns [first, last), pixel rows [first, last).
+TILE_FIRST, TILE_LAST, ROW_FIRST, ROW_LAST, BOX_FIELDS = 0, 1, 2, 3, 4
+
+
+@kernel
+def sort_visible(depths: F32, radii: I32, order: I32, keys: NDArray[np.uint32], scratch: I32) -> int:
+    """Indices of the visible Gaussians by depth, ties by index; returns how many (stable radix sort).
+
+    Bits of positive floats sort like the floats. ``order`` and ``scratch`` have room for all Gaussians.
+    """
+    size = 1 << RADIX_BITS
+    count = 0
+    for n in range(radii.shape[0]):
+        if radii[n] > 0:
+            order[count] = n
+            count += 1
+    histogram = np.zeros((3, size), np.int64)
+    for i in range(count):
+        key = keys[order[i]]
+        for digit in range(3):
+            histogram[digit, (key >> np.uint32(RADIX_BITS * digit)) & np.uint32(size - 1)] += 1
+    source, target = order, scratch
+    for digit in range(3):
+        total = 0
+        for j in range(size):
+            here = histogram[digit, j]
+            histogram[digit, j] = total
+            total += here
+        for i in range(count):
+            n = source[i]
+            slot = (keys[n] >> np.uint32(RADIX_BITS * digit)) & np.uint32(size - 1)
+            target[histogram[digit, slot]] = n
+            histogram[digit, slot] += 1
+        source, target = target, source
+    # After three passes the result lies in scratch.
+    order[:count] = scratch[:count]
+    return count
+
+
+@kernel
+def find_boxes(
+    start: int,
+    stop: int,
+    order: I32,
+    means2d: F32,
+    conics: F32,
+    opacities: F32,
+    extents: F32,
+    width: int,
+    height: int,
+    ellipses: F32,
+    boxes: I32,
+    counts: I64,
+) -> None:
+    """Gather the ellipses in depth order and round their boxes, once, to tile columns and pixel rows."""
+    half = np.float32(0.5)
+    for k in range(start, stop):
+        n = order[k]
+        x, y = np.float64(means2d[n, 0]), np.float64(means2d[n, 1])
+        ellipses[k, CENTRE_X] = means2d[n, 0]
+        ellipses[k, CENTRE_Y] = means2d[n, 1]
+        ellipses[k, HALF_A] = half * conics[n, 0]
+        ellipses[k, CONIC_B] = conics[n, 1]
+        ellipses[k, HALF_C] = half * conics[n, 2]
+        ellipses[k, OPACITY] = opacities[n]
+        reach_x, reach_y = extents[n, 0] + SLACK, extents[n, 1] + SLACK
+        # First and last pixel whose centre (index + 0.5) is inside; clamped before the cast, so it always fits.
+        left = int(math.ceil(min(max(x - reach_x - 0.5, 0.0), float(width))))
+        right = int(math.floor(min(max(x + reach_x - 0.5, -1.0), float(width - 1))))
+        top = int(math.ceil(min(max(y - reach_y - 0.5, 0.0), float(height))))
+        bottom = int(math.floor(min(max(y + reach_y - 0.5, -1.0), float(height - 1))))
+        if right < left or bottom < top:
+            boxes[k, TILE_FIRST] = boxes[k, TILE_LAST] = boxes[k, ROW_FIRST] = boxes[k, ROW_LAST] = 0
+            counts[k] = 0
+            continue
+        boxes[k, TILE_FIRST] = left // TILE
+        boxes[k, TILE_LAST] = right // TILE + 1
+        boxes[k, ROW_FIRST] = top
+        boxes[k, ROW_LAST] = bottom + 1
+        counts[k] = (right // TILE + 1 - left // TILE) * (bottom // TILE + 1 - top // TILE)
+
+
+@kernel
+def count_pairs(start: int, stop: int, boxes: I32, tiles_x: int, strips: int, histogram: I64) -> None:
+    """Pairs of every tile, for each strip of Gaussians on its own."""
+    total = boxes.shape[0]
+    for strip in range(start, stop):
+        for k in range(strip * total // strips, (strip + 1) * total // strips):
+            if boxes[k, ROW_LAST] == 0:
+                continue
+            for tile_y in range(boxes[k, ROW_FIRST] // TILE, (boxes[k, ROW_LAST] - 1) // TILE + 1):
+                for tile_x in range(boxes[k, TILE_FIRST], boxes[k, TILE_LAST]):
+                    histogram[strip, tile_y * tiles_x + tile_x] += 1
+
+
+@kernel
+def offsets_of(histogram: I64, tile_offsets: I64) -> None:
+    """Turn the counts into the place of each tile's, and within it each strip's, first pair."""
+    strips, tiles = histogram.shape
+    total = 0
+    for tile in range(tiles):
+        tile_offsets[tile] = total
+        for strip in range(strips):
+            here = histogram[strip, tile]
+            histogram[strip, tile] = total
+            total += here
+    tile_offsets[tiles] = total
+
+
+@kernel
+def fill_pairs(
+    start: int,
+    stop: int,
+    boxes: I32,
+    tiles_x: int,
+    strips: int,
+    histogram: I64,
+    pair_offsets: I64,
+    members: I32,
+    pairs: I32,
+) -> None:
+    """List the pairs by tile; strips follow each other within a tile, so depth order is kept."""
+    total = boxes.shape[0]
+    for strip in range(start, stop):
+        for k in range(strip * total // strips, (strip + 1) * total // strips):
+            if boxes[k, ROW_LAST] == 0:
+                continue
+            pair = pair_offsets[k]
+            for tile_y in range(boxes[k, ROW_FIRST] // TILE, (boxes[k, ROW_LAST] - 1) // TILE + 1):
+                for tile_x in range(boxes[k, TILE_FIRST], boxes[k, TILE_LAST]):
+                    tile = tile_y * tiles_x + tile_x
+                    slot = histogram[strip, tile]
+                    histogram[strip, tile] = slot + 1
+                    members[slot] = k
+                    pairs[slot] = pair
+                    pair += 1

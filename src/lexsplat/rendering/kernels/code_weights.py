@@ -1,0 +1,145 @@
+"""How much each Gaussian contributes to the pixels of each code: one scatter per pixel and Gaussian.
+
+A tile usually holds a handful of codes. Each pair keeps one number per code of its tile, so nothing is ever as
+large as Gaussians x codes except the result, and no two threads write the same number.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.rendering.kernels.binning import ROW_FIRST, ROW_LAST, TILE
+from lexsplat.rendering.kernels.blending import CHECK_EVERY, PIXELS, ZERO, blend_weights, start_tile, sum_of
+from lexsplat.rendering.kernels.jit import kernel
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+
+@kernel
+def list_codes(
+    start: int, stop: int, codes: I32, num_codes: int, tiles_x: int, local: I32, listed: I32, counts: I64
+) -> None:
+    """The different codes of each tile, and each pixel's index in its tile's list.
+
+    Args:
+        start: First tile.
+        stop: One past the last tile.
+        codes: Code of each pixel ``[H, W]``; negative pixels are left out.
+        num_codes: Codes are below this.
+        tiles_x: Tiles in a row.
+        local: Written: index in the tile's list, or -1 ``[H, W]``.
+        listed: Written: codes of each tile ``[T, min(256, K)]``.
+        counts: Written: how many ``[T]``.
+    """
+    height, width = codes.shape
+    place = np.full(num_codes, -1, np.int32)
+    for tile in range(start, stop):
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        count = 0
+        for y in range(top, min(top + TILE, height)):
+            for x in range(left, min(left + TILE, width)):
+                code = codes[y, x]
+                if code < 0:
+                    local[y, x] = -1
+                    continue
+                if place[code] < 0:
+                    place[code] = count
+                    listed[tile, count] = code
+                    count += 1
+                local[y, x] = place[code]
+        counts[tile] = count
+        for i in range(count):
+            place[listed[tile, i]] = -1
+
+
+@kernel
+def weigh_codes(
+    start: int,
+    stop: int,
+    first_tile: int,
+    ellipses: F32,
+    boxes: I32,
+    tile_offsets: I64,
+    members: I32,
+    tiles_x: int,
+    local: I32,
+    counts: I64,
+    entry_offsets: I64,
+    entries: F32,
+) -> None:
+    """Weight of each pair at each code of its tile, for tiles ``first_tile + start`` to ``first_tile + stop``.
+
+    ``entries`` (zeroed) holds a block ``[pairs, codes]`` for each tile of the batch at ``entry_offsets``.
+    """
+    height, width = local.shape
+    work = np.empty((5, PIXELS), np.float32)
+    x, y, live, final, weights = work[0], work[1], work[2], work[3], work[4]
+    index = np.empty(PIXELS, np.int32)
+    for batch_tile in range(start, stop):
+        tile = first_tile + batch_tile
+        if counts[tile] == 0:
+            continue
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        start_tile(tile, tiles_x, width, height, x, y, live)
+        index[:] = -1
+        for j in range(min(TILE, height - top)):
+            for i in range(min(TILE, width - left)):
+                index[j * TILE + i] = local[top + j, left + i]
+        countdown = CHECK_EVERY
+        entry = entry_offsets[batch_tile]
+        for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
+            k = members[slot]
+            first = max(boxes[k, ROW_FIRST] - top, 0) * TILE
+            last = min(boxes[k, ROW_LAST] - top, TILE) * TILE
+            total = blend_weights(
+                x[first:last],
+                y[first:last],
+                ellipses[k],
+                live[first:last],
+                final[first:last],
+                weights[first:last],
+            )
+            if total > ZERO:
+                for i in range(first, last):
+                    if index[i] >= 0:
+                        entries[entry + index[i]] += weights[i]
+            entry += counts[tile]
+            countdown -= 1
+            if countdown == 0:
+                countdown = CHECK_EVERY
+                if sum_of(live) == ZERO:
+                    break
+
+
+@kernel
+def scatter_codes(
+    start: int,
+    stop: int,
+    parts: int,
+    first_tile: int,
+    last_tile: int,
+    order: I32,
+    tile_offsets: I64,
+    members: I32,
+    listed: I32,
+    counts: I64,
+    entries: F32,
+    totals: F32,
+) -> None:
+    """Add the entries to ``totals [N, K]``. A part owns a range of Gaussians, so parts never meet."""
+    visible = order.shape[0]
+    for part in range(start, stop):
+        begin, end = part * visible // parts, (part + 1) * visible // parts
+        entry = 0
+        for tile in range(first_tile, last_tile):
+            count = counts[tile]
+            for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
+                k = members[slot]
+                if begin <= k < end:
+                    n = order[k]
+                    for i in range(count):
+                        totals[n, listed[tile, i]] += entries[entry + i]
+                entry += count

@@ -1,0 +1,120 @@
+"""How the kernels are compiled, announced and spread over threads.
+
+Kernels release the GIL and are driven by our own threads instead of Numba's ``prange``: they compile several
+times faster, need no threading layer (whose pitfalls are forked children and two callers at once), and several
+Python threads may render at the same time.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+
+logger = logging.getLogger("lexsplat")
+
+# Everything fast-math allows, except the promise that there are no NaN and no infinities: with that promise the
+# outcome of a comparison with NaN is undefined, and an undefined comparison decides where memory is written.
+FAST_MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
+
+_dispatchers: list[Any] = []
+_announced = False
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile with exact IEEE semantics: geometry and everything that decides about memory."""
+    return _compile(function, fastmath=False)
+
+
+def fast_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile with reassociation, so that sums over pixels use the whole vector unit."""
+    return _compile(function, fastmath=FAST_MATH)
+
+
+def _compile(function: Callable[..., Any], fastmath: Any) -> Callable[..., Any]:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    try:
+        dispatcher = numba.njit(cache=True, **options)(function)
+    except RuntimeError:
+        # Neither the package folder nor the home folder can be written: keep the cache for this machine only.
+        folder = (
+            Path(tempfile.gettempdir()) / f"lexsplat-numba-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+        )
+        logger.warning(
+            "no writable folder for compiled kernels; using %s (set NUMBA_CACHE_DIR to choose)", folder
+        )
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        numba.config.CACHE_DIR = str(folder)
+        dispatcher = numba.njit(cache=True, **options)(function)
+    _dispatchers.append((dispatcher, function))
+    return dispatcher
+
+
+def announce_compilation() -> None:
+    """Log once per process, before the first kernel runs, if the kernels must be compiled first."""
+    global _announced
+    if _announced:
+        return
+    _announced = True
+    if not all(_is_cached(dispatcher, function) for dispatcher, function in _dispatchers):
+        logger.info("compiling CPU kernels, once (about 20 seconds)")
+
+
+def _is_cached(dispatcher: Any, function: Callable[..., Any]) -> bool:
+    module = Path(function.__code__.co_filename)
+    names = Path(dispatcher.stats.cache_path).glob(f"{module.stem}.{function.__name__}-*.nbi")
+    return any(name.stat().st_mtime >= module.stat().st_mtime for name in names)
+
+
+_pool: ThreadPoolExecutor | None = None
+
+
+def _forget_pool() -> None:
+    global _pool
+    _pool = None
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork; a child starts its own.
+    os.register_at_fork(after_in_child=_forget_pool)
+
+
+def parallel(function: Callable[..., Any], count: int, grain: int, *arguments: Any) -> None:
+    """Run ``function(start, stop, *arguments)`` over ``range(count)`` on as many threads as torch uses.
+
+    Args:
+        function: A kernel.
+        count: Number of work items.
+        grain: Items handed out at a time; threads take the next piece when they are done.
+        *arguments: Passed through.
+    """
+    global _pool
+    if count <= 0:
+        return
+    pieces = -(-count // grain)
+    threads = min(torch.get_num_threads(), pieces)
+    if threads <= 1:
+        function(0, count, *arguments)
+        return
+    ticket = itertools.count()  # next() is atomic
+
+    def work() -> None:
+        while (piece := next(ticket)) < pieces:
+            function(piece * grain, min(count, (piece + 1) * grain), *arguments)
+
+    if _pool is None:
+        _pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1, thread_name_prefix="lexsplat")
+    helpers = [_pool.submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            helper.result()

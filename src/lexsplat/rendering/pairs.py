@@ -1,0 +1,106 @@
+"""The list of (tile, Gaussian) pairs of one view: what both passes of the CPU rasterizer read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.rendering.kernels import binning
+from lexsplat.rendering.kernels.jit import parallel
+
+STRIPS = 16
+"""Pieces in which Gaussians are counted and listed."""
+GRAIN = 2048
+"""Gaussians a thread takes at a time."""
+
+
+@dataclass(frozen=True)
+class TilePairs:
+    """Visible Gaussians in depth order and the tiles they touch.
+
+    Args:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        count: Number of all Gaussians N.
+        order: Index of each visible Gaussian, nearest first ``[V]``.
+        ellipses: Centre, half conic and opacity in that order ``[V, 8]``.
+        boxes: Tile columns and pixel rows ``[V, 4]``, half open.
+        pair_offsets: First pair of each Gaussian in the list by Gaussian ``[V + 1]``.
+        tile_offsets: First pair of each tile in the list by tile ``[T + 1]``.
+        members: Position in ``order`` of each pair, by tile and depth ``[M]``.
+        pairs: Place of each pair in the list by Gaussian ``[M]``.
+    """
+
+    width: int
+    height: int
+    count: int
+    order: NDArray[np.int32]
+    ellipses: NDArray[np.float32]
+    boxes: NDArray[np.int32]
+    pair_offsets: NDArray[np.int64]
+    tile_offsets: NDArray[np.int64]
+    members: NDArray[np.int32]
+    pairs: NDArray[np.int32]
+
+    @property
+    def tiles_x(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // binning.TILE)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles in all."""
+        return self.tiles_x * -(-self.height // binning.TILE)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by the lists."""
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
+
+
+def find_pairs(
+    means2d: NDArray[np.float32],
+    conics: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    extents: NDArray[np.float32],
+    depths: NDArray[np.float32],
+    radii: NDArray[np.int32],
+    width: int,
+    height: int,
+) -> TilePairs:
+    """Sort by depth once, then count and list the pairs tile by tile.
+
+    Args:
+        means2d: Centres ``[N, 2]`` in pixels.
+        conics: Inverse covariances ``[N, 3]`` (xx, xy, yy) in 1 / square pixels.
+        opacities: Effective opacities ``[N]``.
+        extents: Half sizes of the box outside of which alpha is below its threshold ``[N, 2]`` in pixels.
+        depths: Positive depths ``[N]``.
+        radii: 0 for Gaussians that are not drawn ``[N]``.
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+    count = len(depths)
+    buffer, scratch = np.empty(count, np.int32), np.empty(count, np.int32)
+    visible = binning.sort_visible(depths, radii, buffer, depths.view(np.uint32), scratch)
+    order = buffer[:visible].copy()
+    ellipses = np.empty((visible, binning.ELLIPSE_FIELDS), np.float32)
+    boxes = np.empty((visible, binning.BOX_FIELDS), np.int32)
+    counts = np.empty(visible, np.int64)
+    parallel(
+        binning.find_boxes, visible, GRAIN,
+        order, means2d, conics, opacities, extents, width, height, ellipses, boxes, counts,
+    )  # fmt: skip
+    pair_offsets = np.zeros(visible + 1, np.int64)
+    np.cumsum(counts, out=pair_offsets[1:])
+    total = int(pair_offsets[-1])
+    members, pairs = np.empty(total, np.int32), np.empty(total, np.int32)
+    tiles_x, tiles_y = -(-width // binning.TILE), -(-height // binning.TILE)
+    histogram = np.zeros((STRIPS, tiles_x * tiles_y), np.int64)
+    tile_offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
+    parallel(binning.count_pairs, STRIPS, 1, boxes, tiles_x, STRIPS, histogram)
+    binning.offsets_of(histogram, tile_offsets)
+    parallel(binning.fill_pairs, STRIPS, 1, boxes, tiles_x, STRIPS, histogram, pair_offsets, members, pairs)
+    return TilePairs(width, height, count, order, ellipses, boxes, pair_offsets, tile_offsets, members, pairs)
