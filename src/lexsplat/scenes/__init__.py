@@ -1,0 +1,8 @@
+"""Captures: photos with cameras in, views with pinhole cameras out, everything keyed by image name."""
+
+from lexsplat.scenes.loading import load_scene
+from lexsplat.scenes.masks import load_mask, load_masks
+from lexsplat.scenes.scene import Scene, View, stem_of
+from lexsplat.scenes.undistortion import Lens
+
+__all__ = ["Lens", "Scene", "View", "load_mask", "load_masks", "load_scene", "stem_of"]

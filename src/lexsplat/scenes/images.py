@@ -1,0 +1,142 @@
+"""Pictures on disk as arrays: every mode Pillow knows, and typed errors for what it cannot read."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lexsplat.errors import CaptureError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+"""Suffixes taken for pictures, in the order in which they are tried where a capture names none."""
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """A picture opened by Pillow, its pixels not read yet.
+
+    The EXIF orientation is not applied: cameras that come with a capture were computed on the pixels as
+    they are stored (COLMAP, nerfstudio and instant-ngp ignore the tag); turning them would break the poses.
+
+    Raises:
+        CaptureError: If the file is missing, is no picture, is cut off, or would unpack to an absurd size.
+    """
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise CaptureError(path, expected="an image", found=found, remedy="restore the file")
+    try:
+        with warnings.catch_warnings():
+            # Between one and two times the limit Pillow only warns; such photos are large but honest.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                yield image
+    except Image.DecompressionBombError as error:
+        raise CaptureError(
+            path,
+            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels",
+            found="more",
+            remedy="scale the image down before building",
+        ) from error
+    except Image.UnidentifiedImageError as error:
+        raise CaptureError(
+            path,
+            expected="an image",
+            found=f"{path.stat().st_size} bytes that are none Pillow can read",
+            remedy="replace it with a JPEG or PNG, or remove it from the capture",
+        ) from error
+    except CaptureError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, TypeError) as error:
+        # Pillow's decoders fail in all these ways on damaged files; nothing of ours runs inside the block.
+        raise CaptureError(
+            path,
+            expected="a whole image",
+            found=f"damaged data ({error or type(error).__name__})",
+            remedy="copy the file again, or remove it from the capture",
+        ) from error
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels from the header alone.
+
+    Raises:
+        CaptureError: As :func:`open_image`, and for an image without pixels.
+    """
+    with open_image(path) as image:
+        width, height = image.size
+    if width < 1 or height < 1:
+        raise CaptureError(
+            path, expected="at least one pixel", found=f"{width}x{height}", remedy="replace the file"
+        )
+    return width, height
+
+
+def read_image(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> NDArray[np.float32]:
+    """A picture as ``[H, W, 3]`` float32 in 0..1; alpha is composited on ``background``.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    with open_image(path) as image:
+        image.load()
+        if image.mode.startswith("I") or image.mode == "F":
+            values = np.asarray(image, dtype=np.float32)
+            # Pillow hands out 16-bit grey as I or I;16; float pictures hold 0..1 by convention.
+            grey = values if image.mode == "F" else values / 65535.0
+            grey = np.clip(np.nan_to_num(grey, nan=0.0), 0.0, 1.0)
+            return np.repeat(grey[..., None], 3, axis=2)
+        if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
+            rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+            alpha = rgba[..., 3:]
+            return rgba[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1.0 - alpha)
+        return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """A mask as ``[H, W]`` bool: true where the picture is brighter than half.
+
+    A picture with values 0 and 1 only counts 1 as true.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    with open_image(path) as image:
+        image.load()
+        values = np.asarray(image if image.mode.startswith(("I", "F", "1")) else image.convert("L"))
+    if values.dtype == np.bool_:
+        return values
+    highest = float(values.max(initial=0))
+    if highest <= 1:
+        return values > 0.5
+    return values > (127 if highest <= 255 else 32767)
+
+
+def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """A picture ``[H, W, C]`` at another ``(width, height)``.
+
+    Each new pixel is the mean over the area it covers when the picture shrinks, and bilinear when it grows.
+    """
+    height, width = image.shape[:2]
+    if (width, height) == tuple(size):
+        return image
+    shrinks = size[0] <= width and size[1] <= height
+    resample = Image.Resampling.BOX if shrinks else Image.Resampling.BILINEAR
+    channels = [
+        np.asarray(Image.fromarray(np.ascontiguousarray(image[..., c])).resize(size, resample))
+        for c in range(image.shape[2])
+    ]
+    return np.stack(channels, axis=-1)
+
+
+def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
+    """Whether one size is the other scaled uniformly, each side rounded by less than a pixel."""
+    low, high = 0.0, np.inf
+    for a, b in zip(found, expected):
+        low, high = max(low, (a - 1) / b), min(high, (a + 1) / b)
+    return bool(low < high)

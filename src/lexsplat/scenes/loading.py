@@ -1,0 +1,180 @@
+"""From a capture folder to a scene: find the camera files, check every photo's header, choose the split."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from lexsplat.cameras import Camera
+from lexsplat.errors import CaptureError
+from lexsplat.scenes.capture import Capture, Photo
+from lexsplat.scenes.colmap import find_model, read_colmap
+from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, sizes_agree
+from lexsplat.scenes.scene import Scene, View, stem_of
+from lexsplat.scenes.splits import choose_test_names, mask_folders
+from lexsplat.scenes.transforms_json import find_transforms, read_transforms
+from lexsplat.scenes.undistortion import pinhole_of
+
+SEGMENTATIONS = "segmentations"
+"""Folder of a capture with ``STEM/PROMPT.png``: masks to measure against."""
+
+IGNORE_FOLDER = "masks"
+"""Folder of a capture with ``NAME.png`` or ``STEM.png``: black where pixels take no part in any loss."""
+
+
+def load_scene(
+    path: str | Path,
+    *,
+    downscale: float = 1.0,
+    test_every: int = 8,
+    test_names: Sequence[str] | None = None,
+) -> Scene:
+    """Load a capture: COLMAP (binary or text), ``transforms.json`` (nerfstudio, instant-ngp, NeRF-synthetic).
+
+    Photos are not read beyond their headers. Where a capture has both a COLMAP model and a
+    ``transforms.json``, the model is taken, because it also has points; give the JSON file as ``path`` to
+    take that.
+
+    Args:
+        path: The capture folder, or its ``transforms.json``.
+        downscale: How many times smaller than the undistorted photos to work, at least 1 as a rule.
+        test_every: Hold out every n-th view, counting from the first by name; 0 holds out nothing.
+        test_names: Names or stems of the views to hold out, instead of every other rule.
+
+    Raises:
+        CaptureError: If there are no cameras or photos, or one of them cannot be used.
+        FileFormatError: If a camera file is damaged.
+        ValueError: If ``downscale`` is not positive and finite or ``test_every`` makes no sense.
+    """
+    if not 0 < downscale < 1e6:
+        raise ValueError(f"downscale must be positive, got {downscale:g}")
+    capture = _read_capture(Path(path))
+    warnings = list(capture.warnings)
+    if capture.missing:
+        total = len(capture.photos) + len(capture.missing)
+        warnings.append(
+            f"{capture.origin}: {len(capture.missing)} of {total} images "
+            f"have no file and are skipped: {', '.join(sorted(capture.missing))}"
+        )
+    if not capture.photos:
+        raise CaptureError(
+            capture.origin,
+            expected="images with files",
+            found=f"{len(capture.missing)} images, none of which is there",
+            remedy="put the images where the capture names them, for COLMAP into images/",
+        )
+    views = {
+        photo.name: _make_view(photo, capture, downscale)
+        for photo in sorted(capture.photos, key=lambda photo: photo.name)
+    }
+    if len(views) < len(capture.photos):
+        names = [photo.name for photo in capture.photos]
+        doubled = next(name for name in names if names.count(name) > 1)
+        raise CaptureError(
+            capture.origin,
+            expected="every image once",
+            found=f"{doubled} twice",
+            remedy="remove one of the two from the file",
+        )
+    segmentations = capture.root / SEGMENTATIONS
+    has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
+    chosen, split_warnings = choose_test_names(
+        list(views),
+        root=capture.root,
+        test_names=test_names,
+        listed=capture.test_names,
+        segmentations=segmentations if has_masks else None,
+        test_every=test_every,
+    )
+    warnings += split_warnings
+    for warning in warnings:
+        logging.getLogger("lexsplat").warning(warning)
+    return Scene(
+        root=capture.root,
+        views=views,
+        train_names=tuple(name for name in views if name not in set(chosen)),
+        test_names=chosen,
+        points=capture.points,
+        point_colors=capture.point_colors,
+        segmentations=segmentations if has_masks else None,
+        warnings=tuple(warnings),
+        source=capture.source,
+        background=capture.background,
+    )
+
+
+def _read_capture(path: Path) -> Capture:
+    if path.is_file() and path.suffix == ".json":
+        return read_transforms(path)
+    if not path.is_dir():
+        found = "a file" if path.exists() else "no such folder"
+        raise CaptureError(path, expected="a capture folder", found=found, remedy="check the path")
+    model = find_model(path)
+    if model is not None:
+        return read_colmap(path, model)
+    transforms = find_transforms(path)
+    if transforms is not None:
+        return read_transforms(transforms)
+    photos = [file for folder in (path, path / "images") if folder.is_dir() for file in _photos_in(folder)]
+    if photos:
+        raise CaptureError(
+            path,
+            expected="cameras (a COLMAP model in sparse/0, or transforms.json)",
+            found=f"{len(photos)} photos without cameras",
+            remedy=f"run: lexsplat poses {path}",
+        )
+    raise CaptureError(
+        path,
+        expected="photos with a COLMAP model in sparse/0 or a transforms.json",
+        found="an empty folder" if not any(path.iterdir()) else "neither cameras nor photos",
+        remedy="give the folder of a capture",
+    )
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def _make_view(photo: Photo, capture: Capture, downscale: float) -> View:
+    """Fit the lens to the photo's real size and replace it by a pinhole camera."""
+    found = image_size(photo.path)
+    stated = (photo.lens.width, photo.lens.height)
+    # Photos scaled after the cameras were computed are common (images_4 of Mip-NeRF 360); another aspect
+    # means that the photo was cropped, turned or exchanged, and no camera can be derived.
+    if not sizes_agree(found, stated):
+        turned = " (turned on its side)" if sizes_agree(found[::-1], stated) else ""
+        raise CaptureError(
+            photo.path,
+            expected=f"{stated[0]}x{stated[1]} pixels as in {capture.origin}, or scaled uniformly",
+            found=f"{found[0]}x{found[1]}{turned}",
+            remedy="use the photos the cameras were computed from, not cropped or rotated",
+        )
+    try:
+        lens = photo.lens.resized(*found)
+        width, height, K = pinhole_of(lens)
+        camera = Camera(width, height, K, photo.viewmat)
+    except ValueError as error:
+        raise CaptureError(
+            capture.origin,
+            expected=f"a usable camera for image {photo.name}",
+            found=str(error),
+            remedy="correct the camera, or run COLMAP again with a simpler camera model",
+        ) from error
+    return View(
+        name=photo.name,
+        image_path=photo.path,
+        camera=camera if downscale == 1 else camera.downscaled(downscale),
+        capture_size=(width, height),
+        lens=lens,
+        background=capture.background,
+        ignore_path=photo.ignore_path or _ignore_file(capture.root, photo.name),
+    )
+
+
+def _ignore_file(root: Path, name: str) -> Path | None:
+    """The mask of a photo: ``masks/NAME.png`` as COLMAP names it, or ``masks/STEM.png``; or None."""
+    for file in (root / IGNORE_FOLDER / f"{name}.png", root / IGNORE_FOLDER / f"{stem_of(name)}.png"):
+        if file.is_file():
+            return file
+    return None
