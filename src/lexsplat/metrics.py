@@ -179,6 +179,15 @@ def resize_scores(scores: ArrayLike, width: int, height: int) -> NDArray[np.floa
 
 
 @dataclass(frozen=True)
+class MaskScores:
+    """`iou`, `pixel_accuracy` and `precision` of one mask."""
+
+    iou: float
+    accuracy: float
+    precision: float
+
+
+@dataclass(frozen=True)
 class ThresholdCounts:
     """What a map finds at each of `THRESHOLDS`, small enough to keep for every view and prompt.
 
@@ -199,6 +208,18 @@ class ThresholdCounts:
         union = self.hits[0] + self.false_alarms
         return np.where(union > 0, self.hits / np.maximum(union, 1), 1.0)
 
+    def at(self, threshold: float) -> MaskScores:
+        """Strict scores of the mask at one threshold, rounded down to the next of `THRESHOLDS`."""
+        index = int(np.searchsorted(THRESHOLDS, threshold, side="right")) - 1
+        hits, alarms = int(self.hits[index]), int(self.false_alarms[index])
+        positives, pixels = int(self.hits[0]), int(self.hits[0] + self.false_alarms[0])
+        found = hits + alarms
+        return MaskScores(
+            iou=float(self.iou[index]),
+            accuracy=(pixels - alarms - (positives - hits)) / pixels,
+            precision=hits / found if found else float(positives == 0),
+        )
+
     @property
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Precision and recall ``[T]`` from the highest threshold that finds something to the lowest."""
@@ -210,7 +231,7 @@ class ThresholdCounts:
 def threshold_counts(scores: ArrayLike, truth: ArrayLike) -> ThresholdCounts:
     """Counts at 1001 thresholds in 0..1; scores outside are clipped."""
     values, mask = _scores(scores, truth)
-    bins = np.floor(np.clip(values, 0, 1) * 1000 + 1e-9).astype(np.int64)
+    bins = np.searchsorted(THRESHOLDS, np.clip(values, 0, 1), side="right") - 1
     counts = [np.bincount(bins[side], minlength=1001)[::-1].cumsum()[::-1] for side in (mask, ~mask)]
     return ThresholdCounts(*counts)
 
