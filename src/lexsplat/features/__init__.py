@@ -110,15 +110,14 @@ class FeatureConfig:
             raise ValueError(
                 f"needs one crop stride a crop size, got {len(self.crop_strides)} for {len(self.crop_sizes)}"
             )
-        positive = (
-            "map_cells",
-            "max_short_side",
-            "dino_short_side",
-            "dino_stride",
-            "dino_max_tokens",
-            "memory",
-        )
-        for name in positive:
+        if min(self.crop_sizes) <= 0 or min(self.crop_strides) <= 0:
+            raise ValueError("crop sizes and strides must be positive")
+        if not 0 < self.random_sizes[0] <= self.random_sizes[1]:
+            raise ValueError(f"random_sizes must be positive and in order, got {self.random_sizes}")
+        if self.dino_facet not in ("key", "token"):
+            raise ValueError(f"dino_facet must be 'key' or 'token', got {self.dino_facet!r}")
+        sizes = ("map_cells", "max_short_side", "dino_short_side", "dino_stride", "dino_max_tokens")
+        for name in (*sizes, "random_crops", "random_levels", "memory"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -126,8 +125,8 @@ class FeatureConfig:
     def embedded(cls) -> FeatureConfig:
         """Settings for the small encoders that ship with the package, chosen by measurement."""
         return cls(
-            crop_sizes=(40 / 240, 64 / 240),
-            crop_strides=(0.25, 0.25),
+            crop_sizes=(32 / 240, 44 / 240),
+            crop_strides=(0.375, 0.375),
             map_cells=60,
             max_short_side=360,
             dino_short_side=240,
@@ -175,9 +174,12 @@ def extract_features(
     workers = (
         1 if clip.device.type == "cuda" else min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing)))
     )
-    work = _Extraction(scene.views, entries, missing, clip, dino, config, workers)
-    for _ in work.run():
-        done += 1
+    pictures: dict[tuple[Path, Path | None], list[str]] = {}  # views with the same picture share their files
+    for name in missing:
+        pictures.setdefault((entries[name].clip, entries[name].dino), []).append(name)
+    twins = {names[0]: names for names in pictures.values()}
+    for name in _Extraction(scene.views, entries, list(twins), clip, dino, config, workers).run():
+        done += len(twins[name])
         listener(Event("features", done, total))
 
     def load(name: str) -> FeatureMap:
@@ -308,7 +310,7 @@ class _Extraction:
             image = pixels.permute(2, 0, 1)
             if self.dino is not None and entry.dino is not None and not is_stored(entry.dino):
                 write_grid(entry.dino, self._dense(self.dino, image))
-            if is_stored(entry.clip):  # also when another view has the same picture
+            if is_stored(entry.clip):
                 self._finished.put(name)
                 continue
             levels = self._levels(entry)

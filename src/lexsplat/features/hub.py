@@ -102,11 +102,15 @@ def _cached_folder(name: str) -> Path | None:
     from huggingface_hub import constants, snapshot_download
     from huggingface_hub.errors import HFValidationError
 
-    refs = Path(constants.HF_HUB_CACHE) / ("models--" + name.replace("/", "--")) / "refs" / "pr"
+    refs = Path(constants.HF_HUB_CACHE) / ("models--" + name.replace("/", "--")) / "refs" / "refs" / "pr"
     revisions = ["main", *(f"refs/pr/{path.name}" for path in sorted(refs.glob("*")))]
     for revision in revisions:
         try:
-            folder = Path(snapshot_download(name, revision=revision, local_files_only=True))
+            folder = Path(
+                snapshot_download(
+                    name, revision=revision, local_files_only=True, allow_patterns=_WANTED_FILES
+                )
+            )
         except (OSError, HFValidationError):
             continue
         if is_model_folder(folder):
