@@ -3,6 +3,19 @@
 from lexsplat.scenes.loading import load_scene
 from lexsplat.scenes.masks import load_mask, load_masks
 from lexsplat.scenes.scene import Scene, View, stem_of
+from lexsplat.scenes.triangulation import InitialPoints, initial_points, random_points_in_frusta, triangulate
 from lexsplat.scenes.undistortion import Lens
 
-__all__ = ["Lens", "Scene", "View", "load_mask", "load_masks", "load_scene", "stem_of"]
+__all__ = [
+    "InitialPoints",
+    "Lens",
+    "Scene",
+    "View",
+    "initial_points",
+    "load_mask",
+    "load_masks",
+    "load_scene",
+    "random_points_in_frusta",
+    "stem_of",
+    "triangulate",
+]
