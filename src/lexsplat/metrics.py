@@ -40,8 +40,9 @@ def psnr(image: ArrayLike, target: ArrayLike) -> float:
 def ssim(image: ArrayLike, target: ArrayLike) -> float:
     """Structural similarity of images ``[H, W, 3]`` in 0..1 as in Wang et al. 2004.
 
-    Gaussian window of 11 pixels, sigma 1.5, biased moments, mean over pixels whose window lies inside: what
-    torchmetrics computes by default. The zero-padded variant of splatting papers differs a little.
+    Gaussian window of 11 pixels, sigma 1.5, biased moments, mean over the pixels whose window lies inside
+    (scikit-image's). torchmetrics and the code of splatting papers count the border too, with reflected or
+    zero padding, and differ in the third decimal.
 
     Raises:
         ValueError: If shapes differ or a side is shorter than 11 pixels.

@@ -207,9 +207,10 @@ def _language_table(data: Mapping[str, Any]) -> str:
         for name, row in _protocol_rows(data["language"])
     ]
     note = (
-        "<p>Prompts are averaged within a view, then views. The automatic threshold is chosen for each prompt "
-        "from training views and never sees the truth. The oracle does: it is an upper bound, not a result. "
-        "The official protocol repeats the authors' released evaluation, quirks included; its mAP can be 1.01.</p>"
+        "<p>Prompts are averaged within a view, then views. The automatic threshold is chosen for each "
+        "prompt from training views and never sees the truth. The oracle does: it is an upper bound, not a "
+        "result. The official protocol repeats the authors' released evaluation, quirks included; its mAP "
+        "can be 1.01.</p>"
     )
     form, method = (escape(str(data["language"].get(key))) for key in ("form", "method"))
     kind = f"<p>Relevancy: form <code>{form}</code>; language field: <code>{method}</code>.</p>"
