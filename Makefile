@@ -17,7 +17,7 @@ demo: $(VENV)/.runtime  ## reconstruct, embed, query and evaluate the scene that
 	$(BIN)/lexsplat demo --output $(OUTPUT)
 
 test: $(VENV)/.dev  ## run the tests
-	$(BIN)/python -m pytest -n $(PYTEST_WORKERS)
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadgroup
 
 lint: $(VENV)/.dev  ## style and types
 	$(BIN)/ruff check .

@@ -1,3 +1,28 @@
-"""lexsplat: search a place with words."""
+"""lexsplat: search a place with words.
+
+    import lexsplat
+    scene = lexsplat.open_scene("output/demo")
+    scores = scene.scores(["red apple"])
+
+Everything else is imported from its module: ``from lexsplat.rendering import render``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lexsplat.search import SearchableScene, open_scene
 
 __version__ = "0.1.0"
+
+__all__ = ["SearchableScene", "__version__", "open_scene"]
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded when first used, so that `import lexsplat` and `lexsplat --help` stay quick.
+    if name in ("open_scene", "SearchableScene"):
+        from lexsplat import search
+
+        return getattr(search, name)
+    raise AttributeError(f"module 'lexsplat' has no attribute {name!r}")

@@ -1,0 +1,36 @@
+"""A few Gaussians, a camera, an image, and gradients through it.
+
+python examples/01_render.py [OUTPUT.png]
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from lexsplat.cameras import look_at
+from lexsplat.gaussians import gaussians_from_points
+from lexsplat.rendering import render
+
+rng = np.random.default_rng(0)
+
+# Points on a ball, coloured by where they are.
+directions = rng.normal(size=(2000, 3))
+points = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+gaussians = gaussians_from_points(points, 0.5 + 0.5 * points, sh_degree=0, opacity=0.8)
+
+camera = look_at([0.0, -3.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], width=320, height=240, fov_y=0.8)
+
+# Everything is differentiable: here, how must the colours change to make the picture greener?
+gaussians.sh0.requires_grad_()
+rendering = render(gaussians, camera)
+rendering.image[..., 1].mean().backward()
+print(f"alpha covers {float(rendering.alpha.detach().mean()):.0%} of the image")
+print(f"{int((gaussians.sh0.grad[:, 0, 1] > 0).sum())} of {len(gaussians)} Gaussians are in sight")
+
+output = Path(sys.argv[1] if len(sys.argv) > 1 else "output/ball.png")
+output.parent.mkdir(parents=True, exist_ok=True)
+pixels = (rendering.image.detach().clamp(0, 1) * 255).to(torch.uint8).numpy()
+Image.fromarray(pixels).save(output)

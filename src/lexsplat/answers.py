@@ -1,0 +1,248 @@
+"""What the commands ``query``, ``evaluate`` and ``info`` answer: plain data for JSON, pictures for people."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from lexsplat.errors import CaptureError, SceneFolderError
+from lexsplat.evaluation import EvaluationConfig, evaluate
+from lexsplat.heatmaps import overlay_heatmap
+from lexsplat.pipeline import machine_facts
+from lexsplat.progress import Listener, silent
+from lexsplat.queries import check_prompts
+from lexsplat.report import Gallery, write_report
+from lexsplat.scene_folder import SceneFolder, atomic_path, write_json
+from lexsplat.scenes import Scene, load_masks, load_scene
+from lexsplat.search import SearchableScene
+
+MAX_DEFAULT_VIEWS = 6
+"""How many held-out views a query without ``--view`` draws."""
+
+
+def answer_queries(
+    scene: SearchableScene,
+    prompts: Sequence[str],
+    views: Sequence[str],
+    threshold: float | None,
+    folder: Path,
+) -> dict[str, Any]:
+    """Answer prompts in views, and write a heatmap and a mask for each pair.
+
+    Args:
+        scene: The scene to ask.
+        prompts: What to look for.
+        views: Names of views; none means up to `MAX_DEFAULT_VIEWS` held-out views.
+        threshold: Relevancy from which a pixel belongs to a mask; none chooses one for each prompt.
+        folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go.
+
+    Returns:
+        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "best_view", "gaussians" and
+        "views".
+
+    Raises:
+        QueryError: If a prompt is empty or a view is unknown.
+    """
+    prompts = check_prompts(prompts)
+    names = [scene.view(name).name for name in views] or _default_views(scene)
+    if threshold is None:
+        thresholds = scene.thresholds(prompts).tolist()
+    else:
+        thresholds = [float(threshold)] * len(prompts)
+    scores = scene.scores(prompts)
+    answers: list[dict[str, Any]] = [
+        {
+            "prompt": prompt,
+            "threshold": round(limit, 4),
+            "peak": 0.0,
+            "best_view": names[0],
+            "gaussians": int((score >= limit).sum()),
+            "views": {},
+        }
+        for prompt, limit, score in zip(prompts, thresholds, scores)
+    ]
+    for name in names:
+        picture = _to_uint8(scene.render(name).image)
+        relevancy = scene.relevancy(prompts, name).cpu().numpy()
+        for answer, limit, values in zip(answers, thresholds, relevancy):
+            answer["views"][name] = _write_pictures(folder, answer["prompt"], name, picture, values, limit)
+            if values.max() > answer["peak"]:
+                answer["peak"], answer["best_view"] = float(values.max()), name
+    return {
+        "scene": str(scene.folder.root) if scene.folder else None,
+        "form": scene.query.form,
+        "prompts": answers,
+    }
+
+
+def _default_views(scene: SearchableScene) -> list[str]:
+    held_out = [name for name, view in scene.views.items() if view.split == "test"]
+    names = held_out or list(scene.views)
+    return names[:: max(1, len(names) // MAX_DEFAULT_VIEWS)][:MAX_DEFAULT_VIEWS]
+
+
+def _write_pictures(
+    folder: Path, prompt: str, name: str, picture: np.ndarray, relevancy: np.ndarray, threshold: float
+) -> dict[str, Any]:
+    mask = relevancy >= threshold
+    row, column = np.unravel_index(int(relevancy.argmax()), relevancy.shape)
+    stem = folder / file_name(prompt) / Path(name).with_suffix("")
+    heatmap_path = stem.with_name(stem.name + ".png")
+    mask_path = stem.with_name(stem.name + ".mask.png")
+    for path, pixels in (
+        (heatmap_path, overlay_heatmap(picture, relevancy)),
+        (mask_path, mask.astype(np.uint8) * 255),
+    ):
+        with atomic_path(path) as temporary:
+            Image.fromarray(pixels).save(temporary, format="PNG")
+    return {
+        "peak": round(float(relevancy.max()), 4),
+        "peak_pixel": [int(column), int(row)],
+        "mask_share": round(float(mask.mean()), 5),
+        "heatmap": str(heatmap_path),
+        "mask": str(mask_path),
+    }
+
+
+def file_name(prompt: str) -> str:
+    """A file name for a prompt: its letters and digits, in any alphabet, joined by underscores."""
+    return re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80] or "prompt"
+
+
+def _to_uint8(image: torch.Tensor) -> np.ndarray:
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def scene_facts(folder: SceneFolder) -> dict[str, Any]:
+    """What ``lexsplat info`` says about a scene folder."""
+    record = folder.record
+    views = folder.read_cameras()
+    splits = [view.split for view in views.values()]
+    sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
+    config = record.get("config", {})
+    stages = record["stages"]
+    facts: dict[str, Any] = {
+        "scene": str(folder.root),
+        "capture": record.get("capture"),
+        "views": {"training": splits.count("train"), "held out": splits.count("test")},
+        "size": ", ".join(sizes),
+        "finished": ", ".join(stages) or "nothing yet",
+        "seconds": folder.stage_seconds(),
+        "gaussians": stages.get("reconstruct", {}).get("gaussians"),
+        "codes": stages.get("codebook", {}).get("codes"),
+        "codes_used": stages.get("codebook", {}).get("codes_used"),
+        "method": stages.get("embed", {}).get("method"),
+        "clip": config.get("clip"),
+        "dino": config.get("dino"),
+        "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
+        "language_bytes": folder.bytes_on_disk(folder.language_path),
+        "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
+        "warnings": len(record.get("warnings", [])),
+        "lexsplat": record.get("provenance", {}).get("lexsplat"),
+    }
+    return facts
+
+
+def evaluate_scene(
+    scene: SearchableScene,
+    *,
+    capture: Path | None = None,
+    masks: Path | None = None,
+    title: str = "lexsplat",
+    listener: Listener = silent,
+) -> dict[str, Any]:
+    """Measure a scene on its held-out views; writes metrics.json, report.html and heatmaps/ into its folder.
+
+    Args:
+        scene: An opened scene folder.
+        capture: Where the photos are, if not where the build found them.
+        masks: Folder with STEM/PROMPT.png, if not ``segmentations/`` of the capture.
+        title: Heading of the report.
+        listener: Told how far it is.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        SceneFolderError: If the photos are not there.
+        CaptureError: If a photo or a mask cannot be used.
+    """
+    if scene.folder is None:
+        raise ValueError("only a scene opened from a folder can be evaluated")
+    folder, record = scene.folder, scene.folder.record
+    photos = load_photos(scene, capture)
+    if masks is not None:
+        if not masks.is_dir():
+            raise CaptureError(masks, expected="a folder with STEM/PROMPT.png", found="no such folder")
+        photos = replace(photos, segmentations=masks)
+    gallery = Gallery()
+    metrics = evaluate(
+        photos,
+        scene.gaussians,
+        scene.field,
+        scene.encode_text,
+        EvaluationConfig(query=scene.query),
+        masks=load_masks(photos) if photos.segmentations else {},
+        observer=gallery.add,
+        listener=listener,
+        stage_seconds=folder.stage_seconds(),
+        stored_bytes={
+            "language_bytes": folder.bytes_on_disk(folder.language_path),
+            "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
+        },
+        settings=record.get("config", {}),
+        machine=machine_facts(),
+    )
+    result = metrics.to_json()
+    write_json(folder.root / "metrics.json", result)
+    write_report(folder.root / "report.html", metrics, gallery, title=title)
+    for (view, prompt), pictures in gallery.cases.items():
+        stem = Path(view).with_suffix("")
+        path = folder.root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(pictures["heatmap"])
+    return result
+
+
+def load_photos(scene: SearchableScene, capture: Path | None) -> Scene:
+    """The capture of a scene, with the views, sizes and split of the build."""
+    views = scene.views
+    held_out = [name for name, view in views.items() if view.split == "test"]
+    config = scene.folder.record.get("config", {}) if scene.folder else {}
+    photos = load_scene(
+        capture_of(scene, capture), downscale=config.get("downscale") or 1.0, test_names=held_out
+    )
+    missing = set(views) - set(photos.views)
+    if missing:
+        raise SceneFolderError(
+            photos.root,
+            expected=f"the {len(views)} photos of the build",
+            found=f"{len(missing)} missing, such as {min(missing)}",
+            remedy="put them back or build again",
+        )
+    return photos
+
+
+def capture_of(scene: SearchableScene, capture: Path | None) -> Path:
+    """Where the photos of a scene are.
+
+    Raises:
+        SceneFolderError: If they are not where the build found them and no other place is given.
+    """
+    recorded = scene.folder.record.get("capture") if scene.folder else None
+    place = capture or (Path(recorded) if recorded else None)
+    if place is None or not place.exists():
+        raise SceneFolderError(
+            place or "capture",
+            expected="the photos the scene was made from",
+            found="no such folder",
+            remedy="say where they are with --capture",
+        )
+    return place

@@ -1,0 +1,126 @@
+"""All settings of a build in one place; each stage owns and documents its part."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from lexsplat.codebook import CodebookConfig
+from lexsplat.embedding import EmbeddingConfig
+from lexsplat.errors import BackendError
+from lexsplat.features import FeatureConfig
+from lexsplat.lifting import LiftingConfig, TuningConfig
+from lexsplat.reconstruction import ReconstructionConfig
+
+DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+"""The CLIP of the paper's released code."""
+DEFAULT_DINO = "facebook/dino-vits8"
+"""The DINO of the paper's released code."""
+
+CPU_PIXELS = 80_000
+"""Working image size on a CPU when no downscale is given: about 320x240, some 60 ms an iteration on two cores."""
+CUDA_PIXELS = 2_000_000
+"""Working image size on CUDA when no downscale is given: 1600 pixels wide at 4:3, as 3DGS does."""
+CPU_ITERATIONS = 3_000
+"""Reconstruction steps on a CPU when none are given."""
+CUDA_ITERATIONS = 30_000
+"""Reconstruction steps on CUDA when none are given: the paper's number."""
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """Everything that decides what a build makes.
+
+    Args:
+        clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "embedded" (small, made by us,
+            knows only scenes like the demo).
+        dino: Dense encoder, in the same way, or "none" (the paper's ablation without DINO).
+        device: "auto" takes CUDA where there is a GPU.
+        seed: Seed of all randomness.
+        memory: Host memory to stay within, such as "4GB".
+        downscale: Factor by which photos are made smaller for reconstruction and language; none chooses one that
+            suits the device.
+        iterations: Reconstruction steps; none means 30,000 on CUDA and 3,000 on a CPU.
+        test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
+        method: "trained" is the paper's optimisation, "lifted" computes the evidence directly, "lifted+tuned"
+            starts the paper's field from it.
+        reconstruction: Geometry and appearance.
+        features: Dense CLIP and DINO features.
+        codebook: Quantization.
+        embedding: Training of the language field.
+        lifting: Computing the language field directly.
+        tuning: From the lifted field to the paper's form.
+    """
+
+    clip: str = DEFAULT_CLIP
+    dino: str = DEFAULT_DINO
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    seed: int = 0
+    memory: str = "4GB"
+    downscale: float | None = None
+    iterations: int | None = None
+    test_every: int = 8
+    method: Literal["trained", "lifted", "lifted+tuned"] = "trained"
+    reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    codebook: CodebookConfig = field(default_factory=CodebookConfig)
+    embedding: EmbeddingConfig = field(default_factory=EmbeddingConfig)
+    lifting: LiftingConfig = field(default_factory=LiftingConfig)
+    tuning: TuningConfig = field(default_factory=TuningConfig)
+
+    def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
+        """The same settings with nothing left open.
+
+        Args:
+            device: "cpu" or "cuda".
+            capture_size: Width and height of the largest photo.
+        """
+        downscale = self.downscale
+        if downscale is None:
+            pixels = CPU_PIXELS if device == "cpu" else CUDA_PIXELS
+            factor = math.sqrt(capture_size[0] * capture_size[1] / pixels)
+            # Halves keep the numbers readable; never enlarge.
+            downscale = max(1.0, round(factor * 2) / 2)
+        features = self.features
+        if self.clip == "embedded" and features == FeatureConfig():
+            features = FeatureConfig.embedded()
+        iterations = self.iterations or (CPU_ITERATIONS if device == "cpu" else CUDA_ITERATIONS)
+        return replace(
+            self,
+            device=device,  # type: ignore[arg-type]
+            downscale=downscale,
+            iterations=iterations,
+            features=features,
+            reconstruction=replace(self.reconstruction, iterations=iterations),
+        )
+
+
+def choose_device(wanted: str) -> str:
+    """ "cpu" or "cuda" from "auto", "cpu" or "cuda".
+
+    Raises:
+        BackendError: If CUDA is asked for and there is none.
+    """
+    import torch
+
+    if wanted == "cpu":
+        return "cpu"
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        found = "none" if torch.version.cuda else "a PyTorch built for the CPU only"
+        raise BackendError("--device cuda", expected="a CUDA GPU", found=found, remedy="use --device cpu")
+    return "cuda" if available else "cpu"
+
+
+def parse_bytes(text: str) -> int:
+    """Number of bytes in "4GB", "512 MiB" or "1000000000" (units are powers of 1024).
+
+    Raises:
+        ValueError: If the text is not a size.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?\s*", text, flags=re.IGNORECASE)
+    if match is None or float(match[1]) == 0:
+        raise ValueError(f"memory must be a size like 4GB or 512MB, got {text!r}")
+    return int(float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " "))

@@ -1,0 +1,292 @@
+"""From a capture to a searchable scene: the stages in order, each finished once and kept.
+
+A stage is done again only when something it depends on has changed: its record in ``scene.json`` holds a
+fingerprint of the photos, the cameras, the settings and the stages before it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lexsplat import __version__
+from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
+from lexsplat.config import BuildConfig, choose_device, parse_bytes
+from lexsplat.embedding import train_field
+from lexsplat.errors import ModelError
+from lexsplat.features import FeatureMaps, extract_features
+from lexsplat.gaussians import Gaussians
+from lexsplat.language_field import LanguageField
+from lexsplat.lifting import lift, tune
+from lexsplat.progress import Event, Listener, silent
+from lexsplat.reconstruction import reconstruct
+from lexsplat.scene_folder import SceneFolder, fingerprint, read_tensors, write_tensors
+from lexsplat.scenes import Scene, load_scene
+
+STAGES = ("reconstruct", "features", "codebook", "embed")
+"""Names of the stages in the order in which they run."""
+
+
+def build(
+    capture: Path,
+    output: Path,
+    config: BuildConfig,
+    *,
+    until: str = "embed",
+    test_names: list[str] | None = None,
+    listener: Listener = silent,
+) -> SceneFolder:
+    """Make a searchable scene from a capture, going on where an earlier build stopped.
+
+    Args:
+        capture: Folder with photos and cameras (COLMAP or ``transforms.json``).
+        output: The scene folder to make or to go on with.
+        config: Settings; open ones are chosen to suit the device.
+        until: Last stage to run, one of `STAGES`.
+        test_names: Names of held-out views; none takes what the capture says, else every n-th.
+        listener: Told how far each stage is.
+
+    Raises:
+        LexsplatError: With one line that says what is wrong and what to do.
+        ValueError: If ``until`` is not a stage.
+    """
+    if until not in STAGES:
+        raise ValueError(f"until must be one of {', '.join(STAGES)}, got {until!r}")
+    device = choose_device(config.device)
+    parse_bytes(config.memory)
+    # The first look costs only headers; the second uses the working resolution that suits the device.
+    scene = load_scene(capture, test_every=config.test_every, test_names=test_names)
+    sizes = [view.capture_size for view in scene.views.values()]
+    config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
+    if config.downscale != 1.0:
+        scene = load_scene(
+            capture, downscale=config.downscale or 1.0, test_every=config.test_every, test_names=test_names
+        )
+    folder = SceneFolder(output)
+    with folder.locked():
+        return _Builder(scene, folder, config, device, listener).run(until)
+
+
+class _Builder:
+    """One run of the stages. ``made_from`` holds the fingerprints of the stages run so far."""
+
+    def __init__(
+        self, scene: Scene, folder: SceneFolder, config: BuildConfig, device: str, listener: Listener
+    ) -> None:
+        self.scene, self.folder, self.config = scene, folder, config
+        self.device, self.listener = device, listener
+        self.made_from: dict[str, str] = {}
+
+    def run(self, until: str) -> SceneFolder:
+        capture_hash = self._write_provenance()
+        stages: dict[str, tuple[tuple[Any, ...], Callable[[], dict[str, Any]], list[Path]]] = {
+            "reconstruct": (
+                (capture_hash, self.config.reconstruction, self.config.seed, self.device),
+                self._reconstruct,
+                [self.folder.gaussians_path],
+            ),
+            "features": (
+                (capture_hash, self.config.features, self._model_identity("clip"), self._model_identity("dino")),
+                self._extract_features,
+                [self.folder.features_path],
+            ),
+            "codebook": (("features", self.config.codebook, self.config.seed), self._fit_codebook, self._code_paths()),
+            "embed": (
+                ("reconstruct", "codebook", self.config.method, self.config.embedding, self.config.lifting, self.config.tuning, self.config.seed),
+                self._embed,
+                [self.folder.language_path],
+            ),
+        }  # fmt: skip
+        for name in STAGES[: STAGES.index(until) + 1]:
+            inputs, work, outputs = stages[name]
+            self._run_stage(name, inputs, work, outputs)
+        return self.folder
+
+    def _run_stage(
+        self, name: str, inputs: tuple[Any, ...], work: Callable[[], dict[str, Any]], outputs: list[Path]
+    ) -> None:
+        # A stage named among the inputs stands for everything that stage was made from.
+        made_from = fingerprint([self.made_from.get(p, p) if isinstance(p, str) else p for p in inputs])
+        self.made_from[name] = made_from
+        if self.folder.is_finished(name, made_from) and all(path.exists() for path in outputs):
+            self.listener(Event(name, 1, 1, {"kept": 1.0}))
+            return
+        self.folder.reopen(name)
+        start = time.perf_counter()
+        facts = work()
+        self.folder.finish(name, made_from, time.perf_counter() - start, **facts)
+
+    # -- what a stage does
+
+    def _reconstruct(self) -> dict[str, Any]:
+        gaussians = reconstruct(
+            self.scene,
+            self.config.reconstruction,
+            device=self.device,
+            seed=self.config.seed,
+            listener=self.listener,
+        )
+        self.folder.write_gaussians(gaussians)
+        return {"gaussians": len(gaussians)}
+
+    def _extract_features(self) -> dict[str, Any]:
+        maps = self._feature_maps()
+        return {"views": len(maps)}
+
+    def _fit_codebook(self) -> dict[str, Any]:
+        maps = self._feature_maps()
+        names = self.scene.train_names
+        codebook = fit_codebook(
+            maps, names, self.config.codebook, seed=self.config.seed, listener=self.listener
+        )
+        code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
+        for name, code_map in code_maps.items():
+            self.folder.write_code_map(name, code_map)
+        write_tensors(self.folder.codebook_path, codebook.tensors(), {})
+        usage = code_usage(code_maps.values(), codebook.num_codes)
+        return {
+            "codes": codebook.num_codes,
+            "codes_used": usage.used,
+            "perplexity": round(usage.perplexity, 2),
+        }
+
+    def _embed(self) -> dict[str, Any]:
+        gaussians = self.folder.read_gaussians().to(self.device)
+        cameras = {name: self.scene.views[name].camera for name in self.scene.train_names}
+        code_maps = {name: self.folder.read_code_map(name) for name in cameras}
+        codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
+        field = make_field(gaussians, cameras, code_maps, codebook, self.config, self.listener)
+        metadata = {**field.metadata(), "reconstruction": self.made_from["reconstruct"]}
+        write_tensors(self.folder.language_path, field.tensors(), metadata)
+        return {"method": field.method}
+
+    # -- what stages share
+
+    def _feature_maps(self) -> FeatureMaps:
+        from lexsplat.features.encoders import load_clip, load_dino
+
+        clip = load_clip(self.config.clip, self.device)
+        dino = None if self.config.dino == "none" else load_dino(self.config.dino, self.device)
+        return extract_features(
+            self.scene,
+            clip,
+            dino,
+            replace(self.config.features, memory=parse_bytes(self.config.memory)),
+            cache_dir=self.folder.features_path,
+            listener=self.listener,
+        )
+
+    def _code_paths(self) -> list[Path]:
+        return [self.folder.codebook_path, *(self.folder.code_map_path(n) for n in self.scene.train_names)]
+
+    def _model_identity(self, kind: str) -> list[str]:
+        """The name of a model; for a folder also the size and time of its files."""
+        name = str(getattr(self.config, kind))
+        folder = Path(name)
+        if not folder.is_dir():
+            return [name]
+        files = sorted(file for file in folder.iterdir() if file.is_file())
+        if not files:
+            raise ModelError(name, expected="a model folder", found="an empty folder")
+        return [name, *(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)]
+
+    def _write_provenance(self) -> str:
+        """Record where the scene comes from; returns a fingerprint of photos, cameras and split."""
+        views = {
+            name: (view.camera, "test" if name in self.scene.test_names else "train")
+            for name, view in self.scene.views.items()
+        }
+        sources = {name: _file_hash(view.image_path) for name, view in self.scene.views.items()}
+        self.folder.write_cameras(views)
+        self.folder.record["capture"] = str(Path(self.scene.root).resolve())
+        self.folder.record["config"] = _settings(self.config)
+        self.folder.record["provenance"] = {
+            "lexsplat": __version__,
+            "versions": _versions(),
+            "seed": self.config.seed,
+            "sources": sources,
+        }
+        self.folder.record["warnings"] = list(self.scene.warnings)
+        self.folder.save()
+        cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
+        return fingerprint(sources, cameras)
+
+
+def make_field(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Any],
+    code_maps: Mapping[str, np.ndarray],
+    codebook: Codebook,
+    config: BuildConfig,
+    listener: Listener = silent,
+) -> LanguageField:
+    """The language field by the method the settings name."""
+    if config.method == "trained":
+        return train_field(
+            gaussians, cameras, code_maps, codebook, config.embedding, seed=config.seed, listener=listener
+        )
+    lifted = lift(gaussians, cameras, code_maps, codebook, config.lifting, listener=listener)
+    if config.method == "lifted":
+        return lifted
+    return tune(
+        lifted, gaussians, cameras, code_maps, config.tuning, config.embedding,
+        seed=config.seed, listener=listener,
+    )  # fmt: skip
+
+
+def _file_hash(path: Path) -> str:
+    digest = hashlib.blake2b(digest_size=12)
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _settings(config: BuildConfig) -> dict[str, Any]:
+    from lexsplat.scene_folder import to_json
+
+    return to_json(config)
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version()}
+    for package in ("torch", "numpy", "numba", "gsplat", "pycolmap", "transformers"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def machine_facts() -> dict[str, Any]:
+    """The machine, in words a reader of numbers needs."""
+    import torch
+
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "platform": platform.platform(),
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "gpu": gpu,
+        "versions": {"lexsplat": __version__, **_versions()},
+    }
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -1,0 +1,178 @@
+"""A finished scene, open for questions: the Python face of lexsplat.
+
+import lexsplat
+scene = lexsplat.open_scene("output/demo")
+relevancy = scene.relevancy(["red apple"], view="frame_0005.jpg")  # [1, H, W]
+scores = scene.scores(["red apple"])  # [1, N], one for each Gaussian
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from lexsplat.cameras import Camera
+from lexsplat.errors import QueryError, SceneFolderError
+from lexsplat.gaussians import Gaussians
+from lexsplat.language_field import LanguageField, field_from_tensors
+from lexsplat.queries import (
+    CANONICAL_PHRASES,
+    QueryConfig,
+    embed_prompts,
+    gaussian_relevancy,
+    render_relevancy,
+    scene_threshold,
+)
+from lexsplat.rendering import Rendering, render
+from lexsplat.scene_folder import SceneFolder, StoredView, read_tensors
+
+
+class SearchableScene:
+    """Gaussians, their language and the views they were made from.
+
+    Args:
+        gaussians: Geometry and appearance.
+        field: Their language.
+        views: The views by name.
+        clip: Name or folder of the encoder the language was made with.
+        query: How questions are answered.
+        folder: Where the scene was opened from, if from disk.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        field: LanguageField,
+        views: Mapping[str, StoredView],
+        clip: str,
+        query: QueryConfig | None = None,
+        folder: SceneFolder | None = None,
+    ) -> None:
+        self.gaussians, self.field, self.views = gaussians, field, dict(views)
+        self.clip, self.query, self.folder = clip, query or QueryConfig(), folder
+        self._encoder: Any = None
+        self._texts: dict[str, Tensor] = {}
+
+    # -- text
+
+    def embed(self, prompts: Sequence[str]) -> Tensor:
+        """Unit text embeddings ``[P, D]``; each prompt is encoded once.
+
+        Raises:
+            QueryError: If there is no prompt or one is empty.
+            ModelError: If the text encoder cannot be loaded.
+        """
+        import torch
+
+        for prompt in prompts:
+            if prompt not in self._texts:
+                self._texts[prompt] = embed_prompts([prompt], self.encode_text, self.query.templates)[0]
+        if not prompts:
+            raise QueryError("query", expected="at least one prompt", found="none")
+        return torch.stack([self._texts[prompt] for prompt in prompts])
+
+    def encode_text(self, texts: list[str]) -> Tensor:
+        """Embeddings ``[T, D]`` of whole sentences, by the encoder the language was made with."""
+        if self._encoder is None:
+            from lexsplat.features.encoders import load_clip
+
+            self._encoder = load_clip(self.clip, str(self.gaussians.device))
+        return self._encoder.encode_text(texts)
+
+    def _negatives(self) -> Tensor:
+        return self.embed(list(self.query.negatives or CANONICAL_PHRASES))
+
+    # -- answers
+
+    def relevancy(self, prompts: Sequence[str], view: str | Camera) -> Tensor:
+        """Relevancy maps ``[P, H, W]`` in 0..1 of the prompts in a view (a name or any camera)."""
+        camera = view if isinstance(view, Camera) else self.view(view).camera
+        positives = self.embed(prompts)
+        return render_relevancy(self.field, self.gaussians, camera, positives, self._negatives(), self.query)
+
+    def scores(self, prompts: Sequence[str]) -> Tensor:
+        """Relevancy ``[P, N]`` in 0..1 of every Gaussian for the prompts."""
+        return gaussian_relevancy(self.field, self.embed(prompts), self._negatives(), self.query)
+
+    def thresholds(self, prompts: Sequence[str]) -> Tensor:
+        """An automatic threshold ``[P]`` for each prompt, from the scene alone."""
+        return scene_threshold(self.field, self.gaussians, self._threshold_cameras(), self.embed(prompts),
+                               self._negatives(), self.query)  # fmt: skip
+
+    def render(self, view: str | Camera) -> Rendering:
+        """The scene in colour."""
+        import torch
+
+        camera = view if isinstance(view, Camera) else self.view(view).camera
+        with torch.no_grad():
+            return render(self.gaussians, camera)
+
+    def view(self, name: str) -> StoredView:
+        """The view called ``name``, with or without its suffix.
+
+        Raises:
+            QueryError: If there is none.
+        """
+        if name in self.views:
+            return self.views[name]
+        matches = [view for key, view in self.views.items() if Path(key).stem == Path(name).stem]
+        if len(matches) != 1:
+            known = ", ".join(list(self.views)[:5])
+            raise QueryError(
+                f"view {name!r}",
+                expected="the name of a view",
+                found="none such" if not matches else f"{len(matches)} such",
+                remedy=f"the scene has {len(self.views)} views, such as {known}",
+            )
+        return matches[0]
+
+    def _threshold_cameras(self) -> list[Camera]:
+        """Up to eight training cameras, spread over the capture."""
+        cameras = [view.camera for view in self.views.values() if view.split == "train"]
+        step = max(1, len(cameras) // 8)
+        return cameras[::step][:8]
+
+
+def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> SearchableScene:
+    """Open a scene folder for questions.
+
+    Args:
+        path: A folder that ``lexsplat build`` or ``lexsplat demo`` made.
+        device: "auto", "cpu" or "cuda".
+        clip: Name or folder of the text encoder, if it is not where the build found it.
+
+    Raises:
+        SceneFolderError: If the folder is not a finished scene.
+        FileFormatError: If one of its files is damaged.
+    """
+    from lexsplat.config import choose_device
+
+    folder = SceneFolder.open(Path(path))
+    if "embed" not in folder.record["stages"] or not folder.language_path.exists():
+        finished = ", ".join(folder.record["stages"]) or "none"
+        raise SceneFolderError(
+            path,
+            expected="a scene with language",
+            found=f"finished stages: {finished}",
+            remedy="run the build again to finish it",
+        )
+    place = choose_device(device)
+    gaussians = folder.read_gaussians()
+    tensors, metadata = read_tensors(folder.language_path)
+    field = field_from_tensors(tensors, metadata)
+    made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
+    if metadata.get("reconstruction") != made_from or len(field) != len(gaussians):
+        raise SceneFolderError(
+            path,
+            expected="language made for these Gaussians",
+            found="language of an earlier reconstruction",
+            remedy="the scene is being rebuilt or was left half way: run the build again",
+        )
+    config = folder.record.get("config", {})
+    return SearchableScene(
+        gaussians.to(place), field.to(place), folder.read_cameras(), clip or config.get("clip", "embedded"),
+        folder=folder,
+    )  # fmt: skip

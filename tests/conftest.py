@@ -1,0 +1,50 @@
+"""Fixtures shared by the tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_capture import write_capture
+
+TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(items):
+    """Tests marked ``gpu`` are skipped where there is no CUDA device."""
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if "gpu" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.fixture(scope="session")
+def tiny_capture(tmp_path_factory) -> Path:
+    """Twelve ray-traced views of two spheres with cameras, points and masks; read-only."""
+    return write_capture(tmp_path_factory.mktemp("capture") / "tiny")
+
+
+QUICK_BUILD = [
+    "--clip", "embedded", "--dino", "embedded", "--device", "cpu", "--iterations", "120",
+    "--codebook.num-codes", "16", "--embedding.iterations", "60",
+]  # fmt: skip
+"""Options of ``lexsplat build`` that make a small scene in seconds."""
+
+
+@pytest.fixture(scope="session")
+def built(tiny_capture, tmp_path_factory) -> Path:
+    """A scene built from the tiny capture by the command line; its results must not be changed."""
+    from lexsplat import cli
+
+    output = tmp_path_factory.mktemp("scene") / "tiny"
+    assert cli.main(["build", str(tiny_capture), "--output", str(output), *QUICK_BUILD]) == 0
+    return output
+
+
+@pytest.fixture
+def real_captures() -> Path:
+    """The folder of real photos, where there is one."""
+    if not TEST_DATA.is_dir():
+        pytest.skip(f"no real captures: set LEXSPLAT_TEST_DATA ({TEST_DATA} is absent)")
+    return TEST_DATA

@@ -1,0 +1,203 @@
+"""The command line end to end on a tiny capture: build, go on, ask, evaluate, refuse."""
+
+import json
+import os
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import QUICK_BUILD as QUICK
+from PIL import Image
+from tiny_capture import write_capture
+
+from lexsplat import cli, open_scene
+
+pytestmark = pytest.mark.xdist_group("built")
+
+
+def modified(folder: Path) -> dict[str, int]:
+    return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
+
+
+def test_build_writes_the_scene_folder_of_the_design(built):
+    names = {p.name for p in built.iterdir()}
+    assert {"scene.json", "cameras.json", "gaussians.ply", "language.safetensors", "codes"} <= names
+    record = json.loads((built / "scene.json").read_text())
+    assert list(record["stages"]) == ["reconstruct", "features", "codebook", "embed"]
+    views = json.loads((built / "cameras.json").read_text())["views"]
+    held_out = [v["name"] for v in views if v["split"] == "test"]
+    assert held_out == ["view_02.png", "view_06.png", "view_10.png"], "views with masks are held out"
+    codes = {p.stem for p in (built / "codes").iterdir()}
+    assert codes.isdisjoint({"view_02", "view_06", "view_10"}), "held-out views take no part in the codebook"
+    assert len(codes) == 9
+
+
+def test_building_again_changes_no_result(built, tiny_capture):
+    before = modified(built)
+    assert cli.main(["build", str(tiny_capture), "--output", str(built), *QUICK]) == 0
+    after = modified(built)
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed <= {"scene.json", "cameras.json", ".lock"}
+
+
+def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(built, copy)
+    before = modified(copy)
+    arguments = [*QUICK, "--embedding.no-use-smoothing"]
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *arguments]) == 0
+    after = modified(copy)
+    assert after["language.safetensors"] != before["language.safetensors"]
+    for kept in ("gaussians.ply", "checkpoints/codebook.safetensors", "codes/view_01.png"):
+        assert after[kept] == before[kept], kept
+
+
+@pytest.mark.parametrize("method", ["lifted", "lifted+tuned"])
+def test_every_method_makes_a_scene_that_answers(built, tiny_capture, tmp_path, method):
+    copy = tmp_path / "copy"
+    shutil.copytree(built, copy)
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", method]) == 0
+    scene = open_scene(copy, device="cpu")
+    assert scene.field.method == method
+    relevancy = scene.relevancy(["red apple"], "view_02")
+    assert relevancy.shape == (1, 72, 96)
+    assert float(relevancy.max()) > float(relevancy.min())
+
+
+def test_query_writes_pictures_and_json(built, tmp_path, capsys):
+    arguments = ["query", str(built), "red apple", "blue ball", "--view", "view_02.png", "--json"]
+    assert cli.main([*arguments, "--output", str(tmp_path)]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert [p["prompt"] for p in answer["prompts"]] == ["red apple", "blue ball"]
+    for prompt in answer["prompts"]:
+        view = prompt["views"]["view_02.png"]
+        heatmap, mask = Image.open(view["heatmap"]), np.array(Image.open(view["mask"]))
+        assert heatmap.size == (96, 72)
+        assert set(np.unique(mask)) <= {0, 255}
+        assert view["mask_share"] == pytest.approx((mask > 0).mean(), abs=1e-4)
+        assert 0 <= prompt["threshold"] <= 1
+
+
+def test_evaluate_writes_metrics_and_a_report_that_stands_alone(built, capsys):
+    assert cli.main(["evaluate", str(built), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    written = json.loads((built / "metrics.json").read_text())
+    assert printed == written
+    assert written["quality"]["psnr"] > 15
+    strict = written["language"]["strict"]
+    for form in ("auto", "fixed", "oracle"):
+        assert set(strict[form]) >= {"mIoU", "mPA", "mP"}
+    assert strict["oracle"]["mIoU"] >= max(strict["auto"]["mIoU"], strict["fixed"]["mIoU"])
+    assert set(written) >= {"quality", "language", "speed", "size", "config", "machine"}
+    html = (built / "report.html").read_text()
+    HTMLParser().feed(html)
+    assert 'src="http' not in html
+    assert "red apple" in html
+
+
+def test_info_tells_what_is_there(built, capsys):
+    assert cli.main(["info", str(built), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["views"] == {"training": 9, "held out": 3}
+    assert facts["gaussians"] > 0
+    assert cli.main(["info", str(built)]) == 0
+    assert "gaussian bytes" in capsys.readouterr().out
+
+
+def test_export_writes_the_standard_ply(built, tmp_path):
+    assert cli.main(["export", str(built), str(tmp_path / "a.ply")]) == 0
+    assert (tmp_path / "a.ply").read_bytes() == (built / "gaussians.ply").read_bytes()
+
+
+def fails_in_one_line(capsys, arguments: list[str], *words: str) -> None:
+    assert cli.main(arguments) == 1
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.startswith("error:")]
+    assert len(lines) == 1, captured.err
+    assert "Traceback" not in captured.err
+    for word in words:
+        assert word in lines[0], lines[0]
+
+
+def test_an_empty_prompt_is_refused(built, capsys):
+    fails_in_one_line(capsys, ["query", str(built), "  "], "prompt")
+
+
+def test_an_unknown_view_names_views_there_are(built, capsys):
+    fails_in_one_line(capsys, ["query", str(built), "x", "--view", "nowhere"], "nowhere", "view_01.png")
+
+
+def test_an_unknown_model_says_the_three_ways_to_get_one(tiny_capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    output = tmp_path / "out"
+    arguments = ["embed", str(tiny_capture), "--output", str(output), "--iterations", "2", "--device", "cpu"]
+    fails_in_one_line(
+        capsys, [*arguments, "--clip", "nobody/nothing"], "nobody/nothing", "embedded", "folder"
+    )
+    assert not (output / "language.safetensors").exists()
+
+
+def broken(tmp_path: Path, damage) -> Path:
+    capture = write_capture(tmp_path / "capture", views=4, width=32, height=24)
+    damage(capture)
+    return capture
+
+
+def truncate_image(capture: Path) -> None:
+    path = capture / "images" / "view_01.png"
+    path.write_bytes(path.read_bytes()[:300])
+
+
+def resize_image(capture: Path) -> None:
+    path = capture / "images" / "view_01.png"
+    Image.open(path).resize((32, 40)).save(path)
+
+
+def poison_pose(capture: Path) -> None:
+    path = capture / "sparse" / "0" / "images.txt"
+    lines = path.read_text().splitlines()
+    parts = lines[0].split()
+    parts[5] = "nan"
+    path.write_text("\n".join([" ".join(parts), *lines[1:]]) + "\n")
+
+
+def orphan_mask(capture: Path) -> None:
+    path = capture / "segmentations" / "view_77" / "mug.png"
+    path.parent.mkdir(parents=True)
+    Image.new("L", (32, 24)).save(path)
+
+
+DAMAGES = {
+    "no such folder": (shutil.rmtree, "capture"),
+    "empty folder": (lambda c: [shutil.rmtree(c), os.mkdir(c)], "capture"),
+    "no cameras": (lambda c: shutil.rmtree(c / "sparse"), "capture"),
+    "truncated image": (truncate_image, "view_01.png"),
+    "image of another shape": (resize_image, "view_01.png"),
+    "NaN in a pose": (poison_pose, "view_01.png"),
+    "mask without a view": (orphan_mask, "view_77"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_bad_captures_end_in_one_line_and_no_half_written_output(tmp_path, capsys, kind):
+    damage, word = DAMAGES[kind]
+    capture, output = broken(tmp_path, damage), tmp_path / "out"
+    arguments = ["build", str(capture), "--output", str(output), *QUICK, "--iterations", "5"]
+    fails_in_one_line(capsys, arguments, word)
+    left = [
+        p for p in output.rglob("*") if p.is_file() and p.name not in (".lock", "scene.json", "cameras.json")
+    ]
+    assert left == []
+
+
+def test_wrong_usage_is_status_2():
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["build"])
+    assert caught.value.code == 2
+
+
+def test_version_is_printed(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("lexsplat 0.")
