@@ -30,6 +30,7 @@ from lexsplat.losses import (
     uncertainty_loss,
 )
 from lexsplat.progress import Event, Listener, silent
+from lexsplat.rendering import PreparedView, prepare
 
 REPORT_EVERY = 25
 """Steps between two events, which is also how often the loss is checked."""
@@ -67,6 +68,8 @@ class EmbeddingConfig:
         normalise_rendering: Scale the rendered s to unit length before decoding (authors' code).
         clip_decoder_grad: Largest norm of the decoder's gradient, which keeps a bad batch from ruining it;
             None is off (paper).
+        memory_bytes: Bound for projections of views kept between steps; further views are projected anew each
+            time.
     """
 
     iterations: int = 1500
@@ -93,6 +96,7 @@ class EmbeddingConfig:
     num_frequencies: int = 0
     normalise_rendering: bool = False
     clip_decoder_grad: float | None = 1.0
+    memory_bytes: int = 1 << 30
 
     def __post_init__(self) -> None:
         if (
@@ -188,12 +192,15 @@ class EmbeddingTrainer:
         # AdamW without weight decay is Adam, the paper's optimizer.
         return torch.optim.AdamW(groups, betas=(0.9, 0.999))
 
-    def step(self, camera: Camera, code_map: NDArray[np.uint8] | Tensor) -> dict[str, Tensor]:
+    def step(
+        self, camera: Camera, code_map: NDArray[np.uint8] | Tensor, *, prepared: PreparedView | None = None
+    ) -> dict[str, Tensor]:
         """One step on one view.
 
         Args:
-            camera: The view, at the resolution of the reconstruction.
+            camera: The view, at the resolution to render.
             code_map: Its index map ``[h, w]``; cells with an index of K or above are ignored.
+            prepared: Its projection, when the geometry has not changed since.
 
         Returns:
             Losses by name, without gradient history.
@@ -203,9 +210,7 @@ class EmbeddingTrainer:
             progress = self.iteration / max(config.iterations, 1)
             group["lr"] = group["base_lr"] * config.final_lr_factor ** min(progress, 1.0)
         self.optimizer.zero_grad(set_to_none=True)
-        semantics, uncertainty = field.render_semantics(
-            self.gaussians, camera.downscaled(config.render_downscale)
-        )
+        semantics, uncertainty = field.render_semantics(self.gaussians, camera, prepared=prepared)
         losses = self._semantic_terms(semantics, uncertainty, code_map)
         smoothing = semantics.new_zeros(())
         if config.use_smoothing and self.iteration % config.smoothing_every == 0:
@@ -357,9 +362,11 @@ def train_field(
     names = sorted(cameras)
     check_views(names, code_maps)
     trainer = trainer or EmbeddingTrainer(gaussians, codebook, config, seed=seed)
+    views = _prepare_views(trainer.gaussians, cameras, config)
     while trainer.iteration < config.iterations:
         name = trainer.view_of_step(names)
-        losses = trainer.step(cameras[name], code_maps[name])
+        camera, prepared = views[name]
+        losses = trainer.step(camera, code_maps[name], prepared=prepared)
         done = trainer.iteration
         if done % REPORT_EVERY == 0 or done == config.iterations:
             metrics = {key: float(value) for key, value in losses.items()}
@@ -374,6 +381,20 @@ def train_field(
         if checkpoint is not None and done % checkpoint_every == 0:
             checkpoint(trainer)
     return trainer.field
+
+
+def _prepare_views(
+    gaussians: Gaussians, cameras: Mapping[str, Camera], config: EmbeddingConfig
+) -> dict[str, tuple[Camera, PreparedView | None]]:
+    """Cameras at the size to render, with their projections as far as memory allows (geometry is fixed)."""
+    left = config.memory_bytes
+    views: dict[str, tuple[Camera, PreparedView | None]] = {}
+    for name, camera in cameras.items():
+        resized = camera.downscaled(config.render_downscale)
+        prepared = prepare(gaussians, resized) if left > 0 else None
+        left -= prepared.nbytes if prepared is not None else 0
+        views[name] = (resized, prepared)
+    return views
 
 
 def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -> Tensor:

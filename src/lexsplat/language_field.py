@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -23,7 +23,7 @@ from torch.nn import functional
 from lexsplat.cameras import Camera
 from lexsplat.codebook import Codebook
 from lexsplat.gaussians import Gaussians
-from lexsplat.rendering import render
+from lexsplat.rendering import PreparedView, prepare, render
 
 SEMANTIC_CHANNELS = 8
 """S, the paper's d_s."""
@@ -193,10 +193,14 @@ class TrainedField(nn.Module):
         """u_G ``[N]`` in 0..1."""
         return self.uncertainty_logits.detach().sigmoid()
 
-    def render_semantics(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
+    def render_semantics(
+        self, gaussians: Gaussians, camera: Camera, *, prepared: PreparedView | None = None
+    ) -> tuple[Tensor, Tensor]:
         """R_s and R_u: ``[H, W, 8]`` and ``[H, W]``, in one pass, with gradients to s_G and u only."""
         carried = torch.cat([self.semantics, self.uncertainty_logits.sigmoid()[:, None]], dim=1)
-        rendered = render(gaussians, camera, features=carried, color=False).features
+        rendered = render(
+            gaussians.detach(), camera, features=carried, color=False, prepared=prepared
+        ).features
         return rendered[..., :SEMANTIC_CHANNELS], rendered[..., SEMANTIC_CHANNELS]
 
     def decode(self, semantics: Tensor) -> Tensor:
@@ -317,11 +321,7 @@ class LiftedField:
     @torch.no_grad()
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """Blended distributions ``[H, W, K]``, rendered `RENDER_CHANNELS` codes at a time."""
-        rendered = [
-            render(gaussians, camera, features=self._dense(codes), color=False).features
-            for codes in _chunks(self.codebook.num_codes)
-        ]
-        return torch.cat(rendered, dim=-1)
+        return _render_chunks(gaussians, camera, self.codebook.num_codes, self._dense)
 
     def scores(self, table: Tensor) -> Tensor:
         """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``."""
@@ -336,11 +336,9 @@ class LiftedField:
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
         """The rendering of `scores`: ``[K, P]`` to ``[H, W, P]``, one channel a prompt."""
         scores = self.scores(table)
-        rendered = [
-            render(gaussians, camera, features=scores[:, columns].contiguous(), color=False).features
-            for columns in _chunks(scores.shape[1])
-        ]
-        return torch.cat(rendered, dim=-1)
+        return _render_chunks(
+            gaussians, camera, scores.shape[1], lambda columns: scores[:, columns].contiguous()
+        )
 
     def _dense(self, codes: slice) -> Tensor:
         """Columns of the distribution for a range of codes ``[N, k]``."""
@@ -423,9 +421,19 @@ def _mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Seque
     return nn.Sequential(*layers[:-1])
 
 
-def _chunks(count: int) -> Iterator[slice]:
+def _render_chunks(
+    gaussians: Gaussians, camera: Camera, count: int, columns_of: Callable[[slice], Tensor]
+) -> Tensor:
+    """Render ``count`` channels, `RENDER_CHANNELS` at a time: ``[H, W, count]``."""
+    prepared = prepare(gaussians, camera)
+    image = torch.empty(camera.height, camera.width, count, device=gaussians.device)
     for start in range(0, count, RENDER_CHANNELS):
-        yield slice(start, min(start + RENDER_CHANNELS, count))
+        columns = slice(start, min(start + RENDER_CHANNELS, count))
+        features = columns_of(columns)
+        image[..., columns] = render(
+            gaussians, camera, features=features, color=False, prepared=prepared
+        ).features
+    return image
 
 
 def _check_table(table: Tensor, codebook: Codebook) -> None:

@@ -137,9 +137,9 @@ def accumulate_histogram(
         dense = torch.zeros(count, len(codes), device=gaussians.device)
         for done, name in enumerate(names, start=1):
             camera = cameras[name]
-            code_map = _full_size(code_maps[name], camera).to(gaussians.device) - codes.start
+            code_map = _full_size(code_maps[name], camera) - codes.start
             code_map[(code_map < 0) | (code_map >= len(codes))] = -1
-            dense += accumulate_codes(gaussians, camera, code_map, len(codes))
+            accumulate_codes(gaussians, camera, code_map, len(codes), out=dense)
             listener(Event("lift", part * len(names) + done, len(ranges) * len(names)))
         totals += dense.sum(1)
         for rows in _row_ranges(count):
@@ -380,7 +380,7 @@ def _full_size(code_map: NDArray[np.uint8], camera: Camera) -> Tensor:
 
 
 def _code_ranges(num_codes: int, count: int, memory_bytes: int) -> Iterator[range]:
-    """Codes in ranges so small that two float32 histograms (a view's and the sum) keep to the bound."""
+    """Codes in ranges so small that a float32 histogram and one working copy keep to the bound."""
     width = max(1, min(num_codes, memory_bytes // (2 * 4 * max(count, 1))))
     for start in range(0, num_codes, width):
         yield range(start, min(start + width, num_codes))
