@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lexsplat.cameras import Camera, camera_extent, camera_from_opengl, invert_pose, look_at
+
+K = np.array([[100.0, 0, 32], [0, 110.0, 24], [0, 0, 1]])
+unit = st.floats(-1, 1)
+
+
+def project(camera: Camera, point: np.ndarray) -> np.ndarray:
+    local = camera.viewmat @ np.append(point, 1.0)
+    return (camera.K @ local[:3])[:2] / local[2]
+
+
+def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
+    camera = look_at([3, 1, 2], [0.5, 0, 0], [0, 0, 1], 64, 48, 0.9)
+    assert project(camera, np.array([0.5, 0, 0])) == pytest.approx([32, 24])
+    assert project(camera, np.array([0.5, 0, 0.1]))[1] < 24  # image y grows downwards
+    assert np.linalg.det(camera.viewmat[:3, :3]) == pytest.approx(1)
+
+
+def test_look_at_spans_the_vertical_field_of_view():
+    camera = look_at([0, 0, 0], [0, 0, 1], [0, -1, 0], 64, 48, np.pi / 2)
+    assert project(camera, np.array([0, 1.0, 1.0]))[1] == pytest.approx(48)  # 45 degrees down: the lower edge
+
+
+@given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit))
+def test_position_and_forward_agree_with_the_inverse_of_the_pose(position, offset):
+    position = np.array(position)
+    direction = np.array(offset) + [0, 0, 2.0]
+    camera = look_at(position, position + direction, [0, 1, 0], 8, 8, 1.0)
+    pose = invert_pose(camera.viewmat)
+    assert camera.position == pytest.approx(pose[:3, 3], abs=1e-9)
+    assert camera.forward == pytest.approx(direction / np.linalg.norm(direction), abs=1e-9)
+    assert camera.forward == pytest.approx(pose[:3, 2], abs=1e-9)
+
+
+def test_opengl_identity_looks_along_minus_z_with_y_up():
+    camera = camera_from_opengl(64, 48, K, np.eye(4))
+    assert camera.forward == pytest.approx([0, 0, -1])
+    assert project(camera, np.array([0, 0, -1.0])) == pytest.approx([32, 24])
+    assert project(camera, np.array([0.1, 0.1, -1.0])) == pytest.approx([42, 13])  # right and up in the image
+
+
+@given(st.integers(1, 300), st.integers(1, 300))
+def test_resizing_keeps_where_a_ray_falls_relative_to_the_image(width, height):
+    camera = Camera(64, 48, K, np.eye(4))
+    point = np.array([0.1, -0.05, 1.0])
+    before = project(camera, point) / [64, 48]
+    resized = camera.resized(width, height)
+    assert (resized.width, resized.height) == (width, height)
+    assert project(resized, point) / [width, height] == pytest.approx(before)
+
+
+def test_downscaling_rounds_sizes_and_keeps_a_pixel():
+    camera = Camera(799, 532, K, np.eye(4))
+    assert (camera.downscaled(4).width, camera.downscaled(4).height) == (200, 133)
+    assert (camera.downscaled(10_000).width, camera.downscaled(10_000).height) == (1, 1)
+    with pytest.raises(ValueError, match="downscale"):
+        camera.downscaled(0)
+
+
+def test_extent_is_the_radius_times_1_1_and_1_for_a_point():
+    views = [look_at([r, 0, 0], [0, 9, 0], [0, 0, 1], 8, 8, 1.0) for r in (-2, 2)]
+    assert camera_extent(views) == pytest.approx(2.2)
+    assert camera_extent(views[:1]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K": np.eye(2)}, "K must be"),
+        ({"viewmat": np.eye(3)}, "viewmat must be"),
+        ({"viewmat": np.full((4, 4), np.nan)}, "not finite"),
+        ({"K": np.diag([np.inf, 1, 1])}, "not finite"),
+        ({"width": 0}, "image size"),
+        ({"K": np.diag([-1.0, 1, 1])}, "focal"),
+    ],
+)
+def test_impossible_cameras_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        Camera(**{"width": 4, "height": 4, "K": np.eye(3), "viewmat": np.eye(4), **change})

@@ -1,0 +1,124 @@
+import numpy as np
+import pycolmap
+import pytest
+from captures import picture
+
+from lexsplat.scenes.images import resize_image
+from lexsplat.scenes.undistortion import Lens, pinhole_of, undistort
+
+SIZE = (96, 72)
+CENTER = (47.0, 37.0)
+F = 80.0
+LENSES = {
+    "SIMPLE_PINHOLE": (F, *CENTER),
+    "PINHOLE": (F, F + 2, *CENTER),
+    "SIMPLE_RADIAL": (F, *CENTER, -0.1),
+    "RADIAL": (F, *CENTER, -0.1, 0.05),
+    "OPENCV": (F, F + 2, *CENTER, -0.1, 0.05, 0.002, -0.003),
+    "FULL_OPENCV": (F, F + 2, *CENTER, -0.1, 0.05, 0.002, -0.003, 0.01, 0.02, 0.01, 0.0),
+    "SIMPLE_RADIAL_FISHEYE": (F, *CENTER, 0.02),
+    "RADIAL_FISHEYE": (F, *CENTER, 0.02, -0.01),
+    "OPENCV_FISHEYE": (F, F + 2, *CENTER, 0.02, -0.01, 0.005, 0.0),
+    "FOV": (F, F + 2, *CENTER, 0.5),
+    "THIN_PRISM_FISHEYE": (F, F + 2, *CENTER, 0.02, -0.01, 0.001, 0.002, 0.0, 0.0, 0.001, 0.0),
+}
+
+
+def photo_through(lens: Lens) -> np.ndarray:
+    """The analytic picture as the lens sees it: colour of every photo pixel from its ray."""
+    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    rays = lens.to_pycolmap().cam_from_img(np.stack([x.ravel(), y.ravel()], 1))
+    return picture(*rays.T).reshape(lens.height, lens.width, 3).astype(np.float32)
+
+
+def pinhole_picture(lens: Lens, size: tuple[int, int]) -> np.ndarray:
+    """What a pinhole camera sees of the analytic picture: the mean over 4x4 samples of each pixel."""
+    width, height, K = pinhole_of(lens)
+    fine = (np.arange(4) + 0.5) / 4
+    u = (np.arange(size[0])[:, None] + fine).ravel() * width / size[0]
+    v = (np.arange(size[1])[:, None] + fine).ravel() * height / size[1]
+    x, y = np.meshgrid((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
+    return picture(x, y).reshape(size[1], 4, size[0], 4, 3).mean((1, 3))
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_undistorted_photos_show_what_a_pinhole_camera_sees(model):
+    lens = Lens(model, *SIZE, LENSES[model])
+    width, height, _ = pinhole_of(lens)
+    seen = undistort(photo_through(lens), lens, (width, height))
+    assert np.abs(seen - pinhole_picture(lens, (width, height))).max() < 0.012
+    assert np.abs(seen - pinhole_picture(lens, (width, height))).mean() < 0.001
+
+
+@pytest.mark.parametrize("divisor", [1.5, 4, 7])
+def test_smaller_undistorted_photos_average_the_area(divisor):
+    lens = Lens("OPENCV", *SIZE, LENSES["OPENCV"])
+    width, height, _ = pinhole_of(lens)
+    size = (round(width / divisor), round(height / divisor))
+    rng = np.random.default_rng(0)
+    noisy = photo_through(lens) + rng.normal(0, 0.1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
+    seen = undistort(np.clip(noisy, 0, 1), lens, size)
+    error = (seen - pinhole_picture(lens, size)).std()
+    # The mean over divisor^2 independent pixels; skipping pixels would leave the noise at 0.1.
+    assert error < 1.6 * 0.1 / divisor
+
+
+def test_every_perspective_model_of_pycolmap_is_taken():
+    for name, model in pycolmap.CameraModelId.__members__.items():
+        if name == "INVALID":
+            continue
+        camera = pycolmap.Camera.create_from_model_id(1, model, 500.0, 640, 480)
+        if camera.is_perspective():
+            width, height, K = pinhole_of(Lens(name, 640, 480, tuple(camera.params)))
+            assert (width, height) == pytest.approx((640, 480), abs=110)
+            assert K[0, 0] == pytest.approx(500)
+
+
+def test_panoramas_are_refused_because_no_pinhole_can_replace_them():
+    with pytest.raises(ValueError, match="EQUIRECTANGULAR"):
+        Lens("EQUIRECTANGULAR", 640, 320, (640.0, 320.0))
+
+
+def test_no_pixel_of_the_result_lies_outside_the_photo():
+    for model, params in LENSES.items():
+        lens = Lens(model, *SIZE, params)
+        width, height, K = pinhole_of(lens)
+        border = np.array([(u, v, 1.0) for u in (0.5, width - 0.5) for v in (0.5, height - 0.5)])
+        border[:, :2] = (border[:, :2] - K[:2, 2]) / np.diag(K)[:2]
+        where = lens.to_pycolmap().img_from_cam(border)
+        assert (where > -0.75).all(), model
+        assert (where < np.array(SIZE) + 0.75).all(), model
+
+
+def test_without_distortion_the_camera_stays():
+    width, height, K = pinhole_of(Lens("RADIAL", *SIZE, (F, *CENTER, 0.0, 0.0)))
+    assert (width, height) == SIZE
+    np.testing.assert_array_equal(K, [[F, 0, 47], [0, F, 37], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("model", "size", "params", "message"),
+    [
+        ("PINHOLE", (0, 4), (1.0, 1, 1, 1), "image size"),
+        ("PINHOLE", (10**9, 4), (1.0, 1, 1, 1), "image size"),
+        ("PINHOLE", SIZE, (F, F, 1.0), "parameters"),
+        ("PINHOLE", SIZE, (F, np.nan, 1.0, 1.0), "finite"),
+        ("PINHOLE", SIZE, (-F, F, 1.0, 1.0), "focal"),
+        ("PINHOLE", SIZE, (1e-9, F, 1.0, 1.0), "focal"),
+        ("WIDE", SIZE, (F, F, 1.0, 1.0), "model"),
+    ],
+)
+def test_impossible_lenses_are_refused(model, size, params, message):
+    with pytest.raises(ValueError, match=message):
+        Lens(model, *size, params)
+
+
+def test_shrinking_is_the_mean_of_the_covered_area():
+    image = np.random.default_rng(0).random((12, 18, 3)).astype(np.float32)
+    small = resize_image(image, (6, 4))
+    np.testing.assert_allclose(small, image.reshape(4, 3, 6, 3, 3).mean((1, 3)), atol=1e-6)
+
+
+def test_shrinking_by_a_fraction_keeps_the_mean():
+    image = np.random.default_rng(0).random((11, 17, 3)).astype(np.float32)
+    assert resize_image(image, (7, 5)).mean() == pytest.approx(image.mean(), abs=1e-3)
