@@ -81,11 +81,18 @@ class GridEncoder:
 
 
 @dataclasses.dataclass(frozen=True)
+class FakeLens:
+    params: tuple[float, ...] = (40.0, 24.0, 16.0)
+
+
+@dataclasses.dataclass(frozen=True)
 class FakeView:
     name: str
     image_path: Path
     camera: Camera
     loads: list
+    lens: FakeLens = FakeLens()
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def stem(self):
@@ -115,7 +122,7 @@ def make_scene(folder: Path, count: int = 5):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)).save(path)
         views[name] = FakeView(name, path, Camera(WIDTH, HEIGHT, K, np.eye(4)), loads)
-    return SimpleNamespace(views=views, background=(0.0, 0.0, 0.0), loads=loads)
+    return SimpleNamespace(views=views, loads=loads)
 
 
 CONFIG = FeatureConfig(
@@ -244,15 +251,13 @@ def test_the_cache_follows_everything_that_changes_features_and_nothing_else(sce
     assert _work(scene, tmp_path, dataclasses.replace(CONFIG, dino_stride=4)) == (False, 5)
     assert _work(scene, tmp_path, dataclasses.replace(CONFIG, max_short_side=20)) == (True, 5)
     assert _work(scene, tmp_path, clip_hash="another") == (True, 0)
-    scene.background = (1.0, 1.0, 1.0)
-    assert _work(scene, tmp_path) == (True, 5)
-    scene.background = (0.0, 0.0, 0.0)
     path = scene.views["left/0.png"].image_path  # same name, same size, other content
     Image.fromarray(np.full((HEIGHT, WIDTH, 3), 7, np.uint8)).save(path)
     assert _work(scene, tmp_path) == (True, 1)
     view = scene.views["left/1.png"]
-    other = Camera(WIDTH, HEIGHT, view.camera.K + np.diag([1.0, 0, 0]), np.eye(4))  # undistorted differently
-    scene.views["left/1.png"] = dataclasses.replace(view, camera=other)
+    scene.views["left/1.png"] = dataclasses.replace(view, lens=FakeLens((41.0, 24.0, 16.0)))
+    assert _work(scene, tmp_path) == (True, 1)
+    scene.views["left/1.png"] = dataclasses.replace(view, background=(1.0, 1.0, 1.0))
     assert _work(scene, tmp_path) == (True, 1)
     scene.views["left/1.png"] = dataclasses.replace(view, camera=view.camera.downscaled(2))
     assert _work(scene, tmp_path) == (False, 0)  # the working resolution is not what features are made from
@@ -279,9 +284,9 @@ def test_the_same_picture_under_two_names_is_encoded_once(scene, tmp_path):
     twin = dataclasses.replace(scene.views["left/0.png"], name="right/0.png")
     single = ColourEncoder()
     views = {"left/0.png": scene.views["left/0.png"]}
-    one = SimpleNamespace(views=views, background=(0, 0, 0))
+    one = SimpleNamespace(views=views)
     extract_features(one, single, None, CONFIG, cache_dir=tmp_path / "one")
-    both = SimpleNamespace(views={**views, "right/0.png": twin}, background=(0, 0, 0))
+    both = SimpleNamespace(views={**views, "right/0.png": twin})
     clip = ColourEncoder()
     maps = extract_features(both, clip, None, CONFIG, cache_dir=tmp_path / "both")
     torch.set_num_threads(2)
@@ -301,7 +306,7 @@ def test_views_draw_different_random_crops_that_do_not_depend_on_each_other(scen
     config = dataclasses.replace(CONFIG, mode="random", random_crops=20, random_levels=2)
     extract_features(scene, ColourEncoder(), None, config, cache_dir=tmp_path / "all")
     first = {"left/0.png": scene.views["left/0.png"]}
-    alone = SimpleNamespace(views=first, background=scene.background)
+    alone = SimpleNamespace(views=first)
     extract_features(alone, ColourEncoder(), None, config, cache_dir=tmp_path / "alone")
     (path,) = (tmp_path / "alone").glob("*.safetensors")
     stored = {file.name: load_file(file)["lefts.0"] for file in (tmp_path / "all").glob("*.safetensors")}

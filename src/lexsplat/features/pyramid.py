@@ -157,24 +157,27 @@ def dense_map(
     xs = (np.arange(cols) + 0.5) * width / cols
     ys = (np.arange(rows) + 0.5) * height / rows
     dim = embeddings.shape[-1]
-    total = torch.zeros(rows, cols, dim)
+    total = torch.zeros(rows, cols * dim)
     count = torch.zeros(rows, cols, 1)
+    downs: list[Tensor] = []  # grid levels are summed by one matrix product over the rows of all of them
+    strips: list[Tensor] = []
     start = 0
     for level in levels:
         vectors = embeddings[start : start + len(level)].float()
         start += len(level)
         if level.grid:
             across = _linear_weights(xs, level.lefts + level.size / 2)
-            down = _linear_weights(ys, level.tops + level.size / 2)
-            mixed = across @ vectors.reshape(len(level.tops), len(level.lefts), dim)
-            total += (down @ mixed.reshape(len(level.tops), -1)).reshape(rows, cols, dim)
+            strips.append((across @ vectors.reshape(len(level.tops), len(level.lefts), dim)).flatten(1))
+            downs.append(_linear_weights(ys, level.tops + level.size / 2))
             count += 1
         else:
             weights = _tent_weights(level, xs, ys)
             reached = weights.sum(-1, keepdim=True)
-            mean = (weights @ vectors) / reached.clamp_min(1e-12)
-            total += mean.reshape(rows, cols, dim)
+            total += ((weights @ vectors) / reached.clamp_min(1e-12)).reshape(rows, -1)
             count += (reached > 0).float().reshape(rows, cols, 1)
+    if downs:
+        total += torch.cat(downs, 1) @ torch.cat(strips)
+    total = total.reshape(rows, cols, dim)
     if bool((count == 0).any()):  # random crops need not reach every corner: the nearest crop speaks for it
         empty = (count == 0).squeeze(-1)
         total[empty] = embeddings[_nearest_crops(levels, xs, ys)[empty]].float()
