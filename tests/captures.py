@@ -1,4 +1,4 @@
-"""Small captures on disk for the tests of scenes: a smooth analytic picture on a wall, seen by known cameras."""
+"""Small captures on disk for the tests of scenes, and a smooth picture to see through lenses."""
 
 from __future__ import annotations
 

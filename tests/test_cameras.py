@@ -29,7 +29,7 @@ def test_look_at_spans_the_vertical_field_of_view():
 @given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit))
 def test_position_and_forward_agree_with_the_inverse_of_the_pose(position, offset):
     position = np.array(position)
-    direction = np.array(offset) + [0, 0, 2.0]
+    direction = np.add(offset, (0, 0, 2.0))
     camera = look_at(position, position + direction, [0, 1, 0], 8, 8, 1.0)
     pose = invert_pose(camera.viewmat)
     assert camera.position == pytest.approx(pose[:3, 3], abs=1e-9)

@@ -201,8 +201,8 @@ class _Reader:
             width, height = image_size(path)
         focal_x = self._focal(frame, "fl_x", "camera_angle_x", width)
         focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
-        focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
-        if not focal_x or not focal_y:
+        focal_x, focal_y = focal_y if focal_x is None else focal_x, focal_x if focal_y is None else focal_y
+        if focal_x is None or focal_y is None:
             raise CaptureError(
                 self.file,
                 expected=f'"fl_x" or "camera_angle_x" for image {name}',

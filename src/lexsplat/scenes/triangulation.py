@@ -310,9 +310,9 @@ def _known_reconstruction(
     known = pycolmap.Reconstruction()
     database = pycolmap.Database.open(database_path)
     try:
+        entries = {entry.name: entry for entry in database.read_all_images()}
         for index, (view, (width, height)) in enumerate(zip(views, sizes)):
-            entry = database.read_image_with_name(_file_name(index))
-            assert entry is not None, "every image was imported"
+            entry = entries[_file_name(index)]
             K = view.camera.resized(width, height).K
             camera = pycolmap.Camera(
                 camera_id=entry.camera_id,

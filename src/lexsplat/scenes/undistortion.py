@@ -98,10 +98,24 @@ def pinhole_of(lens: Lens) -> tuple[int, int, NDArray[np.float64]]:
     if lens.distorts:
         camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     K = np.asarray(camera.calibration_matrix(), dtype=np.float64)
-    if not np.isfinite(K).all() or min(camera.width, camera.height) < 1:
+    if not np.isfinite(K).all() or min(camera.width, camera.height) < 1 or not _covers(lens, camera):
         raise ValueError(f"distortion of {lens.model} {list(lens.params)} that cannot be undone")
     K.setflags(write=False)
     return int(camera.width), int(camera.height), K
+
+
+def _covers(lens: Lens, pinhole: pycolmap.Camera) -> bool:
+    """Whether a grid of the pinhole image's pixels falls into the photo, give or take a fiftieth.
+
+    COLMAP searches its pinhole camera by Newton steps, which wild parameters send anywhere without a word.
+    """
+    steps = np.linspace(0, 1, 9)
+    u, v = np.meshgrid(steps * pinhole.width, steps * pinhole.height)
+    rays = np.ones((81, 3))
+    rays[:, :2] = pinhole.cam_from_img(np.stack([u.ravel(), v.ravel()], axis=1))
+    where = np.asarray(lens.to_pycolmap().img_from_cam(rays)) / [lens.width, lens.height]
+    slack = 0.02 + 2.0 / min(lens.width, lens.height)  # COLMAP rounds sizes to whole pixels
+    return bool(((where >= -slack) & (where <= 1 + slack)).all())
 
 
 def undistort(
