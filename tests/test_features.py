@@ -505,3 +505,32 @@ def test_the_pca_picture_of_equal_or_few_features_is_calm():
     assert (picture[..., 1:] == 128).all()
     with pytest.raises(ValueError):
         pca_image(torch.ones(3, 4))
+
+
+def test_the_sparse_settings_take_a_sixth_of_the_crops():
+    def crops(config):
+        return sum(map(len, grid_levels(1297, 840, config.crop_sizes, config.crop_strides)))
+
+    assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
+
+
+def test_embedded_settings_with_the_embedded_encoders_find_the_red_half(tmp_path):
+    """The whole way, photo to answer: relevancy for a colour is higher where the colour is."""
+    from lexsplat.features.encoders import load_clip, load_dino
+
+    picture = np.zeros((240, 320, 3), np.uint8)
+    picture[:, :160], picture[:, 160:] = (200, 30, 30), (30, 60, 200)
+    path = tmp_path / "a.png"
+    Image.fromarray(picture).save(path)
+    view = FakeView("a.png", path, Camera(320, 240, np.diag([200.0, 200.0, 1.0]), np.eye(4)), [])
+    clip = load_clip("embedded")
+    scene = SimpleNamespace(views={"a.png": view})
+    maps = extract_features(
+        scene, clip, load_dino("embedded"), FeatureConfig.embedded(), cache_dir=tmp_path / "c"
+    )
+    found = maps["a.png"]
+    assert found.clip.shape == (60, 80, 128)
+    assert found.dino.shape == (60, 80, 128)
+    red, blue = clip.encode_text(["something red", "something blue"])
+    reddish = found.clip @ (red - blue)
+    assert reddish[:, :36].min() > 0 > reddish[:, 44:].max()
