@@ -23,6 +23,15 @@ from lexsplat.language_field import (
 )
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tensors are so small that threads would only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def scene():
     return make_scene(per_ball=8, views=2, width=16, height=12, num_codes=70)

@@ -228,7 +228,7 @@ def smooth_codes(
         own = torch.arange(rows.start, rows.stop, device=means.device)
         trust = torch.where(neighbours == own[:, None], torch.zeros_like(trust), trust)
         trust = trust / trust.sum(1, keepdim=True).clamp_min(1e-12)
-        mixed = torch.zeros(len(own), num_codes, device=means.device)
+        mixed = weights.new_zeros(len(own), num_codes)
         mixed.scatter_add_(1, codes[rows].long(), (1 - share[rows])[:, None] * weights[rows])
         for column in range(near):
             index, portion = neighbours[:, column], (share[rows] * trust[:, column])[:, None]
