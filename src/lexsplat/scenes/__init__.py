@@ -2,6 +2,7 @@
 
 from lexsplat.scenes.loading import load_scene
 from lexsplat.scenes.masks import load_mask, load_masks
+from lexsplat.scenes.photos import PhotoPoses, poses_from_photos
 from lexsplat.scenes.scene import Scene, View, stem_of
 from lexsplat.scenes.triangulation import InitialPoints, initial_points, random_points_in_frusta, triangulate
 from lexsplat.scenes.undistortion import Lens
@@ -9,12 +10,14 @@ from lexsplat.scenes.undistortion import Lens
 __all__ = [
     "InitialPoints",
     "Lens",
+    "PhotoPoses",
     "Scene",
     "View",
     "initial_points",
     "load_mask",
     "load_masks",
     "load_scene",
+    "poses_from_photos",
     "random_points_in_frusta",
     "stem_of",
     "triangulate",

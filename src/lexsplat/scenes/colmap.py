@@ -40,12 +40,13 @@ def find_model(root: Path) -> Path | None:
     return None
 
 
-def read_colmap(root: Path, model: Path) -> Capture:
+def read_colmap(root: Path, model: Path, images: Path | None = None) -> Capture:
     """The capture described by a COLMAP model.
 
     Args:
         root: The capture folder, which holds the photos.
         model: The folder with ``cameras``, ``images`` and (optionally) ``points3D``, ``.bin`` or ``.txt``.
+        images: The folder of the photos; None looks for it in ``root``.
 
     Raises:
         FileFormatError: If a file is cut off or damaged.
@@ -68,7 +69,7 @@ def read_colmap(root: Path, model: Path) -> Capture:
             found=f"{sorted(doubled)[0]} twice",
             remedy="remove one of the two from the model",
         )
-    folder = _image_folder(root, names)
+    folder = _image_folder(root, names) if images is None else images
     photos, missing = [], []
     for name, (_, camera_id, quaternion, translation) in zip(names, entries):
         if camera_id not in lenses:

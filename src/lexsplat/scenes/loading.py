@@ -29,6 +29,7 @@ def load_scene(
     downscale: float = 1.0,
     test_every: int = 8,
     test_names: Sequence[str] | None = None,
+    images: str | Path | None = None,
 ) -> Scene:
     """Load a capture: COLMAP (binary or text), ``transforms.json`` (nerfstudio, instant-ngp, NeRF-synthetic).
 
@@ -41,6 +42,7 @@ def load_scene(
         downscale: How many times smaller than the undistorted photos to work, at least 1 as a rule.
         test_every: Hold out every n-th view, counting from the first by name; 0 holds out nothing.
         test_names: Names or stems of the views to hold out, instead of every other rule.
+        images: Where the photos of a COLMAP model are, if not in the capture folder.
 
     Raises:
         CaptureError: If there are no cameras or photos, or one of them cannot be used.
@@ -49,7 +51,7 @@ def load_scene(
     """
     if not 0 < downscale < 1e6:
         raise ValueError(f"downscale must be positive, got {downscale:g}")
-    capture = _read_capture(Path(path))
+    capture = _read_capture(Path(path), None if images is None else Path(images))
     warnings = list(capture.warnings)
     if capture.missing:
         total = len(capture.photos) + len(capture.missing)
@@ -104,7 +106,7 @@ def load_scene(
     )
 
 
-def _read_capture(path: Path) -> Capture:
+def _read_capture(path: Path, images: Path | None) -> Capture:
     if path.is_file() and path.suffix == ".json":
         return read_transforms(path)
     if not path.is_dir():
@@ -112,7 +114,7 @@ def _read_capture(path: Path) -> Capture:
         raise CaptureError(path, expected="a capture folder", found=found, remedy="check the path")
     model = find_model(path)
     if model is not None:
-        return read_colmap(path, model)
+        return read_colmap(path, model, images)
     transforms = find_transforms(path)
     if transforms is not None:
         return read_transforms(transforms)

@@ -120,7 +120,7 @@ def triangulate(
     if cached is not None and (known := _read_cache(cached)) is not None:
         return known
     total = len(views) + 3
-    with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, _quiet_pycolmap(seed):
+    with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
         folder = Path(temporary)
         sizes = []
         for done, view in enumerate(views):
@@ -341,7 +341,7 @@ def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 @contextmanager
-def _quiet_pycolmap(seed: int) -> Iterator[None]:
+def quiet_pycolmap(seed: int) -> Iterator[None]:
     """pycolmap with a fixed seed and without its log on standard error."""
     import pycolmap
 
