@@ -8,7 +8,7 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -271,16 +271,16 @@ class Info:
             print(f"{name.replace('_', ' '):<{width}}  {text}")
 
 
-Command = Union[
-    Annotated[Demo, tyro.conf.subcommand("demo")],
-    Annotated[Build, tyro.conf.subcommand("build")],
-    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")],
-    Annotated[Embed, tyro.conf.subcommand("embed")],
-    Annotated[Query, tyro.conf.subcommand("query")],
-    Annotated[Evaluate, tyro.conf.subcommand("evaluate")],
-    Annotated[Export, tyro.conf.subcommand("export")],
-    Annotated[Info, tyro.conf.subcommand("info")],
-]
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Build, tyro.conf.subcommand("build")]
+    | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[Embed, tyro.conf.subcommand("embed")]
+    | Annotated[Query, tyro.conf.subcommand("query")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+)
 
 
 def _open(path: str, device: str, clip: str | None) -> SearchableScene:

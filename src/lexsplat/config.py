@@ -20,7 +20,7 @@ DEFAULT_DINO = "facebook/dino-vits8"
 """The DINO of the paper's released code."""
 
 CPU_PIXELS = 80_000
-"""Working image size on a CPU when no downscale is given: about 320x240, some 60 ms an iteration on two cores."""
+"""Working image size on a CPU when no downscale is given: about 320x240."""
 CUDA_PIXELS = 2_000_000
 """Working image size on CUDA when no downscale is given: 1600 pixels wide at 4:3, as 3DGS does."""
 CPU_ITERATIONS = 3_000
@@ -40,8 +40,8 @@ class BuildConfig:
         device: "auto" takes CUDA where there is a GPU.
         seed: Seed of all randomness.
         memory: Host memory to stay within, such as "4GB".
-        downscale: Factor by which photos are made smaller for reconstruction and language; none chooses one that
-            suits the device.
+        downscale: Factor by which photos are made smaller for reconstruction and language; none chooses one
+            that suits the device.
         iterations: Reconstruction steps; none means 30,000 on CUDA and 3,000 on a CPU.
         test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
         method: "trained" is the paper's optimisation, "lifted" computes the evidence directly, "lifted+tuned"
@@ -84,8 +84,8 @@ class BuildConfig:
             # Halves keep the numbers readable; never enlarge.
             downscale = max(1.0, round(factor * 2) / 2)
         features = self.features
-        if self.clip == "embedded" and features == FeatureConfig():
-            features = FeatureConfig.embedded()
+        if features == FeatureConfig() and (self.clip == "embedded" or device == "cpu"):
+            features = FeatureConfig.embedded() if self.clip == "embedded" else FeatureConfig.sparse()
         iterations = self.iterations or (CPU_ITERATIONS if device == "cpu" else CUDA_ITERATIONS)
         return replace(
             self,

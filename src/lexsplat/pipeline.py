@@ -84,36 +84,40 @@ class _Builder:
         self.scene, self.folder, self.config = scene, folder, config
         self.device, self.listener = device, listener
         self.made_from: dict[str, str] = {}
+        self.clip_hash = ""
 
     def run(self, until: str) -> SceneFolder:
         capture_hash = self._write_provenance()
-        stages: dict[str, tuple[tuple[Any, ...], Callable[[], dict[str, Any]], list[Path]]] = {
+        config, folder = self.config, self.folder
+        models = [self._model_identity("clip"), self._model_identity("dino")]
+        language = [config.method, config.embedding, config.lifting, config.tuning]
+        # What each stage is made from (a stage's name stands for all of its inputs), what it does, what it writes.
+        stages: dict[str, tuple[list[Any], Callable[[], dict[str, Any]], list[Path]]] = {
             "reconstruct": (
-                (capture_hash, self.config.reconstruction, self.config.seed, self.device),
+                [capture_hash, config.reconstruction, config.seed, self.device],
                 self._reconstruct,
-                [self.folder.gaussians_path],
+                [folder.gaussians_path],
             ),
             "features": (
-                (capture_hash, self.config.features, self._model_identity("clip"), self._model_identity("dino")),
+                [capture_hash, config.features, models],
                 self._extract_features,
-                [self.folder.features_path],
+                [folder.features_path],
             ),
-            "codebook": (("features", self.config.codebook, self.config.seed), self._fit_codebook, self._code_paths()),
+            "codebook": (["features", config.codebook, config.seed], self._fit_codebook, self._code_paths()),
             "embed": (
-                ("reconstruct", "codebook", self.config.method, self.config.embedding, self.config.lifting, self.config.tuning, self.config.seed),
+                ["reconstruct", "codebook", language, config.seed],
                 self._embed,
-                [self.folder.language_path],
+                [folder.language_path],
             ),
-        }  # fmt: skip
+        }
         for name in STAGES[: STAGES.index(until) + 1]:
             inputs, work, outputs = stages[name]
             self._run_stage(name, inputs, work, outputs)
         return self.folder
 
     def _run_stage(
-        self, name: str, inputs: tuple[Any, ...], work: Callable[[], dict[str, Any]], outputs: list[Path]
+        self, name: str, inputs: list[Any], work: Callable[[], dict[str, Any]], outputs: list[Path]
     ) -> None:
-        # A stage named among the inputs stands for everything that stage was made from.
         made_from = fingerprint([self.made_from.get(p, p) if isinstance(p, str) else p for p in inputs])
         self.made_from[name] = made_from
         if self.folder.is_finished(name, made_from) and all(path.exists() for path in outputs):
@@ -139,7 +143,7 @@ class _Builder:
 
     def _extract_features(self) -> dict[str, Any]:
         maps = self._feature_maps()
-        return {"views": len(maps)}
+        return {"views": len(maps), "clip_hash": self.clip_hash}
 
     def _fit_codebook(self) -> dict[str, Any]:
         maps = self._feature_maps()
@@ -174,6 +178,7 @@ class _Builder:
         from lexsplat.features.encoders import load_clip, load_dino
 
         clip = load_clip(self.config.clip, self.device)
+        self.clip_hash = clip.content_hash
         dino = None if self.config.dino == "none" else load_dino(self.config.dino, self.device)
         return extract_features(
             self.scene,

@@ -8,14 +8,16 @@ scores = scene.scores(["red apple"])  # [1, N], one for each Gaussian
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from lexsplat.cameras import Camera
-from lexsplat.errors import QueryError, SceneFolderError
+from lexsplat.errors import ModelError, QueryError, SceneFolderError
+from lexsplat.features.text import TextCache
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField, field_from_tensors
 from lexsplat.queries import (
@@ -28,6 +30,9 @@ from lexsplat.queries import (
 )
 from lexsplat.rendering import Rendering, render
 from lexsplat.scene_folder import SceneFolder, StoredView, read_tensors
+
+if TYPE_CHECKING:
+    from lexsplat.features.encoders import ImageTextEncoder
 
 
 class SearchableScene:
@@ -53,7 +58,8 @@ class SearchableScene:
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.query, self.folder = clip, query or QueryConfig(), folder
-        self._encoder: Any = None
+        self._encoder: ImageTextEncoder | None = None
+        self._cache: TextCache | None = None
         self._texts: dict[str, Tensor] = {}
 
     # -- text
@@ -75,12 +81,33 @@ class SearchableScene:
         return torch.stack([self._texts[prompt] for prompt in prompts])
 
     def encode_text(self, texts: list[str]) -> Tensor:
-        """Embeddings ``[T, D]`` of whole sentences, by the encoder the language was made with."""
-        if self._encoder is None:
-            from lexsplat.features.encoders import load_clip
+        """Embeddings ``[T, D]`` of whole sentences, by the encoder the language was made with.
 
+        They are kept in the scene folder, so that a question asked twice loads no model.
+
+        Raises:
+            ModelError: If the encoder cannot be loaded, or is not the one the language was made with.
+        """
+        known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
+        if self.folder is None or known is None or not os.access(self.folder.root, os.W_OK):
+            return self._load_encoder(known).encode_text(texts)
+        if self._cache is None:
+            self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
+        return self._cache.encode(known, texts, lambda: self._load_encoder(known))
+
+    def _load_encoder(self, known: str | None) -> ImageTextEncoder:
+        from lexsplat.features.encoders import load_clip
+
+        if self._encoder is None:
             self._encoder = load_clip(self.clip, str(self.gaussians.device))
-        return self._encoder.encode_text(texts)
+        if known is not None and self._encoder.content_hash != known:
+            raise ModelError(
+                self.clip,
+                expected="the encoder the scene was made with",
+                found="another one",
+                remedy="name the right one with --clip, or build the scene again with this one",
+            )
+        return self._encoder
 
     def _negatives(self) -> Tensor:
         return self.embed(list(self.query.negatives or CANONICAL_PHRASES))
