@@ -47,7 +47,7 @@ PHOTO_TEMPLATES = (
 )
 """A small ensemble of sentences; their embeddings are averaged."""
 
-_CHUNK = 1 << 15
+_CHUNK = 1 << 13  # pixels at a time; small enough that a block stays in the cache
 _MIN_COVERAGE = 0.05
 
 TextEncoder = Callable[[list[str]], Tensor]
