@@ -11,14 +11,14 @@ PACKAGE = Path(__file__).parent.parent / "src" / "lexsplat"
 
 # The order in which data flow. A module may import only what stands before it (or its own folder).
 ORDER = [
-    "errors", "progress", "cameras", "scenes", "gaussians", "densification", "rendering", "image_losses",
-    "reconstruction", "features", "codebook", "language_field", "losses", "embedding", "lifting", "queries",
+    "errors", "progress", "cameras", "scenes", "gaussians", "rendering", "image_losses", "training_images",
+    "optimizers", "exposures", "densification", "reconstruction", "features", "codebook", "language_field", "losses", "embedding", "lifting", "queries",
     "metrics", "heatmaps", "evaluation", "report", "formats", "scene_folder", "config", "search", "pipeline",
     "answers", "viewer", "demo", "progress_bars", "cli", "__init__",
 ]  # fmt: skip
 
 # Kernels and helpers that belong to a neighbour share its place in the order.
-SHARES_PLACE_WITH = {"image_loss_kernels": "image_losses"}
+SHARES_PLACE_WITH = {"image_loss_kernels": "image_losses", "optimizer_kernels": "optimizers"}
 
 # Imports inside functions that point down the list, each with its reason.
 LAZY_EXCEPTIONS = {

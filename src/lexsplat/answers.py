@@ -215,9 +215,12 @@ def load_photos(scene: SearchableScene, capture: Path | None) -> Scene:
     """The capture of a scene, with the views, sizes and split of the build."""
     views = scene.views
     held_out = [name for name, view in views.items() if view.split == "test"]
-    config = scene.folder.record.get("config", {}) if scene.folder else {}
+    record = scene.folder.record if scene.folder else {}
     photos = load_scene(
-        capture_of(scene, capture), downscale=config.get("downscale") or 1.0, test_names=held_out
+        capture_of(scene, capture),
+        downscale=record.get("config", {}).get("downscale") or 1.0,
+        test_names=held_out,
+        images=record.get("images"),
     )
     missing = set(views) - set(photos.views)
     if missing:

@@ -73,8 +73,8 @@ class Build:
     stopped; only what a changed setting touches is done again.
 
     Args:
-        capture: Folder with photos and cameras: a COLMAP model (``images/`` and ``sparse/0/``) or a
-            ``transforms.json`` of nerfstudio, instant-ngp or NeRF-synthetic.
+        capture: Folder with photos and cameras: a COLMAP model (images/ and sparse/0/) or a transforms.json of
+            nerfstudio, instant-ngp or NeRF-synthetic. Photos alone get cameras by structure from motion.
         output: The scene folder to make.
         test_views: Names of the views to hold out for evaluation.
         settings: What is made and how.
@@ -104,6 +104,33 @@ class Build:
         print(f"{folder.root}: {', '.join(folder.record['stages'])} finished")
         if self.until == "embed":
             print(f'next: lexsplat query {folder.root} "something you see"')
+
+
+@dataclasses.dataclass
+class Poses:
+    """Estimate the cameras of a folder of photos and write them as a COLMAP model.
+
+    ``build`` does this by itself where there are no cameras; this is for looking at them first, or for use in other
+    programs.
+
+    Args:
+        photos: Folder of photos that overlap by 60 to 80 percent.
+        output: Folder to write ``sparse/0`` into.
+        seed: Seed of all randomness.
+    """
+
+    photos: tyro.conf.Positional[Path]
+    output: Path
+    seed: int = 0
+
+    def run(self) -> None:
+        """Write the model and say how many photos were placed."""
+        from lexsplat.progress_bars import ProgressBars
+        from lexsplat.scenes import poses_from_photos
+
+        with ProgressBars() as bars:
+            result = poses_from_photos(self.photos, self.output, seed=self.seed, listener=bars)
+        print(f"{self.output / 'sparse' / '0'}: {result.note}")
 
 
 @dataclasses.dataclass
@@ -274,6 +301,7 @@ class Info:
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Build, tyro.conf.subcommand("build")]
+    | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
     | Annotated[Embed, tyro.conf.subcommand("embed")]
     | Annotated[Query, tyro.conf.subcommand("query")]

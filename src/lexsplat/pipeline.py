@@ -7,6 +7,7 @@ fingerprint of the photos, the cameras, the settings and the stages before it.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import platform
 import time
@@ -29,7 +30,7 @@ from lexsplat.lifting import lift, tune
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.reconstruction import reconstruct
 from lexsplat.scene_folder import SceneFolder, fingerprint, read_tensors, write_tensors
-from lexsplat.scenes import Scene, load_scene
+from lexsplat.scenes import Scene, is_photo_folder, load_scene, poses_from_photos
 
 STAGES = ("reconstruct", "features", "codebook", "embed")
 """Names of the stages in the order in which they run."""
@@ -47,7 +48,7 @@ def build(
     """Make a searchable scene from a capture, going on where an earlier build stopped.
 
     Args:
-        capture: Folder with photos and cameras (COLMAP or ``transforms.json``).
+        capture: Folder with photos and cameras (COLMAP or ``transforms.json``), or with photos alone.
         output: The scene folder to make or to go on with.
         config: Settings; open ones are chosen to suit the device.
         until: Last stage to run, one of `STAGES`.
@@ -62,17 +63,35 @@ def build(
         raise ValueError(f"until must be one of {', '.join(STAGES)}, got {until!r}")
     device = choose_device(config.device)
     parse_bytes(config.memory)
-    # The first look costs only headers; the second uses the working resolution that suits the device.
-    scene = load_scene(capture, test_every=config.test_every, test_names=test_names)
-    sizes = [view.capture_size for view in scene.views.values()]
-    config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
-    if config.downscale != 1.0:
-        scene = load_scene(
-            capture, downscale=config.downscale or 1.0, test_every=config.test_every, test_names=test_names
-        )
     folder = SceneFolder(output)
     with folder.locked():
+        scene = _load_capture(capture, folder, config, test_names, listener)
+        sizes = [view.capture_size for view in scene.views.values()]
+        config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
+        scene = scene.downscaled(config.downscale or 1.0)
         return _Builder(scene, folder, config, device, listener).run(until)
+
+
+def _load_capture(
+    capture: Path,
+    folder: SceneFolder,
+    config: BuildConfig,
+    test_names: list[str] | None,
+    listener: Listener,
+) -> Scene:
+    """The capture; photos without cameras get them by structure from motion, kept in ``poses/``."""
+    if not is_photo_folder(capture):
+        folder.record.pop("images", None)
+        return load_scene(capture, test_every=config.test_every, test_names=test_names)
+    poses = folder.root / "poses"
+    made_from = fingerprint([[f.name, f.stat().st_size] for f in sorted(capture.rglob("*")) if f.is_file()])
+    if not folder.is_finished("poses", made_from) or not (poses / "sparse" / "0").is_dir():
+        start = time.perf_counter()
+        placed = poses_from_photos(capture, poses, seed=config.seed, listener=listener)
+        logging.getLogger("lexsplat").warning(placed.note)
+        folder.finish("poses", made_from, time.perf_counter() - start, placed=len(placed.placed))
+    folder.record["images"] = str(capture.resolve())
+    return load_scene(poses, images=capture, test_every=config.test_every, test_names=test_names)
 
 
 class _Builder:

@@ -1,6 +1,6 @@
 """Captures: photos with cameras in, views with pinhole cameras out, everything keyed by image name."""
 
-from lexsplat.scenes.loading import load_scene
+from lexsplat.scenes.loading import is_photo_folder, load_scene
 from lexsplat.scenes.masks import load_mask, load_masks
 from lexsplat.scenes.photos import PhotoPoses, poses_from_photos
 from lexsplat.scenes.scene import Scene, View, stem_of
@@ -14,6 +14,7 @@ __all__ = [
     "Scene",
     "View",
     "initial_points",
+    "is_photo_folder",
     "load_mask",
     "load_masks",
     "load_scene",

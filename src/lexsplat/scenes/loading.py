@@ -118,7 +118,7 @@ def _read_capture(path: Path, images: Path | None) -> Capture:
     transforms = find_transforms(path)
     if transforms is not None:
         return read_transforms(transforms)
-    photos = [file for folder in (path, path / "images") if folder.is_dir() for file in _photos_in(folder)]
+    photos = _photos_of(path)
     if photos:
         raise CaptureError(
             path,
@@ -134,8 +134,19 @@ def _read_capture(path: Path, images: Path | None) -> Capture:
     )
 
 
-def _photos_in(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+def is_photo_folder(path: Path) -> bool:
+    """Whether a folder holds photos but no cameras, so that cameras have to be estimated first."""
+    return (
+        path.is_dir()
+        and find_model(path) is None
+        and find_transforms(path) is None
+        and bool(_photos_of(path))
+    )
+
+
+def _photos_of(path: Path) -> list[Path]:
+    folders = [folder for folder in (path, path / "images") if folder.is_dir()]
+    return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _make_view(photo: Photo, capture: Capture, downscale: float) -> View:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +182,14 @@ class Scene:
     def test_views(self) -> tuple[View, ...]:
         """The views that are only measured on, by name."""
         return tuple(self.views[name] for name in self.test_names)
+
+    def downscaled(self, factor: float) -> Scene:
+        """The same capture to be worked on ``factor`` times smaller than the undistorted photos."""
+        views = {
+            name: replace(view, camera=view.camera.resized(*view.capture_size).downscaled(factor))
+            for name, view in self.views.items()
+        }
+        return replace(self, views=views)
 
     @property
     def extent(self) -> float:
