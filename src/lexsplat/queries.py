@@ -262,10 +262,12 @@ def probability_relevancy(
     """
     config = config or QueryConfig()
     codewords, positives, negatives = _matching(codewords.to(probabilities.device), positives, negatives)
-    coverage = probabilities.sum(-1, keepdim=True).clamp(0.0, 1.0)
     if config.form == "code":
         scores = probabilities @ code_relevancy(codewords, positives, negatives, config.temperature)
-        return _divide(scores, coverage) if config.coverage == "divide" else scores.clamp(0.0, 1.0)
+        if config.coverage == "divide":
+            return _divide(scores, probabilities.sum(-1, keepdim=True))
+        return scores.clamp_(0.0, 1.0)
+    coverage = probabilities.sum(-1, keepdim=True).clamp_(0.0, 1.0)
     cosines = feature_cosines(probabilities, codewords, torch.cat([positives, negatives]))
     split = len(positives)
     relevancy = pairwise_relevancy(cosines[..., :split], cosines[..., split:], config.temperature)
