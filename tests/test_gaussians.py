@@ -29,6 +29,15 @@ def test_first_colour_seen_is_the_colour_of_the_point():
     assert not gaussians.shN.any()
 
 
+def test_the_callers_points_are_not_changed_with_the_gaussians():
+    points, colors = some_points()
+    before = points.copy(), colors.copy()
+    for tensor in gaussians_from_points(points, colors).tensors().values():
+        tensor.fill_(7.0)
+    np.testing.assert_array_equal(points, before[0])
+    np.testing.assert_array_equal(colors, before[1])
+
+
 def test_first_opacity_is_the_one_asked_for():
     points, colors = some_points()
     torch.testing.assert_close(

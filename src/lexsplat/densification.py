@@ -176,19 +176,28 @@ class DensityControl:
 
         if step >= self.schedule.stop or self._default is None:
             return False
-        info = _gsplat_info(means2d, radii, image_size)
-        # gsplat gathers and refines in one call. At its starting step it only gathers; a second call in
-        # which no Gaussian is visible then only refines, and between them the threshold can be raised to
-        # keep the cap.
-        self._default.step_post_backward(parameters, optimizers, self._state, self.schedule.start, info)
+        self._gather(means2d, radii, image_size)
         changed = self._refines_at(step)
         if changed:
-            info["radii"] = torch.zeros_like(info["radii"])
+            # gsplat gathers and refines in one call: nothing is visible to it here, so it only refines.
             self._default.grow_grad2d = self._threshold_within_cap(len(parameters["means"]))
+            info = _nothing_visible(len(means2d), self._device)
             self._default.step_post_backward(parameters, optimizers, self._state, step, info)
         if self.reset_opacities and step > 0 and step % self.schedule.reset_every == 0:
             ops.reset_opa(parameters, optimizers, self._state, value=2.0 * self._default.prune_opa)
         return changed
+
+    def _gather(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
+        """Add up gradients and visibility as gsplat does, without gathering indices: four passes over [N]."""
+        if means2d.grad is None:
+            raise ValueError("means2d has no gradient: density control runs after the backward pass")
+        if self._state["grad2d"] is None:
+            self._state["grad2d"] = torch.zeros(len(radii), device=self._device)
+            self._state["count"] = torch.zeros(len(radii), device=self._device)
+        visible = radii > 0
+        x, y = (means2d.grad * torch.tensor(image_size, device=self._device).div(2.0)).unbind(1)
+        self._state["grad2d"] += (x * x + y * y).sqrt_() * visible
+        self._state["count"] += visible
 
     def _refines_at(self, step: int) -> bool:
         schedule = self.schedule
@@ -295,17 +304,12 @@ def _operators_for(device: torch.device) -> Iterator[None]:
             ops.compute_relocation, ops.quat_scale_to_covar_preci = original
 
 
-def _gsplat_info(means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> dict[str, Any]:
-    """What gsplat's rasterizer would report for one camera."""
-    if means2d.grad is None:
-        raise ValueError("means2d has no gradient: density control runs after the backward pass")
+def _nothing_visible(count: int, device: torch.device) -> dict[str, Any]:
+    """What gsplat's rasterizer reports for a camera that sees no Gaussian."""
     return {
-        "means2d": SimpleNamespace(grad=means2d.grad[None]),
-        "radii": radii[None, :, None].expand(-1, -1, 2),
-        "width": image_size[0],
-        "height": image_size[1],
-        "n_cameras": 1,
-        "gaussian_ids": None,
+        "means2d": SimpleNamespace(grad=torch.zeros(1, count, 2, device=device)),
+        "radii": torch.zeros(1, count, 2, device=device),
+        **{"width": 1, "height": 1, "n_cameras": 1, "gaussian_ids": None},
     }
 
 

@@ -149,7 +149,7 @@ def gaussians_from_points(
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     return Gaussians(
-        means=torch.from_numpy(points),
+        means=torch.from_numpy(points.copy()),  # trained in place: must not be the caller's memory
         quats=quats,
         log_scales=log_scales,
         opacity_logits=torch.full((count,), float(np.log(opacity / (1 - opacity)))),

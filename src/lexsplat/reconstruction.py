@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -17,16 +18,27 @@ from torch import Tensor
 
 from lexsplat.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
 from lexsplat.errors import TrainingError
+from lexsplat.exposures import Exposures
 from lexsplat.gaussians import Gaussians, gaussians_from_points
+from lexsplat.optimizers import (
+    Adam,
+    below_prefix,
+    load_optimizer_tensors,
+    optimizer_tensors,
+    with_prefix,
+)
 from lexsplat.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.scenes import Scene, View
+    from lexsplat.scenes.triangulation import InitialPoints
 
 STAGE = "reconstruct"
 """Name of the stage in events."""
 EVENT_EVERY = 10
 """Iterations between two events."""
+RESET_FROM_ITERATIONS = 15_000
+"""Shorter trainings do not reset opacities unless asked to."""
 GSPLAT_NAMES = {
     "means": "means",
     "quats": "quats",
@@ -53,7 +65,8 @@ class ReconstructionConfig:
         densify_min_every: Rounds are never closer than this many actual steps.
         grow_gradient: Mean gradient of projected centres above which "default" adds Gaussians.
         min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
-        reset_opacities: Whether "default" lowers all opacities every 3,000 steps.
+        reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None does so in trainings of at
+            least 15,000, which have the time to recover.
         noise: Strength of the noise of "mcmc".
         opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
         scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as
@@ -83,7 +96,7 @@ class ReconstructionConfig:
     densify_min_every: int = 1
     grow_gradient: float = 2e-4
     min_opacity: float = 0.005
-    reset_opacities: bool = True
+    reset_opacities: bool | None = None
     noise: float = 5e5
     opacity_weight: float | None = None
     scale_weight: float | None = None
@@ -113,6 +126,13 @@ class ReconstructionConfig:
         if not 0 < self.initial_opacity < 1:
             raise ValueError(f"initial_opacity must be between 0 and 1, got {self.initial_opacity:g}")
 
+    @property
+    def resets_opacities(self) -> bool:
+        """`reset_opacities` with nothing left open."""
+        if self.reset_opacities is None:
+            return self.iterations >= RESET_FROM_ITERATIONS
+        return self.reset_opacities
+
     def rates(self, extent: float) -> dict[str, float]:
         """Learning rates at the start by parameter (our names)."""
         return {
@@ -131,15 +151,17 @@ def reconstruct(
     *,
     device: torch.device | str = "cpu",
     seed: int = 0,
+    cache_dir: Path | None = None,
     listener: Listener = silent,
 ) -> Gaussians:
     """Train Gaussians on the training views of a scene.
 
     Args:
-        scene: Views, split and points to start from.
+        scene: Views, split, and the points to start from; where it has none they are triangulated.
         config: Settings.
         device: Where to train.
-        seed: Of the order of views and of density control.
+        seed: Of the order of views, of density control and of what replaces missing points.
+        cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
         listener: Hears an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
             views) and "gaussians".
 
@@ -147,7 +169,10 @@ def reconstruct(
         TrainingError: If there is nothing to train on or the optimisation diverges.
         CaptureError: If a photo cannot be read.
     """
-    trainer = Reconstructor(scene, config, device=device, seed=seed)
+    from lexsplat.scenes.triangulation import initial_points
+
+    points = initial_points(scene, seed=seed, cache_dir=cache_dir, listener=listener)
+    trainer = Reconstructor(scene, config, points, device=device, seed=seed)
     trainer.run(listener)
     return trainer.gaussians()
 
@@ -156,8 +181,9 @@ class Reconstructor:
     """A training that can be stepped, saved and resumed bit for bit.
 
     Args:
-        scene: Views, split and points to start from.
+        scene: Views and split.
         config: Settings.
+        points: Where Gaussians start, from `lexsplat.scenes.triangulation.initial_points`.
         device: Where to train.
         seed: Of the order of views and of density control.
 
@@ -169,6 +195,7 @@ class Reconstructor:
         self,
         scene: Scene,
         config: ReconstructionConfig,
+        points: InitialPoints,
         *,
         device: torch.device | str = "cpu",
         seed: int = 0,
@@ -176,20 +203,22 @@ class Reconstructor:
         self.config = config
         self.device = torch.device(device)
         self.steps_done = 0
-        self._extent = scene.extent
         self._views = {view.name: view for view in scene.train_views}
         self._names = sorted(self._views)
         if not self._names:
             raise TrainingError(
                 scene.root, expected="at least one training view", found="none", remedy="hold out fewer views"
             )
+        self._extent = scene.extent
         self._background = torch.tensor(scene.background, dtype=torch.float32, device=self.device)
         self._generator = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.int64)
         self._recent_error = float("nan")
-        self._parameters = self._initial_parameters(scene)
+        self._parameters = self._initial_parameters(points)
         self._optimizers = self._new_optimizers()
-        self._exposures = _Exposures(len(self._names), config, self.device)
+        self._exposures = None
+        if config.exposure:
+            self._exposures = Exposures(len(self._names), config.exposure_rate, self.device)
         self._density = DensityControl(
             config.strategy,
             density_schedule(
@@ -202,7 +231,7 @@ class Reconstructor:
             max_gaussians=config.max_gaussians,
             grow_gradient=config.grow_gradient,
             min_opacity=config.min_opacity,
-            reset_opacities=config.reset_opacities,
+            reset_opacities=config.resets_opacities,
             noise=config.noise,
             seed=seed,
             device=self.device,
@@ -249,7 +278,12 @@ class Reconstructor:
         rendering = render(
             self._as_gaussians(), camera, sh_degree=self._active_sh_degree(), background=self._background
         )
-        image = self._exposures.apply(rendering.image, index)
+        image = rendering.image
+        if self._exposures is not None:
+            image = self._exposures.apply(image, index)
+        valid = images.valid(self._names[index])
+        if valid is not None:
+            image = torch.where(valid[..., None], image, target.image)
         loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularisation()
         loss.backward()
         value = loss.item() if self._checks_now() else 0.0
@@ -295,7 +329,11 @@ class Reconstructor:
         gaussians = self.gaussians()
         for view in views:
             image = render(gaussians, view.camera, background=self._background).image
-            scores.append(psnr(image, torch.from_numpy(view.load_image()).to(self.device)))
+            photo = torch.from_numpy(view.load_image()).to(self.device)
+            valid = view.load_valid()
+            if valid is not None:
+                image, photo = image[valid], photo[valid]
+            scores.append(psnr(image, photo))
         if not scores:
             raise ValueError("no views to evaluate on")
         return sum(scores) / len(scores)
@@ -310,11 +348,10 @@ class Reconstructor:
         }
         for ours, theirs in GSPLAT_NAMES.items():
             tensors[f"parameters/{ours}"] = self._parameters[theirs].detach().clone()
-            tensors.update(_optimizer_state(f"optimizers/{ours}/", self._optimizers[theirs]))
-        tensors.update({f"density/{name}": value for name, value in self._density.state_tensors().items()})
-        tensors.update(
-            {f"exposures/{name}": value for name, value in self._exposures.state_tensors().items()}
-        )
+            tensors.update(with_prefix(f"optimizers/{ours}/", optimizer_tensors(self._optimizers[theirs])))
+        tensors.update(with_prefix("density/", self._density.state_tensors()))
+        if self._exposures is not None:
+            tensors.update(with_prefix("exposures/", self._exposures.state_tensors()))
         return tensors
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -336,35 +373,34 @@ class Reconstructor:
             self._parameters[theirs] = torch.nn.Parameter(value)
         self._optimizers = self._new_optimizers()
         for ours, theirs in GSPLAT_NAMES.items():
-            _load_optimizer_state(f"optimizers/{ours}/", self._optimizers[theirs], tensors)
-        self._density.load_state_tensors(_below("density/", tensors))
-        self._exposures.load_state_tensors(_below("exposures/", tensors))
+            state = below_prefix(f"optimizers/{ours}/", tensors)
+            load_optimizer_tensors(self._optimizers[theirs], state)
+        self._density.load_state_tensors(below_prefix("density/", tensors))
+        if self._exposures is not None:
+            self._exposures.load_state_tensors(below_prefix("exposures/", tensors))
 
-    def _initial_parameters(self, scene: Scene) -> dict[str, torch.nn.Parameter]:
-        points, colors = scene.points, scene.point_colors
+    def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
+        points, colors = start.points, start.colors
         if len(points) == 0:
             raise TrainingError(
-                scene.root, expected="points to start from", found="none", remedy="check the cameras"
+                "reconstruction", expected="points to start from", found="none", remedy="check the cameras"
             )
         if len(points) > self.config.max_gaussians:
             chosen = torch.randperm(len(points), generator=self._generator)[: self.config.max_gaussians]
             points, colors = points[chosen.numpy()], colors[chosen.numpy()]
-        start = gaussians_from_points(
+        gaussians = gaussians_from_points(
             points,
             colors,
             sh_degree=self.config.sh_degree,
             opacity=self.config.initial_opacity,
             device=self.device,
         )
-        tensors = start.tensors()
+        tensors = gaussians.tensors()
         return {theirs: torch.nn.Parameter(tensors[ours]) for ours, theirs in GSPLAT_NAMES.items()}
 
-    def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
+    def _new_optimizers(self) -> dict[str, Adam]:
         rates = self.config.rates(self._extent)
-        return {
-            theirs: torch.optim.Adam([self._parameters[theirs]], lr=rates[ours], eps=1e-15, fused=True)
-            for ours, theirs in GSPLAT_NAMES.items()
-        }
+        return {theirs: Adam(self._parameters[theirs], rates[ours]) for ours, theirs in GSPLAT_NAMES.items()}
 
     def _as_gaussians(self) -> Gaussians:
         tensors = {ours: self._parameters[theirs] for ours, theirs in GSPLAT_NAMES.items()}
@@ -427,63 +463,5 @@ class Reconstructor:
         for optimizer in self._optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        self._exposures.optimize()
-
-
-class _Exposures:
-    """An affine colour change ``[3, 4]`` per training photo, the identity at the start; off unless
-    configured."""
-
-    def __init__(self, count: int, config: ReconstructionConfig, device: torch.device) -> None:
-        self._matrices: torch.nn.Parameter | None = None
-        if config.exposure:
-            self._matrices = torch.nn.Parameter(torch.eye(3, 4, device=device).repeat(count, 1, 1))
-            self._optimizer = torch.optim.Adam([self._matrices], lr=config.exposure_rate)
-
-    def apply(self, image: Tensor, index: int) -> Tensor:
-        """``[H, W, 3]`` as photo ``index`` would show it."""
-        if self._matrices is None:
-            return image
-        matrix = self._matrices[index]
-        return image @ matrix[:, :3].T + matrix[:, 3]
-
-    def optimize(self) -> None:
-        """Step, then take the mean change out: the scene keeps the average exposure of all photos."""
-        if self._matrices is None:
-            return
-        self._optimizer.step()
-        self._optimizer.zero_grad(set_to_none=True)
-        with torch.no_grad():
-            identity = torch.eye(3, 4, device=self._matrices.device)
-            self._matrices.add_(identity - self._matrices.mean(0))
-
-    def state_tensors(self) -> dict[str, Tensor]:
-        if self._matrices is None:
-            return {}
-        return {
-            "matrices": self._matrices.detach().clone(),
-            **_optimizer_state("optimizer/", self._optimizer),
-        }
-
-    def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
-        if self._matrices is None:
-            return
-        with torch.no_grad():
-            self._matrices.copy_(tensors["matrices"])
-        _load_optimizer_state("optimizer/", self._optimizer, tensors)
-
-
-def _optimizer_state(prefix: str, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    (parameter,) = optimizer.param_groups[0]["params"]
-    return {f"{prefix}{name}": value.clone() for name, value in optimizer.state[parameter].items()}
-
-
-def _load_optimizer_state(prefix: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    (parameter,) = optimizer.param_groups[0]["params"]
-    state = {name: value.to(parameter.device, copy=True) for name, value in _below(prefix, tensors).items()}
-    if state:
-        optimizer.state[parameter] = state
-
-
-def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+        if self._exposures is not None:
+            self._exposures.optimize()

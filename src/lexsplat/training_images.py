@@ -45,6 +45,7 @@ class TrainingImages:
         self._photo_room = memory
         self._moment_room = max(0, memory - 3 * pixels)
         self._photos: dict[str, Tensor] = {}
+        self._valid: dict[str, Tensor | None] = {}
         self._moments: dict[str, tuple[Tensor, Tensor]] = {}
 
     def camera(self, name: str) -> Camera:
@@ -66,6 +67,15 @@ class TrainingImages:
             self._moment_room -= size
             self._moments[name] = (target.mean, target.variance)
         return target
+
+    def valid(self, name: str) -> Tensor | None:
+        """Which pixels of a view take part in the loss, ``[H, W]`` bool; None for all."""
+        if name not in self._valid:
+            camera = self._cameras[name]
+            mask = self._views[name].load_valid((camera.width, camera.height))
+            # A byte a pixel, and only where a capture masks its photos: not counted in the budget.
+            self._valid[name] = None if mask is None else torch.from_numpy(mask).to(self._device)
+        return self._valid[name]
 
     @property
     def cached_bytes(self) -> int:
