@@ -57,7 +57,7 @@ class Camera:
     @property
     def forward(self) -> NDArray[np.float64]:
         """Viewing direction in world coordinates ``[3]``, unit length."""
-        return self.viewmat[2, :3] / np.linalg.norm(self.viewmat[2, :3])
+        return np.asarray(self.viewmat[2, :3] / np.linalg.norm(self.viewmat[2, :3]), dtype=np.float64)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size (the field of view stays)."""

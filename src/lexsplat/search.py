@@ -189,9 +189,9 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     place = choose_device(device)
     gaussians = folder.read_gaussians()
     tensors, metadata = read_tensors(folder.language_path)
-    field = field_from_tensors(tensors, metadata)
+    field = field_from_tensors({name: tensor.to(place) for name, tensor in tensors.items()}, metadata)
     made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
-    if metadata.get("reconstruction") != made_from or len(field) != len(gaussians):
+    if metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
         raise SceneFolderError(
             path,
             expected="language made for these Gaussians",
@@ -200,6 +200,6 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         )
     config = folder.record.get("config", {})
     return SearchableScene(
-        gaussians.to(place), field.to(place), folder.read_cameras(), clip or config.get("clip", "embedded"),
+        gaussians.to(place), field, folder.read_cameras(), clip or config.get("clip", "embedded"),
         folder=folder,
     )  # fmt: skip
