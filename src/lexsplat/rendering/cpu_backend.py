@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
-from lexsplat.rendering.kernels import blending, code_weights, projection, spherical_harmonics
+from lexsplat.rendering.kernels import blending, code_weights, gradients, projection, spherical_harmonics
 from lexsplat.rendering.kernels.jit import announce_compilation, parallel
 from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs
 
@@ -125,9 +125,9 @@ class _Blend(torch.autograd.Function):
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image
         grad_alpha = torch.zeros_like(alpha) if grad_alpha is None else grad_alpha
         values = _gather(pairs, colors, features)
-        rows = np.empty((len(pairs.members), blending.GEOMETRY_FIELDS + image.shape[2]), np.float32)
+        rows = np.empty(len(pairs.members) * gradients.row_width(image.shape[2]), np.float32)
         parallel(
-            blending.blend_backward, pairs.tiles, TILE_GRAIN,
+            gradients.blend_backward, pairs.tiles, TILE_GRAIN,
             pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members, pairs.pairs, values, pairs.tiles_x,
             color_channels, geometry, *[_array(t) for t in (image, alpha, grad_image, grad_alpha)], rows,
         )  # fmt: skip
@@ -135,7 +135,7 @@ class _Blend(torch.autograd.Function):
         outputs = [torch.zeros(count, 2), torch.zeros(count, 3), torch.zeros(count)]
         outputs += [torch.zeros(pairs.count, color_channels), torch.zeros(pairs.count, _channels(features))]
         parallel(
-            blending.sum_pairs, visible, GRAIN,
+            gradients.sum_pairs, visible, GRAIN,
             pairs.order, pairs.ellipses, pairs.pair_offsets, rows, geometry, color_channels,
             *[_array(t) for t in outputs],
         )  # fmt: skip
@@ -156,7 +156,7 @@ def _gather(pairs: TilePairs, *sources: Tensor | None) -> NDArray[np.float32]:
     column = 0
     for source in sources:
         if source is not None:
-            parallel(blending.gather, visible, GRAIN, pairs.order, _array(source), column, values)
+            parallel(gradients.gather, visible, GRAIN, pairs.order, _array(source), column, values)
             column += source.shape[1]
     return values
 
@@ -195,7 +195,7 @@ def blend(
 def accumulate_codes(
     projected: tuple[Tensor, ...], pairs: TilePairs, codes: NDArray[np.int32], num_codes: int, totals: Tensor
 ) -> None:
-    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``; negative codes are left out."""
+    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``; negative codes not."""
     tiles = pairs.tiles
     local = np.empty_like(codes)
     listed = np.empty((tiles, min(num_codes, blending.PIXELS)), np.int32)

@@ -84,7 +84,7 @@ def find_pairs(
     """
     count = len(depths)
     buffer, scratch = np.empty(count, np.int32), np.empty(count, np.int32)
-    visible = binning.sort_visible(depths, radii, buffer, depths.view(np.uint32), scratch)
+    visible = binning.sort_visible(depths.view(np.uint32), radii, buffer, scratch)
     order = buffer[:visible].copy()
     ellipses = np.empty((visible, binning.ELLIPSE_FIELDS), np.float32)
     boxes = np.empty((visible, binning.BOX_FIELDS), np.int32)

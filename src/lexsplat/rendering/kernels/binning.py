@@ -33,10 +33,11 @@ TILE_FIRST, TILE_LAST, ROW_FIRST, ROW_LAST, BOX_FIELDS = 0, 1, 2, 3, 4
 
 
 @kernel
-def sort_visible(depths: F32, radii: I32, order: I32, keys: NDArray[np.uint32], scratch: I32) -> int:
+def sort_visible(keys: NDArray[np.uint32], radii: I32, order: I32, scratch: I32) -> int:
     """Indices of the visible Gaussians by depth, ties by index; returns how many (stable radix sort).
 
-    Bits of positive floats sort like the floats. ``order`` and ``scratch`` have room for all Gaussians.
+    ``keys`` are the bits of the depths: those of positive floats sort like the floats. ``order`` and ``scratch``
+    have room for all Gaussians.
     """
     size = 1 << RADIX_BITS
     count = 0
@@ -95,10 +96,10 @@ def find_boxes(
         ellipses[k, OPACITY] = opacities[n]
         reach_x, reach_y = extents[n, 0] + SLACK, extents[n, 1] + SLACK
         # First and last pixel whose centre (index + 0.5) is inside; clamped before the cast, so it always fits.
-        left = int(math.ceil(min(max(x - reach_x - 0.5, 0.0), float(width))))
-        right = int(math.floor(min(max(x + reach_x - 0.5, -1.0), float(width - 1))))
-        top = int(math.ceil(min(max(y - reach_y - 0.5, 0.0), float(height))))
-        bottom = int(math.floor(min(max(y + reach_y - 0.5, -1.0), float(height - 1))))
+        left = math.ceil(min(max(x - reach_x - 0.5, 0.0), float(width)))
+        right = math.floor(min(max(x + reach_x - 0.5, -1.0), float(width - 1)))
+        top = math.ceil(min(max(y - reach_y - 0.5, 0.0), float(height)))
+        bottom = math.floor(min(max(y + reach_y - 0.5, -1.0), float(height - 1)))
         if right < left or bottom < top:
             boxes[k, TILE_FIRST] = boxes[k, TILE_LAST] = boxes[k, ROW_FIRST] = boxes[k, ROW_LAST] = 0
             counts[k] = 0

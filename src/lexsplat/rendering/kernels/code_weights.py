@@ -9,9 +9,33 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.rendering.kernels.binning import ROW_FIRST, ROW_LAST, TILE
-from lexsplat.rendering.kernels.blending import CHECK_EVERY, PIXELS, ZERO, blend_weights, start_tile, sum_of
+from lexsplat.rendering.kernels.binning import (
+    CENTRE_X,
+    CENTRE_Y,
+    CONIC_B,
+    HALF_A,
+    HALF_C,
+    OPACITY,
+    ROW_FIRST,
+    ROW_LAST,
+    TILE,
+)
+from lexsplat.rendering.kernels.blending import (
+    CHECK_EVERY,
+    EIGHTH,
+    HALF,
+    ONE,
+    PIXELS,
+    TRANSMITTANCE_MIN,
+    ZERO,
+    alpha_of,
+    column_numbers,
+    finish_pixels,
+    start_tile,
+    tile_finished,
+)
 from lexsplat.rendering.kernels.jit import kernel
+from lexsplat.rendering.kernels.lanes import any_positive, load, select_greater, store
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -75,15 +99,15 @@ def weigh_codes(
     ``entries`` (zeroed) holds a block ``[pairs, codes]`` for each tile of the batch at ``entry_offsets``.
     """
     height, width = local.shape
-    work = np.empty((5, PIXELS), np.float32)
-    x, y, live, final, weights = work[0], work[1], work[2], work[3], work[4]
+    live, weights = np.empty(PIXELS, np.float32), np.empty(TILE, np.float32)
     index = np.empty(PIXELS, np.int32)
+    columns = column_numbers()
     for batch_tile in range(start, stop):
         tile = first_tile + batch_tile
         if counts[tile] == 0:
             continue
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        start_tile(tile, tiles_x, width, height, x, y, live)
+        start_tile(tile, tiles_x, width, height, live)
         index[:] = -1
         for j in range(min(TILE, height - top)):
             for i in range(min(TILE, width - left)):
@@ -92,25 +116,32 @@ def weigh_codes(
         entry = entry_offsets[batch_tile]
         for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
             k = members[slot]
-            first = max(boxes[k, ROW_FIRST] - top, 0) * TILE
-            last = min(boxes[k, ROW_LAST] - top, TILE) * TILE
-            total = blend_weights(
-                x[first:last],
-                y[first:last],
-                ellipses[k],
-                live[first:last],
-                final[first:last],
-                weights[first:last],
+            a, b, c = (
+                EIGHTH * ellipses[k, HALF_A],
+                EIGHTH * ellipses[k, CONIC_B],
+                EIGHTH * ellipses[k, HALF_C],
             )
-            if total > ZERO:
-                for i in range(first, last):
-                    if index[i] >= 0:
-                        entries[entry + index[i]] += weights[i]
+            opacity = ellipses[k, OPACITY]
+            dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
+            y = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
+            across, slope = dx * dx * a, dx * b
+            for j in range(max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)):
+                dy = np.float32(j) + y
+                alpha = alpha_of(across + c * dy * dy, slope, dy, opacity)
+                before = load(live, j * TILE)
+                after = before * (ONE - alpha)
+                weight = select_greater(after, TRANSMITTANCE_MIN, alpha * before, ZERO)
+                store(live, j * TILE, finish_pixels(before, after))
+                if any_positive(weight):
+                    store(weights, 0, weight)
+                    for i in range(TILE):
+                        if index[j * TILE + i] >= 0:
+                            entries[entry + index[j * TILE + i]] += weights[i]
             entry += counts[tile]
             countdown -= 1
             if countdown == 0:
                 countdown = CHECK_EVERY
-                if sum_of(live) == ZERO:
+                if tile_finished(live):
                     break
 
 

@@ -1,8 +1,8 @@
 """How the kernels are compiled, announced and spread over threads.
 
-Kernels release the GIL and are driven by our own threads instead of Numba's ``prange``: they compile several
-times faster, need no threading layer (whose pitfalls are forked children and two callers at once), and several
-Python threads may render at the same time.
+Kernels release the GIL and are driven by our own threads instead of Numba's ``prange``. They compile several
+times faster that way, need no threading layer (whose pitfalls are forked children and two callers at once), and
+several Python threads may render at the same time.
 """
 
 from __future__ import annotations
@@ -21,41 +21,32 @@ import torch
 
 logger = logging.getLogger("lexsplat")
 
-# Everything fast-math allows, except the promise that there are no NaN and no infinities: with that promise the
-# outcome of a comparison with NaN is undefined, and an undefined comparison decides where memory is written.
-FAST_MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
-
 _dispatchers: list[Any] = []
 _announced = False
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile with exact IEEE semantics: geometry and everything that decides about memory."""
-    return _compile(function, fastmath=False)
+    """Compile a function, without the GIL and with a cache on disk.
 
-
-def fast_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile with reassociation, so that sums over pixels use the whole vector unit."""
-    return _compile(function, fastmath=FAST_MATH)
-
-
-def _compile(function: Callable[..., Any], fastmath: Any) -> Callable[..., Any]:
-    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    Fast-math stays off: under its promise that there are no NaN, the outcome of a comparison with one is
+    undefined, and comparisons decide here where memory is written.
+    """
     try:
-        dispatcher = numba.njit(cache=True, **options)(function)
+        dispatcher = _compile(function)
     except RuntimeError:
-        # Neither the package folder nor the home folder can be written: keep the cache for this machine only.
-        folder = (
-            Path(tempfile.gettempdir()) / f"lexsplat-numba-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
-        )
-        logger.warning(
-            "no writable folder for compiled kernels; using %s (set NUMBA_CACHE_DIR to choose)", folder
-        )
+        # Neither the package folder nor the home folder can be written.
+        owner = os.getuid() if hasattr(os, "getuid") else "user"
+        folder = Path(tempfile.gettempdir()) / f"lexsplat-kernels-{owner}"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        numba.config.CACHE_DIR = str(folder)
-        dispatcher = numba.njit(cache=True, **options)(function)
+        logger.info("keeping compiled kernels in %s (NUMBA_CACHE_DIR chooses another folder)", folder)
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+        dispatcher = _compile(function)
     _dispatchers.append((dispatcher, function))
     return dispatcher
+
+
+def _compile(function: Callable[..., Any]) -> Any:
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
 
 
 def announce_compilation() -> None:

@@ -125,7 +125,6 @@ def project(
         _to_camera(camera, rotation, scale, axes)
         slope_x = _clamped_slope(tx / tz, fx, cx, width)
         slope_y = _clamped_slope(ty / tz, fy, cy, height)
-        a = b = c = 0.0
         u0 = fx / tz * (axes[0] - slope_x * axes[6])
         u1 = fx / tz * (axes[1] - slope_x * axes[7])
         u2 = fx / tz * (axes[2] - slope_x * axes[8])
@@ -184,7 +183,7 @@ def project_backward(
 ) -> None:
     """Gradients of `project`. Gaussians that were not seen get zeros."""
     rotation, axes, scale = np.empty(9), np.empty(9), np.empty(3)
-    grad_axes, grad_rotation, direction = np.empty(9), np.empty(9), np.empty(9)
+    grad_axes, grad_rotation = np.empty(9), np.empty(9)
     fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
     for n in range(start, stop):
         for j in range(3):

@@ -1,0 +1,282 @@
+"""The gradient of blending: one row of numbers per pair, then a sum over the pairs of each Gaussian.
+
+Blending runs again from front to back. What everything behind a Gaussian contributes to the loss is the total,
+known from the image, less what has been passed; so nothing per pixel needs to be kept from the forward pass.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.rendering.kernels.binning import (
+    CENTRE_X,
+    CENTRE_Y,
+    CONIC_B,
+    HALF_A,
+    HALF_C,
+    OPACITY,
+    ROW_FIRST,
+    ROW_LAST,
+    TILE,
+)
+from lexsplat.rendering.kernels.blending import (
+    ALPHA_MAX,
+    CHECK_EVERY,
+    EIGHTH,
+    HALF,
+    ONE,
+    PIXELS,
+    TRANSMITTANCE_MIN,
+    ZERO,
+    alpha_of,
+    column_numbers,
+    finish_pixels,
+    start_tile,
+    tile_finished,
+)
+from lexsplat.rendering.kernels.jit import kernel
+from lexsplat.rendering.kernels.lanes import (
+    any_positive,
+    load,
+    select_greater,
+    splat,
+    store,
+    store_totals,
+    total,
+)
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+GEOMETRY_FIELDS = 6
+"""Columns of a row before the channels: gradient by the exponent times 1, dx, dy, dx^2, dx dy, dy^2."""
+
+
+@kernel
+def row_width(channels: int) -> int:
+    """Numbers per pair: the moments and the channels, and always room for two vectors of four."""
+    return max(GEOMETRY_FIELDS + channels, 8)
+
+
+@kernel
+def _load_tile(
+    tile: int,
+    tiles_x: int,
+    colors: int,
+    image: F32,
+    alpha: F32,
+    grad_image: F32,
+    grad_alpha: F32,
+    upstream: F32,
+    behind: F32,
+) -> None:
+    """Gradients of the tile's pixels, and what the whole stack of Gaussians contributes to the loss."""
+    height, width, channels = image.shape
+    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    if left + TILE > width or top + TILE > height:
+        upstream[:] = ZERO
+        behind[:] = ZERO
+    for j in range(min(TILE, height - top)):
+        for i in range(min(TILE, width - left)):
+            loss = (alpha[top + j, left + i] - ONE) * grad_alpha[top + j, left + i]
+            for channel in range(channels):
+                gradient = grad_image[top + j, left + i, channel]
+                upstream[(j * channels + channel) * TILE + i] = gradient
+                if channel < colors:
+                    loss += gradient * image[top + j, left + i, channel]
+            behind[j * TILE + i] = loss
+
+
+@kernel
+def _feature_gradients(
+    first: int, last: int, colors: int, channels: int, weights: F32, upstream: F32, row: int, rows: F32
+) -> None:
+    """Sum of weight times upstream gradient for the channels after the colours, four at a time.
+
+    The last group of four overlaps the one before it; fewer than four channels go one by one.
+    """
+    channel = colors
+    while channel < channels:
+        if channels - colors >= 4:
+            channel = min(channel, channels - 4)
+            s0, s1, s2, s3 = splat(ZERO), splat(ZERO), splat(ZERO), splat(ZERO)
+            for j in range(first, last):
+                weight = load(weights, j * TILE)
+                place = (j * channels + channel) * TILE
+                s0 += weight * load(upstream, place)
+                s1 += weight * load(upstream, place + TILE)
+                s2 += weight * load(upstream, place + 2 * TILE)
+                s3 += weight * load(upstream, place + 3 * TILE)
+            store_totals(rows, row + GEOMETRY_FIELDS + channel, s0, s1, s2, s3)
+            channel += 4
+        else:
+            s0 = splat(ZERO)
+            for j in range(first, last):
+                s0 += load(weights, j * TILE) * load(upstream, (j * channels + channel) * TILE)
+            rows[row + GEOMETRY_FIELDS + channel] = total(s0)
+            channel += 1
+
+
+@kernel
+def blend_backward(
+    start: int,
+    stop: int,
+    ellipses: F32,
+    boxes: I32,
+    tile_offsets: I64,
+    members: I32,
+    pairs: I32,
+    values: F32,
+    tiles_x: int,
+    colors: int,
+    geometry: bool,
+    image: F32,
+    alpha: F32,
+    grad_image: F32,
+    grad_alpha: F32,
+    rows: F32,
+) -> None:
+    """Gradients of every pair in tiles ``start`` to ``stop``, written to ``rows [M * row_width(C)]``.
+
+    Args:
+        colors: 3 or 0. Only these first channels and alpha have a say in the geometry; the other channels give
+            gradients to their values alone.
+        geometry: Whether the geometry wants gradients at all.
+    """
+    height, width, channels = image.shape
+    live, behind, weights = (
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+    )
+    upstream = np.empty(PIXELS * channels, np.float32)
+    fields = row_width(channels)
+    columns = column_numbers()
+    zeros = splat(ZERO)
+    for tile in range(start, stop):
+        if tile_offsets[tile] == tile_offsets[tile + 1]:
+            continue
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        start_tile(tile, tiles_x, width, height, live)
+        _load_tile(tile, tiles_x, colors, image, alpha, grad_image, grad_alpha, upstream, behind)
+        countdown = CHECK_EVERY
+        finished = False
+        for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
+            row = np.int64(pairs[slot]) * fields
+            for field in range(row, row + fields):
+                rows[field] = ZERO
+            if finished:
+                continue
+            k = members[slot]
+            a, b, c = (
+                EIGHTH * ellipses[k, HALF_A],
+                EIGHTH * ellipses[k, CONIC_B],
+                EIGHTH * ellipses[k, HALF_C],
+            )
+            opacity = ellipses[k, OPACITY]
+            dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
+            y = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
+            across, slope = dx * dx * a, dx * b
+            red, green, blue = ZERO, ZERO, ZERO
+            if colors == 3:
+                red, green, blue = values[k, 0], values[k, 1], values[k, 2]
+            g0, g1, g2, r0, r1, r2 = zeros, zeros, zeros, zeros, zeros, zeros
+            first, last = max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)
+            touched = False
+            for j in range(first, last):
+                dy = np.float32(j) + y
+                row_alpha = alpha_of(across + c * dy * dy, slope, dy, opacity)
+                before = load(live, j * TILE)
+                after = before * (ONE - row_alpha)
+                weight = select_greater(after, TRANSMITTANCE_MIN, row_alpha * before, ZERO)
+                store(live, j * TILE, finish_pixels(before, after))
+                store(weights, j * TILE, weight)
+                if not any_positive(weight):
+                    continue
+                touched = True
+                dots = zeros
+                if colors == 3:
+                    place = j * channels * TILE
+                    u0, u1, u2 = (
+                        load(upstream, place),
+                        load(upstream, place + TILE),
+                        load(upstream, place + 2 * TILE),
+                    )
+                    r0 += weight * u0
+                    r1 += weight * u1
+                    r2 += weight * u2
+                    dots = u0 * red + u1 * green + u2 * blue
+                if not geometry:
+                    continue
+                # d loss / d alpha = T dots - rest / (1 - alpha); alpha d alpha / d exponent = -alpha.
+                share = weight * dots
+                rest = load(behind, j * TILE) - share
+                store(behind, j * TILE, rest)
+                gradient = rest * row_alpha / (ONE - row_alpha) - share
+                gradient = select_greater(weight, ZERO, gradient, ZERO)
+                gradient = select_greater(ALPHA_MAX, row_alpha, gradient, ZERO)
+                g0 += gradient
+                g1 += gradient * dy
+                g2 += gradient * (dy * dy)
+            if touched:
+                # Without colours the two sums after the moments are zero and features overwrite them.
+                store_totals(rows, row, g0, g0 * dx, g1, g0 * dx * dx)
+                store_totals(rows, row + 4, g1 * dx, g2, r0, r1)
+                if colors == 3:
+                    rows[row + GEOMETRY_FIELDS + 2] = total(r2)
+                _feature_gradients(first, last, colors, channels, weights, upstream, row, rows)
+            countdown -= 1
+            if countdown == 0:
+                countdown = CHECK_EVERY
+                finished = tile_finished(live)
+
+
+@kernel
+def sum_pairs(
+    start: int,
+    stop: int,
+    order: I32,
+    ellipses: F32,
+    pair_offsets: I64,
+    rows: F32,
+    geometry: bool,
+    colors: int,
+    grad_means2d: F32,
+    grad_conics: F32,
+    grad_opacities: F32,
+    grad_colors: F32,
+    grad_features: F32,
+) -> None:
+    """Sum the rows of each Gaussian in a fixed order and turn moments into gradients."""
+    fields = row_width(colors + grad_features.shape[1])
+    sums = np.empty(fields, np.float32)
+    two = np.float32(2)
+    for k in range(start, stop):
+        n = order[k]
+        sums[:] = ZERO
+        for pair in range(pair_offsets[k], pair_offsets[k + 1]):
+            for field in range(fields):
+                sums[field] += rows[pair * fields + field]
+        for channel in range(colors):
+            grad_colors[n, channel] = sums[GEOMETRY_FIELDS + channel]
+        for channel in range(grad_features.shape[1]):
+            grad_features[n, channel] = sums[GEOMETRY_FIELDS + colors + channel]
+        if geometry:
+            a, b, c = two * ellipses[k, HALF_A], ellipses[k, CONIC_B], two * ellipses[k, HALF_C]
+            grad_means2d[n, 0] = -(a * sums[1] + b * sums[2])
+            grad_means2d[n, 1] = -(b * sums[1] + c * sums[2])
+            grad_conics[n, 0] = HALF * sums[3]
+            grad_conics[n, 1] = sums[4]
+            grad_conics[n, 2] = HALF * sums[5]
+            grad_opacities[n] = -sums[0] / ellipses[k, OPACITY]
+
+
+@kernel
+def gather(start: int, stop: int, order: I32, source: F32, column: int, values: F32) -> None:
+    """Rows of ``source`` in depth order into columns ``column`` and on of ``values``."""
+    for k in range(start, stop):
+        n = order[k]
+        for channel in range(source.shape[1]):
+            values[k, column + channel] = source[n, channel]
