@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from lexsplat.rendering.kernels.jit import fast_kernel, parallel
+from lexsplat.rendering.kernels.jit import kernel, parallel
 
 TAPS = 11
 RADIUS = 5
@@ -50,16 +50,18 @@ def photometric(
     products = np.empty((3, height, width3), np.float32)
     by_blurred = np.empty((3, height, width3), np.float32)
     gradient = np.empty((height, width3), np.float32)
-    row_sums = np.empty((2, height), np.float64)
+    # Summed at the end by numpy: a sum inside a kernel's loop would keep the loop from being vectorised.
+    scores = np.empty((height, width3), np.float32)
+    differences = np.empty((height, width3), np.float32)
     weights = np.float32(l1_weight), np.float32(ssim_weight)
     grain = max(1, 3 * PIXELS_PER_PIECE // width3)
     parallel(_multiply, height, grain, image, target, products)
-    parallel(_compare, height, grain, products, mean, variance, vertical, horizontal, by_blurred, row_sums[1])
+    parallel(_compare, height, grain, products, mean, variance, vertical, horizontal, by_blurred, scores)
     parallel(
         *(_backward, height, grain, by_blurred, image, target),
-        *(vertical_t, horizontal_t, *weights, gradient, row_sums[0]),
+        *(vertical_t, horizontal_t, *weights, gradient, differences),
     )
-    return float(row_sums[0].sum()), float(row_sums[1].sum()), gradient
+    return float(differences.sum(dtype=np.float64)), float(scores.sum(dtype=np.float64)), gradient
 
 
 def reflected_taps(length: int) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +88,7 @@ def reflected_taps(length: int) -> tuple[np.ndarray, np.ndarray]:
     return forward.astype(np.float32), transposed.astype(np.float32)
 
 
-@fast_kernel
+@kernel
 def _multiply(start: int, stop: int, image: np.ndarray, target: np.ndarray, products: np.ndarray) -> None:
     """The three maps whose blurs SSIM needs: x, x^2 and x t."""
     for y in range(start, stop):
@@ -97,7 +99,7 @@ def _multiply(start: int, stop: int, image: np.ndarray, target: np.ndarray, prod
             products[2, y, i] = x * target[y, i]
 
 
-@fast_kernel
+@kernel
 def _blur_row(
     maps: np.ndarray,
     y: int,
@@ -133,7 +135,7 @@ def _blur_row(
             blurred[c, i] = total
 
 
-@fast_kernel
+@kernel
 def _compare(
     start: int,
     stop: int,
@@ -143,9 +145,9 @@ def _compare(
     vertical: np.ndarray,
     horizontal: np.ndarray,
     by_blurred: np.ndarray,
-    row_ssim: np.ndarray,
+    scores: np.ndarray,
 ) -> None:
-    """SSIM of every pixel, summed by row, and its derivative by the three blurred maps.
+    """SSIM of every pixel and its derivative by the three blurred maps.
 
     With m, q, p the blurs of x, x^2, x t: SSIM = a1 a2 / (b1 b2), a1 = 2 m mt + C1, a2 = 2 (p - m mt) + C2,
     b1 = m^2 + mt^2 + C1, b2 = (q - m^2) + vt + C2.
@@ -156,7 +158,6 @@ def _compare(
     blurred = np.empty((3, width3), np.float32)
     for y in range(start, stop):
         _blur_row(products, y, vertical, horizontal, padded, blurred)
-        total = np.float32(0.0)
         for i in range(width3):
             m = blurred[0, i]
             mt = mean[y, i]
@@ -168,7 +169,7 @@ def _compare(
             b2 = blurred[1, i] - square + variance[y, i] + C2
             scale = np.float32(1.0) / (b1 * b2)
             score = a1 * a2 * scale
-            total += score
+            scores[y, i] = score
             by_product = two * a1 * scale
             by_square = -score / b2
             by_blurred[0, y, i] = (
@@ -176,10 +177,9 @@ def _compare(
             )
             by_blurred[1, y, i] = by_square
             by_blurred[2, y, i] = by_product
-        row_ssim[y] = total
 
 
-@fast_kernel
+@kernel
 def _backward(
     start: int,
     stop: int,
@@ -191,7 +191,7 @@ def _backward(
     l1_weight: np.float32,
     ssim_weight: np.float32,
     gradient: np.ndarray,
-    row_l1: np.ndarray,
+    differences: np.ndarray,
 ) -> None:
     """The gradient by the image, from the transposed blur of the derivatives, and absolute differences."""
     width3 = image.shape[1]
@@ -200,13 +200,11 @@ def _backward(
     blurred = np.empty((3, width3), np.float32)
     for y in range(start, stop):
         _blur_row(by_blurred, y, vertical_t, horizontal_t, padded, blurred)
-        total = np.float32(0.0)
         for i in range(width3):
             x = image[y, i]
             t = target[y, i]
             by_ssim = blurred[0, i] + two * x * blurred[1, i] + t * blurred[2, i]
             difference = x - t
-            total += abs(difference)
+            differences[y, i] = abs(difference)
             sign = np.float32(difference > 0) - np.float32(difference < 0)
             gradient[y, i] = l1_weight * sign - ssim_weight * by_ssim
-        row_l1[y] = total
