@@ -7,6 +7,8 @@ several Python threads may render at the same time.
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import itertools
 import logging
 import os
@@ -31,22 +33,44 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     Fast-math stays off: under its promise that there are no NaN, the outcome of a comparison with one is
     undefined, and comparisons decide here where memory is written.
     """
+    # Numba takes the folder from its global settings when the cache is made; leave those as they were.
+    before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    numba.config.CACHE_DIR = _cache_folder()  # type: ignore[attr-defined]
     try:
-        dispatcher = _compile(function)
-    except RuntimeError:
-        # Neither the package folder nor the home folder can be written.
-        owner = os.getuid() if hasattr(os, "getuid") else "user"
-        folder = Path(tempfile.gettempdir()) / f"lexsplat-kernels-{owner}"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        logger.info("keeping compiled kernels in %s (NUMBA_CACHE_DIR chooses another folder)", folder)
-        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-        dispatcher = _compile(function)
+        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
     _dispatchers.append((dispatcher, function))
     return dispatcher
 
 
-def _compile(function: Callable[..., Any]) -> Any:
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+@functools.cache
+def _cache_folder() -> str:
+    """Where compiled kernels are kept, for exactly these sources.
+
+    Numba looks only at the file of the function it compiles, and would keep kernels whose parts, written in
+    another file, have changed. The first folder that can be written is taken: that of the environment variable
+    NUMBA_CACHE_DIR, the package's, the user's, a temporary one.
+    """
+    digest = hashlib.sha256()
+    here = Path(__file__).parent
+    for source in sorted(here.glob("*.py")):
+        digest.update(source.read_bytes())
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
+    places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home).expanduser() / "lexsplat"]
+    for place in places:
+        folder = place / f"kernels-{digest.hexdigest()[:12]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return str(folder)
+        except (OSError, RuntimeError):
+            continue
+    logger.info(
+        "no folder for compiled kernels can be written; set NUMBA_CACHE_DIR to keep them between runs"
+    )
+    return tempfile.mkdtemp(prefix="lexsplat-kernels-")
 
 
 def announce_compilation() -> None:
@@ -56,7 +80,7 @@ def announce_compilation() -> None:
         return
     _announced = True
     if not all(_is_cached(dispatcher, function) for dispatcher, function in _dispatchers):
-        logger.info("compiling CPU kernels, once (about 20 seconds)")
+        logger.info("compiling CPU kernels, once (about 15 seconds)")
 
 
 def _is_cached(dispatcher: Any, function: Callable[..., Any]) -> bool:
