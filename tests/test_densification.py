@@ -64,18 +64,18 @@ def assert_same(left: dict, right: dict) -> None:
         assert torch.equal(left[name], right[name]), name
 
 
-def test_default_control_does_exactly_what_gsplats_strategy_does():
+def test_default_control_does_exactly_what_gsplats_strategy_does_until_its_missing_reset():
     from gsplat.strategy import DefaultStrategy
 
     ours, our_optimizers = some_parameters()
-    run(new_control(reset_opacities=False), ours, our_optimizers, range(32))
+    run(new_control(), ours, our_optimizers, range(20))
 
     reference, optimizers = some_parameters()
     strategy = DefaultStrategy(refine_start_iter=2, refine_stop_iter=100, refine_every=5, reset_every=20)
     state = strategy.initialize_state(scene_scale=1.0)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        for step in range(32):
+        for step in range(20):
             means2d, radii = projected(len(reference["means"]), seed=step)
             batched = torch.zeros(1, len(radii), 2, requires_grad=True)
             batched.grad = means2d.grad[None]
@@ -83,7 +83,7 @@ def test_default_control_does_exactly_what_gsplats_strategy_does():
             info |= {"width": 200, "height": 100, "n_cameras": 1, "gaussian_ids": None}
             strategy.step_post_backward(reference, optimizers, state, step, info)
 
-    assert len(ours["means"]) > 60
+    assert len(ours["means"]) > 50
     assert_same(ours, reference)
     for name in ours:
         assert_same(our_optimizers[name].state[ours[name]], optimizers[name].state[reference[name]])
@@ -129,6 +129,16 @@ def test_opacities_are_reset_when_due_and_only_then():
     run(control, parameters, optimizers, range(20, 21))
     assert float(parameters["opacities"].detach().sigmoid().max()) == pytest.approx(0.01, rel=1e-5)
     assert not optimizers["opacities"].state[parameters["opacities"]]["exp_avg"].any()
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_large_gaussians_are_removed_only_where_opacities_are_reset(resets):
+    parameters, optimizers = some_parameters()
+    with torch.no_grad():
+        parameters["opacities"].fill_(3.0)
+        parameters["scales"][:10] = -1.0  # 0.37, more than a tenth of the extent of 1
+    run(new_control(reset_opacities=resets, grow_gradient=1.0), parameters, optimizers, range(26))
+    assert len(parameters["means"]) == (30 if resets else 40)
 
 
 def test_nothing_changes_after_the_stop():

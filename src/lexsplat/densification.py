@@ -22,6 +22,8 @@ from torch import Tensor
 
 REFERENCE_ITERATIONS = 30_000
 """The length of training that all step numbers of 3DGS refer to."""
+NEVER = 1 << 62
+"""A step that no training reaches."""
 MAX_COPIES = 51
 """More copies of one Gaussian than this are treated as this many (as gsplat does)."""
 
@@ -79,7 +81,8 @@ class DensityControl:
         grow_gradient: Mean gradient of the projected centres, in halves of the image, above which "default"
             adds.
         min_opacity: Gaussians fainter than this are removed ("default") or moved ("mcmc").
-        reset_opacities: Whether "default" resets the opacities to twice ``min_opacity`` now and then.
+        reset_opacities: Whether "default" resets the opacities to twice ``min_opacity`` now and then, and
+            from the first time on removes Gaussians larger than a tenth of the scene.
         noise: Strength of the noise of "mcmc", times the learning rate of the means.
         seed: Of the random generator.
         device: Where the parameters are.
@@ -119,7 +122,12 @@ class DensityControl:
         }
         if strategy == "default":
             self._default = DefaultStrategy(
-                prune_opa=min_opacity, grow_grad2d=grow_gradient, reset_every=schedule.reset_every, **steps
+                prune_opa=min_opacity,
+                grow_grad2d=grow_gradient,
+                # gsplat also removes Gaussians larger than a tenth of the scene once opacities were reset. Without
+                # resets that would only punch holes into a background that few Gaussians cover.
+                reset_every=schedule.reset_every if reset_opacities else NEVER,
+                **steps,
             )
             self._mcmc = None
             self._state = self._default.initialize_state(scene_scale=extent)
