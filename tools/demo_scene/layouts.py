@@ -98,6 +98,7 @@ class Layout:
     width: int
     height: int
     views: int
+    test_every: int
     field_of_view: float
     path: CameraPath
     placements: tuple[Placement, ...]
@@ -115,8 +116,8 @@ class Layout:
         return [f"view_{number:03d}" for number in range(self.views)]
 
     def test_names(self) -> list[str]:
-        """Every sixth view, never the first or the last: each lies between training views of the path."""
-        return self.names()[3::6]
+        """Every so many views, never the first or the last: each lies between training views of the path."""
+        return self.names()[self.test_every // 2 :: self.test_every]
 
 
 TABLETOP = Layout(
@@ -124,6 +125,7 @@ TABLETOP = Layout(
     width=480,
     height=360,
     views=72,
+    test_every=6,
     field_of_view=44,
     path=CameraPath(
         sweeps=((17, 24), (31, 37), (46, 40)),
@@ -185,6 +187,7 @@ SECOND = Layout(
     width=320,
     height=240,
     views=30,
+    test_every=5,
     field_of_view=46,
     path=CameraPath(
         sweeps=((22, 28), (40, 34)),

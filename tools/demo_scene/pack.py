@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from sparse_model import depth_errors, pinhole, slim_model, triangulate
 
-JPEG_QUALITY = 92
+JPEG_QUALITY = 90
 MIN_PIXELS = 150
 MIN_PART_PIXELS = 40
 """A view has a mask for a thing, or a part of one, that shows at least so many pixels."""
@@ -90,7 +90,7 @@ def pack(layout: Layout, work: Path, output: Path, *, truth: bool, say: Callable
     (output / "images").mkdir(parents=True)
     for name in layout.names():
         picture = Image.open(work / "pictures" / f"{name}.png").convert("RGB")
-        picture.save(output / "images" / f"{name}.jpg", quality=JPEG_QUALITY, optimize=True)
+        picture.save(output / "images" / f"{name}.jpg", quality=JPEG_QUALITY, progressive=True)
     (output / "test_views.json").write_text(json.dumps(layout.test_names(), indent=1) + "\n")
     kinds = {text: prompt.kind for text, prompt in layout.prompts.items()}
     (output / "prompts.json").write_text(json.dumps(kinds, indent=1) + "\n")
