@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.cameras import Camera
+from lexsplat.cameras import Camera, look_at
 from lexsplat.gaussians import Gaussians
 
 
@@ -53,33 +53,28 @@ def project(p: dict[str, Tensor], camera: Camera, antialiased: bool, near: float
     return {"means2d": means2d, "conic": conic, "opacity": opacity, "depth": at[:, 2]}
 
 
-def spherical_harmonics(direction: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics by associated Legendre functions (scipy's complex ones), no gradient."""
-    from scipy.special import sph_harm_y
+def shade(p: dict[str, Tensor], camera: Camera, degree: int) -> Tensor:
+    """RGB [N, 3]; the polynomials are those of gsplat's torch twin."""
+    from gsplat.cuda._torch_impl import _spherical_harmonics
 
-    d = (direction / direction.norm(dim=-1, keepdim=True)).detach().numpy()
-    theta, phi = np.arccos(np.clip(d[:, 2], -1, 1)), np.arctan2(d[:, 1], d[:, 0])
-    columns = []
-    for l in range(degree + 1):
-        for m in range(-l, l + 1):
-            value = sph_harm_y(l, abs(m), theta, phi)
-            if m == 0:
-                columns.append(value.real)
-            else:
-                columns.append(math.sqrt(2) * (value.imag if m < 0 else value.real))
-    return torch.from_numpy(np.stack(columns, -1))
+    direction = p["means"] - torch.from_numpy(camera.position)
+    return (_spherical_harmonics(degree, direction, torch.cat([p["sh0"], p["shN"]], 1)) + 0.5).clamp_min(0)
 
 
 def blend(
     projected: dict[str, Tensor], values: Tensor, camera: Camera, near: float = 0.01
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Channels [H, W, C], alpha [H, W] and the weight of each Gaussian at each pixel [N, H, W]."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Channels [H, W, C], alpha [H, W], the weight of each Gaussian at each pixel [N, H, W], and clear [H, W].
+
+    A pixel is clear if no decision there (threshold, clamp, end) is so close that float32 may take the other way.
+    """
     ys, xs = torch.meshgrid(
         torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
     )
     pixels = torch.stack([xs, ys], -1).double()
     transmittance = torch.ones(camera.height, camera.width, dtype=torch.float64)
     done = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    clear = ~done
     image = torch.zeros(camera.height, camera.width, values.shape[1], dtype=torch.float64)
     weights: list[Tensor] = [torch.zeros_like(transmittance)] * len(values)
     depth = projected["depth"].detach()
@@ -88,12 +83,59 @@ def blend(
             continue
         offset = pixels - projected["means2d"][n]
         power = 0.5 * torch.einsum("hwi,ij,hwj->hw", offset, projected["conic"][n], offset)
-        alpha = (projected["opacity"][n] * torch.exp(-power)).clamp_max(0.999)
+        alpha = projected["opacity"][n] * torch.exp(-power)
+        for decision in (1 / 255, 0.999):
+            clear &= (alpha.detach() / decision - 1).abs() > 2e-5
+        alpha = alpha.clamp_max(0.999)
         alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
         after = transmittance * (1 - alpha)
+        clear &= done | ((after.detach() / 1e-4 - 1).abs() > 1e-3)
         done = done | (after <= 1e-4)
         weight = torch.where(done, torch.zeros_like(alpha), alpha * transmittance)
         transmittance = torch.where(done, transmittance, after)
         image = image + weight[..., None] * values[n]
         weights[n] = weight
-    return image, 1 - transmittance, torch.stack(weights)
+    return image, 1 - transmittance, torch.stack(weights), clear
+
+
+def render(
+    p: dict[str, Tensor], camera: Camera, *, antialiased: bool, degree: int, background: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Image over the background, alpha, weights and clear pixels."""
+    projected = project(p, camera, antialiased)
+    image, alpha, weights, clear = blend(projected, shade(p, camera, degree), camera)
+    if background is not None:
+        image = image + (1 - alpha)[..., None] * background
+    return {"image": image, "alpha": alpha, "weights": weights, "clear": clear, **projected}
+
+
+def random_gaussians(
+    count: int, seed: int, *, degree: int = 3, antialiased: bool = False, scale: float = 0.15
+) -> Gaussians:
+    """Around the origin, standard deviations around ``scale``, some nearly opaque."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    return Gaussians(
+        means=0.8 * normal(count, 3),
+        quats=normal(count, 4),
+        log_scales=math.log(scale) + 0.5 * normal(count, 3),
+        opacity_logits=2 * normal(count),
+        sh0=normal(count, 1, 3),
+        shN=0.3 * normal(count, (degree + 1) ** 2 - 1, 3),
+        antialiased=antialiased,
+    )
+
+
+def front_camera(width: int = 50, height: int = 37) -> Camera:
+    """A little above and beside the axis, so that nothing is symmetric."""
+    return look_at(
+        np.array([0.4, -0.3, -3.0]),
+        np.array([0.05, 0.0, 0.0]),
+        np.array([0.1, -1.0, 0.0]),
+        width,
+        height,
+        0.8,
+    )
