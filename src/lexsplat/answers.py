@@ -19,7 +19,7 @@ from lexsplat.pipeline import machine_facts
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import check_prompts
 from lexsplat.report import Gallery, write_report
-from lexsplat.scene_folder import SceneFolder, atomic_path, write_json
+from lexsplat.scene_folder import SceneFolder, atomic_path, read_json, write_json
 from lexsplat.scenes import Scene, load_masks, load_scene
 from lexsplat.search import SearchableScene
 
@@ -199,6 +199,7 @@ def evaluate_scene(
         },
         settings=record.get("config", {}),
         machine=machine_facts(),
+        prompt_kinds=_prompt_kinds(photos.root),
     )
     result = metrics.to_json()
     write_json(folder.root / "metrics.json", result)
@@ -209,6 +210,17 @@ def evaluate_scene(
         with atomic_path(path) as temporary:
             temporary.write_bytes(pictures["heatmap"])
     return result
+
+
+def _prompt_kinds(root: Path) -> dict[str, str]:
+    """``prompts.json`` of a capture, ``{prompt: kind}``, where there is one."""
+    path = root / "prompts.json"
+    if not path.is_file():
+        return {}
+    content = read_json(path)
+    if not isinstance(content, dict) or not all(isinstance(kind, str) for kind in content.values()):
+        raise CaptureError(path, expected="an object of prompt: kind", found=type(content).__name__)
+    return content
 
 
 def load_photos(scene: SearchableScene, capture: Path | None) -> Scene:

@@ -165,6 +165,7 @@ def evaluate(
     stored_bytes: Mapping[str, int] | None = None,
     settings: Mapping[str, Any] | None = None,
     machine: Mapping[str, Any] | None = None,
+    prompt_kinds: Mapping[str, str] | None = None,
 ) -> Metrics:
     """Measure a scene on its held-out views, one view in memory at a time.
 
@@ -182,6 +183,8 @@ def evaluate(
         stored_bytes: "language_bytes" and "gaussian_bytes" on disk; else the size of the tensors.
         settings: Settings of the build, passed through.
         machine: Passed through.
+        prompt_kinds: What kind of question a prompt is ("name", "colour", "part", ...); the numbers are then also
+            given for each kind.
 
     Raises:
         ValueError: If there are masks and a language but no ``encode_text``.
@@ -198,6 +201,7 @@ def evaluate(
     words = summarize_language(run.pairs, run.thresholds)
     if words is not None and language is not None:
         words = {"form": config.query.form, "method": language.method, **words}
+        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, prompt_kinds or {})
     return Metrics(
         quality=quality,
         language=words,
@@ -387,6 +391,28 @@ def summarize_language(pairs: Pairs, thresholds: Mapping[str, Mapping[str, float
             for view, prompts in pairs.items()
         },
     }
+
+
+def summarize_kinds(
+    pairs: Pairs, thresholds: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str]
+) -> dict[str, Any]:
+    """The strict numbers of `summarize_language` for each kind of prompt alone: ``{kind: {..., "prompts"}}``."""
+    table: dict[str, Any] = {}
+    for kind in sorted({kinds[prompt] for prompt in thresholds if prompt in kinds}):
+        chosen = {prompt: limits for prompt, limits in thresholds.items() if kinds.get(prompt) == kind}
+        part = {
+            view: {p: pair for p, pair in prompts.items() if p in chosen} for view, prompts in pairs.items()
+        }
+        summary = summarize_language({view: prompts for view, prompts in part.items() if prompts}, chosen)
+        if summary is not None:
+            strict = summary["strict"]
+            table[kind] = {
+                **{f"mIoU_{name}": strict[name]["mIoU"] for name in THRESHOLD_KINDS},
+                "mAP": strict["mAP"],
+                "localization": strict["localization"],
+                "prompts": len(chosen),
+            }
+    return table
 
 
 def _prompt_row(

@@ -145,6 +145,12 @@ def format_table(result: Mapping[str, Any]) -> str:
         for name, row in _protocol_rows(result["language"]):
             lines.append(f"{name:<22}" + "".join(f"{_number(row.get(key)):>8}" for key in _COLUMNS))
         lines += [f"{'localisation':<22}{_number(strict['localization']):>8}", ""]
+        kinds = result["language"].get("per_kind") or {}
+        for kind, row in kinds.items():
+            numbers = (row["mIoU_auto"], row["mAP"], row["localization"])
+            cells = "".join(f"{_number(number):>8}" for number in numbers)
+            lines.append(f"{kind + ' prompts':<22}{cells}{row['prompts']:>7}")
+        lines += ["(by kind: mIoU auto, mAP, localisation, prompts)", ""] if kinds else []
         prompts = result["language"]["per_prompt"]
         width = min(40, max(len(prompt) for prompt in prompts))
         lines.append(f"{'prompt':<{width}}{'IoU':>8}{'AP':>8}{'loc':>8}{'views':>7}")
