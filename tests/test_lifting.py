@@ -133,7 +133,7 @@ def test_the_error_of_sparsity_is_reported(small, reference) -> None:
 
 
 def test_lifting_recovers_known_labels(scene) -> None:
-    for config in (LiftingConfig(), EXACT):
+    for config in (LiftingConfig(use_smoothing=True), EXACT):
         field = lift_scene(scene, config)
         assert label_accuracy(field, scene) > 0.95
         known = field.weights.sum(1) > 0
@@ -203,7 +203,7 @@ def test_gaussians_no_view_shows_stay_silent_without_smoothing_and_follow_their_
     hidden.means[-1] = torch.tensor([-0.9, 0.0, 0.0])  # inside the first ball
     hidden.log_scales[-1] = -9.0
     hidden.opacity_logits[-1] = -20.0
-    for config, expected in ((EXACT, 0.0), (LiftingConfig(), 1.0)):
+    for config, expected in ((EXACT, 0.0), (LiftingConfig(use_smoothing=True), 1.0)):
         field = lift(hidden, scene.cameras, scene.code_maps, scene.codebook, config)
         assert float(field.uncertainties[-1]) == 1
         assert float(field.code_probabilities()[-1].sum()) == pytest.approx(expected, abs=1e-6)

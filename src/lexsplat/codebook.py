@@ -65,9 +65,9 @@ class CodebookConfig:
     init: Literal["kmeans", "uniform"] = "kmeans"
     kmeans_iterations: int = 20
     steps: int = 100
-    learning_rate: float = 1e-4
+    learning_rate: float = 1e-3
     weight_decay: float = 0.0
-    batch_size: int = 8192
+    batch_size: int = 4096
     sample_size: int = 50_000
 
     def __post_init__(self) -> None:
@@ -87,7 +87,9 @@ class CodebookConfig:
 
     def as_in_paper(self) -> CodebookConfig:
         """The same weights with the fit of the paper: gradient steps on Eq. 7 from a random start."""
-        return replace(self, init="uniform", steps=2000, learning_rate=1e-4, weight_decay=0.01)
+        return replace(
+            self, init="uniform", steps=2000, learning_rate=1e-4, weight_decay=0.01, batch_size=16_384
+        )
 
 
 def similarity(

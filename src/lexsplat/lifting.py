@@ -43,7 +43,8 @@ class LiftingConfig:
         min_visibility: A Gaussian with less weight than this over all training views, in pixels, counts as
             never seen.
         prior_visibility: Weight in pixels at which the histogram is half believed; below it u tends to 1.
-        use_smoothing: Mix the distributions of neighbours in, in the spirit of Eq. 14.
+        use_smoothing: Mix the distributions of neighbours in, in the spirit of Eq. 14. Off by default: it changed
+            nothing for the better where every surface is seen; it also fills in what no training view shows.
         neighbours: How many.
         min_smoothing_weight: w_s of Eq. 14.
         memory_bytes: Bound for the dense histogram; beyond it the views are passed over several times, for a
@@ -53,7 +54,7 @@ class LiftingConfig:
     top: int = 4
     min_visibility: float = 0.01
     prior_visibility: float = 1.0
-    use_smoothing: bool = True
+    use_smoothing: bool = False
     neighbours: int = 8
     min_smoothing_weight: float = 0.1
     memory_bytes: int = 1 << 30
@@ -246,15 +247,16 @@ class TuningConfig:
     Args:
         fit_steps: Steps that fit s_G and the decoder to the distributions, without rendering.
         batch_size: Gaussians of such a step, drawn in proportion to 1 - u (certain and well seen).
-        fit_lr: Learning rate of s_G, decoder and smoothing MLP in these steps.
-        iterations: Rendered steps afterwards; the other settings of the rendered steps are
-            `EmbeddingConfig`'s.
+        fit_lr: Learning rate of s_G and the decoder in these steps; the smoothing MLP has a tenth of it.
+        iterations: Rendered steps afterwards; what is not set here is set by `EmbeddingConfig`.
+        semantics_lr: Learning rate of s_G in the rendered steps, which start close to the goal.
     """
 
     fit_steps: int = 300
-    batch_size: int = 4096
-    fit_lr: float = 5e-3
-    iterations: int = 300
+    batch_size: int = 2048
+    fit_lr: float = 0.02
+    iterations: int = 200
+    semantics_lr: float = 0.01
 
     def __post_init__(self) -> None:
         if self.fit_steps < 0 or self.iterations < 0 or self.batch_size < 1:
@@ -280,7 +282,7 @@ def tune(
         cameras: The training views by name, and only these.
         code_maps: Index maps by view name.
         config: Settings of the fit.
-        embedding: Settings of the rendered steps (its number of iterations is replaced).
+        embedding: Settings of the rendered steps, but for what `TuningConfig` sets.
         seed: Of the decoder's start and of all samples.
         listener: Hears of stages "fit" and "embed".
     """
@@ -297,7 +299,7 @@ def tune(
         field.semantics.copy_(principal_semantics(lifted))
         field.uncertainty_logits.copy_(lifted.uncertainties.clamp(0.01, 0.9).logit())
     fit_semantics(field, lifted, gaussians, config, generator=generator, listener=listener)
-    rendered = replace(embedding, iterations=config.iterations)
+    rendered = replace(embedding, iterations=config.iterations, semantics_lr=config.semantics_lr)
     trainer = EmbeddingTrainer(gaussians, lifted.codebook, rendered, seed=seed, field=field)
     return train_field(
         gaussians,
@@ -350,14 +352,18 @@ def fit_semantics(
     known = (lifted.weights.sum(1) > 0).nonzero()[:, 0]
     if len(known) == 0 or config.fit_steps == 0:
         return
-    parameters = [field.semantics, *field.decoder.parameters(), *field.smoother.parameters()]
-    optimizer = torch.optim.Adam(parameters, lr=config.fit_lr)
+    optimizer = torch.optim.Adam(
+        [
+            {"params": [field.semantics, *field.decoder.parameters()], "base_lr": config.fit_lr},
+            {"params": list(field.smoother.parameters()), "base_lr": 0.1 * config.fit_lr},
+        ]
+    )
     cumulative = (1 - lifted.uncertainties[known]).clamp_min(0.05).double().cpu().cumsum(0)
     for step in range(config.fit_steps):
         draws = torch.rand(config.batch_size, generator=generator, dtype=torch.float64) * cumulative[-1]
         rows = known[torch.searchsorted(cumulative, draws).clamp_max(len(known) - 1).to(known.device)]
         for group in optimizer.param_groups:
-            group["lr"] = config.fit_lr * 0.1 ** (step / config.fit_steps)
+            group["lr"] = group["base_lr"] * 0.1 ** (step / config.fit_steps)
         log_p = field.decode(field.semantics[rows]).log_softmax(-1)
         loss = -(lifted.weights[rows] * log_p.gather(1, lifted.codes[rows].long())).sum(1).mean()
         smoothed = field.smoother(gaussians.means[rows])
