@@ -65,7 +65,7 @@ def test_what_is_not_drawn_could_not_be_seen():
     gaussians.means.mul_(2.5)
     leaves = {k: v.double() for k, v in gaussians.tensors().items()}
     projected = reference.project(leaves, camera, antialiased=True)
-    *_, radii, extents = cpu_backend.project(gaussians, camera, 0.01)
+    *_, radii, extents, _ = cpu_backend.project(gaussians, camera, 0.01)
     hidden = (radii == 0) & (projected["depth"] > 0.01)
     assert int(hidden.sum()) > 50
     xs, ys = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(30) + 0.5, indexing="xy")
@@ -89,7 +89,10 @@ def test_colours_equal_gsplats_torch_twin(degree):
     direction = leaves["means"] - torch.from_numpy(camera.position)
     expected = (_spherical_harmonics(degree, direction, coefficients) + 0.5).clamp_min(0)
     ours = gaussians.map(lambda t: t.clone().requires_grad_())
-    found = cpu_backend.shade(ours, camera, torch.ones(300, dtype=torch.int32), degree)
+    projected = list(cpu_backend.project(ours, camera, 0.01))
+    projected[4] = torch.ones(300, dtype=torch.int32)  # colours of all, drawn or not
+    projected[6] = ours.means
+    found = cpu_backend.shade(ours, camera, tuple(projected), degree)
     assert torch.allclose(found.double(), expected, atol=1e-5)
     grad = torch.randn(300, 3, generator=torch.Generator().manual_seed(1))
     found.backward(grad)
@@ -322,6 +325,6 @@ def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tm
 def test_a_far_turned_camera_keeps_depths_positive():
     camera = look_at(np.array([0.0, 0, 0]), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]), 64, 48, 1.2)
     gaussians = random_gaussians(300, 4, scale=0.05)
-    _, _, _, depths, radii, _ = cpu_backend.project(gaussians, camera, 0.2)
+    _, _, _, depths, radii, *_ = cpu_backend.project(gaussians, camera, 0.2)
     assert (depths[radii > 0] >= 0.2).all()
     assert (radii[(gaussians.means[:, 0] < 0.2 - 1e-5)] == 0).all()

@@ -183,7 +183,7 @@ def render(
     if color:
         stored = gaussians.sh_degree
         degree = stored if sh_degree is None else max(0, min(sh_degree, stored))
-        colors = module.shade(gaussians, camera, radii, degree)
+        colors = module.shade(gaussians, camera, projected, degree)
     extra = features
     if depth:
         column = depths[:, None]

@@ -33,8 +33,16 @@ def _array(tensor: Tensor) -> NDArray[Any]:
     return tensor.detach().contiguous().numpy()
 
 
+def _zeros(*shape: int) -> Tensor:
+    """Zeros from fresh pages: torch would fill them on its own threads, which then spin beside ours."""
+    return torch.from_numpy(np.zeros(shape, np.float32))
+
+
 class _Project(torch.autograd.Function):
-    """(means, quats, log_scales, opacity_logits) -> (means2d, conics, opacities, depths, radii, extents)."""
+    """(means, quats, log_scales, opacity_logits) -> (means2d, conics, opacities, depths, radii, extents, means).
+
+    The means are handed on for shading, so that their two gradients meet in the kernel.
+    """
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
@@ -49,17 +57,21 @@ class _Project(torch.autograd.Function):
         ctx.camera, ctx.antialiased = camera, antialiased
         ctx.save_for_backward(*tensors, outputs[4])
         ctx.mark_non_differentiable(*outputs[3:])
-        return tuple(outputs)
+        ctx.set_materialize_grads(False)
+        return (*outputs, tensors[0].detach())
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Any) -> tuple[Any, ...]:
         *tensors, radii = ctx.saved_tensors
         outputs = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
+        shapes = ((len(radii), 2), (len(radii), 3), (len(radii),), (len(radii), 3))
+        given = (*grads[:3], grads[6])
+        incoming = [_array(_zeros(*shape) if g is None else g) for g, shape in zip(given, shapes)]
         parallel(
             projection.project_backward, len(radii), GRAIN,
             *[_array(t) for t in tensors], ctx.camera, ctx.antialiased, _array(radii),
-            *[_array(g) for g in grads[:3]], *[_array(t) for t in outputs],
+            *incoming, *[_array(t) for t in outputs],
         )  # fmt: skip
         return (*outputs, None, None)
 
@@ -122,8 +134,8 @@ class _Blend(torch.autograd.Function):
         pairs: TilePairs = ctx.pairs
         visible, color_channels = len(pairs.order), _channels(colors)
         geometry = any(ctx.needs_input_grad[:3])
-        grad_image = torch.zeros_like(image) if grad_image is None else grad_image
-        grad_alpha = torch.zeros_like(alpha) if grad_alpha is None else grad_alpha
+        grad_image = _zeros(*image.shape) if grad_image is None else grad_image
+        grad_alpha = _zeros(*alpha.shape) if grad_alpha is None else grad_alpha
         values = _gather(pairs, colors, features)
         rows = np.empty(len(pairs.members) * gradients.row_width(image.shape[2]), np.float32)
         parallel(
@@ -132,8 +144,14 @@ class _Blend(torch.autograd.Function):
             color_channels, geometry, *[_array(t) for t in (image, alpha, grad_image, grad_alpha)], rows,
         )  # fmt: skip
         count = pairs.count if geometry else 0
-        outputs = [torch.zeros(count, 2), torch.zeros(count, 3), torch.zeros(count)]
-        outputs += [torch.zeros(pairs.count, color_channels), torch.zeros(pairs.count, _channels(features))]
+        shapes = (
+            (count, 2),
+            (count, 3),
+            (count,),
+            (pairs.count, color_channels),
+            (pairs.count, _channels(features)),
+        )
+        outputs = [_zeros(*shape) for shape in shapes]
         parallel(
             gradients.sum_pairs, visible, GRAIN,
             pairs.order, pairs.ellipses, pairs.pair_offsets, rows, geometry, color_channels,
@@ -162,7 +180,10 @@ def _gather(pairs: TilePairs, *sources: Tensor | None) -> NDArray[np.float32]:
 
 
 def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
-    """Means2d, conics, opacities, depths, radii and extents of every Gaussian; the first three have gradients."""
+    """Means2d, conics, opacities, depths, radii and extents of every Gaussian; the first three have gradients.
+
+    The last entry are the means again, for `shade`.
+    """
     announce_compilation()
     g = gaussians
     tensors = (g.means, g.quats, g.log_scales, g.opacity_logits)
@@ -171,14 +192,14 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, 
 
 def pairs_of(projected: tuple[Tensor, ...], camera: Camera) -> TilePairs:
     """The pairs of a projection."""
-    means2d, conics, opacities, depths, radii, extents = (_array(t) for t in projected)
+    means2d, conics, opacities, depths, radii, extents = (_array(t) for t in projected[:6])
     return find_pairs(means2d, conics, opacities, extents, depths, radii, camera.width, camera.height)
 
 
-def shade(gaussians: Gaussians, camera: Camera, radii: Tensor, degree: int) -> Tensor:
+def shade(gaussians: Gaussians, camera: Camera, projected: tuple[Tensor, ...], degree: int) -> Tensor:
     """RGB ``[N, 3]`` of the visible Gaussians seen from the camera."""
     eye = np.ascontiguousarray(camera.position)
-    return _Shade.apply(gaussians.means, gaussians.sh0, gaussians.shN, radii, eye, degree)
+    return _Shade.apply(projected[6], gaussians.sh0, gaussians.shN, projected[4], eye, degree)
 
 
 def blend(

@@ -91,13 +91,15 @@ def pairs_of(projected: tuple[Tensor, ...], camera: Camera) -> TileLists:
     return TileLists(camera.width, camera.height, offsets, members)
 
 
-def shade(gaussians: Gaussians, camera: Camera, radii: Tensor, degree: int) -> Tensor:
+def shade(gaussians: Gaussians, camera: Camera, projected: tuple[Tensor, ...], degree: int) -> Tensor:
     """RGB ``[N, 3]`` of the visible Gaussians seen from the camera: max(0, SH + 0.5)."""
     from gsplat.cuda._wrapper import spherical_harmonics
 
     eye = torch.as_tensor(camera.position, dtype=torch.float32, device=gaussians.device)
     coefficients = torch.cat([gaussians.sh0, gaussians.shN[:, : (degree + 1) ** 2 - 1]], 1)
-    colors = spherical_harmonics(degree, gaussians.means - eye, coefficients, masks=(radii > 0).all(-1))
+    colors = spherical_harmonics(
+        degree, gaussians.means - eye, coefficients, masks=(projected[4] > 0).all(-1)
+    )
     return torch.clamp_min(colors + 0.5, 0.0)
 
 

@@ -176,12 +176,16 @@ def project_backward(
     grad_means2d: F32,
     grad_conics: F32,
     grad_opacities: F32,
+    grad_shaded: F32,
     grad_means: F32,
     grad_quats: F32,
     grad_log_scales: F32,
     grad_opacity_logits: F32,
 ) -> None:
-    """Gradients of `project`. Gaussians that were not seen get zeros."""
+    """Gradients of `project`. Gaussians that were not seen get zeros.
+
+    ``grad_shaded [N, 3]`` is what their colours say about the means, and is added.
+    """
     rotation, axes, scale = np.empty(9), np.empty(9), np.empty(3)
     grad_axes, grad_rotation = np.empty(9), np.empty(9)
     fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
@@ -278,7 +282,7 @@ def project_backward(
         gtx, gty = grad_slope_x / tz, grad_slope_y / tz
         gtz -= (grad_slope_x * tx + grad_slope_y * ty) / (tz * tz)
         for j in range(3):
-            grad_means[n, j] = camera[j] * gtx + camera[3 + j] * gty + camera[6 + j] * gtz
+            grad_means[n, j] = camera[j] * gtx + camera[3 + j] * gty + camera[6 + j] * gtz + grad_shaded[n, j]
 
         for j in range(3):
             total = axes[j] * grad_axes[j] + axes[3 + j] * grad_axes[3 + j] + axes[6 + j] * grad_axes[6 + j]
