@@ -18,7 +18,12 @@ from lexsplat.errors import TrainingError
 from lexsplat.progress import Event
 
 QUICK = EmbeddingConfig(
-    iterations=80, pixel_sample=200, smoothing_sample=100, semantics_lr=0.1, decoder_lr=5e-3
+    iterations=80,
+    render_downscale=1.0,
+    pixel_sample=200,
+    smoothing_sample=100,
+    semantics_lr=0.1,
+    decoder_lr=5e-3,
 )
 
 

@@ -72,10 +72,10 @@ class EmbeddingConfig:
             time.
     """
 
-    iterations: int = 1500
-    pixel_sample: int = 4096
+    iterations: int = 1000
+    pixel_sample: int = 2048
     render_downscale: float = 1.0
-    semantics_lr: float = 0.02
+    semantics_lr: float = 0.05
     uncertainty_lr: float = 0.02
     decoder_lr: float = 2e-3
     smoothing_lr: float = 1e-3
@@ -92,7 +92,7 @@ class EmbeddingConfig:
     smoothing_weight: SmoothingWeight = "max"
     smoothing_squared: bool = False
     smoothing_every: int = 1
-    smoothing_sample: int = 4096
+    smoothing_sample: int = 2048
     num_frequencies: int = 0
     normalise_rendering: bool = False
     clip_decoder_grad: float | None = 1.0
