@@ -217,3 +217,33 @@ def test_settings_out_of_range_are_named(change):
     (name,) = change
     with pytest.raises(ValueError, match=name):
         ReconstructionConfig(**change)
+
+
+def test_the_full_length_has_the_rates_and_the_schedule_of_3dgs():
+    config = ReconstructionConfig()
+    expected = {"means": 3.2e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3}
+    assert config.rates(extent=2.0) == pytest.approx({**expected, "shN": 2.5e-3 / 20})
+    assert config.warm_up_iterations == 0
+    assert config.is_long
+
+
+def test_short_trainings_take_longer_strides_and_start_small():
+    config = ReconstructionConfig(iterations=3_750)
+    assert config.rates(1.0)["means"] == pytest.approx(2 * 1.6e-4)
+    assert config.rates(1.0)["opacity_logits"] == 5e-2
+    assert config.warm_up_iterations == 1_125
+    assert not config.is_long
+
+
+def test_what_is_set_is_not_overruled():
+    config = ReconstructionConfig(iterations=100, warm_up=0.0, rate_scale=1.0, max_gaussians=7)
+    assert config.warm_up_iterations == 0
+    assert config.rates(1.0)["means"] == pytest.approx(1.6e-4)
+    assert config.cap(torch.device("cuda")) == config.cap(torch.device("cpu")) == 7
+
+
+def test_the_learning_rate_of_the_means_decays_to_a_hundredth(scene, points):
+    trainer = Reconstructor(scene, SHORT, points)
+    first = trainer._means_rate()
+    trainer.steps_done = SHORT.iterations
+    assert trainer._means_rate() == pytest.approx(first / 100)

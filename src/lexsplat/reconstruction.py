@@ -74,8 +74,10 @@ class ReconstructionConfig:
         antialiased: Train and render with the mip filter.
         initial_opacity: Opacity of the first Gaussians.
         warm_up: Share of the iterations that run at half resolution, at the start; None is 0.3 in trainings
-            shorter than 15,000 (a third less time, the same quality), else 0.
+            shorter than 15,000, else 0.
         exposure: Fit an affine colour change per training photo, for captures whose exposure varies.
+        rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
+            30,000 / iterations, between 1 and 3: a short training takes longer strides.
         means_rate: Learning rate of the centres at the start, relative to the extent of the scene.
         means_rate_final: The same at the end; it decays exponentially.
         scales_rate: Learning rate of the logarithms of the scales.
@@ -105,6 +107,7 @@ class ReconstructionConfig:
     initial_opacity: float = 0.1
     warm_up: float | None = None
     exposure: bool = False
+    rate_scale: float | None = None
     means_rate: float = 1.6e-4
     means_rate_final: float = 1.6e-6
     scales_rate: float = 5e-3
@@ -153,13 +156,16 @@ class ReconstructionConfig:
 
     def rates(self, extent: float) -> dict[str, float]:
         """Learning rates at the start by parameter (our names)."""
+        scale = self.rate_scale
+        if scale is None:
+            scale = min(3.0, max(1.0, (REFERENCE_ITERATIONS / self.iterations) ** (1 / 3)))
         return {
-            "means": self.means_rate * extent,
-            "quats": self.quats_rate,
-            "log_scales": self.scales_rate,
+            "means": scale * self.means_rate * extent,
+            "quats": scale * self.quats_rate,
+            "log_scales": scale * self.scales_rate,
             "opacity_logits": self.opacities_rate,
-            "sh0": self.sh0_rate,
-            "shN": self.shN_rate,
+            "sh0": scale * self.sh0_rate,
+            "shN": scale * self.shN_rate,
         }
 
 
@@ -431,9 +437,8 @@ class Reconstructor:
 
     def _means_rate(self) -> float:
         config = self.config
-        progress = self.steps_done / config.iterations
-        decay = (config.means_rate_final / config.means_rate) ** progress
-        return config.means_rate * self._extent * decay
+        decay = (config.means_rate_final / config.means_rate) ** (self.steps_done / config.iterations)
+        return config.rates(self._extent)["means"] * decay
 
     def _next_view(self) -> int:
         """Views come in random permutations, so each is seen equally often."""
