@@ -4,14 +4,17 @@ import os
 from pathlib import Path
 
 import pytest
-import torch
 from tiny_capture import write_capture
+
+import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
 
 TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
 def pytest_collection_modifyitems(items):
     """Tests marked ``gpu`` are skipped where there is no CUDA device."""
+    import torch
+
     if torch.cuda.is_available():
         return
     for item in items:
