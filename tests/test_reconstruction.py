@@ -93,12 +93,15 @@ def test_state_survives_safetensors(scene, points, tmp_path):
     assert trainer.step() == other.step()
 
 
-def test_seeds_decide_and_nothing_else(scene, points):
+def test_seeds_decide_and_neither_the_global_generator_nor_the_threads(scene, points):
     def means(seed: int, outside: int) -> torch.Tensor:
+        threads = torch.get_num_threads()
         torch.manual_seed(outside)
+        torch.set_num_threads(1 + 2 * outside)
         trainer = Reconstructor(scene, SHORT, points, seed=seed)
         for _ in range(8):
             trainer.step()
+        torch.set_num_threads(threads)
         return trainer.gaussians().means
 
     assert torch.equal(means(0, 0), means(0, 1))
