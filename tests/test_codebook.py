@@ -29,6 +29,15 @@ from lexsplat.codebook import (
 )
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tensors are so small that threads would only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @dataclass
 class Map:
     clip: torch.Tensor
@@ -219,7 +228,7 @@ def test_fit_finds_the_groups(settings_: CodebookConfig) -> None:
     maps, labels = clustered_maps(2)
     if settings_.init == "uniform":
         # From a random start several groups may share a code, the weakness k-means++ seeds do not have.
-        settings_ = CodebookConfig(num_codes=24, init="uniform", steps=400, learning_rate=1e-2)
+        settings_ = CodebookConfig(num_codes=24, init="uniform", steps=200, learning_rate=1e-2)
     book = fit_codebook(maps, sorted(maps), settings_, seed=0)
     code_maps = assign_code_maps(maps, book)
     codes = np.concatenate([code_maps[name].ravel() for name in maps])
@@ -305,7 +314,7 @@ def test_load_balancing_uses_more_codes_than_its_ablation() -> None:
         config = CodebookConfig(
             num_codes=16,
             init="uniform",
-            steps=300,
+            steps=200,
             learning_rate=3e-3,
             load_balancing=on,
             lambda_lb=1.0,
