@@ -134,7 +134,9 @@ def test_the_code_form_is_linear_and_the_feature_form_is_not():
     expected = 0.25 * table[:1] + 0.75 * table[1:2]
     by_code = queries.probability_relevancy(mixed, codewords, positives, negatives, QueryConfig(form="code"))
     torch.testing.assert_close(by_code, expected)
-    by_feature = queries.probability_relevancy(mixed, codewords, positives, negatives)
+    by_feature = queries.probability_relevancy(
+        mixed, codewords, positives, negatives, QueryConfig(form="feature")
+    )
     assert (by_feature - expected).abs().max() > 1e-2
 
 

@@ -79,7 +79,7 @@ def camera_from_opengl(width: int, height: int, K: NDArray, camera_to_world: NDA
 
 def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse of a rigid or similarity transform ``[4, 4]``."""
-    return np.linalg.inv(pose)
+    return np.asarray(np.linalg.inv(pose), dtype=np.float64)
 
 
 def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height: int, fov_y: float) -> Camera:

@@ -30,7 +30,7 @@ from lexsplat.lifting import lift, tune
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.reconstruction import reconstruct
 from lexsplat.scene_folder import SceneFolder, fingerprint, read_tensors, write_tensors
-from lexsplat.scenes import Scene, is_photo_folder, load_scene, poses_from_photos
+from lexsplat.scenes import Scene, is_photo_folder, load_masks, load_scene, poses_from_photos
 
 STAGES = ("reconstruct", "features", "codebook", "embed")
 """Names of the stages in the order in which they run."""
@@ -66,6 +66,8 @@ def build(
     folder = SceneFolder(output)
     with folder.locked():
         scene = _load_capture(capture, folder, config, test_names, listener)
+        if scene.segmentations is not None:
+            load_masks(scene)  # a mask that belongs to no view is told now, not after the training
         sizes = [view.capture_size for view in scene.views.values()]
         config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
         scene = scene.downscaled(config.downscale or 1.0)
@@ -155,6 +157,7 @@ class _Builder:
             self.config.reconstruction,
             device=self.device,
             seed=self.config.seed,
+            cache_dir=self.folder.root / "checkpoints" / "points",
             listener=self.listener,
         )
         self.folder.write_gaussians(gaussians)

@@ -60,7 +60,8 @@ class QueryConfig:
 
     Args:
         temperature: Factor on cosines before the pairwise softmax (the paper and LERF: 10).
-        form: ``"feature"`` compares the blended feature (paper), ``"code"`` blends the comparisons of codes.
+        form: ``"code"`` blends the comparisons of codes with the text; ``"feature"`` compares the blended feature
+            (the paper). "code" measured better for every field (docs/results.md).
         negatives: Phrases that a prompt has to beat.
         templates: Sentences with ``{}`` for the prompt; several are averaged.
         threshold: Relevancy from which a pixel belongs to the mask, in 0..1 (paper: 0.5).
@@ -68,7 +69,7 @@ class QueryConfig:
     """
 
     temperature: float = 10.0
-    form: Literal["feature", "code"] = "feature"
+    form: Literal["feature", "code"] = "code"
     negatives: tuple[str, ...] = CANONICAL_PHRASES
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5

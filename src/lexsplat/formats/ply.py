@@ -141,8 +141,10 @@ def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> G
         )
 
     num_rest = sum(1 for name in table.dtype.names or () if name.startswith("f_rest_"))
-    if num_rest not in (0, 9, 24, 45, 72):
-        raise FileFormatError(path, expected="0, 9, 24, 45 or 72 f_rest properties", found=str(num_rest))
+    complete = all(f"f_rest_{i}" in (table.dtype.names or ()) for i in range(num_rest))
+    if num_rest not in (0, 9, 24, 45, 72) or not complete:
+        found = str(num_rest) if complete else "gaps in their numbers"
+        raise FileFormatError(path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found)
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
     gaussians = Gaussians(
         means=columns("x", "y", "z"),

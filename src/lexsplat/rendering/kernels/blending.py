@@ -29,7 +29,8 @@ F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
-assert TILE == LANES  # a row of a tile is one vector
+if TILE != LANES:
+    raise RuntimeError(f"a row of a tile must be one vector: TILE {TILE}, LANES {LANES}")
 PIXELS = TILE * TILE
 # Literals in kernels are float32: a float64 literal would widen everything it touches.
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
