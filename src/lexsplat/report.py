@@ -220,7 +220,19 @@ def _language_table(data: Mapping[str, Any]) -> str:
     )
     form, method = (escape(str(data["language"].get(key))) for key in ("form", "method"))
     kind = f"<p>Relevancy: form <code>{form}</code>; language field: <code>{method}</code>.</p>"
-    return _table(["", *_COLUMNS], rows) + kind + note
+    return _table(["", *_COLUMNS], rows) + _kind_table(data["language"].get("per_kind") or {}) + kind + note
+
+
+def _kind_table(kinds: Mapping[str, Mapping[str, Any]]) -> str:
+    """The strict numbers of each kind of prompt, where the capture says what kinds there are."""
+    if not kinds:
+        return ""
+    names = ("mIoU_auto", "mIoU_oracle", "mAP", "localization")
+    rows = [
+        [f"{escape(kind)} ({row['prompts']})", *(_number(row[name]) for name in names)]
+        for kind, row in kinds.items()
+    ]
+    return _table(["kind of prompt", "mIoU auto", "oracle", "mAP", "localisation"], rows)
 
 
 def _prompt_table(data: Mapping[str, Any]) -> str:

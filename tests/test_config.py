@@ -1,0 +1,66 @@
+"""Settings: sizes in words, and what is chosen where nothing is said."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lexsplat.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig, choose_device, parse_bytes
+from lexsplat.errors import BackendError
+from lexsplat.features import FeatureConfig
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("4GB", 4 << 30), ("512 MiB", 512 << 20), ("1.5g", 3 << 29), ("1000", 1000), ("2tb", 2 << 40)],
+)
+def test_sizes_are_read_as_people_write_them(text, count):
+    assert parse_bytes(text) == count
+
+
+@pytest.mark.parametrize("text", ["", "0", "GB", "-1GB", "4 GBs", "1e9", "lots"])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(ValueError, match="like 4GB"):
+        parse_bytes(text)
+
+
+@given(width=st.integers(1, 20_000), height=st.integers(1, 20_000))
+def test_photos_are_never_enlarged_and_end_near_the_size_that_suits_the_device(width, height):
+    resolved = BuildConfig().resolved("cpu", (width, height))
+    assert resolved.downscale >= 1
+    pixels = width * height / resolved.downscale**2
+    assert pixels <= CPU_PIXELS * 1.8  # factors are whole halves
+
+
+def test_what_is_given_is_not_overruled():
+    config = BuildConfig(downscale=3.0, iterations=77, features=FeatureConfig(map_cells=9))
+    resolved = config.resolved("cpu", (4000, 3000))
+    assert (resolved.downscale, resolved.iterations, resolved.reconstruction.iterations) == (3.0, 77, 77)
+    assert resolved.features.map_cells == 9
+
+
+def test_the_number_of_steps_suits_the_device():
+    assert BuildConfig().resolved("cpu", (10, 10)).reconstruction.iterations == CPU_ITERATIONS
+    assert BuildConfig().resolved("cuda", (10, 10)).reconstruction.iterations == 30_000
+
+
+def test_features_suit_the_encoder_and_the_device():
+    embedded = BuildConfig(clip="embedded").resolved("cpu", (10, 10))
+    assert embedded.features == FeatureConfig.embedded()
+    assert BuildConfig().resolved("cpu", (10, 10)).features == FeatureConfig.sparse()
+    assert BuildConfig().resolved("cuda", (10, 10)).features == FeatureConfig()
+
+
+def test_resolving_twice_changes_nothing():
+    once = BuildConfig(clip="embedded").resolved("cpu", (800, 600))
+    assert once.resolved("cpu", (800, 600)) == once
+    assert replace(once, seed=1) != once
+
+
+def test_cuda_where_there_is_none_is_told_in_one_line(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto") == "cpu"
+    with pytest.raises(BackendError, match="use --device cpu"):
+        choose_device("cuda")
