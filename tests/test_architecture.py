@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "src" / "lexsplat"
 
 # The order in which data flow. A module may import only what stands before it (or its own folder).
 ORDER = """
-    errors progress cameras scenes gaussians rendering image_losses training_images optimizers exposures
+    errors atomic progress cameras scenes gaussians rendering image_losses training_images optimizers exposures
     densification reconstruction features codebook language_field losses embedding lifting queries metrics
     heatmaps evaluation report formats scene_folder config search pipeline answers viewer demo progress_bars cli
     __init__

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from lexsplat.atomic import atomic_path
 from lexsplat.cameras import look_at
 from lexsplat.errors import FileFormatError, SceneFolderError
 from lexsplat.scene_folder import (
     SceneFolder,
-    atomic_path,
     fingerprint,
     read_json,
     read_tensors,

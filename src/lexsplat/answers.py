@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from lexsplat.atomic import atomic_path
 from lexsplat.errors import CaptureError, SceneFolderError
 from lexsplat.evaluation import EvaluationConfig, evaluate
 from lexsplat.heatmaps import overlay_heatmap
@@ -19,7 +20,7 @@ from lexsplat.pipeline import machine_facts
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import check_prompts
 from lexsplat.report import Gallery, write_report
-from lexsplat.scene_folder import SceneFolder, atomic_path, read_json, write_json
+from lexsplat.scene_folder import SceneFolder, read_json, write_json
 from lexsplat.scenes import Scene, load_masks, load_scene
 from lexsplat.search import SearchableScene
 

@@ -258,8 +258,9 @@ class Export:
 
     def run(self) -> None:
         """Write the file."""
+        from lexsplat.atomic import atomic_path
         from lexsplat.formats.ply import write_ply
-        from lexsplat.scene_folder import SceneFolder, atomic_path
+        from lexsplat.scene_folder import SceneFolder
 
         if self.file.suffix.lower() != ".ply":
             raise SceneFolderError(

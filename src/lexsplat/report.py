@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat.atomic import atomic_path
 from lexsplat.evaluation import Metrics, ViewPictures
 from lexsplat.heatmaps import color_scale, overlay_heatmap, overlay_mask
 
@@ -105,13 +105,8 @@ def write_report(
         style=_STYLE + _view_styles(gallery, {case.view for case in cases[:max_cases]}),
         body="\n".join(section for section in sections if section),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

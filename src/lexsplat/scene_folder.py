@@ -28,6 +28,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from lexsplat.atomic import atomic_path
 from lexsplat.cameras import Camera
 from lexsplat.errors import FileFormatError, SceneFolderError
 from lexsplat.gaussians import Gaussians
@@ -36,23 +37,6 @@ FORMAT_VERSION = 1
 """Raised when a reader of the old layout would misread the new one."""
 
 _MAX_JSON_BYTES = 256 << 20
-
-
-@contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its place when the block ends without an error.
-
-    Readers see the old file or the new one, never a part. The data reach the disk before the name changes.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def to_json(value: Any) -> Any:

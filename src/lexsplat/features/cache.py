@@ -8,15 +8,13 @@ precision.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock, get_ident
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.atomic import atomic_path
 from lexsplat.errors import FileFormatError
 from lexsplat.features.pyramid import CropLevel, dense_map
 
@@ -179,22 +178,10 @@ def is_stored(path: Path) -> bool:
         return False
 
 
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path that takes the place of ``path`` if the block ends well; nobody sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _write(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
     from safetensors.torch import save_file
 
-    with replacing(path) as temporary:
+    with atomic_path(path) as temporary:
         save_file(tensors, temporary, {"format_version": FORMAT_VERSION, "facts": json.dumps(facts)})
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lexsplat.features.cache import replacing
+from lexsplat.atomic import atomic_path
 from lexsplat.features.encoders import ImageTextEncoder
 
 
@@ -74,5 +74,5 @@ class TextCache:
         # Prompts may hold any character, and "__metadata__" is no name for a tensor: names are hashes of
         # prompts.
         keys = {hashlib.blake2b(prompt.encode(), digest_size=16).hexdigest(): prompt for prompt in known}
-        with replacing(self._path(content_hash)) as temporary:
+        with atomic_path(self._path(content_hash)) as temporary:
             save_file({key: known[prompt].clone() for key, prompt in keys.items()}, temporary, keys)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat.atomic import atomic_path
 from lexsplat.errors import CaptureError
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.scenes.capture import MAX_COORDINATE
@@ -381,11 +381,5 @@ def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] |
 
 def _write_cache(file: Path, points: NDArray[np.float32], colors: NDArray[np.float32]) -> None:
     """Keep points; the file appears whole or not at all."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        with open(temporary, "wb") as stream:
-            np.savez(stream, points=points, colors=colors)
-        os.replace(temporary, file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_path(file) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, points=points, colors=colors)
