@@ -192,10 +192,26 @@ def test_bad_captures_end_in_one_line_and_no_half_written_output(tmp_path, capsy
     assert left == []
 
 
-def test_wrong_usage_is_status_2():
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["build"],
+        ["build", "x", "--output", "y", "--memory", "plenty"],
+        ["build", "x", "--output", "y", "--downscale", "-1"],
+        ["build", "x", "--output", "y", "--iterations", "0"],
+        ["build", "x", "--output", "y", "--test-every", "1"],
+        ["build", "x", "--output", "y", "--codebook.num-codes", "300"],
+        ["query", "x", "apple", "--threshold", "nan"],
+        ["query", "x", "apple", "--template", "no braces"],
+        ["query", "x", "apple", "--temperature", "-1"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_is_status_2_and_words(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
-        cli.main(["build"])
+        cli.main(arguments)
     assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_version_is_printed(capsys):

@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from lexsplat import __version__
 from lexsplat.config import BuildConfig
 from lexsplat.errors import LexsplatError, SceneFolderError
+from lexsplat.queries import QueryConfig
 
 if TYPE_CHECKING:
     from lexsplat.search import SearchableScene
@@ -179,18 +181,27 @@ class Query:
     device: Device = "auto"
     json: bool = False
 
-    def run(self) -> None:
-        """Answer and write pictures."""
-        from lexsplat.answers import answer_queries
+    def __post_init__(self) -> None:
+        if self.threshold is not None and not 0 <= self.threshold <= 1:
+            raise ValueError(f"threshold must be in 0..1, got {self.threshold:g}")
+        self._changed(QueryConfig())
 
-        scene = _open(self.scene, self.device, self.clip)
-        changes = {
+    def _changed(self, config: QueryConfig) -> QueryConfig:
+        """The scene's way of answering with what was asked for on the command line."""
+        changes: dict[str, Any] = {
             "form": self.form,
             "negatives": self.negatives or None,
             "temperature": self.temperature,
             "templates": self.template or None,
         }
-        scene.query = dataclasses.replace(scene.query, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
+        return dataclasses.replace(config, **{name: v for name, v in changes.items() if v is not None})
+
+    def run(self) -> None:
+        """Answer and write pictures."""
+        from lexsplat.answers import answer_queries
+
+        scene = _open(self.scene, self.device, self.clip)
+        scene.query = self._changed(scene.query)
         folder = self.output or Path(self.scene) / "heatmaps"
         answers = answer_queries(scene, self.prompts, self.view, self.threshold, folder)
         if self.json:
@@ -332,12 +343,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments[:1] in (["--version"], ["-V"]):
         print(f"lexsplat {__version__}")
         return 0
-    command = tyro.cli(
-        Command,  # type: ignore[arg-type]
-        prog="lexsplat",
-        description="Search a place with words: photos in, 3D Gaussians that carry language out.",
-        args=arguments,
-    )
+    try:
+        command = tyro.cli(
+            Command,  # type: ignore[arg-type]
+            prog="lexsplat",
+            description="Search a place with words: photos in, 3D Gaussians that carry language out.",
+            args=arguments,
+        )
+    except ValueError as error:  # settings check themselves when they are made
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
     try:
         command.run()
     except LexsplatError as error:
@@ -346,6 +361,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("stopped; run the same command again to go on", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read our output has seen enough, as in `lexsplat info SCENE | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         # A full disk or a folder without permission: the system's words and the file are the whole story.
         print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)

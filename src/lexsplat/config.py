@@ -53,6 +53,9 @@ class BuildConfig:
         embedding: Training of the language field.
         lifting: Computing the language field directly.
         tuning: From the lifted field to the paper's form.
+
+    Raises:
+        ValueError: If a number makes no sense.
     """
 
     clip: str = DEFAULT_CLIP
@@ -70,6 +73,15 @@ class BuildConfig:
     embedding: EmbeddingConfig = field(default_factory=EmbeddingConfig)
     lifting: LiftingConfig = field(default_factory=LiftingConfig)
     tuning: TuningConfig = field(default_factory=TuningConfig)
+
+    def __post_init__(self) -> None:
+        parse_bytes(self.memory)
+        if self.downscale is not None and not 0 < self.downscale < 1e6:
+            raise ValueError(f"downscale must be positive, got {self.downscale:g}")
+        if self.iterations is not None and self.iterations < 1:
+            raise ValueError(f"iterations must be positive, got {self.iterations}")
+        if self.test_every < 0 or self.test_every == 1:
+            raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {self.test_every}")
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
         """The same settings with nothing left open.

@@ -84,6 +84,9 @@ class QueryConfig:
             raise ValueError(f"coverage must be 'composite' or 'divide', got {self.coverage!r}")
         if not self.negatives:
             raise ValueError("negatives must hold at least one phrase")
+        for template in self.templates:
+            if template.count("{}") != 1:
+                raise ValueError(f"a template needs {{}} once, got {template!r}")
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"threshold must be in 0..1, got {self.threshold}")
 
