@@ -44,8 +44,8 @@ class BuildConfig:
             that suits the device.
         iterations: Reconstruction steps; none means 30,000 on CUDA and 3,000 on a CPU.
         test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
-        method: "lifted" computes each Gaussian's language directly in one pass: better and some thirty times
-            faster in our measurements (docs/results.md). "trained" is the paper's optimisation, "lifted+tuned"
+        method: "lifted" computes each Gaussian's language directly in one pass: better, and 20 to 40 times
+            faster, in our measurements (docs/results.md). "trained" is the paper's optimisation, "lifted+tuned"
             starts the paper's field from the lifted one.
         reconstruction: Geometry and appearance.
         features: Dense CLIP and DINO features.

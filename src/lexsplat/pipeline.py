@@ -29,7 +29,7 @@ from lexsplat.language_field import LanguageField
 from lexsplat.lifting import lift, tune
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.reconstruction import reconstruct
-from lexsplat.scene_folder import SceneFolder, fingerprint, read_tensors, write_tensors
+from lexsplat.scene_folder import SceneFolder, fingerprint, read_tensors, to_json, write_tensors
 from lexsplat.scenes import Scene, is_photo_folder, load_masks, load_scene, poses_from_photos
 
 STAGES = ("reconstruct", "features", "codebook", "embed")
@@ -234,7 +234,7 @@ class _Builder:
         sources = {name: _file_hash(view.image_path) for name, view in self.scene.views.items()}
         self.folder.write_cameras(views)
         self.folder.record["capture"] = str(Path(self.scene.root).resolve())
-        self.folder.record["config"] = _settings(self.config)
+        self.folder.record["config"] = to_json(self.config)
         self.folder.record["provenance"] = {
             "lexsplat": __version__,
             "versions": _versions(),
@@ -275,12 +275,6 @@ def _file_hash(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _settings(config: BuildConfig) -> dict[str, Any]:
-    from lexsplat.scene_folder import to_json
-
-    return to_json(config)
 
 
 def _versions() -> dict[str, str]:

@@ -21,10 +21,10 @@ SCENES = Path(__file__).parent / "scenes"
 DEMO_CONFIG = BuildConfig(
     clip="embedded",
     dino="embedded",
-    # Chosen on the second scene; the paper takes 64 for its scene with the fewest kinds of things.
+    # As in the paper for a scene with few kinds of things (bonsai); not compared with other numbers.
     codebook=CodebookConfig(num_codes=64),
 )
-"""Settings of the demo. Nothing was chosen on the held-out views of the table top."""
+"""Settings of the demo; docs/results.md says on which views which setting was chosen."""
 
 
 def demo_capture(scene: SceneName = "tabletop") -> Path:
