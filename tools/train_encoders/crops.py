@@ -154,15 +154,20 @@ def random_crop(frames: Frames, rng: np.random.Generator) -> Crop:
     frame = frames.frames[int(rng.integers(len(frames)))]
     height, width = frame.codes.shape
     draw = rng.random()
-    side = float(np.exp(rng.uniform(np.log(26), np.log(120))))
-    if draw < 0.7:
-        values = frame.things if draw < 0.5 else frame.codes
-        boxes = frame.thing_boxes if draw < 0.5 else frame.code_boxes
-        present = [value for value in boxes if value > (0 if draw < 0.5 else -1)]
+    side = float(np.exp(rng.uniform(np.log(18), np.log(120))))
+    if draw < 0.8:
+        of_things = draw < 0.45
+        values = frame.things if of_things else frame.codes
+        boxes = frame.thing_boxes if of_things else frame.code_boxes
+        present = [value for value in boxes if value > (0 if of_things else -1)]
+        if draw > 0.65:  # parts alone, where there are any
+            present = [code for code in present if frames.labels[code].part is not None] or present
         chosen = present[int(rng.integers(len(present)))]
-        if draw < 0.25:  # the whole of it, as in a photograph of it
+        whole = draw < 0.22 or draw > 0.7
+        if whole:  # the whole of it, as in a photograph of it
             x0, y0, x1, y1 = boxes[chosen]
-            side = float(np.clip((max(x1 - x0, y1 - y0) + 1) * rng.uniform(0.7, 1.7), 26, 200))
+            wider = rng.uniform(0.7, 1.7) if of_things else rng.uniform(1.0, 2.5)
+            side = float(np.clip((max(x1 - x0, y1 - y0) + 1) * wider, 14, 200))
             x = (x0 + x1) / 2 + rng.uniform(-0.15, 0.15) * side
             y = (y0 + y1) / 2 + rng.uniform(-0.15, 0.15) * side
         else:

@@ -1,11 +1,12 @@
 """Trains the image-text encoder: contrast between crops and phrases, and relevancy as LERF asks it.
 
-Three losses on a batch of crops and phrases, of which `truth.py` knows which are true of which:
+Four losses on a batch of crops and phrases, of which `truth.py` knows which are true of which:
 
 - contrast: among all phrases, softmax of a crop's similarities falls on those that are true of it, and for a
   phrase on the crops it is true of (several right answers a row);
 - patches: every patch token tells kind, colour and part of what its middle shows, by linear heads that are
   thrown away afterwards; 36 answers a crop instead of one make the image tower learn several times faster;
+- composition: the words of two kinds in two colours form a parallelogram, so pairs never seen have their place;
 - relevancy: sigmoid(10 (cos(crop, phrase) - max over the canonical phrases of cos(crop, canonical))), which is
   LERF's relevancy, is a probability: cross-entropy with the truth. So the right phrase comes to lie above
   "object", "things", "stuff", "texture", and a wrong one below them.
@@ -38,6 +39,7 @@ from words import (
     COLOURS,
     FALSE,
     HELD_OUT_PAIRS,
+    HUES,
     NAMES,
     OPEN,
     PARTS,
@@ -47,6 +49,7 @@ from words import (
     any_phrase,
     in_sentence,
     near_miss,
+    parallelogram,
     phrase_for,
 )
 from workers import average_gradients
@@ -71,6 +74,8 @@ class ClipTraining:
         dim: Numbers of an embedding.
         temperature: Of the relevancy that is trained: that of queries.
         grey: Share of the crops shown in grey, of which colour words are open.
+        turned: Share of the crops whose hues are turned, of which colour words are open too.
+        composition: Weight of the loss that makes colours add to kinds alike in all texts.
         kept: Share of the patches that the image tower sees in the first three quarters of the steps.
         seed: Of everything random.
     """
@@ -86,7 +91,9 @@ class ClipTraining:
     text_layers: int = 3
     dim: int = 128
     temperature: float = 10.0
-    grey: float = 0.08
+    grey: float = 0.12
+    turned: float = 0.25
+    composition: float = 1.0
     kept: float = 0.5
     seed: int = 0
 
@@ -98,6 +105,8 @@ class Batch:
 
     pixels: Tensor
     texts: list[str]
+    corners: list[str]
+    """Of parallelograms of kinds and colours, four and four."""
     truth: Tensor
     patches: Tensor
 
@@ -119,19 +128,59 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     phrases += [any_phrase(rng) for _ in range(config.batch // 4)]
     truth = table.of(phrases, crops)
     pixels = np.stack([crop.pixels(config.image_size) for crop in crops])
-    grey = rng.random(len(crops)) < config.grey
+    draw = rng.random(len(crops))
+    grey, turned = draw < config.grey, draw > 1 - config.turned
     pixels[grey] = pixels[grey].mean(-1, keepdims=True).astype(np.uint8)
+    for row in np.nonzero(turned)[0]:
+        pixels[row] = turned_hues(pixels[row], [table.labels[code] for code in crops[row].codes], rng)
+    colourless = grey | turned
     asks_colour = np.array([phrase.colour is not None for phrase in phrases])
-    truth[np.ix_(grey, asks_colour)] = OPEN
+    truth[np.ix_(colourless, asks_colour)] = OPEN
     texts = [in_sentence(phrase, rng) for phrase in phrases] + list(CANONICAL)
     patches = patch_answers(crops, table.labels, config)
-    patches[grey, :, 1] = UNKNOWN
+    patches[colourless, :, 1] = UNKNOWN
+    corners = [text for _ in range(config.batch // 12) for text in parallelogram(rng)]
     return Batch(
         torch.from_numpy(pixels).permute(0, 3, 1, 2),
         texts,
+        corners,
         torch.from_numpy(truth),
         torch.from_numpy(patches),
     )
+
+
+def turned_hues(
+    pixels: NDArray[np.uint8], labels: list[Label], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """All hues turned by one random angle, but never so that a kind comes near a colour held out for it.
+
+    Args:
+        pixels: ``[s, s, 3]``.
+        labels: What the crop shows.
+        rng: Decides the angle.
+
+    Returns:
+        ``[s, s, 3]``; the grey axis stays where it is.
+    """
+    for _ in range(20):
+        angle = rng.uniform(30, 330)
+        if not any(_comes_near_held_out(label, angle) for label in labels):
+            break
+    else:
+        return pixels
+    cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    # Rodrigues' rotation about (1, 1, 1) / sqrt(3), which takes red to green at 120 degrees.
+    across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
+    rotation = cosine * np.eye(3) + sine * across + (1 - cosine) / 3
+    return np.clip(pixels @ rotation.T, 0, 255).astype(np.uint8)
+
+
+def _comes_near_held_out(label: Label, angle: float) -> bool:
+    if label.colour not in HUES:
+        return False
+    hue = HUES[label.colour] + angle
+    held_out = [HUES[c] for k, c in HELD_OUT_PAIRS if k == label.kind and c in HUES]
+    return any(abs((hue - other + 180) % 360 - 180) < 40 for other in held_out)
 
 
 def patch_answers(crops: list[Crop], labels: list[Label], config: ClipTraining) -> NDArray[np.int64]:
@@ -200,6 +249,16 @@ def patch_loss(answers: Tensor, truth: Tensor) -> Tensor:
     return losses[0] + 0.5 * (losses[1] + losses[2])
 
 
+def composition_loss(corners: Tensor) -> Tensor:
+    """How far texts of kinds and colours are from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
+
+    Args:
+        corners: Unit vectors ``[4 n, D]``, in the order of ``words.parallelogram``.
+    """
+    first, second, third, fourth = corners.unflatten(0, (-1, 4)).unbind(1)
+    return (first - second - third + fourth).square().sum(-1).mean()
+
+
 def relevancy_loss(similarity: Tensor, canonical: Tensor, truth: Tensor, temperature: float) -> Tensor:
     """Cross-entropy of LERF's relevancy with the truth; right and wrong phrases weigh the same.
 
@@ -244,7 +303,7 @@ class Trainer:
     def step(self, batch: Batch) -> dict[str, float]:
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate()
-        words = self.tokens(batch.texts)
+        words = self.tokens([*batch.texts, *batch.corners])
         with torch.autocast("cpu", dtype=torch.bfloat16):
             pixels, patches = mirrored(batch, self.config, self.generator)
             kept = self.kept_patches(len(pixels))
@@ -252,7 +311,8 @@ class Trainer:
             images, tokens = self.see(jittered(pixels, self.generator), kept)
             answers = self.patch_heads(tokens).float()
             texts = pooled(self.model.get_text_features(**words))
-        similarity = F.normalize(images.float(), dim=-1) @ F.normalize(texts.float(), dim=-1).T
+        texts, corners = texts.float().split([len(batch.texts), len(batch.corners)])
+        similarity = F.normalize(images.float(), dim=-1) @ F.normalize(texts, dim=-1).T
         phrases, canonical = similarity[:, : -len(CANONICAL)], similarity[:, -len(CANONICAL) :]
         scale = self.model.logit_scale.exp().clamp(max=50)
         # Canonical phrases stand among the wrong answers, so a right phrase is drawn above them.
@@ -262,7 +322,8 @@ class Trainer:
         )
         relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature)
         named = patch_loss(answers, patches)
-        loss = 0.5 * contrast + relevancy + named
+        composition = composition_loss(F.normalize(corners, dim=-1))
+        loss = 0.5 * contrast + relevancy + named + self.config.composition * composition
         self.optimizer.zero_grad()
         loss.backward()
         average_gradients(self.trained)
@@ -273,7 +334,7 @@ class Trainer:
         with torch.no_grad():
             for slow, fast in zip(self.average.parameters(), self.model.parameters()):
                 slow.lerp_(fast, 1 - keep)
-        losses = {"contrast": contrast, "relevancy": relevancy, "patches": named}
+        losses = {"contrast": contrast, "relevancy": relevancy, "patches": named, "composition": composition}
         return {name: round(value.item(), 3) for name, value in losses.items()}
 
     def kept_patches(self, count: int) -> Tensor:
