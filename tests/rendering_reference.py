@@ -30,8 +30,10 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
-def project(p: dict[str, Tensor], camera: Camera, antialiased: bool, near: float = 0.01) -> dict[str, Tensor]:
-    view = torch.from_numpy(camera.viewmat)
+def project(
+    p: dict[str, Tensor], camera: Camera, antialiased: bool, near: float = 0.01, viewmat: Tensor | None = None
+) -> dict[str, Tensor]:
+    view = torch.from_numpy(camera.viewmat) if viewmat is None else viewmat
     K = camera.K
     at = p["means"] @ view[:3, :3].T + view[:3, 3]
     x, y, z = at.unbind(-1)
@@ -53,11 +55,12 @@ def project(p: dict[str, Tensor], camera: Camera, antialiased: bool, near: float
     return {"means2d": means2d, "conic": conic, "opacity": opacity, "depth": at[:, 2]}
 
 
-def shade(p: dict[str, Tensor], camera: Camera, degree: int) -> Tensor:
+def shade(p: dict[str, Tensor], camera: Camera, degree: int, viewmat: Tensor | None = None) -> Tensor:
     """RGB [N, 3]; the polynomials are those of gsplat's torch twin."""
     from gsplat.cuda._torch_impl import _spherical_harmonics
 
-    direction = p["means"] - torch.from_numpy(camera.position)
+    view = torch.from_numpy(camera.viewmat) if viewmat is None else viewmat
+    direction = p["means"] + view[:3, :3].T @ view[:3, 3]
     return (_spherical_harmonics(degree, direction, torch.cat([p["sh0"], p["shN"]], 1)) + 0.5).clamp_min(0)
 
 
@@ -99,11 +102,17 @@ def blend(
 
 
 def render(
-    p: dict[str, Tensor], camera: Camera, *, antialiased: bool, degree: int, background: Tensor | None = None
+    p: dict[str, Tensor],
+    camera: Camera,
+    *,
+    antialiased: bool,
+    degree: int,
+    background: Tensor | None = None,
+    viewmat: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Image over the background, alpha, weights and clear pixels."""
-    projected = project(p, camera, antialiased)
-    image, alpha, weights, clear = blend(projected, shade(p, camera, degree), camera)
+    """Image over the background, alpha, weights and clear pixels; from ``viewmat`` where it is given."""
+    projected = project(p, camera, antialiased, viewmat=viewmat)
+    image, alpha, weights, clear = blend(projected, shade(p, camera, degree, viewmat), camera)
     if background is not None:
         image = image + (1 - alpha)[..., None] * background
     return {"image": image, "alpha": alpha, "weights": weights, "clear": clear, **projected}

@@ -10,7 +10,8 @@ from test_ply import make
 
 from lexsplat.cameras import Camera, look_at
 from lexsplat.gaussians import Gaussians
-from lexsplat.moving import moved, multiplied, quaternion_of, rotated_harmonics
+from lexsplat.moving import moved, quaternion_of, rotated_harmonics
+from lexsplat.rendering.posing import multiplied
 from lexsplat.rendering import render
 
 

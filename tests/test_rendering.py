@@ -108,6 +108,55 @@ def test_gradients_equal_finite_differences_of_the_reference():
         )
 
 
+def rigid(twist: torch.Tensor) -> torch.Tensor:
+    """Rigid motion [4, 4] of (rotation vector, translation) [6], by the matrix exponential."""
+    zero = torch.zeros((), dtype=twist.dtype)
+    x, y, z, a, b, c = twist.unbind()
+    rows = [zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero]
+    return torch.matrix_exp(torch.stack(rows).reshape(4, 4))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("turned", [0.0, 3.0])
+def test_the_gradient_of_the_pose_equals_the_float64_reference(antialiased, turned):
+    gaussians = with_gradients(random_gaussians(40, 21, antialiased=antialiased))
+    camera = front_camera()
+    # The world is also turned half around, so that the rotation has every form a quaternion takes.
+    world = rigid(torch.tensor([turned, 0.2, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64))
+    start = torch.from_numpy(camera.viewmat) @ world
+    twist = torch.zeros(6, requires_grad=True)
+    twist64 = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    leaves = reference.to_float64(gaussians)
+    expected = reference.render(
+        leaves, camera, antialiased=antialiased, degree=3, viewmat=rigid(twist64) @ start
+    )
+    found = render(gaussians, camera, viewmat=rigid(twist) @ start.float())
+    clear = expected["clear"]
+    assert (found.image - expected["image"])[clear].abs().max() < 2e-5
+    grad_image, grad_alpha = upstream(found, clear)
+    torch.autograd.backward((found.channels, found.alpha), (grad_image, grad_alpha))
+    torch.autograd.backward(
+        (expected["image"], expected["alpha"]), (grad_image.double(), grad_alpha.double())
+    )
+    assert relative_error(twist.grad, twist64.grad) < 1e-4
+    assert (twist64.grad.abs() > 1e-3).all()
+    for name in FIELDS:
+        assert relative_error(getattr(gaussians, name).grad, leaves[name].grad) < 1e-4, name
+
+
+def test_a_pose_that_is_off_finds_back_by_its_gradient():
+    gaussians, camera = random_gaussians(60, 4), front_camera()
+    photo = render(gaussians, camera).image
+    true = torch.from_numpy(camera.viewmat).float()
+    twist = torch.tensor([0.03, -0.02, 0.03, 0.05, 0.04, -0.05], requires_grad=True)
+    optimizer = torch.optim.Adam([twist], lr=3e-3)
+    for _ in range(150):
+        optimizer.zero_grad()
+        (render(gaussians, camera, viewmat=rigid(twist) @ true).image - photo).square().mean().backward()
+        optimizer.step()
+    assert twist.abs().max() < 5e-3
+
+
 def test_features_and_their_gradients_equal_the_float64_reference():
     gaussians, camera = random_gaussians(40, 11), front_camera()
     leaves = {k: v.detach() for k, v in reference.to_float64(gaussians).items()}
@@ -454,6 +503,10 @@ def test_wrong_arguments_are_told():
         render(gaussians, camera, features=torch.zeros(4, 3))
     with pytest.raises(ValueError, match="background must be"):
         render(gaussians, camera, background=torch.zeros(4))
+    with pytest.raises(ValueError, match="viewmat must be"):
+        render(gaussians, camera, viewmat=torch.eye(3))
+    with pytest.raises(ValueError, match="viewmat must be"):
+        render(gaussians, camera, viewmat=torch.eye(4), prepared=prepare(gaussians, camera))
     with pytest.raises(ValueError, match="code_map must be"):
         accumulate_codes(gaussians, camera, np.zeros((3, 3), int), 4)
     with pytest.raises(ValueError, match="code_map must be"):

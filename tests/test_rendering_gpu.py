@@ -50,6 +50,18 @@ def test_cuda_agrees_with_the_cpu(antialiased, degree):
         assert error < 5e-3, (name, float(error))
 
 
+def test_the_gradient_of_the_pose_on_cuda_is_that_on_the_cpu():
+    camera, gradients = front_camera(165, 123), []
+    for device in ("cpu", "cuda"):
+        gaussians = random_gaussians(2000, 3, antialiased=True, scale=0.06).to(device)
+        viewmat = torch.from_numpy(camera.viewmat).float().to(device).requires_grad_()
+        rendering = render(gaussians, camera, viewmat=viewmat)
+        weight = torch.randn(rendering.channels.shape, generator=torch.Generator().manual_seed(0)).to(device)
+        (rendering.channels * weight).sum().backward()
+        gradients.append(viewmat.grad.cpu())
+    assert (gradients[0] - gradients[1]).norm() < 5e-3 * gradients[0].norm()
+
+
 def test_features_do_not_move_geometry_gradients_on_cuda():
     gaussians = random_gaussians(500, 3).to("cuda").map(lambda t: t.detach().clone().requires_grad_())
     features = torch.randn(500, 9, device="cuda", requires_grad=True)

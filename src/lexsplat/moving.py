@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lexsplat.gaussians import Gaussians
 from lexsplat.rendering.kernels.spherical_harmonics import basis_at
+from lexsplat.rendering.posing import multiplied
 
 _DIRECTIONS = 64
 
@@ -91,21 +92,6 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
     return np.array([w, x, y, z])
-
-
-def multiplied(first: Tensor, second: Tensor) -> Tensor:
-    """Products of quaternions wxyz, ``[..., 4]`` each: turn by ``second``, then by ``first``."""
-    w1, x1, y1, z1 = first.unbind(-1)
-    w2, x2, y2, z2 = second.unbind(-1)
-    return torch.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        dim=-1,
-    )
 
 
 def _like(array: NDArray[np.float64], gaussians: Gaussians) -> Tensor:

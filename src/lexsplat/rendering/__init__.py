@@ -18,6 +18,7 @@ from torch import Tensor
 from lexsplat.cameras import Camera
 from lexsplat.errors import BackendError
 from lexsplat.gaussians import Gaussians
+from lexsplat.rendering import posing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -140,6 +141,7 @@ def render(
     background: Tensor | None = None,
     near: float = NEAR,
     depth: bool = False,
+    viewmat: Tensor | None = None,
     prepared: PreparedView | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
@@ -157,6 +159,8 @@ def render(
         background: RGB ``[3]`` behind the Gaussians; black by default.
         near: Gaussians nearer than this are not drawn, world units.
         depth: Also render the mean depth.
+        viewmat: World to camera ``[4, 4]`` in place of the camera's own, for poses that get a gradient. It must be
+            rigid, and its gradient is meant for rigid changes of it (rotation and translation).
         prepared: From `prepare` for the same Gaussians and camera; ``near`` is then that of `prepare`.
         backend: "auto" takes the CPU kernels for CPU tensors and gsplat for CUDA tensors.
 
@@ -170,8 +174,14 @@ def render(
         raise ValueError(f"features must be [{count}, C], got {list(features.shape)}")
     if background is not None and background.shape != (3,):
         raise ValueError(f"background must be [3], got {list(background.shape)}")
+    if viewmat is not None:
+        if viewmat.shape != (4, 4) or prepared is not None:
+            raise ValueError("viewmat must be [4, 4] and does not go with a prepared view")
+        viewmat = viewmat.to(gaussians.means)
+        camera = posing.at_the_origin(camera)
     if prepared is None:
-        projected = module.project(gaussians, camera, near)
+        body = gaussians if viewmat is None else posing.in_camera_frame(gaussians, viewmat)
+        projected = module.project(body, camera, near)
         pairs = module.pairs_of(projected, camera)
     else:
         _check_prepared(prepared, module, gaussians, camera)
@@ -183,7 +193,7 @@ def render(
     if color:
         stored = gaussians.sh_degree
         degree = stored if sh_degree is None else max(0, min(sh_degree, stored))
-        colors = module.shade(gaussians, camera, projected, degree)
+        colors = module.shade(*_to_shade(gaussians, camera, projected, viewmat), degree)
     extra = features
     if depth:
         column = depths[:, None]
@@ -196,6 +206,17 @@ def render(
     if radii.ndim == 2:
         radii = radii.amax(-1)
     return Rendering(channels, alpha, means2d, radii, 3 if color else 0, mean_depth)
+
+
+def _to_shade(
+    gaussians: Gaussians, camera: Camera, projected: tuple[Tensor, ...], viewmat: Tensor | None
+) -> tuple[Gaussians, Camera, tuple[Tensor, ...]]:
+    """What the backends shade: where a pose has a gradient, the world around the camera, in the world's axes."""
+    if viewmat is None:
+        return gaussians, camera, projected
+    around = posing.around_the_camera(gaussians, viewmat)
+    # The CPU backend shades the means that the projection hands on; here they are in other axes.
+    return around, camera, (*projected[:6], around.means)
 
 
 def accumulate_codes(
