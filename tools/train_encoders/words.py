@@ -412,18 +412,15 @@ def _part_phrase(kind: str, part: str, rng: np.random.Generator) -> Phrase:
     return Phrase(f"{word} of {with_article(name, rng)}", kind=kind, part=part)
 
 
+_ONSETS = tuple("b c d f g h k l m n p r s t v w br cl dr fl gr pl sh st tr".split())
+_VOWELS, _CODAS = tuple("a e i o u ea oo ai".split()), tuple("n r l t k m s".split())
+
+
 def _made_up_word(rng: np.random.Generator) -> str:
     """Syllables that are most likely no word: what was never read should match nothing."""
-    starts, ends = (
-        ["b", "c", "d", "f", "g", "h", "k", "l", "m", "n", "p", "r", "s", "t", "v", "w", "br", "cl", "dr", "fl", "gr", "pl", "sh", "st", "tr"],
-        ["n", "r", "l", "t", "k", "m", "s"],
-    )
-    vowels = ["a", "e", "i", "o", "u", "ea", "oo", "ai"]
     while True:
-        syllables = [
-            _pick(tuple(starts), rng) + _pick(tuple(vowels), rng) for _ in range(int(rng.integers(1, 4)))
-        ]
-        word = "".join(syllables) + _pick(tuple(ends), rng)
+        count = int(rng.integers(1, 4))
+        word = "".join(_pick(_ONSETS, rng) + _pick(_VOWELS, rng) for _ in range(count)) + _pick(_CODAS, rng)
         if word not in _KNOWN_WORDS:
             return word
 
