@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -38,6 +38,7 @@ def labels():
     ]
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_phrase_made_for_a_label_is_true_of_it(seed):
     from words import TRUE, phrase_for
@@ -101,6 +102,76 @@ def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
     }
     for prompt in json.loads((SCENES / scene / "prompts.json").read_text()):
         assert set(prompt.split()) <= single | qualities, prompt
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_phrase_is_trained_that_names_a_pair_kept_from_training(seed):
+    # It could only be wrong, and would be learnt as the name of nothing.
+    from words import HELD_OUT_PAIRS, any_phrase, near_miss
+
+    rng = np.random.default_rng(seed)
+    shown = [label for label in labels() if (label.kind, label.colour) not in HELD_OUT_PAIRS]
+    label = shown[int(rng.integers(len(shown)))]
+    for phrase in (near_miss(label, rng), any_phrase(rng)):
+        assert (phrase.kind, phrase.colour) not in HELD_OUT_PAIRS, phrase
+
+
+def test_a_made_up_word_is_none_that_means_something():
+    from words import _KNOWN_WORDS, _made_up_word
+
+    rng = np.random.default_rng(0)
+    words = {_made_up_word(rng) for _ in range(500)}
+    assert len(words) > 300
+    assert not words & _KNOWN_WORDS
+
+
+def test_turned_hues_take_red_to_green_and_leave_grey():
+    from train_clip import turned_hues
+
+    colours = np.array([[[200, 0, 0], [90, 90, 90], [0, 200, 0]]], np.uint8)
+    turned = turned_hues(colours, 120.0).astype(int)
+    assert np.abs(turned - [[[0, 200, 0], [90, 90, 90], [0, 0, 200]]]).max() <= 1
+
+
+def test_no_hue_is_turned_so_that_a_kind_looks_as_it_was_kept_from_training():
+    from train_clip import fair_angle
+    from words import Label
+
+    rng = np.random.default_rng(0)
+    # Held out: the blue bear, at 220 degrees; a red one starts at 0.
+    angles = [fair_angle([Label("teddy", "red")], rng) for _ in range(300)]
+    assert all(abs(angle - 220) >= 25 for angle in angles)
+    assert max(angles) > 250 and min(angles) < 60
+
+
+def test_what_is_blue_is_not_told_to_be_no_bear_since_blue_bears_are_kept_from_training():
+    from crops import cut
+    from train_clip import leave_open
+    from truth import TruthTable
+    from words import FALSE, OPEN, TRUE, Label, Phrase
+
+    shown = [Label("mug", "red"), Label("table", "blue")]
+    crops = [cut(frame_of_two_halves(), left, 5.0, 20.0) for left in (0.0, 40.0)]
+    phrases = [
+        Phrase("bear", kind="teddy"), Phrase("something fluffy", quality="fluffy"), Phrase("red ball", kind="ball"),
+        Phrase("table", kind="table"), Phrase("red", colour="red"),
+    ]  # fmt: skip
+    truth = TruthTable(shown).of(phrases, crops)
+    assert truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [FALSE, FALSE, FALSE, TRUE, FALSE]]
+    leave_open(truth, phrases, crops, shown, np.zeros(2))
+    assert truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [OPEN, OPEN, FALSE, TRUE, FALSE]]
+
+
+def test_texts_whose_colours_add_to_kinds_alike_cost_nothing():
+    import torch
+    from train_clip import composition_loss
+
+    kinds, colours = torch.randn(2, 8), torch.randn(2, 8)
+    corners = torch.stack([kinds[k] + colours[c] for k in (0, 1) for c in (0, 1)])
+    assert float(composition_loss(corners)) == pytest.approx(0, abs=1e-10)
+    corners[3] += torch.eye(8)[0]
+    assert float(composition_loss(corners)) == pytest.approx(1, abs=1e-5)
 
 
 def frame_of_two_halves():

@@ -43,6 +43,7 @@ from words import (
     NAMES,
     OPEN,
     PARTS,
+    QUALITIES,
     TRUE,
     Label,
     Phrase,
@@ -57,6 +58,8 @@ from workers import average_gradients
 KINDS, TINTS, PART_NAMES = list(NAMES), list(COLOURS), [None, *PARTS]
 UNKNOWN = -100
 """An answer that the loss leaves out."""
+NEAR_HUE = 25.0
+"""Degrees within which a turned hue may pass for a colour."""
 MEAN = torch.tensor([0.48145466, 0.4578275, 0.40821073]).view(3, 1, 1)
 STD = torch.tensor([0.26862954, 0.26130258, 0.27577711]).view(3, 1, 1)
 
@@ -101,7 +104,7 @@ class ClipTraining:
 @dataclass(frozen=True)
 class Batch:
     """Crops ``[B, 3, s, s]`` uint8, texts (the canonical phrases last), truth ``[B, T]`` of the others; kind,
-    colour and part of every patch ``[B, P, 3]``, -100 where unknown."""
+    colour and part of every patch ``[B, P, 3]``, -100 where unknown; kinds it is not asked about ``[B, P, 22]``."""
 
     pixels: Tensor
     texts: list[str]
@@ -109,6 +112,7 @@ class Batch:
     """Of parallelograms of kinds and colours, four and four."""
     truth: Tensor
     patches: Tensor
+    left_out: Tensor
 
 
 def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.random.Generator) -> Batch:
@@ -130,14 +134,17 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     pixels = np.stack([crop.pixels(config.image_size) for crop in crops])
     draw = rng.random(len(crops))
     grey, turned = draw < config.grey, draw > 1 - config.turned
+    angles = np.zeros(len(crops))
     pixels[grey] = pixels[grey].mean(-1, keepdims=True).astype(np.uint8)
     for row in np.nonzero(turned)[0]:
-        pixels[row] = turned_hues(pixels[row], [table.labels[code] for code in crops[row].codes], rng)
+        angles[row] = fair_angle([table.labels[code] for code in crops[row].codes], rng)
+        pixels[row] = turned_hues(pixels[row], angles[row])
+    leave_open(truth, phrases, crops, table.labels, angles)
     colourless = grey | turned
     asks_colour = np.array([phrase.colour is not None for phrase in phrases])
     truth[np.ix_(colourless, asks_colour)] = OPEN
     texts = [in_sentence(phrase, rng) for phrase in phrases] + list(CANONICAL)
-    patches = patch_answers(crops, table.labels, config)
+    patches, left_out = patch_answers(crops, table.labels, angles, config)
     patches[colourless, :, 1] = UNKNOWN
     corners = [text for _ in range(config.batch // 12) for text in parallelogram(rng)]
     return Batch(
@@ -146,28 +153,21 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
         corners,
         torch.from_numpy(truth),
         torch.from_numpy(patches),
+        torch.from_numpy(left_out),
     )
 
 
-def turned_hues(
-    pixels: NDArray[np.uint8], labels: list[Label], rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """All hues turned by one random angle, but never so that a kind comes near a colour held out for it.
-
-    Args:
-        pixels: ``[s, s, 3]``.
-        labels: What the crop shows.
-        rng: Decides the angle.
-
-    Returns:
-        ``[s, s, 3]``; the grey axis stays where it is.
-    """
+def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
+    """A random angle by which hues may turn, degrees, that brings no kind near a colour held out for it; or 0."""
     for _ in range(20):
-        angle = rng.uniform(30, 330)
-        if not any(_comes_near_held_out(label, angle) for label in labels):
-            break
-    else:
-        return pixels
+        angle = float(rng.uniform(30, 330))
+        if not any(label.kind in looks_held_out(label, angle) for label in labels):
+            return angle
+    return 0.0
+
+
+def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
+    """All hues turned by an angle in degrees ``[s, s, 3]``; the grey axis stays where it is."""
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     # Rodrigues' rotation about (1, 1, 1) / sqrt(3), which takes red to green at 120 degrees.
     across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
@@ -175,23 +175,63 @@ def turned_hues(
     return np.clip(pixels @ rotation.T, 0, 255).astype(np.uint8)
 
 
-def _comes_near_held_out(label: Label, angle: float) -> bool:
-    if label.colour not in HUES:
-        return False
-    hue = HUES[label.colour] + angle
-    held_out = [HUES[c] for k, c in HELD_OUT_PAIRS if k == label.kind and c in HUES]
-    return any(abs((hue - other + 180) % 360 - 180) < 40 for other in held_out)
+def looks_held_out(label: Label, angle: float = 0.0) -> set[str]:
+    """The kinds whose held-out colour a thing has, its hue turned by ``angle`` degrees."""
+    hue = HUES.get(label.colour)
+    if hue is None:
+        return {kind for kind, colour in HELD_OUT_PAIRS if colour == label.colour}
+    return {
+        kind
+        for kind, colour in HELD_OUT_PAIRS
+        if colour in HUES and abs((hue + angle - HUES[colour] + 180) % 360 - 180) < NEAR_HUE
+    }
 
 
-def patch_answers(crops: list[Crop], labels: list[Label], config: ClipTraining) -> NDArray[np.int64]:
-    """Kind, colour and part at the middle of every patch ``[B, P, 3]``."""
+def leave_open(
+    truth: NDArray[np.int8],
+    phrases: list[Phrase],
+    crops: list[Crop],
+    labels: list[Label],
+    angles: NDArray[np.float64],
+) -> None:
+    """Opens, of what is false, whether a thing in a colour held out for some kind is of that kind.
+
+    No blue bear is ever shown. If every blue thing still said "not a bear", blue would come to mean just that,
+    and a blue bear could not be told: what is kept from training must be kept from it both ways.
+    """
+    means = [
+        {phrase.kind} if phrase.kind else _KINDS_OF_QUALITY[phrase.quality] if phrase.quality else set()
+        for phrase in phrases
+    ]
+    for row, crop in enumerate(crops):
+        shown = [labels[code] for code, weight in zip(crop.codes, crop.weights) if weight > 0.15]
+        unknown = set().union(*(looks_held_out(label, angles[row]) for label in shown))
+        for column, kinds in enumerate(means):
+            if truth[row, column] == FALSE and kinds & unknown:
+                truth[row, column] = OPEN
+
+
+_KINDS_OF_QUALITY = {
+    key: {term.split(":")[0].split(".")[0] for term in quality.of} for key, quality in QUALITIES.items()
+}
+
+
+def patch_answers(
+    crops: list[Crop], labels: list[Label], angles: NDArray[np.float64], config: ClipTraining
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Kind, colour and part at the middle of every patch ``[B, P, 3]``, and the kinds that it is not asked about."""
     count = config.image_size // config.patch
     middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
     codes = np.stack([crop.grid[np.ix_(middles, middles)].ravel() for crop in crops])
     answers = [
         (KINDS.index(label.kind), TINTS.index(label.colour), PART_NAMES.index(label.part)) for label in labels
     ]
-    return np.array([*answers, (UNKNOWN,) * 3])[codes]
+    left_out = np.zeros((*codes.shape, len(KINDS)), np.bool_)
+    for row, angle in enumerate(angles):
+        for code in np.unique(codes[row][codes[row] >= 0]):
+            unknown = looks_held_out(labels[code], angle) - {labels[code].kind}
+            left_out[row, codes[row] == code] = [kind in unknown for kind in KINDS]
+    return np.array([*answers, (UNKNOWN,) * 3])[codes], left_out
 
 
 def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batch]:
@@ -207,13 +247,17 @@ def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batc
     return ready
 
 
-def mirrored(batch: Batch, config: ClipTraining, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def mirrored(batch: Batch, config: ClipTraining, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Half of the crops mirrored, with what their patches show."""
     count = config.image_size // config.patch
     chosen = torch.rand(len(batch.pixels), generator=generator) < 0.5
-    pixels, patches = batch.pixels.clone(), batch.patches.reshape(-1, count, count, 3).clone()
-    pixels[chosen], patches[chosen] = pixels[chosen].flip(-1), patches[chosen].flip(2)
-    return pixels, patches.reshape(batch.patches.shape)
+    pixels = torch.where(chosen[:, None, None, None], batch.pixels.flip(-1), batch.pixels)
+
+    def of_patches(values: Tensor) -> Tensor:
+        grid = values.unflatten(1, (count, count))
+        return torch.where(chosen[:, None, None, None], grid.flip(2), grid).flatten(1, 2)
+
+    return pixels, of_patches(batch.patches), of_patches(batch.left_out)
 
 
 def jittered(pixels: Tensor, generator: torch.Generator) -> Tensor:
@@ -240,9 +284,10 @@ def contrastive_loss(logits: Tensor, truth: Tensor) -> Tensor:
     return -(picked.sum(1)[rows] / right.sum(1)[rows]).mean()
 
 
-def patch_loss(answers: Tensor, truth: Tensor) -> Tensor:
-    """Cross-entropy of kind, colour and part of the patches ``[B, P, 3]``."""
-    split = answers.split([len(KINDS), len(TINTS), len(PART_NAMES)], dim=-1)
+def patch_loss(answers: Tensor, truth: Tensor, left_out: Tensor) -> Tensor:
+    """Cross-entropy of kind, colour and part of the patches ``[B, P, 3]``; kinds left out are no answer."""
+    kinds, *others = answers.split([len(KINDS), len(TINTS), len(PART_NAMES)], dim=-1)
+    split = [kinds.masked_fill(left_out, -torch.inf), *others]
     losses = [
         F.cross_entropy(part.flatten(0, 1), truth[..., place].flatten()) for place, part in enumerate(split)
     ]
@@ -305,9 +350,10 @@ class Trainer:
             group["lr"] = self.rate()
         words = self.tokens([*batch.texts, *batch.corners])
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            pixels, patches = mirrored(batch, self.config, self.generator)
+            pixels, patches, left_out = mirrored(batch, self.config, self.generator)
             kept = self.kept_patches(len(pixels))
             patches = patches.gather(1, kept[..., None].expand(-1, -1, 3))
+            left_out = left_out.gather(1, kept[..., None].expand(-1, -1, len(KINDS)))
             images, tokens = self.see(jittered(pixels, self.generator), kept)
             answers = self.patch_heads(tokens).float()
             texts = pooled(self.model.get_text_features(**words))
@@ -321,7 +367,7 @@ class Trainer:
             scale * phrases.T, batch.truth.T
         )
         relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature)
-        named = patch_loss(answers, patches)
+        named = patch_loss(answers, patches, left_out)
         composition = composition_loss(F.normalize(corners, dim=-1))
         loss = 0.5 * contrast + relevancy + named + self.config.composition * composition
         self.optimizer.zero_grad()

@@ -412,8 +412,8 @@ def _part_phrase(kind: str, part: str, rng: np.random.Generator) -> Phrase:
     return Phrase(f"{word} of {with_article(name, rng)}", kind=kind, part=part)
 
 
-_ONSETS = tuple("b c d f g h k l m n p r s t v w br cl dr fl gr pl sh st tr".split())
-_VOWELS, _CODAS = tuple("a e i o u ea oo ai".split()), tuple("n r l t k m s".split())
+_ONSETS = (*"bcdfghklmnprstvw", "br", "cl", "dr", "fl", "gr", "pl", "sh", "st", "tr")
+_VOWELS, _CODAS = (*"aeiou", "ea", "oo", "ai"), tuple("nrltkms")
 
 
 def _made_up_word(rng: np.random.Generator) -> str:
