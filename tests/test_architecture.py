@@ -15,7 +15,7 @@ ORDER = """
     image_losses training_images optimizers exposures densification reconstruction features codebook
     language_field losses embedding joint lifting queries selection presence truth picking phrases relations
     heatmaps baselines evaluation report formats scene_folder config search editing exporting pipeline
-    experiments ablation comparison answers viewer demo progress_bars experiment_commands cli __init__
+    experiments ablation comparison answers viewer demo progress_bars cli __init__
 """.split()  # noqa: SIM905  (thirty quoted names would not read as a list)
 
 # Kernels and helpers that belong to a neighbour share its place in the order.

@@ -9,7 +9,7 @@ from colour_encoder import ColourClip, ColourDino
 from test_ablation import CONFIG
 
 from lexsplat import baselines, comparison
-from lexsplat.experiment_commands import capture_and_settings
+from lexsplat.cli.captures import capture_and_settings
 
 
 @pytest.fixture(scope="module")

@@ -142,6 +142,6 @@ def test_the_command_line_serves_until_it_is_interrupted(built, monkeypatch, cap
         served.append(urllib.request.urlopen(address, timeout=10).status)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "wait_for_interrupt", visit)
+    monkeypatch.setattr("lexsplat.cli.view.wait_for_interrupt", visit)
     assert cli.main(["view", str(built), "--port", "0"]) == 0
     assert served == [200]

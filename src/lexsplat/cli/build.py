@@ -1,0 +1,74 @@
+"""``lexsplat build``, ``reconstruct`` and ``embed``: photos in, a searchable scene out."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+
+from lexsplat.cli.options import Settings
+from lexsplat.config import BuildConfig
+
+
+@dataclasses.dataclass
+class Build:
+    """Make a searchable scene from photos with cameras.
+
+    All stages: reconstruct, features, codebook, embed. Run it again with the same output to go on where it
+    stopped; only what a changed setting touches is done again.
+
+    Args:
+        capture: Folder with photos and cameras: a COLMAP model (images/ and sparse/0/) or a transforms.json of
+            nerfstudio, instant-ngp or NeRF-synthetic. Photos alone get cameras by structure from motion.
+        output: The scene folder to make.
+        test_views: Names of the views to hold out for evaluation.
+        settings: What is made and how.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    output: Path
+    test_views: tuple[str, ...] = ()
+    settings: Settings = dataclasses.field(default_factory=BuildConfig)
+
+    until = "embed"
+
+    def run(self) -> None:
+        """Build up to the last stage of this command."""
+        from lexsplat.pipeline import build
+        from lexsplat.progress_bars import ProgressBars
+
+        with ProgressBars() as bars:
+            folder = build(
+                self.capture,
+                self.output,
+                self.settings,
+                until=self.until,
+                test_names=list(self.test_views) or None,
+                splats=getattr(self, "splats", None),
+                listener=bars,
+            )
+        print(f"{folder.root}: {', '.join(folder.record['stages'])} finished")
+        if self.until == "embed":
+            print(f'next: lexsplat query {folder.root} "something you see"')
+
+
+@dataclasses.dataclass
+class Reconstruct(Build):
+    """Only reconstruct: 3D Gaussians from photos with cameras (the first stage of build)."""
+
+    until = "reconstruct"
+
+
+@dataclasses.dataclass
+class Embed(Build):
+    """Give a scene its language: the stages after reconstruct (which is run first where it is missing).
+
+    With --splats, Gaussians made by another program are taken as they are; photos and poses must be those they were
+    made from, in the same axes and units.
+
+    Args:
+        splats: Gaussians to take instead of reconstructing: .ply, .splat, .spz, .compressed.ply or .ksplat.
+    """
+
+    splats: Path | None = None

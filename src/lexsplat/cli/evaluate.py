@@ -1,0 +1,68 @@
+"""``lexsplat evaluate``: a scene against its held-out views."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from lexsplat.cli.options import Device, open_scene, print_evaluation, print_json
+
+
+@dataclasses.dataclass
+class Evaluate:
+    """Measure a scene on its held-out views: picture quality, and language where there are masks.
+
+    Writes metrics.json, metrics.csv, metrics.tex, report.html and heatmaps/ into the scene folder.
+
+    Args:
+        scene: A scene folder.
+        masks: Folder with truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
+            the capture.
+        prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
+        protocols: How to measure (docs/evaluation.md).
+        capture: Where the photos are now, if they have moved.
+        form: See ``lexsplat query --help``.
+        clip: Text encoder, if it is not where the build found it.
+        device: Where to compute.
+        json: Print metrics.json on standard output.
+    """
+
+    scene: tyro.conf.Positional[str]
+    masks: Path | None = None
+    prompt_list: Literal["paper", "released"] | None = None
+    protocols: tuple[Literal["strict", "official", "lerf-2d", "lerf-3d"], ...] = (
+        "strict",
+        "official",
+        "lerf-2d",
+        "lerf-3d",
+    )
+    capture: Path | None = None
+    form: Literal["feature", "code"] | None = None
+    clip: str | None = None
+    device: Device = "auto"
+    json: bool = False
+
+    def run(self) -> None:
+        """Evaluate and print the table."""
+        from lexsplat.answers import evaluate_scene
+        from lexsplat.progress_bars import ProgressBars
+
+        scene = open_scene(self.scene, self.device, self.clip)
+        if self.form:
+            scene.query = dataclasses.replace(scene.query, form=self.form)
+        with ProgressBars() as bars:
+            result = evaluate_scene(
+                scene,
+                capture=self.capture,
+                masks=self.masks,
+                prompt_list=self.prompt_list,
+                protocols=self.protocols,
+                listener=bars,
+            )
+        if self.json:
+            print_json(result)
+        else:
+            print_evaluation(result, Path(self.scene))

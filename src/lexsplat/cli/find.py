@@ -1,0 +1,51 @@
+"""``lexsplat find``: things in 3D."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import tyro
+
+from lexsplat.cli.options import Device, open_scene, print_json
+
+
+@dataclasses.dataclass
+class Find:
+    """Find things in 3D: where they are, how large, how many, and whether the scene has them at all.
+
+    Phrases may relate things: "mug on the cloth", "largest book", "fruit but not the banana", "how many apples",
+    "chair next to the table" (left of, right of, in front of, behind, on, under, above, below, inside, next to,
+    nearest to). Put words into quotation marks inside the phrase to keep them together.
+
+    Args:
+        scene: A scene folder.
+        phrases: What to look for.
+        view: Whose left and right are meant; none takes the view that shows the other thing best.
+        clip: Text encoder, if it is not where the build found it.
+        device: Where to compute.
+        json: Print one JSON document on standard output.
+    """
+
+    scene: tyro.conf.Positional[str]
+    phrases: tyro.conf.Positional[tuple[str, ...]]
+    view: str | None = None
+    clip: str | None = None
+    device: Device = "auto"
+    json: bool = False
+
+    def run(self) -> None:
+        """Find and print."""
+        from lexsplat.answers import find_phrases
+
+        answers = find_phrases(open_scene(self.scene, self.device, self.clip), self.phrases, self.view)
+        if self.json:
+            print_json(answers)
+            return
+        for answer in answers["phrases"]:
+            count = answer["count"]
+            print(f"{answer['phrase']}: present: {answer['present']}, {count} found")
+            for number, thing in enumerate(answer["instances"], start=1):
+                center = ", ".join(f"{v:.2f}" for v in thing["center"])
+                size = " x ".join(f"{v:.2f}" for v in thing["size"])
+                print(f"  {number}. at ({center}), size {size}, score {thing['score']:.2f}, "
+                      f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}")  # fmt: skip

@@ -1,0 +1,52 @@
+"""What several commands share: options, opening a scene, printing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from lexsplat.config import BuildConfig
+
+if TYPE_CHECKING:
+    from lexsplat.search import SearchableScene
+
+Settings = Annotated[BuildConfig, tyro.conf.arg(name="")]
+Device = Literal["auto", "cpu", "cuda"]
+
+
+def open_scene(path: str, device: str, clip: str | None) -> SearchableScene:
+    """The scene a command was given, ready to be asked."""
+    from lexsplat import search
+
+    return search.open_scene(path, device=device, clip=clip)
+
+
+def print_json(document: Any) -> None:
+    """One JSON document on standard output."""
+    print(json.dumps(document, indent=2, ensure_ascii=False))
+
+
+def print_evaluation(result: dict, folder: Path) -> None:
+    """The table of one evaluated scene, and where its report lies."""
+    from lexsplat.report import format_table
+
+    print(format_table(result))
+    print(f"report: {folder / 'report.html'}")
+
+
+def print_json_file(path: Path) -> None:
+    """One JSON document that a command has written, on standard output."""
+    print_json(json.loads(path.read_text(encoding="utf-8")))
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Refuse an empty list of seeds.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if not seeds:
+        raise ValueError("at least one seed is needed")
