@@ -2,8 +2,10 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from colour_encoder import ColourClip, ColourDino
 
@@ -65,13 +67,51 @@ def test_every_row_of_the_papers_table_switches_off_what_it_says():
 
 
 def test_a_lifted_field_is_ablated_in_its_quantization_only():
-    assert ablation.variants_of("lifted") == ("w/o DINO", "w/o L_lb", "full")
-    assert ablation.variants_of("trained") == tuple(ablation.VARIANTS)
+    assert ablation.variants_of("lifted") == ("w/o DINO", "w/o L_lb", "with neighbours", "one code", "full")
+    table_2 = ("w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full")
+    assert ablation.variants_of("trained") == table_2
+    assert ablation.variants_of("lifted+tuned") == tuple(ablation.VARIANTS)
+    config = BuildConfig(method="lifted")
+    assert ablation.changed(config, "with neighbours").lifting.use_smoothing
+    assert ablation.changed(config, "one code").lifting.top == 1
+
+
+def test_several_methods_stand_beside_each_other_with_wrong_labels(
+    ablated, tiny_capture, tmp_path, monkeypatch
+):
+    shutil.copytree(ablated / "scene", tmp_path / "scene")
+    seen, original = [], ablation.make_field
+    monkeypatch.setattr(ablation, "make_field", lambda *a: seen.append(a[2]) or original(*a))
+    rows = ablation.ablate(
+        tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=("trained", "lifted"), variants=("full", "one code"),
+        wrong_labels=0.3,
+    )  # fmt: skip
+    assert [row["name"] for row in rows] == ["trained: full", "lifted: full", "lifted: one code"]
+    assert all(row["language_seconds"][0] > 0 and row["storage_bytes"][0] > 0 for row in rows)
+    clean = ablation.ablate(
+        tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=("trained", "lifted"), variants=("full",)
+    )  # other labels are other runs: they are measured anew
+    assert len(seen) == 5
+    name = next(iter(seen[0]))
+    assert 0.1 < np.mean(seen[0][name] != seen[3][name]) < 0.35
+    assert rows[1]["mAP"] != clean[1]["mAP"]
+
+
+def test_wrong_labels_differ_in_every_view_and_keep_their_share():
+    maps = {name: np.zeros((80, 90), np.uint8) for name in "ab"}
+    wrong = ablation.with_wrong_labels(maps, 0.25, 10, seed=3)
+    assert np.mean(wrong["a"] != 0) == pytest.approx(0.25 * 0.9, abs=0.02)
+    assert (wrong["a"] != wrong["b"]).any()
+    assert wrong["a"].dtype == np.uint8 and wrong["a"].max() == 9
+    again = ablation.with_wrong_labels(maps, 0.25, 10, seed=3)
+    assert all((again[name] == wrong[name]).all() for name in maps)
+    with pytest.raises(ValueError, match="share"):
+        ablation.with_wrong_labels(maps, 1.5, 10, seed=3)
 
 
 def test_the_tables_have_all_rows_with_mean_and_spread(ablated):
     rows = rows_of(ablated)
-    assert [row["name"] for row in rows] == list(ablation.VARIANTS)
+    assert [row["name"] for row in rows] == list(ablation.variants_of("trained"))
     assert all(row["runs"] == "2" for row in rows)
     record = json.loads((ablated / "ablation.json").read_text())
     values = [run["auto"]["mIoU"] for run in record["runs"]["full"]]

@@ -1,7 +1,8 @@
-"""``lexsplat ablate``: the paper's Table 2 over several seeds.
+"""``lexsplat ablate``: the paper's Table 2 over several seeds, for one method or several beside each other.
 
 Every variant leaves one part of the method out. Gaussians and features are shared by all, codebooks by those that
-do not change the quantization; the seed is that of codebook and language.
+do not change the quantization; the seed is that of codebook and language. With wrong labels mixed in on purpose
+(`with_wrong_labels`) the same table is a stress test.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lexsplat.config import BuildConfig
 from lexsplat.evaluation import EvaluationConfig
 from lexsplat.experiments import Bench, with_seed
@@ -21,25 +25,52 @@ from lexsplat.progress import Listener, silent
 from lexsplat.report import table_rows, write_rows
 from lexsplat.scene_folder import to_json, write_json
 
-VARIANTS: Mapping[str, Mapping[str, Mapping[str, bool]]] = {
+VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "w/o DINO": {"codebook": {"use_dino": False}},
     "w/o L_lb": {"codebook": {"load_balancing": False}},
     "w/o u_G": {"embedding": {"use_uncertainty": False}},
     "w/o MLP": {"embedding": {"use_smoothing": False}},
     "w/o u_G & MLP": {"embedding": {"use_uncertainty": False, "use_smoothing": False}},
+    "with neighbours": {"lifting": {"use_smoothing": True}},
+    "one code": {"lifting": {"top": 1}},
     "full": {},
 }
-"""The rows of the paper's Table 2, in its order: what each switches off."""
+"""What each row changes: those of the paper's Table 2 in its order, and what a lifted field can have otherwise."""
 
-COLUMNS = ("mPA", "mP", "mIoU", "mAP", "mIoU_fixed", "mIoU_oracle", "localization")
+COLUMNS = (
+    "mPA", "mP", "mIoU", "mAP", "mIoU_fixed", "mIoU_oracle", "localization", "language_seconds", "storage_bytes",
+)  # fmt: skip
 """What the table shows; the file has every number."""
 
 
 def variants_of(method: str) -> tuple[str, ...]:
     """The variants that make a difference for a method: a lifted field has no u_G to train and no MLP."""
-    if method != "lifted":
-        return tuple(VARIANTS)
-    return tuple(name for name, changes in VARIANTS.items() if "embedding" not in changes)
+    without = {"lifted": "embedding", "trained": "lifting"}.get(method)
+    return tuple(name for name, changes in VARIANTS.items() if without not in changes)
+
+
+def with_wrong_labels(
+    code_maps: Mapping[str, NDArray[np.uint8]], share: float, num_codes: int, seed: int
+) -> dict[str, NDArray[np.uint8]]:
+    """Index maps with ``share`` of the pixels replaced by random codes, others in every view.
+
+    Args:
+        code_maps: Index maps ``[H, W]`` by view.
+        share: Of the pixels, 0 to 1.
+        num_codes: K; each code is as likely.
+        seed: Decides which pixels and codes.
+
+    Raises:
+        ValueError: If the share is not within 0..1.
+    """
+    if not 0 <= share <= 1:
+        raise ValueError(f"the share of wrong labels must be in 0..1, got {share:g}")
+    wrong = {}
+    for place, (name, codes) in enumerate(code_maps.items()):
+        rng = np.random.default_rng([seed, place])
+        hit = rng.random(codes.shape) < share
+        wrong[name] = np.where(hit, rng.integers(0, num_codes, codes.shape), codes).astype(codes.dtype)
+    return wrong
 
 
 def changed(config: BuildConfig, variant: str) -> BuildConfig:
@@ -66,6 +97,8 @@ def ablate(
     *,
     seeds: Sequence[int] = (0, 1, 2),
     variants: Sequence[str] = (),
+    methods: Sequence[str] = (),
+    wrong_labels: float = 0.0,
     evaluation: EvaluationConfig | None = None,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
@@ -79,6 +112,9 @@ def ablate(
         config: Settings of the full method; ``config.seed`` is the seed of the Gaussians.
         seeds: Seeds of codebook and language.
         variants: Names out of `VARIANTS`; none takes those that make a difference for the method.
+        methods: "trained", "lifted", "lifted+tuned"; none takes that of the settings. Rows of several are called
+            "METHOD: VARIANT".
+        wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
         evaluation: How to measure; by default in the form of the paper, without LPIPS.
         listener: Told how far each stage is.
 
@@ -89,21 +125,33 @@ def ablate(
         ValueError: If a variant is unknown, or there is no seed.
         CaptureError: If the capture has no masks.
     """
-    names = list(variants or variants_of(config.method))
+    plan = _plan(config, list(methods) or [config.method], variants)
     if not seeds:
         raise ValueError("an ablation needs at least one seed")
-    for name in names:
-        changed(config, name)  # an unknown name is told before anything is made
+    with_wrong_labels({}, wrong_labels, 1, 0)  # a wrong share is told before anything is made
     bench = Bench(capture, output, config, evaluation or paper_evaluation(), listener)
     results: dict[str, list[dict[str, Any]]] = {}
     rows: list[dict[str, Any]] = []
     for seed in seeds:  # one seed for all variants first: a stopped run leaves whole tables of fewer seeds
-        for name in names:
-            settings = with_seed(changed(bench.config, name), seed)
-            run = bench.run(name, seed, language_settings(settings), lambda: make_language(bench, settings))  # noqa: B023
+        for name, method, variant in plan:
+            settings = with_seed(changed(replace(bench.config, method=method), variant), seed)
+            made_from = [*language_settings(settings), *([wrong_labels] if wrong_labels else [])]
+            run = bench.run(name, seed, made_from, lambda: make_language(bench, settings, wrong_labels))  # noqa: B023
             results.setdefault(name, []).append(run.result)
-            rows = table_rows({name: results[name] for name in names if name in results})
+            rows = table_rows({name: results[name] for name, _, _ in plan if name in results})
             _write(output, rows, bench, results)
+    return rows
+
+
+def _plan(config: BuildConfig, methods: Sequence[str], variants: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Name, method and variant of every row."""
+    for variant in variants:
+        changed(config, variant)  # an unknown name is told before anything is made
+    rows = []
+    for method in methods:
+        replace(config, method=method)  # as is an unknown method
+        for variant in [v for v in variants or variants_of(method) if v in variants_of(method)]:
+            rows.append((variant if len(methods) == 1 else f"{method}: {variant}", method, variant))
     return rows
 
 
@@ -113,10 +161,14 @@ def paper_evaluation() -> EvaluationConfig:
     return replace(config, query=replace(config.query, form="feature"))
 
 
-def make_language(bench: Bench, config: BuildConfig) -> tuple[LanguageField, dict[str, float]]:
+def make_language(
+    bench: Bench, config: BuildConfig, wrong_labels: float = 0.0
+) -> tuple[LanguageField, dict[str, float]]:
     """A language field by the settings, with the seconds of its stages."""
     codebook, code_maps, fit_seconds = bench.codebook(config.codebook, config.seed)
     cameras = {name: bench.scene.views[name].camera for name in bench.scene.train_names}
+    if wrong_labels:
+        code_maps = with_wrong_labels(code_maps, wrong_labels, codebook.num_codes, config.seed)
     start = time.perf_counter()
     field = make_field(bench.gaussians, cameras, code_maps, codebook, config, bench.listener)
     return field, {"codebook": fit_seconds, "embed": time.perf_counter() - start}

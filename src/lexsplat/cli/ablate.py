@@ -25,6 +25,9 @@ class Ablate:
         output: Where everything goes.
         seeds: Seeds of codebook and language.
         variants: Which rows; none takes all that make a difference for the method.
+        methods: Which ways to the language, beside each other; none takes that of the settings (trained).
+        wrong_labels: Stress test: replace the code of this share of the pixels by a random one, others in every
+            view.
         form: How codes and text are compared; the paper's is "feature".
         as_in_paper: Fit and train as the paper does (30,000 steps) instead of our short settings.
         json: Print ablation.json on standard output.
@@ -34,7 +37,21 @@ class Ablate:
     capture: tyro.conf.Positional[str]
     output: Path
     seeds: tuple[int, ...] = (0, 1, 2)
-    variants: tuple[Literal["w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full"], ...] = ()
+    variants: tuple[
+        Literal[
+            "w/o DINO",
+            "w/o L_lb",
+            "w/o u_G",
+            "w/o MLP",
+            "w/o u_G & MLP",
+            "with neighbours",
+            "one code",
+            "full",
+        ],
+        ...,
+    ] = ()
+    methods: tuple[Literal["trained", "lifted", "lifted+tuned"], ...] = ()
+    wrong_labels: float = 0.0
     form: Literal["feature", "code"] = "feature"
     as_in_paper: bool = False
     json: bool = False
@@ -42,6 +59,8 @@ class Ablate:
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
+        if not 0 <= self.wrong_labels <= 1:
+            raise ValueError(f"--wrong-labels must be in 0..1, got {self.wrong_labels:g}")
 
     def run(self) -> None:
         """Measure and print the table."""
@@ -61,6 +80,8 @@ class Ablate:
                 settings,
                 seeds=self.seeds,
                 variants=self.variants,
+                methods=self.methods,
+                wrong_labels=self.wrong_labels,
                 evaluation=dataclasses.replace(evaluation, query=query),
                 listener=bars,
             )

@@ -24,6 +24,7 @@ _PAPER = {
 
 _HONEST = {
     "mIoU_fixed": ("mIoU 0.5", 3), "mIoU_oracle": ("oracle", 3), "localization": ("localisation", 3),
+    "language_seconds": ("language", -2),
 }  # fmt: skip
 """Columns that the paper does not have."""
 
@@ -127,6 +128,7 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
     for protocol in ("official", "lerf_2d", "lerf_3d"):
         numbers |= {f"{protocol}_{name}": v for name, v in (language.get(protocol) or {}).items()}
     seconds = speed.get("stage_seconds") or {}
+    language_stages = [seconds[stage] for stage in ("codebook", "embed") if stage in seconds]
     return numbers | {
         "fps": speed.get("render_fps"),
         "query_ms": speed.get("query_ms"),
@@ -134,6 +136,7 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
         "gpu_bytes": size.get("peak_gpu_bytes"),
         "storage_bytes": size.get("language_bytes"),
         "training_seconds": sum(seconds.values()) if seconds else None,
+        "language_seconds": sum(language_stages) if language_stages else None,
     }
 
 
