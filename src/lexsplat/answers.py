@@ -13,6 +13,7 @@ from PIL import Image
 
 from lexsplat.atomic import atomic_path
 from lexsplat.boxes import gravity_up
+from lexsplat.captures import reload_capture
 from lexsplat.errors import CaptureError, SceneFolderError
 from lexsplat.evaluation import PROTOCOLS, EvaluationConfig, evaluate
 from lexsplat.heatmaps import overlay_heatmap
@@ -22,7 +23,7 @@ from lexsplat.progress import Listener, silent
 from lexsplat.queries import check_prompts
 from lexsplat.report import Gallery, table_rows, write_report, write_rows
 from lexsplat.scene_folder import SceneFolder, read_json, write_json
-from lexsplat.scenes import Scene, load_annotations, load_scene
+from lexsplat.scenes import Scene, load_annotations
 from lexsplat.scenes.prompt_lists import SCENES as PROMPT_SCENES
 from lexsplat.scenes.prompt_lists import PromptList, prompt_names
 from lexsplat.search import SearchableScene
@@ -286,40 +287,20 @@ def _prompt_kinds(root: Path) -> dict[str, str]:
 
 
 def load_photos(scene: SearchableScene, capture: Path | None) -> Scene:
-    """The capture of a scene, with the views, sizes and split of the build."""
-    views = scene.views
-    held_out = [name for name, view in views.items() if view.split == "test"]
-    record = scene.folder.record if scene.folder else {}
-    photos = load_scene(
-        capture_of(scene, capture),
-        downscale=record.get("config", {}).get("downscale") or 1.0,
-        test_names=held_out,
-        images=record.get("images"),
-    )
-    missing = set(views) - set(photos.views)
+    """The capture of a scene, with the views, sizes and split of the build.
+
+    Raises:
+        SceneFolderError: If the photos are not where the build found them and no other place is given.
+    """
+    if scene.folder is None:
+        raise ValueError("only a scene opened from a folder knows its photos")
+    photos = reload_capture(scene.folder, capture)
+    missing = set(scene.views) - set(photos.views)
     if missing:
         raise SceneFolderError(
             photos.root,
-            expected=f"the {len(views)} photos of the build",
+            expected=f"the {len(scene.views)} photos of the build",
             found=f"{len(missing)} missing, such as {min(missing)}",
             remedy="put them back or build again",
         )
     return photos
-
-
-def capture_of(scene: SearchableScene, capture: Path | None) -> Path:
-    """Where the photos of a scene are.
-
-    Raises:
-        SceneFolderError: If they are not where the build found them and no other place is given.
-    """
-    recorded = scene.folder.record.get("capture") if scene.folder else None
-    place = capture or (Path(recorded) if recorded else None)
-    if place is None or not place.exists():
-        raise SceneFolderError(
-            place or "capture",
-            expected="the photos the scene was made from",
-            found="no such folder",
-            remedy="say where they are with --capture",
-        )
-    return place

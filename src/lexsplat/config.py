@@ -13,6 +13,8 @@ from lexsplat.errors import BackendError
 from lexsplat.features import FeatureConfig
 from lexsplat.lifting import LiftingConfig, TuningConfig
 from lexsplat.reconstruction import ReconstructionConfig
+from lexsplat.scenes.photos import PoseConfig
+from lexsplat.scenes.video import DEFAULT_FRAMES
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 """The CLIP of the paper's released code."""
@@ -27,6 +29,10 @@ CPU_ITERATIONS = 3_000
 """Reconstruction steps on a CPU when none are given."""
 CUDA_ITERATIONS = 30_000
 """Reconstruction steps on CUDA when none are given: the paper's number."""
+
+
+LanguageMethod = Literal["trained", "lifted", "lifted+tuned"]
+"""Ways from index maps to language on the Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +50,14 @@ class BuildConfig:
         downscale: Factor by which photos are made smaller for reconstruction and language; none chooses one
             that suits the device.
         iterations: Reconstruction steps; none means 30,000 on CUDA and 3,000 on a CPU.
+        frames: How many frames a video is sampled to.
         test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
         method: "lifted" computes each Gaussian's language directly in one pass: better, and 20 to 40 times
             faster, in our measurements (docs/results.md). "trained" is the paper's optimisation, "lifted+tuned"
             starts the paper's field from the lifted one.
         joint: Train language together with geometry from the first step, as the authors' code does (with
             method "trained"; its steps are then those of the reconstruction).
+        poses: Structure from motion, for photos without cameras and videos.
         reconstruction: Geometry and appearance.
         features: Dense CLIP and DINO features.
         codebook: Quantization.
@@ -69,9 +77,11 @@ class BuildConfig:
     checkpoint_seconds: float = 20.0
     downscale: float | None = None
     iterations: int | None = None
+    frames: int = DEFAULT_FRAMES
     test_every: int = 8
-    method: Literal["trained", "lifted", "lifted+tuned"] = "lifted"
+    method: LanguageMethod = "lifted"
     joint: bool = False
+    poses: PoseConfig = field(default_factory=PoseConfig)
     reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     codebook: CodebookConfig = field(default_factory=CodebookConfig)
@@ -89,6 +99,8 @@ class BuildConfig:
             raise ValueError(f"checkpoint_seconds must be at least 0, got {self.checkpoint_seconds:g}")
         if self.iterations is not None and self.iterations < 1:
             raise ValueError(f"iterations must be positive, got {self.iterations}")
+        if self.frames < 3:
+            raise ValueError(f"frames must be at least 3, got {self.frames}")
         if self.test_every < 0 or self.test_every == 1:
             raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {self.test_every}")
 

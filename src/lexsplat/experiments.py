@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from lexsplat.captures import reload_capture
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.errors import CaptureError, FileFormatError
@@ -28,7 +29,7 @@ from lexsplat.language_field import LanguageField
 from lexsplat.pipeline import build, feature_maps, machine_facts
 from lexsplat.progress import Listener, silent
 from lexsplat.scene_folder import SceneFolder, fingerprint, read_json, write_json
-from lexsplat.scenes import Annotations, Scene, load_annotations, load_scene
+from lexsplat.scenes import Annotations, Scene, load_annotations
 from lexsplat.tensor_files import read_tensors, write_tensors
 
 log = logging.getLogger("lexsplat")
@@ -96,13 +97,7 @@ class Bench:
         self._clip: Any = None
 
     def _load_scene(self, config: BuildConfig) -> tuple[Scene, BuildConfig]:
-        record, views = self.folder.record, self.folder.read_cameras()
-        scene = load_scene(
-            record["capture"],
-            downscale=record["config"].get("downscale") or 1.0,
-            test_names=[name for name, view in views.items() if view.split == "test"],
-            images=record.get("images"),
-        )
+        scene = reload_capture(self.folder)
         sizes = [view.capture_size for view in scene.views.values()]
         return scene, config.resolved(self.device, max(sizes, key=lambda size: size[0] * size[1]))
 

@@ -7,7 +7,6 @@ fingerprint of the photos, the cameras, the settings and the stages before it.
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 import platform
 import time
@@ -21,6 +20,7 @@ import torch
 
 from lexsplat import __version__
 from lexsplat.cameras import Camera
+from lexsplat.captures import load_capture
 from lexsplat.checkpoints import Checkpoint
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
@@ -36,7 +36,7 @@ from lexsplat.progress import Event, Listener, silent
 from lexsplat.reconstruction import Reconstructor, reconstruct
 from lexsplat.rendering import render
 from lexsplat.scene_folder import SceneFolder, fingerprint, to_json
-from lexsplat.scenes import Scene, is_photo_folder, load_annotations, load_scene, poses_from_photos
+from lexsplat.scenes import Scene, load_annotations
 from lexsplat.scenes.triangulation import initial_points
 from lexsplat.tensor_files import read_tensors, write_tensors
 
@@ -57,7 +57,7 @@ def build(
     """Make a searchable scene from a capture, going on where an earlier build stopped.
 
     Args:
-        capture: Folder with photos and cameras (COLMAP or ``transforms.json``), or with photos alone.
+        capture: Folder with photos and cameras (COLMAP or ``transforms.json``), or with photos alone; or a video.
         output: The scene folder to make or to go on with.
         config: Settings; open ones are chosen to suit the device.
         until: Last stage to run, one of `STAGES`.
@@ -75,34 +75,12 @@ def build(
     parse_bytes(config.memory)
     folder = SceneFolder(output)
     with folder.locked():
-        scene = _load_capture(capture, folder, config, test_names, listener)
+        scene = load_capture(capture, folder, config, test_names, listener)
         load_annotations(scene)  # a mask that belongs to no view is told now, not after the training
         sizes = [view.capture_size for view in scene.views.values()]
         config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
         scene = scene.downscaled(config.downscale or 1.0)
         return _Builder(scene, folder, config, device, listener, splats).run(until)
-
-
-def _load_capture(
-    capture: Path,
-    folder: SceneFolder,
-    config: BuildConfig,
-    test_names: list[str] | None,
-    listener: Listener,
-) -> Scene:
-    """The capture; photos without cameras get them by structure from motion, kept in ``poses/``."""
-    if not is_photo_folder(capture):
-        folder.record.pop("images", None)
-        return load_scene(capture, test_every=config.test_every, test_names=test_names)
-    poses = folder.root / "poses"
-    made_from = fingerprint([[f.name, f.stat().st_size] for f in sorted(capture.rglob("*")) if f.is_file()])
-    if not folder.is_finished("poses", made_from) or not (poses / "sparse" / "0").is_dir():
-        start = time.perf_counter()
-        placed = poses_from_photos(capture, poses, seed=config.seed, listener=listener)
-        logging.getLogger("lexsplat").warning(placed.note)
-        folder.finish("poses", made_from, time.perf_counter() - start, placed=len(placed.placed))
-    folder.record["images"] = str(capture.resolve())
-    return load_scene(poses, images=capture, test_every=config.test_every, test_names=test_names)
 
 
 class _Builder:
@@ -299,7 +277,8 @@ class _Builder:
         }
         sources = {name: _file_hash(view.image_path) for name, view in self.scene.views.items()}
         self.folder.write_cameras(views)
-        self.folder.record["capture"] = str(Path(self.scene.root).resolve())
+        if "images" not in self.folder.record:
+            self.folder.record["capture"] = str(Path(self.scene.root).resolve())
         self.folder.record["config"] = to_json(self.config)
         self.folder.record["provenance"] = {
             "lexsplat": __version__,

@@ -13,14 +13,15 @@ from lexsplat.config import BuildConfig
 
 @dataclasses.dataclass
 class Build:
-    """Make a searchable scene from photos with cameras.
+    """Make a searchable scene from photos, with or without cameras, or from a video.
 
     All stages: reconstruct, features, codebook, embed. Run it again with the same output to go on where it
     stopped; only what a changed setting touches is done again.
 
     Args:
         capture: Folder with photos and cameras: a COLMAP model (images/ and sparse/0/) or a transforms.json of
-            nerfstudio, instant-ngp or NeRF-synthetic. Photos alone get cameras by structure from motion.
+            nerfstudio, instant-ngp or NeRF-synthetic. Photos alone, and a video (.mp4, .mov), get cameras by
+            structure from motion; pixels that are black in ``masks/NAME.png`` take no part in anything.
         output: The scene folder to make.
         test_views: Names of the views to hold out for evaluation.
         settings: What is made and how.

@@ -3,7 +3,7 @@
 from lexsplat.scenes.annotations import Annotations, load_annotations
 from lexsplat.scenes.loading import is_photo_folder, load_scene
 from lexsplat.scenes.masks import load_mask, load_masks
-from lexsplat.scenes.photos import PhotoPoses, poses_from_photos
+from lexsplat.scenes.photos import PhotoPoses, PoseConfig, poses_from_photos
 from lexsplat.scenes.scene import Scene, View, stem_of
 from lexsplat.scenes.triangulation import InitialPoints, initial_points, random_points_in_frusta, triangulate
 from lexsplat.scenes.undistortion import Lens
@@ -13,6 +13,7 @@ __all__ = [
     "InitialPoints",
     "Lens",
     "PhotoPoses",
+    "PoseConfig",
     "Scene",
     "View",
     "initial_points",

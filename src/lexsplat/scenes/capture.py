@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -67,19 +68,26 @@ def checked_name(name: str, origin: Path) -> str:
     """An image name as a plain relative path with "/".
 
     Raises:
-        CaptureError: If the name is empty, absolute, or leads out of the capture.
+        CaptureError: If the name is empty, absolute, leads out of the capture, or is none a file can have.
     """
     plain = name.replace("\\", "/")
     parts = PurePosixPath(plain).parts
     drive = bool(parts) and len(parts[0]) == 2 and parts[0][1] == ":"
-    if not parts or plain.startswith("/") or drive or ".." in parts or "\0" in plain:
+    if not _can_be_a_file(parts) or plain.startswith("/") or drive or ".." in parts:
         raise CaptureError(
             origin,
             expected="image names inside the capture folder",
-            found=repr(name),
+            found=repr(name)[:100],
             remedy="move the images into the capture and name them relative to it",
         )
     return "/".join(parts)
+
+
+def _can_be_a_file(parts: tuple[str, ...]) -> bool:
+    """Whether a file system can have such a path: no control characters, no halves of characters, not too long."""
+    lengths = [len(part.encode("utf-8", "replace")) for part in parts]
+    odd = any(unicodedata.category(letter) in ("Cc", "Cs") for part in parts for letter in part)
+    return bool(parts) and max(lengths) <= 250 and sum(lengths) < 3000 and not odd
 
 
 def checked_pose(viewmat: NDArray[np.float64], name: str, origin: Path) -> NDArray[np.float64]:

@@ -209,7 +209,7 @@ ImageEntry = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 
 
 def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
     if file.suffix == ".txt":
         for line in _records(file):
@@ -236,7 +236,7 @@ def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _example_params(model: str) -> list[float]:
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
     camera_id, focal, width, height = 1, 1.0, 2, 2
     return list(pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height).params)

@@ -98,10 +98,14 @@ def read_image(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0
         return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
 
 
-def read_mask(path: Path) -> NDArray[np.bool_]:
+def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     """A mask as ``[H, W]`` bool: true where the picture is brighter than half.
 
     A picture with values 0 and 1 only counts 1 as true.
+
+    Args:
+        path: The picture.
+        nonzero: True is every pixel that is not black, however dark: what COLMAP takes masks for.
 
     Raises:
         CaptureError: As :func:`open_image`.
@@ -111,6 +115,8 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         values = np.asarray(image if image.mode.startswith(("I", "F", "1")) else image.convert("L"))
     if values.dtype == np.bool_:
         return values
+    if nonzero:
+        return values > 0
     highest = float(values.max(initial=0))
     if highest <= 1:
         return values > 0.5

@@ -12,16 +12,15 @@ from lexsplat.scenes.annotations import annotated_names, find_annotations
 from lexsplat.scenes.capture import Capture, Photo
 from lexsplat.scenes.colmap import find_model, read_colmap
 from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, sizes_agree
-from lexsplat.scenes.scene import Scene, View, stem_of
+from lexsplat.scenes.masks import IGNORE_FOLDER, find_ignore_masks
+from lexsplat.scenes.scene import Scene, View
 from lexsplat.scenes.splits import choose_test_names, mask_folders
 from lexsplat.scenes.transforms_json import find_transforms, read_transforms
 from lexsplat.scenes.undistortion import pinhole_of
+from lexsplat.scenes.video import is_video
 
 SEGMENTATIONS = "segmentations"
 """Folder of a capture with ``STEM/PROMPT.png``: masks to measure against."""
-
-IGNORE_FOLDER = "masks"
-"""Folder of a capture with ``NAME.png`` or ``STEM.png``: black where pixels take no part in any loss."""
 
 
 def load_scene(
@@ -31,6 +30,7 @@ def load_scene(
     test_every: int = 8,
     test_names: Sequence[str] | None = None,
     images: str | Path | None = None,
+    beside: str | Path | None = None,
 ) -> Scene:
     """Load a capture: COLMAP (binary or text), ``transforms.json`` (nerfstudio, instant-ngp, NeRF-synthetic).
 
@@ -44,6 +44,8 @@ def load_scene(
         test_every: Hold out every n-th view, counting from the first by name; 0 holds out nothing.
         test_names: Names or stems of the views to hold out, instead of every other rule.
         images: Where the photos of a COLMAP model are, if not in the capture folder.
+        beside: Folder with ``segmentations/`` and ``test_views.json`` where these do not lie with the cameras: that
+            of the photos, where the cameras were estimated. Masks (``masks/``) always lie with the cameras.
 
     Raises:
         CaptureError: If there are no cameras or photos, or one of them cannot be used.
@@ -67,8 +69,11 @@ def load_scene(
             found=f"{len(capture.missing)} images, none of which is there",
             remedy="put the images where the capture names them, for COLMAP into images/",
         )
+    masked, strays = find_ignore_masks([capture.root / IGNORE_FOLDER], [p.name for p in capture.photos])
+    # Masks of photos that found no place are no mistake: `prepare_photos` has told which fit none.
+    warnings += strays if beside is None else []
     views = {
-        photo.name: _make_view(photo, capture, downscale)
+        photo.name: _make_view(photo, capture, downscale, masked.get(photo.name))
         for photo in sorted(capture.photos, key=lambda photo: photo.name)
     }
     if len(views) < len(capture.photos):
@@ -80,21 +85,22 @@ def load_scene(
             found=f"{doubled} twice",
             remedy="remove one of the two from the file",
         )
-    segmentations = capture.root / SEGMENTATIONS
+    root = capture.root if beside is None else Path(beside)
+    segmentations = root / SEGMENTATIONS
     has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
     chosen, split_warnings = choose_test_names(
         list(views),
-        root=capture.root,
+        root=root,
         test_names=test_names,
         listed=capture.test_names,
-        annotated=_annotated(capture.root, list(views)),
+        annotated=_annotated(root, list(views)),
         test_every=test_every,
     )
     warnings += split_warnings
     for warning in warnings:
         logging.getLogger("lexsplat").warning(warning)
     return Scene(
-        root=capture.root,
+        root=root,
         views=views,
         train_names=tuple(name for name in views if name not in set(chosen)),
         test_names=chosen,
@@ -142,8 +148,11 @@ def _read_capture(path: Path, images: Path | None) -> Capture:
 
 
 def is_photo_folder(path: Path) -> bool:
-    """Whether a folder holds photos but no cameras, so that cameras have to be estimated first."""
-    return (
+    """Whether a folder holds photos but no cameras, so that cameras have to be estimated first.
+
+    A video counts as such a folder: its frames are the photos.
+    """
+    return is_video(path) or (
         path.is_dir()
         and find_model(path) is None
         and find_transforms(path) is None
@@ -156,8 +165,8 @@ def _photos_of(path: Path) -> list[Path]:
     return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
 
 
-def _make_view(photo: Photo, capture: Capture, downscale: float) -> View:
-    """Fit the lens to the photo's real size and replace it by a pinhole camera."""
+def _make_view(photo: Photo, capture: Capture, downscale: float, mask: Path | None) -> View:
+    """Fit the lens to the photo's real size and replace it by a pinhole camera; ``mask`` says which pixels count."""
     found = image_size(photo.path)
     stated = (photo.lens.width, photo.lens.height)
     # Photos scaled after the cameras were computed are common (images_4 of Mip-NeRF 360); another aspect
@@ -181,20 +190,17 @@ def _make_view(photo: Photo, capture: Capture, downscale: float) -> View:
             found=str(error),
             remedy="correct the camera, or run COLMAP again with a simpler camera model",
         ) from error
-    return View(
+    view = View(
         name=photo.name,
         image_path=photo.path,
         camera=camera if downscale == 1 else camera.downscaled(downscale),
         capture_size=(width, height),
         lens=lens,
         background=capture.background,
-        ignore_path=photo.ignore_path or _ignore_file(capture.root, photo.name),
+        ignore_path=photo.ignore_path or mask,
     )
-
-
-def _ignore_file(root: Path, name: str) -> Path | None:
-    """The mask of a photo: ``masks/NAME.png`` as COLMAP names it, or ``masks/STEM.png``; or None."""
-    for file in (root / IGNORE_FOLDER / f"{name}.png", root / IGNORE_FOLDER / f"{stem_of(name)}.png"):
-        if file.is_file():
-            return file
-    return None
+    if view.ignore_path is not None:
+        view.check_mask(
+            view.ignore_path
+        )  # a mask that does not fit is told now, not in the middle of a training
+    return view

@@ -122,7 +122,8 @@ class View:
         """
         if self.ignore_path is None:
             return None
-        return self.load_mask(self.ignore_path, self._checked_size(size))
+        mask = read_mask(self.ignore_path, nonzero=True)
+        return self.place_mask(mask, self.ignore_path, self._checked_size(size))
 
     def check_mask(self, path: Path) -> None:
         """Compare a mask's size with the photo's, from the headers alone.

@@ -27,7 +27,7 @@ from lexsplat.scenes.capture import MAX_COORDINATE
 from lexsplat.scenes.scene import Scene, View
 
 if TYPE_CHECKING:
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
 STAGE = "triangulate"
 ENOUGH_POINTS = 200
@@ -257,7 +257,7 @@ def _run_pycolmap(
     listener: Listener,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Features, matches, verification under the known poses, triangulation."""
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
     database, images = folder / "database.db", folder / "images"
     names = [_file_name(index) for index in range(len(views))]
@@ -305,7 +305,7 @@ def _known_reconstruction(
     database_path: Path, views: tuple[View, ...], sizes: list[tuple[int, int]]
 ) -> pycolmap.Reconstruction:
     """The views' cameras and poses under the ids of the database, whose cameras are set to them."""
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
     known = pycolmap.Reconstruction()
     database = pycolmap.Database.open(database_path)
@@ -342,11 +342,11 @@ def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 @contextmanager
 def quiet_pycolmap(seed: int) -> Iterator[None]:
-    """pycolmap with a fixed seed and without its log on standard error."""
-    import pycolmap
+    """pycolmap with a fixed seed and without its log: what goes wrong is told as an error of ours."""
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR.value)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
     pycolmap.set_random_seed(seed)
     try:
         yield

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lexsplat.scenes.images import resize_image
 
 if TYPE_CHECKING:
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
 MAX_SIDE = 65535
 """Longest image side in pixels (the limit of JPEG); a camera that claims more is damaged."""
@@ -42,7 +42,7 @@ class Lens:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        import pycolmap
+        from lexsplat.scenes.pycolmap_import import pycolmap
 
         if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
             raise ValueError(f"image size {self.width}x{self.height}")
@@ -62,7 +62,7 @@ class Lens:
 
     def to_pycolmap(self) -> pycolmap.Camera:
         """The same camera as pycolmap's object."""
-        import pycolmap
+        from lexsplat.scenes.pycolmap_import import pycolmap
 
         return pycolmap.Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.params)
@@ -92,7 +92,7 @@ def pinhole_of(lens: Lens) -> tuple[int, int, NDArray[np.float64]]:
     Raises:
         ValueError: If the distortion is so strong that no such image exists.
     """
-    import pycolmap
+    from lexsplat.scenes.pycolmap_import import pycolmap
 
     camera = lens.to_pycolmap()
     if lens.distorts:
