@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.evaluation import EvaluationConfig
 from lexsplat.experiments import Bench, with_seed
 from lexsplat.language_field import LanguageField
@@ -97,7 +97,7 @@ def ablate(
     *,
     seeds: Sequence[int] = (0, 1, 2),
     variants: Sequence[str] = (),
-    methods: Sequence[str] = (),
+    methods: Sequence[LanguageMethod] = (),
     wrong_labels: float = 0.0,
     evaluation: EvaluationConfig | None = None,
     listener: Listener = silent,
@@ -143,11 +143,13 @@ def ablate(
     return rows
 
 
-def _plan(config: BuildConfig, methods: Sequence[str], variants: Sequence[str]) -> list[tuple[str, str, str]]:
+def _plan(
+    config: BuildConfig, methods: Sequence[LanguageMethod], variants: Sequence[str]
+) -> list[tuple[str, LanguageMethod, str]]:
     """Name, method and variant of every row."""
     for variant in variants:
         changed(config, variant)  # an unknown name is told before anything is made
-    rows = []
+    rows: list[tuple[str, LanguageMethod, str]] = []
     for method in methods:
         replace(config, method=method)  # as is an unknown method
         for variant in [v for v in variants or variants_of(method) if v in variants_of(method)]:

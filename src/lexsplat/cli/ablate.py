@@ -10,7 +10,7 @@ import tyro
 
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import Settings, check_seeds, print_json_file
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, LanguageMethod
 
 
 @dataclasses.dataclass
@@ -50,7 +50,7 @@ class Ablate:
         ],
         ...,
     ] = ()
-    methods: tuple[Literal["trained", "lifted", "lifted+tuned"], ...] = ()
+    methods: tuple[LanguageMethod, ...] = ()
     wrong_labels: float = 0.0
     form: Literal["feature", "code"] = "feature"
     as_in_paper: bool = False

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from lexsplat.cli.options import Device, print_evaluation
+from lexsplat.config import LanguageMethod
 
 
 @dataclasses.dataclass
@@ -28,7 +29,7 @@ class Demo:
 
     output: Path = Path("output/demo")
     scene: Literal["tabletop", "second"] = "tabletop"
-    method: Literal["trained", "lifted", "lifted+tuned"] | None = None
+    method: LanguageMethod | None = None
     device: Device = "auto"
     seed: int = 0
     iterations: int | None = None

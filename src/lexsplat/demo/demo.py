@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from lexsplat.answers import evaluate_scene
 from lexsplat.codebook import CodebookConfig
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.pipeline import build
 from lexsplat.progress import Listener, silent
 from lexsplat.search import open_scene
@@ -36,7 +36,7 @@ def run_demo(
     output: Path,
     *,
     scene: SceneName = "tabletop",
-    method: Literal["trained", "lifted", "lifted+tuned"] | None = None,
+    method: LanguageMethod | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     seed: int = 0,
     iterations: int | None = None,
