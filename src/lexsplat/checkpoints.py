@@ -57,13 +57,18 @@ class Checkpoint:
         """Bring ``trainer`` to the saved state; returns whether there was one that fits."""
         if not self.path.is_file():
             return False
+        start = trainer.state_dict()
         try:
             state, metadata = read_tensors(self.path)
             if metadata.get("made_from") != self.made_from:
                 return False
+            broken = not_finite(state)
+            if broken:
+                raise ValueError(f"NaN or infinity in {broken}")
             trainer.load_state_dict(state)
-        except (FileFormatError, ValueError) as error:
+        except (FileFormatError, ValueError, RuntimeError, KeyError, TypeError, IndexError) as error:
             log.warning("%s cannot be used, the training starts again: %s", self.path, error)
+            trainer.load_state_dict(start)  # some of the damaged state may have been taken up already
             return False
         return True
 
@@ -87,7 +92,7 @@ class Checkpoint:
         """
         start = time.perf_counter()
         state = trainer.state_dict()
-        broken = _not_finite(state)
+        broken = not_finite(state)
         if broken:
             raise TrainingError(
                 "training",
@@ -122,10 +127,10 @@ class Checkpoint:
             signal.signal(signal.SIGINT, before)
 
 
-def _not_finite(state: Mapping[str, Tensor]) -> str:
+def not_finite(state: Mapping[str, Tensor]) -> str:
     """Name of the first parameter that holds NaN or infinity, or nothing. Running means may still be unset."""
     for name, tensor in state.items():
-        is_parameter = "parameters/" in name or "field." in name
+        is_parameter = any(part in name for part in ("parameters/", "field.", "exposures/"))
         if is_parameter and tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             return name
     return ""

@@ -229,7 +229,14 @@ class DensityControl:
         return tensors
 
     def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
-        """Go on where `state_tensors` was called."""
+        """Go on where `state_tensors` was called.
+
+        Raises:
+            ValueError: If the state of the generator is none.
+        """
+        state = tensors["random_state"]
+        if state.dtype != self._random_state.dtype or state.shape != self._random_state.shape:
+            raise ValueError("the state of the random numbers does not fit")
         self._random_state = tensors["random_state"].clone().cpu()
         if self._default is not None:
             for name in ("grad2d", "count"):

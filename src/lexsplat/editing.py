@@ -36,6 +36,10 @@ from lexsplat.selection import Selection
 Kind = Literal["delete", "keep", "recolour", "move", "duplicate"]
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 JOURNAL_VERSION = 1
+MAX_GROWTH = 16
+"""How many times as many Gaussians as before edits may make: a journal of copies of copies would fill any memory."""
+_DEFLATE = 1032
+"""Bytes at most that one compressed byte can stand for."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,12 @@ class Step:
             ValueError: If the data are no step.
         """
         try:
-            count = int(data["gaussians"])
-            packed = zlib.decompressobj().decompress(base64.b64decode(data["mask"]), count // 8 + 1)
-            bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=count)
-            kind = data["step"]
+            count, kind = data["gaussians"], data["step"]
+            raw = base64.b64decode(data["mask"])
+            if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
+                raise ValueError(f"no step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100])
+            packed = zlib.decompressobj().decompress(raw, count // 8 + 1)
+            bits = np.unpackbits(np.frombuffer(packed, np.uint8))[:count]
         except (KeyError, TypeError, binascii.Error, zlib.error) as error:
             raise ValueError(f"no step: {error!r}") from error
         if kind not in get_args(Kind) or len(bits) != count:
@@ -93,7 +99,7 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     """The scene after one step.
 
     Raises:
-        ValueError: If the step is for another number of Gaussians.
+        ValueError: If the step is for another number of Gaussians, or its numbers make no sense.
     """
     if len(step.mask) != len(gaussians):
         raise ValueError(f"a step for {len(step.mask)} Gaussians does not fit {len(gaussians)}")
@@ -113,6 +119,8 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
         numbers = {name: step.values.get(name) for name in ("rotation", "translation", "center")}
         arrays = {name: np.array(value, float) for name, value in numbers.items() if value is not None}
         changed = moved(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
+        if changed.damage():
+            raise ValueError(f"the move leads to {changed.damage()}")
     tensors: dict[str, Any] = {}
     for name, tensor in gaussians.tensors().items():
         tensors[name] = tensor.clone()
@@ -167,7 +175,15 @@ class Editor:
         self.scene = scene
         if journal is not None and journal.exists():
             self._read(journal)
-            self._replay()
+            try:
+                self._replay()
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
+                raise FileFormatError(
+                    journal,
+                    expected="steps that can be done",
+                    found=repr(error)[:200],
+                    remedy="discard the edit",
+                ) from error
 
     # -- steps
 
@@ -278,6 +294,8 @@ class Editor:
         self._write(step.to_json())
 
     def _advance(self, step: Step) -> None:
+        if len(self.scene.gaussians) > MAX_GROWTH * max(len(self.original.gaussians), 1):
+            raise ValueError(f"edits may make at most {MAX_GROWTH} times as many Gaussians")
         self.scene = self.scene.with_content(*apply(step, self.scene.gaussians, self.scene.field))
         self.steps.append(step)
 
@@ -307,7 +325,12 @@ class Editor:
             os.fsync(file.fileno())
 
     def _read(self, path: Path) -> None:
-        lines = path.read_text(encoding="utf-8").split("\n")
+        try:
+            lines = path.read_text(encoding="utf-8").split("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileFormatError(
+                path, expected="a readable journal", found=str(error), remedy="discard the edit"
+            ) from error
         if lines[-1]:
             logging.getLogger("lexsplat").warning("%s: the last line is cut off and left out", path)
             path.write_text("\n".join([*lines[:-1], ""]), encoding="utf-8")
@@ -323,11 +346,11 @@ class Editor:
                 else:
                     self.steps.append(Step.from_json(entry))
                     self.undone.clear()
-            except (ValueError, IndexError, AttributeError) as error:
+            except (ValueError, IndexError, AttributeError, RecursionError) as error:
                 raise FileFormatError(
                     path,
                     expected="steps of an edit",
-                    found=f"line {number}: {error}",
+                    found=f"line {number}: {error}"[:200],
                     remedy="discard the edit",
                 ) from error
 

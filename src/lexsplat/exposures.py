@@ -43,7 +43,13 @@ class Exposures:
         return {"matrices": self.matrices.detach().clone(), **state}
 
     def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
-        """Go on where `state_tensors` was called."""
+        """Go on where `state_tensors` was called.
+
+        Raises:
+            ValueError: If the state is of another number of photos.
+        """
+        if "matrices" not in tensors or tensors["matrices"].shape != self.matrices.shape:
+            raise ValueError("the state of the exposures does not fit")
         with torch.no_grad():
             self.matrices.copy_(tensors["matrices"])
         load_optimizer_tensors(self._optimizer, below_prefix("optimizer/", tensors))

@@ -7,6 +7,7 @@ S = 8 semantic channels, D feature dimensions, H and W image size, C rendered ch
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -18,6 +19,9 @@ from torch import Tensor
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+LARGEST = 1e12
+"""Numbers of Gaussians beyond this are damage (see `Gaussians.damage`)."""
 
 
 @dataclass
@@ -97,6 +101,28 @@ class Gaussians:
     def detach(self) -> Gaussians:
         """The same values without their gradient history."""
         return self.map(lambda tensor: tensor.detach())
+
+    def damage(self) -> str:
+        """What makes these no Gaussians that can be drawn, such as "NaN or Inf in means"; nothing where all is well.
+
+        Finite is not enough: beyond `LARGEST` squares and sums overflow in float32, and a picture gets NaN.
+        """
+        for name, tensor in self.tensors().items():
+            if not bool(torch.isfinite(tensor).all()):
+                return f"NaN or Inf in {name}"
+        limits = {
+            "means": LARGEST,
+            "quats": LARGEST,
+            "log_scales": math.log(LARGEST),
+            "sh0": LARGEST,
+            "shN": LARGEST,
+        }
+        for name, limit in limits.items():
+            values = getattr(self, name)
+            low = -math.inf if name == "log_scales" else -limit
+            if values.numel() and not bool(((values <= limit) & (values >= low)).all()):
+                return f"absurd numbers in {name}"
+        return ""
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians named by a boolean mask or an index tensor ``[M]``."""

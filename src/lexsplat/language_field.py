@@ -309,6 +309,10 @@ class LiftedField:
                 f"codes [N, T] uint8 and weights [N, T] expected, got {codes.dtype} {list(codes.shape)}, "
                 f"{list(weights.shape)}"
             )
+        if not weights.is_floating_point() or not uncertainties.is_floating_point():
+            raise ValueError(
+                f"weights and uncertainties must be floats, got {weights.dtype}, {uncertainties.dtype}"
+            )
         if uncertainties.shape != codes.shape[:1]:
             raise ValueError(f"uncertainties must be [{len(codes)}], got {list(uncertainties.shape)}")
         if codes.numel() and int(codes.max()) >= codebook.num_codes:
@@ -404,12 +408,18 @@ def field_from_tensors(
     """The field that was stored, whichever kind it is.
 
     Raises:
-        ValueError: If the tensors are of neither kind.
+        ValueError: If the tensors are of neither kind, do not fit each other, or hold a number that is not finite.
     """
-    if "semantics" in tensors:
-        return TrainedField.from_tensors(tensors, metadata)
-    if "codes" in tensors:
-        return LiftedField.from_tensors(tensors, metadata)
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"NaN or infinity in {name}")
+    try:
+        if "semantics" in tensors:
+            return TrainedField.from_tensors(tensors, metadata)
+        if "codes" in tensors:
+            return LiftedField.from_tensors(tensors, metadata)
+    except (IndexError, TypeError, RuntimeError) as error:  # a tensor with fewer axes than it must have
+        raise ValueError(f"language field does not fit: {error}") from error
     raise ValueError("neither semantics (trained) nor codes (lifted) among the tensors of the language field")
 
 

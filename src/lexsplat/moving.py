@@ -52,8 +52,8 @@ def moved(
         raise ValueError("rotation must be a [3, 3] matrix of a proper rotation")
     place = np.zeros(3) if center is None else np.asarray(center, dtype=np.float64)
     shift = np.zeros(3) if translation is None else np.asarray(translation, dtype=np.float64)
-    if not (np.isfinite(place).all() and np.isfinite(shift).all()):
-        raise ValueError("center and translation must be finite")
+    if not all(vector.shape == (3,) and np.isfinite(vector).all() for vector in (place, shift)):
+        raise ValueError("center and translation must be three finite numbers")
     matrix, offset = scale * turn, place + shift - scale * turn @ place
     means = gaussians.means.double() @ _like(matrix.T, gaussians) + _like(offset, gaussians)
     changed = replace(gaussians, means=means.float(), log_scales=gaussians.log_scales + math.log(scale))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -70,11 +70,31 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Give an optimiser of one parameter the state that `optimizer_tensors` returned."""
+    """Give an optimiser of one parameter the state that `optimizer_tensors` returned.
+
+    Raises:
+        ValueError: If the state is of another parameter.
+    """
     (parameter,) = optimizer.param_groups[0]["params"]
+    check_moments(tensors, parameter)
     state = {name: value.to(parameter.device, copy=True) for name, value in tensors.items()}
     if state:
         optimizer.state[parameter] = state
+
+
+def check_moments(tensors: Mapping[str, Tensor], parameter: Tensor) -> None:
+    """Raises ValueError if the state of an Adam is not one of this parameter, or none that a step could leave."""
+    if not tensors:
+        return
+    if not {"step", "exp_avg", "exp_avg_sq"} <= tensors.keys() or tensors["step"].numel() != 1:
+        raise ValueError("the state of an optimiser lacks something")
+    for name in ("exp_avg", "exp_avg_sq"):
+        if tensors[name].shape != parameter.shape or tensors[name].dtype != parameter.dtype:
+            raise ValueError(
+                f"the state of an optimiser is of {list(tensors[name].shape)}, not {list(parameter.shape)}"
+            )
+        if not bool(torch.isfinite(tensors[name]).all()):
+            raise ValueError("the state of an optimiser has a number that is not finite")
 
 
 def with_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

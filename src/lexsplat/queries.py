@@ -113,7 +113,7 @@ def check_prompts(prompts: Sequence[str]) -> list[str]:
     """Prompts without surrounding space.
 
     Raises:
-        QueryError: If there is none, or one is empty.
+        QueryError: If there is none, or one is empty or no text.
     """
     if isinstance(prompts, str):
         prompts = [prompts]
@@ -126,11 +126,13 @@ def check_prompts(prompts: Sequence[str]) -> list[str]:
             remedy='ask for something, such as "red apple"',
         )
     for number, prompt in enumerate(cleaned, start=1):
-        if not prompt:
+        # Bytes that are no text come from the command line as halves of characters.
+        is_text = prompt.encode("utf-8", "ignore").decode("utf-8") == prompt
+        if not prompt or not is_text:
             raise QueryError(
                 f"prompt {number} of {len(cleaned)}",
                 expected="a word or phrase",
-                found="an empty text",
+                found="bytes that are no text" if prompt else "an empty text",
                 remedy='name something, such as "red apple"',
             )
     return cleaned

@@ -409,12 +409,23 @@ class Reconstructor:
         """Go on where `state_dict` was called; scene, config and device must be the same.
 
         Raises:
-            ValueError: If an entry is missing.
+            ValueError: If an entry is missing or does not fit the others.
         """
         expected = {"steps_done", "recent_error", "views/order", "views/generator", "density/random_state"}
         missing = (expected | {f"parameters/{name}" for name in GSPLAT_NAMES}) - tensors.keys()
         if missing:
             raise ValueError(f"checkpoint lacks {', '.join(sorted(missing))}")
+        parameters = {name: tensors[f"parameters/{name}"] for name in GSPLAT_NAMES}
+        Gaussians(**parameters, antialiased=False)  # raises if the shapes do not belong together
+        if sorted(tensors["views/order"].tolist()) not in ([], list(range(len(self._names)))):
+            raise ValueError("the order of views is of another capture")
+        if any(value.dtype != torch.float32 for value in parameters.values()):
+            raise ValueError("parameters must be float32")
+        statistics = [tensors[name] for name in ("density/grad2d", "density/count") if name in tensors]
+        if any(value.shape != parameters["opacity_logits"].shape for value in statistics):
+            raise ValueError("the statistics of density control are of other Gaussians")
+        if not 0 <= int(tensors["steps_done"]) <= self.config.iterations:
+            raise ValueError(f"{int(tensors['steps_done'])} of {self.config.iterations} iterations")
         self.steps_done = int(tensors["steps_done"])
         self._recent_error = float(tensors["recent_error"])
         self._order = tensors["views/order"].clone()

@@ -18,8 +18,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import io
 import json
 import os
+import re
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -31,6 +34,8 @@ from lexsplat.atomic import atomic_path, remove_left_overs
 from lexsplat.cameras import Camera
 from lexsplat.errors import FileFormatError, SceneFolderError
 from lexsplat.gaussians import Gaussians
+from lexsplat.scenes.capture import MAX_COORDINATE, checked_name
+from lexsplat.scenes.undistortion import MAX_SIDE
 
 FORMAT_VERSION = 1
 """Raised when a reader of the old layout would misread the new one."""
@@ -101,6 +106,65 @@ class StoredView:
     split: str
 
 
+def _checked_record(record: Any, path: Path) -> dict[str, Any]:
+    """The content of ``scene.json``, of the types that the rest relies on.
+
+    Raises:
+        SceneFolderError: If it is of another format version.
+        FileFormatError: If an entry is of a wrong type.
+    """
+    version = record.get("format_version") if isinstance(record, dict) else None
+    if version != FORMAT_VERSION or not isinstance(record.get("stages"), dict):
+        raise SceneFolderError(
+            path,
+            expected=f"format_version {FORMAT_VERSION}",
+            found=repr(version)[:60],
+            remedy="build the scene again with this version of lexsplat",
+        )
+    config = record.get("config", {})
+    scale = config.get("downscale") if isinstance(config, dict) else None
+    stages = all(isinstance(stage, dict) for stage in record["stages"].values())
+    encoder = record["stages"].get("features", {}).get("clip_hash") if stages else None
+    sound = {
+        "stages": stages,
+        # It becomes part of a file name.
+        "clip_hash": encoder is None or (isinstance(encoder, str) and re.fullmatch(r"[\w-]+", encoder)),
+        "config": isinstance(config, dict) and isinstance(config.get("clip", ""), str),
+        "downscale": scale is None or (isinstance(scale, (int, float)) and 0 < scale < 1e6),
+        "provenance": isinstance(record.get("provenance", {}), dict),
+        "warnings": isinstance(record.get("warnings", []), list),
+        "capture": isinstance(record.get("capture"), (str, type(None))),
+        "images": isinstance(record.get("images"), (str, type(None))),
+    }
+    wrong = [name for name, holds in sound.items() if not holds]
+    if wrong:
+        raise FileFormatError(
+            path, expected=f"{wrong[0]} as a build writes it", found="something else", remedy="build again"
+        )
+    return record
+
+
+def _stored_view(entry: Any, path: Path) -> StoredView:
+    """A view of ``cameras.json``.
+
+    Raises:
+        CaptureError: If its name leads out of the folder.
+        KeyError, TypeError, ValueError, OverflowError: If something is missing or makes no sense.
+    """
+    name, split, width, height = entry["name"], entry["split"], entry["width"], entry["height"]
+    if not isinstance(name, str) or split not in ("train", "test"):
+        raise ValueError(f"view {name!r} of split {split!r}"[:100])
+    if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE for side in (width, height)):
+        raise ValueError(f"size {width!r} x {height!r}"[:100])
+    camera = Camera(width, height, np.array(entry["K"], float), np.array(entry["viewmat"], float))
+    turn = camera.viewmat[:3, :3]
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+        raise ValueError(f"the pose of {name!r} has no rotation"[:100])
+    if np.abs(camera.viewmat).max() > MAX_COORDINATE:
+        raise ValueError(f"the pose of {name!r} is too far from the origin"[:100])
+    return StoredView(checked_name(name, path), camera, split)
+
+
 class SceneFolder:
     """A scene folder, open for reading or being built.
 
@@ -115,16 +179,7 @@ class SceneFolder:
         self.root = Path(root)
         self.record: dict[str, Any] = {"format_version": FORMAT_VERSION, "stages": {}}
         if self._record_path.exists():
-            record = read_json(self._record_path)
-            version = record.get("format_version") if isinstance(record, dict) else None
-            if version != FORMAT_VERSION or not isinstance(record.get("stages"), dict):
-                raise SceneFolderError(
-                    self._record_path,
-                    expected=f"format_version {FORMAT_VERSION}",
-                    found=repr(version),
-                    remedy="build the scene again with this version of lexsplat",
-                )
-            self.record = record
+            self.record = _checked_record(read_json(self._record_path), self._record_path)
 
     @classmethod
     def open(cls, root: Path) -> SceneFolder:
@@ -263,23 +318,17 @@ class SceneFolder:
         path = self.root / "cameras.json"
         content = read_json(path)
         try:
-            return {
-                str(e["name"]): StoredView(
-                    str(e["name"]),
-                    Camera(
-                        int(e["width"]),
-                        int(e["height"]),
-                        np.array(e["K"], float),
-                        np.array(e["viewmat"], float),
-                    ),
-                    str(e["split"]),
-                )
-                for e in content["views"]
-            }
-        except (KeyError, TypeError, ValueError) as error:
+            views = [_stored_view(entry, path) for entry in content["views"]]
+            if len({view.name for view in views}) < len(views):
+                raise ValueError("a view twice")
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise FileFormatError(
-                path, expected="views with name, size, K and viewmat", found=repr(error), remedy="build again"
+                path,
+                expected="views with name, split, size, K and viewmat",
+                found=repr(error)[:200],
+                remedy="build again",
             ) from error
+        return {view.name: view for view in views}
 
     def write_gaussians(self, gaussians: Gaussians) -> None:
         """Write ``gaussians.ply``."""
@@ -307,11 +356,14 @@ class SceneFolder:
         """
         path = self.code_map_path(name)
         try:
-            with Image.open(path, formats=["PNG"]) as image:
+            content = path.read_bytes()
+            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
                 if image.mode != "L":
                     raise FileFormatError(path, expected="an 8-bit grey PNG", found=f"mode {image.mode}")
+                if len(_pixel_data(content, image.size)) != image.height * (image.width + 1):
+                    raise FileFormatError(path, expected=f"{image.width}x{image.height} codes", found="others")
                 return np.array(image)
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, zlib.error) as error:
             raise FileFormatError(path, expected="a code index map", found=str(error)) from error
 
     def bytes_on_disk(self, *paths: Path) -> int:
@@ -321,3 +373,17 @@ class SceneFolder:
             files = path.rglob("*") if path.is_dir() else [path]
             total += sum(file.stat().st_size for file in files if file.is_file())
         return total
+
+
+def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:
+    """The unpacked pixels of an 8-bit grey PNG with the filter byte of each row; at most one byte too many.
+
+    Pillow fills up with zeros what a PNG promises and does not hold, and zero is a code.
+    """
+    packed, place = [], 8
+    while place + 8 <= len(content):
+        length, kind = int.from_bytes(content[place : place + 4], "big"), content[place + 4 : place + 8]
+        if kind == b"IDAT":
+            packed.append(content[place + 8 : place + 8 + length])
+        place += 12 + length
+    return zlib.decompressobj().decompress(b"".join(packed), size[1] * (size[0] + 1) + 1)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from lexsplat.cameras import Camera
-from lexsplat.errors import ModelError, QueryError, SceneFolderError
+from lexsplat.errors import FileFormatError, ModelError, QueryError, SceneFolderError
 from lexsplat.features.text import TextCache
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField, field_from_tensors
@@ -286,7 +286,15 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     place = choose_device(device)
     gaussians = folder.read_gaussians()
     tensors, metadata = read_tensors(folder.language_path)
-    field = field_from_tensors({name: tensor.to(place) for name, tensor in tensors.items()}, metadata)
+    try:
+        field = field_from_tensors({name: tensor.to(place) for name, tensor in tensors.items()}, metadata)
+    except ValueError as error:
+        raise FileFormatError(
+            folder.language_path,
+            expected="a language field",
+            found=str(error)[:200],
+            remedy="run the build again",
+        ) from error
     made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
     if metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
         raise SceneFolderError(

@@ -22,9 +22,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.atomic import atomic_path
 from lexsplat.errors import FileFormatError
 from lexsplat.features.pyramid import CropLevel, dense_map
+from lexsplat.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = "1"
 
@@ -127,18 +127,8 @@ def read_crops(path: Path, cols: int, rows: int) -> Tensor:
     Raises:
         FileFormatError: If the file is not such a store.
     """
-    tensors, facts = _read(path)
-    try:
-        levels = [
-            CropLevel(
-                level["size"], tensors[f"lefts.{i}"].numpy(), tensors[f"tops.{i}"].numpy(), level["grid"]
-            )
-            for i, level in enumerate(facts["levels"])
-        ]
-        width, height = facts["size"]
-        return dense_map(levels, tensors["embeddings"].float(), width, height, cols, rows)
-    except (KeyError, TypeError, ValueError) as error:
-        raise _damaged(path, error) from error
+    levels, embeddings, (width, height) = _stored_crops(path)
+    return dense_map(levels, embeddings, width, height, cols, rows)
 
 
 def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
@@ -149,20 +139,38 @@ def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
     Raises:
         FileFormatError: If the file is not such a store.
     """
+    levels, embeddings, (width, height) = _stored_crops(path)
+    maps = []
+    for level in levels:
+        maps.append(dense_map([level], embeddings[: len(level)], width, height, cols, rows))
+        embeddings = embeddings[len(level) :]
+    return torch.stack(maps), [level.size / width for level in levels]
+
+
+def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int]]:
+    """Levels, embeddings ``[n, D]`` float32, and width and height of the image, checked against each other."""
     tensors, facts = _read(path)
     try:
+        embeddings = tensors["embeddings"].float()
         width, height = facts["size"]
-        embeddings, maps, sides = tensors["embeddings"].float(), [], []
+        levels = []
         for i, level in enumerate(facts["levels"]):
-            crops = CropLevel(
-                level["size"], tensors[f"lefts.{i}"].numpy(), tensors[f"tops.{i}"].numpy(), level["grid"]
-            )
-            maps.append(dense_map([crops], embeddings[: len(crops)], width, height, cols, rows))
-            embeddings = embeddings[len(crops) :]
-            sides.append(level["size"] / width)
-        return torch.stack(maps), sides
+            lefts, tops = tensors[f"lefts.{i}"], tensors[f"tops.{i}"]
+            if {lefts.dtype, tops.dtype} != {torch.int32} or lefts.ndim != 1 or tops.ndim != 1:
+                raise ValueError("places of crops that are none")
+            levels.append(CropLevel(level["size"], lefts.numpy(), tops.numpy(), level["grid"]))
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
+    sides = [width, height, *(level.size for level in levels)]
+    whole = all(type(side) is int and 1 <= side <= 1 << 16 for side in sides)
+    grids = all(
+        type(level.grid) is bool and (level.grid or len(level.lefts) == len(level.tops)) for level in levels
+    )
+    if not whole or not grids or embeddings.ndim != 2 or len(embeddings) != sum(map(len, levels)):
+        raise _damaged(path, ValueError("crops and embeddings that do not fit"))
+    if len(embeddings) == 0 or not bool(torch.isfinite(embeddings).all()):
+        raise _damaged(path, ValueError("no embeddings, or some that are not finite"))
+    return levels, embeddings, (width, height)
 
 
 def write_grid(path: Path, features: Tensor) -> None:
@@ -177,9 +185,10 @@ def read_grid(path: Path, cols: int, rows: int) -> Tensor:
         FileFormatError: If the file is not such a store.
     """
     tensors, _ = _read(path)
-    if "features" not in tensors or tensors["features"].ndim != 3:
-        raise _damaged(path, KeyError("features"))
-    return resize_grid(tensors["features"].float(), cols, rows)
+    features = tensors.get("features", torch.zeros(0)).float()
+    if features.ndim != 3 or features.numel() == 0 or not bool(torch.isfinite(features).all()):
+        raise _damaged(path, ValueError("no features, or some that are not finite"))
+    return resize_grid(features, cols, rows)
 
 
 def resize_grid(features: Tensor, cols: int, rows: int) -> Tensor:
@@ -203,27 +212,24 @@ def is_stored(path: Path) -> bool:
 
 
 def _write(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    from safetensors.torch import save_file
-
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, {"format_version": FORMAT_VERSION, "facts": json.dumps(facts)})
+    write_tensors(path, tensors, {"format_version": FORMAT_VERSION, "facts": json.dumps(facts)})
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    from safetensors import SafetensorError, safe_open
-
     try:
-        with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {})["facts"])
-            return {name: file.get_tensor(name) for name in file.keys()}, facts  # noqa: SIM118 (not a dict)
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        tensors, metadata = read_tensors(path)
+        facts = json.loads(metadata["facts"])
+    except (FileFormatError, KeyError, ValueError, RecursionError) as error:
         raise _damaged(path, error) from error
+    if not isinstance(facts, dict):
+        raise _damaged(path, TypeError("facts"))
+    return tensors, facts
 
 
 def _damaged(path: Path, error: Exception) -> FileFormatError:
     return FileFormatError(
         path,
         expected="cached features",
-        found=f"{type(error).__name__} {error}",
+        found=f"{type(error).__name__} {error}"[:200],
         remedy="delete the file and run again",
     )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lexsplat.errors import FileFormatError
 from lexsplat.features.cache import FeatureMap, FeatureMaps
+from lexsplat.tensor_files import PICKLES, refuse_pickle
 
 if TYPE_CHECKING:
     from lexsplat.scenes import Scene
@@ -63,6 +64,9 @@ def _source(folder: Path, stem: str) -> Path:
     for path in candidates:
         if path.is_file():
             return path
+    for ending in PICKLES:
+        if (folder / f"{stem}{ending}").exists():
+            refuse_pickle(folder / f"{stem}{ending}")
     raise FileFormatError(
         folder,
         expected=f"{stem}.npy, {stem}.safetensors or {stem}_f.npy with {stem}_s.npy",
@@ -79,8 +83,11 @@ def _read_arrays(path: Path) -> FeatureMap:
 
     try:
         tensors = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise FileFormatError(path, expected="safetensors", found=str(error)) from error
+    except (OSError, SafetensorError, ValueError, RuntimeError) as error:
+        raise FileFormatError(path, expected="safetensors", found=str(error)[:200]) from error
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            raise FileFormatError(path, expected=f"{name} as floating-point numbers", found=str(tensor.dtype))
     dino = tensors.pop("dino", None)
     if len(tensors) != 1 and "clip" not in tensors:
         raise FileFormatError(path, expected='a tensor "clip"', found=", ".join(sorted(tensors)) or "none")
@@ -102,6 +109,12 @@ def _read_segments(path: Path) -> FeatureMap:
         raise FileFormatError(path, expected="[n, D]", found=str(list(features.shape)))
     if segments.ndim not in (2, 3):
         raise FileFormatError(pixels, expected="[h, w] or [L, h, w]", found=str(list(segments.shape)))
+    if (
+        0 in segments.shape
+        or not np.isfinite(segments).all()
+        or np.abs(segments.astype(np.float64)).max() > 2**31
+    ):
+        raise FileFormatError(pixels, expected="segment numbers", found="none, or numbers that are none")
     index = segments.astype(np.int64)
     if index.min() < -1 or index.max() >= len(features) or (index != segments).any():
         raise FileFormatError(
@@ -110,7 +123,7 @@ def _read_segments(path: Path) -> FeatureMap:
             found=f"{segments.min():g} to {segments.max():g}",
         )
     index = index.reshape(-1, *index.shape[-2:])
-    unit = F.normalize(torch.from_numpy(features.astype(np.float32)), dim=-1).numpy()
+    unit = _unit(features[None], path)[0].numpy()
     padded = np.concatenate([unit, np.zeros((1, unit.shape[1]), np.float32)])  # -1 picks the zero at the end
     total = np.zeros((*index.shape[1:], unit.shape[1]), np.float32)
     for level in index:
@@ -135,6 +148,8 @@ def _read_npy(path: Path) -> NDArray:
 def _unit(array: NDArray, path: Path) -> torch.Tensor:
     if array.ndim != 3 or 0 in array.shape:
         raise FileFormatError(path, expected="features [h, w, D]", found=str(list(array.shape)))
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, which is refused below
+        array = array.astype(np.float32)
     values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
     if not bool(torch.isfinite(values).all()):
         raise FileFormatError(path, expected="finite numbers", found="NaN or infinity")

@@ -9,8 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lexsplat.atomic import atomic_path
+from lexsplat.errors import FileFormatError
 from lexsplat.features.encoders import ImageTextEncoder
+from lexsplat.tensor_files import read_tensors, write_tensors
 
 
 class TextCache:
@@ -55,24 +56,22 @@ class TextCache:
         return self._folder / f"text-{content_hash}.safetensors"
 
     def _read(self, content_hash: str) -> dict[str, Tensor]:
-        from safetensors import SafetensorError, safe_open
-
         if content_hash not in self._known:
             found: dict[str, Tensor] = {}
             try:
-                with safe_open(self._path(content_hash), framework="pt") as file:
-                    prompts = file.metadata() or {}
-                    found = {prompts[key]: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-            except (OSError, SafetensorError, KeyError):
+                tensors, prompts = read_tensors(self._path(content_hash))
+                found = {prompts[key]: vector for key, vector in tensors.items()}
+            except (FileFormatError, KeyError):
                 pass  # a cache that cannot be read is an empty one
-            self._known[content_hash] = found
+            sound = all(
+                v.ndim == 1 and v.dtype == torch.float32 and v.isfinite().all() for v in found.values()
+            )
+            alike = len({len(vector) for vector in found.values()}) <= 1 if sound else False
+            self._known[content_hash] = found if alike else {}
         return self._known[content_hash]
 
     def _write(self, content_hash: str, known: dict[str, Tensor]) -> None:
-        from safetensors.torch import save_file
-
         # Prompts may hold any character, and "__metadata__" is no name for a tensor: names are hashes of
         # prompts.
         keys = {hashlib.blake2b(prompt.encode(), digest_size=16).hexdigest(): prompt for prompt in known}
-        with atomic_path(self._path(content_hash)) as temporary:
-            save_file({key: known[prompt].clone() for key, prompt in keys.items()}, temporary, keys)
+        write_tensors(self._path(content_hash), {key: known[prompt] for key, prompt in keys.items()}, keys)

@@ -175,9 +175,7 @@ def _gaussians_from_table(
     )
     if certain_opacities:
         gaussians.opacity_logits.clamp_(-20.0, 20.0)  # keeps NaN, which the check below finds
-    for name, tensor in gaussians.tensors().items():
-        if not torch.isfinite(tensor).all():
-            raise FileFormatError(
-                path, expected="finite numbers", found=f"NaN or Inf in {name}", remedy="make it again"
-            )
+    damage = gaussians.damage()
+    if damage:
+        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="make it again")
     return gaussians

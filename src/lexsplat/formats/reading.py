@@ -9,6 +9,7 @@ from lexsplat.formats.compressed import COMPRESSED, read_compressed
 from lexsplat.formats.ply import read_ply
 from lexsplat.formats.splat import read_splat
 from lexsplat.gaussians import Gaussians
+from lexsplat.tensor_files import refuse_pickle
 
 
 def read_splats(path: Path) -> Gaussians:
@@ -18,6 +19,7 @@ def read_splats(path: Path) -> Gaussians:
         FileFormatError: If the ending is none of these or the content is not what it promises.
         BackendError: If the format needs a library that is not installed.
     """
+    refuse_pickle(path)
     name = path.name.lower()
     for ending, kind in COMPRESSED.items():
         if name.endswith(ending):

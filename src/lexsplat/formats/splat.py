@@ -59,7 +59,7 @@ def read_splat(path: Path) -> Gaussians:
     rgba = torch.from_numpy(table["rgba"].astype(np.float32)) / 255
     quats = (torch.from_numpy(table["quat"].astype(np.float32)) - 128) / 128
     quats[quats.norm(dim=1) < 1e-3] = torch.tensor([1.0, 0, 0, 0])
-    return Gaussians(
+    gaussians = Gaussians(
         means=means,
         quats=quats,
         log_scales=scales.clamp_min(1e-12).log(),
@@ -67,3 +67,7 @@ def read_splat(path: Path) -> Gaussians:
         sh0=((rgba[:, :3] - 0.5) / SH_C0)[:, None, :],
         shN=torch.zeros(len(table), 0, 3),
     )
+    damage = gaussians.damage()
+    if damage:
+        raise FileFormatError(path, expected="positions and sizes of a scene", found=damage)
+    return gaussians
