@@ -30,6 +30,7 @@ from lexsplat.losses import (
     total_loss,
     uncertainty_loss,
 )
+from lexsplat.optimizers import check_moments
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.rendering import PreparedView, prepare
 
@@ -323,11 +324,15 @@ class EmbeddingTrainer:
             self.field.load_state_dict(own)
             self.generator.set_state(state["generator"].cpu())
             self.iteration = int(state["iteration"])
-        except (KeyError, RuntimeError) as error:
+            if self.iteration < 0:
+                raise ValueError(f"iteration {self.iteration}")
+        except (KeyError, RuntimeError, TypeError) as error:
             raise ValueError(f"the training state does not fit: {error}") from error
+        self.optimizer.state.clear()
         for name, parameter in self.field.named_parameters():
             prefix = f"optimizer.{name}."
             moments = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+            check_moments(moments, parameter)
             if moments:
                 self.optimizer.state[parameter] = {key: value.clone() for key, value in moments.items()}
 
