@@ -217,7 +217,7 @@ def test_assign_in_blocks_equals_assign_at_once(monkeypatch: pytest.MonkeyPatch)
     maps, _ = clustered_maps(1, views=1)
     book = Codebook(unit(torch.randn(9, 16)), unit(torch.randn(9, 10)))
     whole = book.assign(maps["v0"])
-    monkeypatch.setattr("lexsplat.codebook.BLOCK_ROWS", 7)
+    monkeypatch.setattr("lexsplat.codebook.space.BLOCK_ROWS", 7)
     np.testing.assert_array_equal(book.assign(maps["v0"]), whole)
 
 
@@ -287,6 +287,20 @@ def test_fit_is_the_same_for_the_same_seed_and_ignores_global_randomness() -> No
     second = fit_codebook(maps, ["v0", "v1"], config, seed=3)
     assert torch.equal(first.clip, second.clip)
     assert torch.equal(first.dino, second.dino)
+
+
+def test_fit_and_assignment_are_the_same_to_the_last_bit_on_any_number_of_threads() -> None:
+    # Batches so large that torch would spread them over its threads.
+    generator = torch.Generator().manual_seed(8)
+    maps = {f"v{i}": Map(*(torch.randn(40, 50, width, generator=generator) for width in (96, 64))) for i in "ab"}
+    config = CodebookConfig(num_codes=32, steps=8, kmeans_iterations=3, batch_size=2048)
+    found = []
+    for threads in (1, 2, 3, 2):
+        torch.set_num_threads(threads)
+        book = fit_codebook(maps, sorted(maps), config, seed=0)
+        assert torch.get_num_threads() == threads, "the setting is put back"
+        found.append([book.clip, book.dino, *map(torch.from_numpy, assign_code_maps(maps, book).values())])
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other))
 
 
 def test_the_sample_is_bounded_and_spread_over_the_views() -> None:

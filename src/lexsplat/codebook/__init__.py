@@ -1,0 +1,33 @@
+"""Quantization of language features: Eq. 2 to 7 of the paper and its supplement A.
+
+A scene holds few meanings, so its hybrid features F = F_CLIP (+) F_DINO (Eq. 2) are replaced by the nearest
+of K codes (the paper calls this number N). The codebook is fitted first and every view is assigned
+afterwards, in one pass with the finished codes. Held-out views take no part in the fit.
+
+Equations 1 to 15 are counted through the main text of the paper; supplement A describes the load-balancing
+loss.
+"""
+
+from lexsplat.codebook.assignment import CodeUsage, assign_code_maps, code_usage
+from lexsplat.codebook.fitting import fit_codebook, mean_cosine, sample_features, spherical_kmeans
+from lexsplat.codebook.losses import cosine_loss, load_balancing_loss, quantization_loss
+from lexsplat.codebook.settings import MAX_CODES, CodebookConfig
+from lexsplat.codebook.space import Codebook, quantize, similarity
+
+__all__ = [
+    "MAX_CODES",
+    "CodeUsage",
+    "Codebook",
+    "CodebookConfig",
+    "assign_code_maps",
+    "code_usage",
+    "cosine_loss",
+    "fit_codebook",
+    "load_balancing_loss",
+    "mean_cosine",
+    "quantization_loss",
+    "quantize",
+    "sample_features",
+    "similarity",
+    "spherical_kmeans",
+]

@@ -1,0 +1,59 @@
+"""Index maps of views, and how they use the codes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.codebook.settings import MAX_CODES
+from lexsplat.codebook.space import Codebook
+from lexsplat.progress import Event, Listener, silent
+
+if TYPE_CHECKING:
+    from lexsplat.features import FeatureMap
+
+
+def assign_code_maps(
+    feature_maps: Mapping[str, FeatureMap],
+    codebook: Codebook,
+    names: Iterable[str] | None = None,
+    *,
+    listener: Listener = silent,
+) -> dict[str, NDArray[np.uint8]]:
+    """The one assignment pass: an index map ``[h, w]`` uint8 for every named view (default: all)."""
+    chosen = list(feature_maps if names is None else names)
+    code_maps = {}
+    for done, name in enumerate(chosen, start=1):
+        code_maps[name] = codebook.assign(feature_maps[name])
+        listener(Event("assign", done, len(chosen)))
+    return code_maps
+
+
+@dataclass(frozen=True)
+class CodeUsage:
+    """How the codes are used by index maps.
+
+    Args:
+        counts: Cells per code ``[K]``.
+        used: Codes with at least one cell.
+        perplexity: exp of the entropy of the counts, 1 to K: how many codes would be as informative if used
+            alike.
+    """
+
+    counts: NDArray[np.int64]
+    used: int
+    perplexity: float
+
+
+def code_usage(code_maps: Iterable[NDArray[np.uint8]], num_codes: int) -> CodeUsage:
+    """Utilisation of the codes over index maps ``[h, w]``; indices from K on (ignored cells) do not count."""
+    counts = np.zeros(num_codes, dtype=np.int64)
+    for code_map in code_maps:
+        counts += np.bincount(np.asarray(code_map).ravel(), minlength=MAX_CODES)[:num_codes]
+    share = counts[counts > 0] / max(counts.sum(), 1)
+    perplexity = float(np.exp(-(share * np.log(share)).sum())) if len(share) else 0.0
+    return CodeUsage(counts, int((counts > 0).sum()), perplexity)

@@ -1,0 +1,236 @@
+"""Fitting the codes: a bounded sample of features, k-means for a start, then gradient steps on Eq. 7.
+
+The fit runs on one thread, and no gradient is gathered by several at once: the same seed gives the same codes to the
+last bit, however busy the machine is and however many cores it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lexsplat.codebook.losses import quantization_loss
+from lexsplat.codebook.settings import CodebookConfig
+from lexsplat.codebook.space import BLOCK_ROWS, Codebook
+from lexsplat.errors import TrainingError
+from lexsplat.progress import Event, Listener, silent
+from lexsplat.threads import one_thread
+
+if TYPE_CHECKING:
+    from lexsplat.features import FeatureMap
+
+
+@one_thread()
+def fit_codebook(
+    feature_maps: Mapping[str, FeatureMap],
+    names: Sequence[str],
+    config: CodebookConfig,
+    *,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    listener: Listener = silent,
+) -> Codebook:
+    """Fit the discrete feature space S by Eq. 7 to a bounded sample of the named views.
+
+    The codes come back with halves of unit length: only their directions enter Eq. 4 and 5.
+
+    Args:
+        feature_maps: Dense features by view name; only `names` are read, one at a time.
+        names: Training views.
+        config: Settings.
+        seed: Of the sample, the start and the batches.
+        device: Where the fit runs and the codebook lies.
+        listener: Hears of stage "codebook", with the mean CLIP cosine between features and codes at the end.
+
+    Raises:
+        ValueError: If `names` is empty, or a feature is not finite.
+        TrainingError: If the loss stops being finite.
+    """
+    if not names:
+        raise ValueError("a codebook needs at least one training view")
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    clip, dino = sample_features(feature_maps, names, config, generator=generator)
+    clip, dino = clip.to(device), None if dino is None else dino.to(device)
+    lambda_dino = config.lambda_dino
+    total = config.steps + 1
+    if config.init == "kmeans":
+        code_clip, code_dino = spherical_kmeans(
+            clip,
+            dino,
+            config.num_codes,
+            lambda_dino,
+            iterations=config.kmeans_iterations,
+            generator=generator,
+        )
+    else:
+        code_clip = _uniform_codes(clip, config.num_codes, generator)
+        code_dino = None if dino is None else _uniform_codes(dino, config.num_codes, generator)
+    listener(Event("codebook", 1, total))
+    code_clip, code_dino = _refine(clip, dino, code_clip, code_dino, config, generator, listener)
+    codebook = Codebook(
+        functional.normalize(code_clip, dim=-1),
+        None if code_dino is None else functional.normalize(code_dino, dim=-1),
+        lambda_dino,
+    )
+    listener(Event("codebook", total, total, {"cosine": mean_cosine(codebook, clip, dino)}))
+    return codebook
+
+
+@torch.no_grad()
+def mean_cosine(codebook: Codebook, clip: Tensor, dino: Tensor | None) -> float:
+    """Mean CLIP cosine between features ``[M, Dc]`` and the codes they are assigned to."""
+    kept = 0.0
+    for start in range(0, len(clip), BLOCK_ROWS):
+        rows = slice(start, start + BLOCK_ROWS)
+        chosen = codebook.similarity(clip[rows], None if dino is None else dino[rows]).argmax(-1)
+        kept += float(functional.cosine_similarity(clip[rows], codebook.clip[chosen], dim=-1).sum())
+    return kept / len(clip)
+
+
+def sample_features(
+    feature_maps: Mapping[str, FeatureMap],
+    names: Sequence[str],
+    config: CodebookConfig,
+    *,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor | None]:
+    """At most ``config.sample_size`` unit features of the named views, as many from each.
+
+    Returns:
+        CLIP parts ``[M, Dc]`` and DINO parts ``[M, Dd]``, or None without DINO. All-zero features are left
+        out.
+
+    Raises:
+        ValueError: If a feature is not finite, or none is left.
+    """
+    quota = -(-config.sample_size // len(names))
+    clips, dinos = [], []
+    for name in names:
+        feature_map = feature_maps[name]
+        clip = torch.as_tensor(feature_map.clip).flatten(0, 1)
+        rows = torch.randperm(len(clip), generator=generator)[:quota]
+        clips.append(clip[rows].float())
+        if config.use_dino and feature_map.dino is not None:
+            dinos.append(torch.as_tensor(feature_map.dino).flatten(0, 1)[rows].float())
+        if not all(bool(torch.isfinite(part[-1]).all()) for part in (clips, dinos) if part):
+            raise ValueError(f"features of {name} have a number that is not finite")
+    if dinos and len(dinos) != len(clips):
+        raise ValueError("some views have DINO features and some have none")
+    clip = torch.cat(clips)
+    dino = torch.cat(dinos) if dinos else None
+    keep = (clip.norm(dim=-1) > 0).nonzero()[:, 0]
+    if len(keep) == 0:
+        raise ValueError("the training views have no features that are not zero")
+    if len(keep) > config.sample_size:
+        keep = keep[torch.randperm(len(keep), generator=generator)[: config.sample_size]]
+    clip = functional.normalize(clip[keep], dim=-1)
+    return clip, None if dino is None else functional.normalize(dino[keep], dim=-1)
+
+
+@torch.no_grad()
+def spherical_kmeans(
+    clip: Tensor,
+    dino: Tensor | None,
+    num_codes: int,
+    lambda_dino: float,
+    *,
+    iterations: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor | None]:
+    """k-means for the similarity of Eq. 4, with k-means++ seeds.
+
+    The normalised sum of a cluster's unit vectors, half by half, minimises Eq. 5 for a given assignment, so
+    every iteration lowers L_cos. A cluster left without features restarts at the feature that is served
+    worst.
+
+    Returns:
+        Codes ``[K, Dc]`` and ``[K, Dd]`` (or None), unit length.
+    """
+    joint = clip if dino is None else torch.cat([clip, lambda_dino**0.5 * dino], dim=-1)
+    split = clip.shape[1]
+    centres = joint[_kmeans_seeds(joint, num_codes, generator)]
+    for _ in range(iterations):
+        best, chosen = _nearest(joint, centres)
+        sums = torch.zeros_like(centres).index_add_(0, chosen, joint)
+        counts = torch.bincount(chosen, minlength=num_codes)
+        empty = (counts == 0).nonzero()[:, 0]
+        if len(empty):
+            worst = best.argsort()[: len(empty)]
+            sums[empty[: len(worst)]] = joint[worst]
+        halves = [functional.normalize(sums[:, :split], dim=-1)]
+        if dino is not None:
+            halves.append(lambda_dino**0.5 * functional.normalize(sums[:, split:], dim=-1))
+        updated = torch.cat(halves, dim=-1)
+        if torch.equal(updated, centres):
+            break
+        centres = updated
+    code_dino = None if dino is None else functional.normalize(centres[:, split:], dim=-1)
+    return functional.normalize(centres[:, :split], dim=-1), code_dino
+
+
+def _uniform_codes(features: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
+    """The authors' start, uniform(-1/K, 1/K), on the device of the features."""
+    unit = torch.rand(num_codes, features.shape[1], generator=generator) * 2 - 1
+    return (unit / num_codes).to(features.device)
+
+
+def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
+    """k-means++: the next seed is drawn in proportion to the squared distance from the seeds so far."""
+    count = len(joint)
+    seeds = [int(torch.randint(count, (1,), generator=generator))]
+    norms = joint.square().sum(-1)
+    nearest = torch.full((count,), torch.inf, device=joint.device)
+    for _ in range(1, num_codes):
+        seed = joint[seeds[-1]]
+        squared = (norms + seed.square().sum() - 2 * (joint @ seed)).clamp_min(0)
+        nearest = torch.minimum(nearest, squared)
+        cumulative = nearest.double().cumsum(0)
+        draw = torch.rand(1, generator=generator, dtype=torch.float64).to(joint.device) * cumulative[-1]
+        seeds.append(min(int(torch.searchsorted(cumulative, draw, right=True)), count - 1))
+    return torch.tensor(seeds, device=joint.device)
+
+
+def _nearest(joint: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """Best similarity and its index for every row, in blocks."""
+    parts = [(joint[i : i + BLOCK_ROWS] @ centres.T).max(-1) for i in range(0, len(joint), BLOCK_ROWS)]
+    return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
+
+
+def _refine(
+    clip: Tensor,
+    dino: Tensor | None,
+    code_clip: Tensor,
+    code_dino: Tensor | None,
+    config: CodebookConfig,
+    generator: torch.Generator,
+    listener: Listener,
+) -> tuple[Tensor, Tensor | None]:
+    """Gradient steps on Eq. 7 over batches of the sample."""
+    parameters = [
+        part.detach().clone().requires_grad_() for part in (code_clip, code_dino) if part is not None
+    ]
+    optimizer = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+    for step in range(config.steps):
+        rows = torch.randint(len(clip), (min(config.batch_size, len(clip)),), generator=generator)
+        rows = rows.to(clip.device)
+        codes_dino = parameters[1] if dino is not None else None
+        loss = quantization_loss(
+            clip[rows], None if dino is None else dino[rows], parameters[0], codes_dino, config
+        )
+        if not bool(torch.isfinite(loss)):
+            raise TrainingError(
+                "codebook",
+                expected="a finite loss",
+                found=f"{float(loss)} at step {step}",
+                remedy="lower learning_rate",
+            )
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        if (step + 1) % 50 == 0:
+            listener(Event("codebook", step + 1, config.steps + 1, {"loss": float(loss.detach())}))
+    return parameters[0].detach(), parameters[1].detach() if dino is not None else None

@@ -1,0 +1,70 @@
+"""What a good codebook is: Eq. 5 to 7 and supplement A."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lexsplat.codebook.settings import CodebookConfig
+from lexsplat.codebook.space import similarity
+
+
+def cosine_loss(
+    clip: Tensor,
+    dino: Tensor | None,
+    quantized_clip: Tensor,
+    quantized_dino: Tensor | None,
+    lambda_dino: float,
+) -> Tensor:
+    """Eq. 5: (1 - cos CLIP) + lambda_DINO (1 - cos DINO), averaged over the M features.
+
+    Args:
+        clip: ``[M, Dc]``.
+        dino: ``[M, Dd]`` or None.
+        quantized_clip: Their codes by Eq. 3 ``[M, Dc]``.
+        quantized_dino: ``[M, Dd]`` or None to leave the second term out.
+        lambda_dino: Weight of the second term.
+    """
+    loss = 1 - functional.cosine_similarity(clip, quantized_clip, dim=-1)
+    if quantized_dino is not None:
+        if dino is None:
+            raise ValueError("quantized DINO features without DINO features")
+        loss = loss + lambda_dino * (1 - functional.cosine_similarity(dino, quantized_dino, dim=-1))
+    return loss.mean()
+
+
+def load_balancing_loss(similarities: Tensor, temperature: float = 1.0) -> Tensor:
+    """Eq. 6 and supplement A: sum_N r * p.
+
+    r is the share of features whose best code is i (a count, without gradient), p the mean softmax
+    probability of code i. The minimum 1 / K is reached where all codes are used alike.
+
+    Args:
+        similarities: D(F_i, S) of a batch ``[M, K]``.
+        temperature: The similarities are divided by it before the softmax; the paper has 1.
+    """
+    num_codes = similarities.shape[-1]
+    chosen = similarities.argmax(-1)
+    used = torch.bincount(chosen, minlength=num_codes).to(similarities.dtype) / len(chosen)
+    probability = (similarities / temperature).softmax(-1).mean(0)
+    return (used * probability).sum()
+
+
+def quantization_loss(
+    clip: Tensor, dino: Tensor | None, code_clip: Tensor, code_dino: Tensor | None, config: CodebookConfig
+) -> Tensor:
+    """Eq. 7: lambda_cos L_cos + lambda_lb L_lb for a batch of features.
+
+    The index m is the argmax of Eq. 4 and has no gradient; the gradient reaches the codes through Eq. 3 and
+    the softmax. Eq. 5 of the chosen codes (`cosine_loss`) is 1 + lambda_DINO less the similarity that chose them, so
+    no row of the codebook is gathered: the gradient of a gather is a sum over the features of a code, which torch's
+    threads add up in the order in which they happen to run.
+    """
+    scores = similarity(clip, dino, code_clip, code_dino, config.lambda_dino)
+    chosen = scores.detach().argmax(-1, keepdim=True)
+    ceiling = 1 + (0 if code_dino is None else config.lambda_dino)
+    loss = config.lambda_cos * (ceiling - scores.gather(1, chosen)).mean()
+    if config.load_balancing:
+        loss = loss + config.lambda_lb * load_balancing_loss(scores, config.temperature)
+    return loss

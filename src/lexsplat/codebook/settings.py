@@ -1,0 +1,68 @@
+"""Settings of the quantization."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+MAX_CODES = 256
+"""An index map holds one byte a pixel."""
+
+
+@dataclass(frozen=True)
+class CodebookConfig:
+    """Settings of the quantization.
+
+    Args:
+        num_codes: Size K of the discrete feature space, 1 to 256. The paper uses 128 (bonsai 64, kitchen 32).
+        lambda_dino: Weight of the DINO cosine in Eq. 4 and 5.
+        lambda_cos: Weight of the cosine loss in Eq. 7.
+        lambda_lb: Weight of the load-balancing loss in Eq. 7 (the authors' code has 1).
+        use_dino: Off is the paper's ablation "w/o DINO".
+        load_balancing: Off is the paper's ablation "w/o L_lb".
+        temperature: Of the softmax in supplement A; the paper has 1.
+        init: "kmeans" starts from spherical k-means, "uniform" from uniform(-1/K, 1/K) as the authors' code
+            does.
+        kmeans_iterations: Lloyd iterations of the k-means start.
+        steps: Gradient steps on Eq. 7 after the start.
+        learning_rate: Of AdamW in these steps.
+        weight_decay: Of AdamW in these steps.
+        batch_size: Feature vectors per gradient step.
+        sample_size: At most so many feature vectors are looked at, spread evenly over the training views.
+    """
+
+    num_codes: int = 128
+    lambda_dino: float = 0.5
+    lambda_cos: float = 1.0
+    lambda_lb: float = 0.5
+    use_dino: bool = True
+    load_balancing: bool = True
+    temperature: float = 1.0
+    init: Literal["kmeans", "uniform"] = "kmeans"
+    kmeans_iterations: int = 20
+    steps: int = 100
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+    batch_size: int = 4096
+    sample_size: int = 50_000
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.num_codes <= MAX_CODES:
+            raise ValueError(
+                f"num_codes must be 1 to {MAX_CODES} because an index map holds one byte a pixel, "
+                f"got {self.num_codes}"
+            )
+        if self.init not in ("kmeans", "uniform"):
+            raise ValueError(f'init must be "kmeans" or "uniform", got {self.init!r}')
+        if self.temperature <= 0:
+            raise ValueError(f"temperature must be positive, got {self.temperature:g}")
+        if self.sample_size < 1 or self.batch_size < 1 or self.steps < 0 or self.kmeans_iterations < 0:
+            raise ValueError(
+                "sample_size and batch_size must be positive, steps and kmeans_iterations not negative"
+            )
+
+    def as_in_paper(self) -> CodebookConfig:
+        """The same weights with the fit of the paper: gradient steps on Eq. 7 from a random start."""
+        return replace(
+            self, init="uniform", steps=2000, learning_rate=1e-4, weight_decay=0.01, batch_size=16_384
+        )
