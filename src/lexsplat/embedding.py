@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lexsplat.cameras import Camera
-from lexsplat.codebook import Codebook
+from lexsplat.codebook import MAX_CODES, Codebook
 from lexsplat.errors import TrainingError
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import TrainedField
@@ -36,6 +36,9 @@ from lexsplat.rendering import PreparedView, prepare
 
 if TYPE_CHECKING:
     from lexsplat.checkpoints import Checkpoint
+
+MASKED_CODE = MAX_CODES
+"""Index of a pixel that takes no part in any loss: above those of every codebook."""
 
 REPORT_EVERY = 25
 """Steps between two events, which is also how often the loss is checked."""
@@ -204,7 +207,8 @@ class EmbeddingTrainer:
 
         Args:
             camera: The view, at the resolution to render.
-            code_map: Its index map ``[h, w]``; cells with an index of K or above are ignored.
+            code_map: Its index map ``[h, w]``; cells with an index of K or above teach no code, and those with
+                `MASKED_CODE` nothing at all.
             prepared: Its projection, when the geometry has not changed since.
 
         Returns:
@@ -240,9 +244,18 @@ class EmbeddingTrainer:
             cross_entropy = cross_entropy_loss(logits, codes)
             return {"cross_entropy": cross_entropy, "semantic": config.lambda_ce * cross_entropy}
         cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten()[pixels])
-        regulariser = uncertainty_loss(uncertainty, config.uncertainty_form)
+        regulariser = uncertainty_loss(self._not_masked(uncertainty, code_map), config.uncertainty_form)
         semantic = semantic_loss(cross_entropy, regulariser, config.lambda_ce, config.lambda_u)
         return {"cross_entropy": cross_entropy, "uncertainty": regulariser, "semantic": semantic}
+
+    def _not_masked(self, uncertainty: Tensor, code_map: Any) -> Tensor:
+        """Those of rendered values ``[H, W]`` whose pixels are not masked; all as they are where none is."""
+        codes = torch.as_tensor(code_map).cpu()
+        if int(codes.max()) < MASKED_CODE:
+            return uncertainty
+        height, width = uncertainty.shape
+        codes = codes_at_pixels(codes, height, width, torch.arange(height * width))
+        return uncertainty.flatten()[(codes != MASKED_CODE).to(uncertainty.device)]
 
     def _sample_pixels(self, height: int, width: int, code_map: Any) -> tuple[Tensor, Tensor]:
         """Flat pixel indices and their codes, without ignored cells."""

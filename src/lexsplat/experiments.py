@@ -26,6 +26,7 @@ from lexsplat.evaluation.methods import Method
 from lexsplat.features import FeatureMaps, TextCache, load_level_maps
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
+from lexsplat.masking import MaskedCodeMaps
 from lexsplat.pipeline import build, feature_maps, machine_facts
 from lexsplat.progress import Listener, silent
 from lexsplat.scene_folder import SceneFolder, fingerprint, read_json, write_json
@@ -142,18 +143,19 @@ class Bench:
             try:
                 tensors, facts = read_tensors(path)
                 maps = {name: tensors.pop(f"codes/{name}").numpy() for name in names}
+                maps = dict(MaskedCodeMaps(maps, self.scene.views))
                 return Codebook.from_tensors(tensors).to(self.device), maps, float(facts["seconds"])
             except (FileFormatError, KeyError, ValueError) as error:
                 log.warning("%s is damaged and made anew (%s)", path, error)
         start = time.perf_counter()
         codebook = fit_codebook(self.maps, names, settings, seed=seed, listener=self.listener)
-        code_maps = assign_code_maps(self.maps, codebook, names, listener=self.listener)
+        assigned = assign_code_maps(self.maps, codebook, names, listener=self.listener)
         seconds = time.perf_counter() - start
         import torch
 
-        stored = {f"codes/{name}": torch.from_numpy(codes) for name, codes in code_maps.items()}
+        stored = {f"codes/{name}": torch.from_numpy(codes) for name, codes in assigned.items()}
         write_tensors(path, {**codebook.tensors(), **stored}, {"seconds": f"{seconds:.3f}"})
-        return codebook.to(self.device), code_maps, seconds
+        return codebook.to(self.device), dict(MaskedCodeMaps(assigned, self.scene.views)), seconds
 
     def _stage(self, name: str) -> str:
         return str(self.folder.record["stages"][name]["fingerprint"])

@@ -32,6 +32,7 @@ from lexsplat.gaussians import Gaussians
 from lexsplat.joint import JointTrainer
 from lexsplat.language_field import LanguageField
 from lexsplat.lifting import lift, tune
+from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.reconstruction import Reconstructor, reconstruct
 from lexsplat.rendering import render
@@ -182,7 +183,7 @@ class _Builder:
             scene, config.reconstruction, points, device=self.device, seed=config.seed
         )
         cameras = {name: scene.views[name].camera for name in scene.train_names}
-        code_maps = {name: self.folder.read_code_map(name) for name in cameras}
+        code_maps = MaskedCodeMaps({name: self.folder.read_code_map(name) for name in cameras}, scene.views)
         codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
         trainer = JointTrainer(
             reconstructor, cameras, code_maps, codebook, config.embedding, seed=config.seed
@@ -226,7 +227,8 @@ class _Builder:
         )
         code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
         for name, code_map in code_maps.items():
-            self.folder.write_code_map(name, code_map)
+            code_maps[name] = mark_masked_cells(code_map, self.scene.views[name], codebook.num_codes)
+            self.folder.write_code_map(name, code_maps[name])
         write_tensors(self.folder.codebook_path, codebook.tensors(), {})
         usage = code_usage(code_maps.values(), codebook.num_codes)
         return {
@@ -238,7 +240,9 @@ class _Builder:
     def _embed(self) -> dict[str, Any]:
         gaussians = self.folder.read_gaussians().to(self.device)
         cameras = {name: self.scene.views[name].camera for name in self.scene.train_names}
-        code_maps = {name: self.folder.read_code_map(name) for name in cameras}
+        code_maps = MaskedCodeMaps(
+            {name: self.folder.read_code_map(name) for name in cameras}, self.scene.views
+        )
         codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
         field = make_field(
             gaussians, cameras, code_maps, codebook, self.config, self.listener, self.checkpoint
@@ -276,6 +280,9 @@ class _Builder:
             for name, view in self.scene.views.items()
         }
         sources = {name: _file_hash(view.image_path) for name, view in self.scene.views.items()}
+        masks = {
+            n: _file_hash(v.ignore_path) for n, v in self.scene.views.items() if v.ignore_path is not None
+        }
         self.folder.write_cameras(views)
         if "images" not in self.folder.record:
             self.folder.record["capture"] = str(Path(self.scene.root).resolve())
@@ -289,7 +296,7 @@ class _Builder:
         self.folder.record["warnings"] = list(self.scene.warnings)
         self.folder.save()
         cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
-        return fingerprint(sources, cameras)
+        return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
 
 
 def existing_splats(path: Path | None) -> Path:
@@ -334,7 +341,7 @@ def feature_maps(
     dino = None if config.dino == "none" else load_dino(config.dino, device)
     settings = replace(config.features, memory=parse_bytes(config.memory))
     maps = extract_features(scene, clip, dino, settings, cache_dir=cache_dir, listener=listener)
-    return maps, clip.content_hash
+    return without_masked_cells(maps, scene), clip.content_hash
 
 
 def make_field(

@@ -194,9 +194,14 @@ class _Evaluation:
             perceptual, reason = load_lpips(str(self.gaussians.device))
         for done, view in enumerate(self.views, start=1):
             photo, image = view.load_image(), self._render_image(view.camera)
+            valid = view.load_valid()
+            if valid is not None:  # masked pixels are those of the photo, and are not counted below
+                image = np.where(valid[..., None], image, photo)
+            counted = 1.0 if valid is None else max(float(valid.mean()), 1e-6)
+            structure = ssim(image, photo) if min(image.shape[:2]) >= 11 else None
             scores: dict[str, float | None] = {
-                "psnr": psnr(image, photo),
-                "ssim": ssim(image, photo) if min(image.shape[:2]) >= 11 else None,
+                "psnr": psnr(image, photo) if valid is None else psnr(image[valid], photo[valid]),
+                "ssim": None if structure is None else 1 - (1 - structure) / counted,
                 "lpips": perceptual(image, photo) if perceptual else None,
             }
             self.pictures[view.name] = scores

@@ -217,9 +217,10 @@ class _Entry:
         image_size = max(1, round(width * factor)), max(1, round(height * factor))
         cells = config.map_cells / min(width, height)
         map_size = max(1, round(width * cells)), max(1, round(height * cells))
-        # The pixels follow from the file, the lens they are undistorted by, the background and the size.
+        # The pixels follow from the file, the lens they are undistorted by, the background, the size and the mask.
         lens = dataclasses.asdict(view.lens)
-        pixels = hash_of(hash_file(view.image_path), lens, list(view.background), image_size)
+        masked = [] if view.ignore_path is None else [hash_file(view.ignore_path)]
+        pixels = hash_of(hash_file(view.image_path), lens, list(view.background), image_size, *masked)
         settings = dataclasses.asdict(config)
         random_names = ("random_crops", "random_levels", "random_sizes", "seed")
         crop_names = ("crop_sizes", "crop_strides") if config.mode == "grid" else random_names

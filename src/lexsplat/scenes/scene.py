@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from lexsplat.cameras import Camera, camera_extent
 from lexsplat.errors import CaptureError
@@ -53,6 +54,9 @@ class View:
     def load_image(self, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
         """The undistorted photo ``[H, W, 3]`` in 0..1, read from disk at every call.
 
+        Masked pixels have the mean colour of the others, so that nothing depends on what was there: not the pixels
+        beside them in a smaller picture, not the window of a loss, not the crop of an encoder.
+
         Args:
             size: Width and height of the result; None takes the camera's.
 
@@ -70,6 +74,13 @@ class View:
                 found=f"{found[0]}x{found[1]}",
                 remedy="the file changed since the capture was loaded; load it again",
             )
+        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
+        if mask is not None and self._is_undistorted(mask):
+            image = undistort(image, self.lens, self.capture_size)
+            return resize_image(filled(image, mask), size)
+        if mask is not None:
+            self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
+            image = filled(image, _resize_nearest(mask, found))
         if self.lens.distorts:
             return undistort(image, self.lens, size)
         return resize_image(image, size)
@@ -102,8 +113,7 @@ class View:
         """
         height, width = mask.shape
         self._check_aspect(subject, (width, height))
-        undistorted = (width, height) == self.capture_size != (self.lens.width, self.lens.height)
-        if undistorted or not self.lens.distorts:
+        if self._is_undistorted(mask) or not self.lens.distorts:
             return mask if size is None else _resize_nearest(mask, self._checked_size(size))
         if size is None:
             full = self.capture_size
@@ -117,13 +127,36 @@ class View:
     def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
         """Which pixels take part in losses, ``[H, W]`` bool at the camera's size, or None for all.
 
+        A pixel takes part when no masked pixel of the photo has a share in it.
+
+        Raises:
+            CaptureError: As :meth:`load_mask`.
+        """
+        share = self.valid_share(size)
+        return None if share is None else share > 1 - 1e-4
+
+    def valid_share(self, size: tuple[int, int] | None = None) -> NDArray[np.float32] | None:
+        """Share of each pixel ``[H, W]`` in 0..1 that is not masked in the photo, or None where there is no mask.
+
+        Where the photo is undistorted, the reach of its interpolation counts as masked too.
+
         Raises:
             CaptureError: As :meth:`load_mask`.
         """
         if self.ignore_path is None:
             return None
+        size = self._checked_size(size)
         mask = read_mask(self.ignore_path, nonzero=True)
-        return self.place_mask(mask, self.ignore_path, self._checked_size(size))
+        self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
+        undistorted = self._is_undistorted(mask)
+        masked = ~_resize_nearest(
+            mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
+        )
+        if undistorted or not self.lens.distorts:
+            return 1.0 - resize_image(masked[..., None].astype(np.float32), size)[..., 0]
+        # Bicubic interpolation reaches two pixels far.
+        reach = binary_dilation(masked, np.ones((5, 5), bool))[..., None].astype(np.float32)
+        return 1.0 - undistort(reach, self.lens, size)[..., 0]
 
     def check_mask(self, path: Path) -> None:
         """Compare a mask's size with the photo's, from the headers alone.
@@ -132,6 +165,11 @@ class View:
             CaptureError: If the mask cannot be read or its aspect is not the photo's.
         """
         self._check_aspect(path, image_size(path))
+
+    def _is_undistorted(self, mask: NDArray[np.bool_]) -> bool:
+        """Whether a mask was drawn on the undistorted photo: it has exactly that one's size, and not the photo's."""
+        found = (mask.shape[1], mask.shape[0])
+        return found == self.capture_size != (self.lens.width, self.lens.height)
 
     def _check_aspect(self, path: Path, found: tuple[int, int]) -> None:
         expected = (self.lens.width, self.lens.height)
@@ -148,6 +186,15 @@ class View:
         if width < 1 or height < 1:
             raise ValueError(f"size must be positive, got {width}x{height}")
         return int(width), int(height)
+
+
+def filled(image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """A picture ``[H, W, C]`` with the mean of the valid pixels ``[H, W]`` in place of the others."""
+    if valid.all():
+        return image
+    kept = image[valid]
+    mean = kept.mean(0, dtype=np.float64) if len(kept) else np.zeros(image.shape[2])
+    return np.where(valid[..., None], image, mean.astype(np.float32))
 
 
 def _resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
