@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import os
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +16,10 @@ from PIL import Image
 
 from lexsplat.errors import CaptureError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+HEIC_SUFFIXES = (".heic", ".heif")
+"""Suffixes of what phones of Apple write; it takes the library pillow-heif to read it."""
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIC_SUFFIXES)
 """Suffixes taken for pictures, in the order in which they are tried where a capture names none."""
 
 
@@ -25,16 +31,19 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     they are stored (COLMAP, nerfstudio and instant-ngp ignore the tag); turning them would break the poses.
 
     Raises:
-        CaptureError: If the file is missing, is no picture, is cut off, or would unpack to an absurd size.
+        CaptureError: If the file is missing, is no picture, is cut off, would unpack to an absurd size, or needs a
+            library that is not installed.
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
         raise CaptureError(path, expected="an image", found=found, remedy="restore the file")
+    if path.suffix.lower() in HEIC_SUFFIXES:
+        _register_heic(path)
     try:
         with warnings.catch_warnings():
             # Between one and two times the limit Pillow only warns; such photos are large but honest.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
+            with _BoundedFile(path) as file, Image.open(file) as image:
                 yield image
     except Image.DecompressionBombError as error:
         raise CaptureError(
@@ -52,7 +61,23 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         ) from error
     except CaptureError:
         raise
-    except (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, TypeError) as error:
+    except MemoryError as error:
+        raise CaptureError(
+            path,
+            expected="an image that fits into memory",
+            found="one that does not",
+            remedy="scale the image down before building",
+        ) from error
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        LookupError,
+        TypeError,
+        ArithmeticError,
+        struct.error,
+    ) as error:
         # Pillow's decoders fail in all these ways on damaged files; nothing of ours runs inside the block.
         raise CaptureError(
             path,
@@ -60,6 +85,32 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             found=f"damaged data ({error or type(error).__name__})",
             remedy="copy the file again, or remove it from the capture",
         ) from error
+
+
+class _BoundedFile(io.BufferedReader):
+    """A file of which no more is read than there is: a damaged length must not become memory."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._end = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Bytes up to the end of the file, or up to ``size`` of them."""
+        left = max(0, self._end - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def _register_heic(path: Path) -> None:
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError as error:
+        raise CaptureError(
+            path,
+            expected="the library pillow-heif, which reads HEIC pictures",
+            found="it is not installed",
+            remedy='pip install "lexsplat[heic]", or save the photos as JPEG',
+        ) from error
+    register_heif_opener()
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -95,7 +146,11 @@ def read_image(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0
             rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
             alpha = rgba[..., 3:]
             return rgba[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1.0 - alpha)
-        return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
+        pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
+        if not pixels.flags.writeable:
+            pixels = pixels.copy()
+        pixels /= np.float32(255.0)  # in place: a large photo takes enough memory as it is
+        return pixels
 
 
 def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:

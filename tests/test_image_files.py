@@ -1,0 +1,212 @@
+"""Photos of every kind as cameras, phones and programs write them: what is read is what was painted."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lexsplat.errors import CaptureError
+from lexsplat.scenes.images import image_size, open_image, read_image, read_mask
+
+WIDTH, HEIGHT = 24, 16
+
+
+def painted() -> np.ndarray:
+    """A smooth picture ``[H, W, 3]`` uint8 without symmetry: a turn, a mirror or a channel exchanged would show."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([x * 10, y * 15, 255 - x * 5 - y * 5], -1).astype(np.uint8)
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png16(pixels: np.ndarray) -> bytes:
+    """A PNG of 16 bits a channel ``[H, W]`` or ``[H, W, 3]`` or ``[H, W, 4]``, by the specification: Pillow writes
+    none in colour."""
+    height, width = pixels.shape[:2]
+    kind = {2: 0, 3: {3: 2, 4: 6}.get(pixels.shape[-1])}[pixels.ndim]
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+
+
+def test_an_opaque_png_is_exact(tmp_path):
+    Image.fromarray(painted()).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "a.png"), painted().astype(np.float32) / np.float32(255)
+    )
+
+
+def test_alpha_is_composited_on_the_background(tmp_path):
+    alpha = np.linspace(0, 255, WIDTH).round().astype(np.uint8)[None].repeat(HEIGHT, 0)
+    Image.fromarray(np.dstack([painted(), alpha])).save(tmp_path / "a.png")
+    share = alpha[..., None] / 255.0
+    expected = painted() / 255.0 * share + np.array([1.0, 0.5, 0.0]) * (1 - share)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png", (1.0, 0.5, 0.0)), expected, atol=1e-6)
+
+
+def test_grey_with_alpha(tmp_path):
+    grey, alpha = painted()[..., 0], painted()[..., 1]
+    Image.merge("LA", [Image.fromarray(grey), Image.fromarray(alpha)]).save(tmp_path / "a.png")
+    share = alpha / 255.0
+    expected = (grey / 255.0 * share + (1 - share))[..., None].repeat(3, 2)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png", (1.0, 1.0, 1.0)), expected, atol=1e-6)
+
+
+def test_16_bit_grey_keeps_its_steps(tmp_path):
+    values = (np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) * 170).astype(np.uint16)
+    (tmp_path / "a.png").write_bytes(png16(values))
+    found = read_image(tmp_path / "a.png")
+    np.testing.assert_allclose(found, (values / 65535.0)[..., None].repeat(3, 2), atol=1e-6)
+    assert len(np.unique(found)) > 256, "more steps than 8 bits have"
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_16_bit_colour(tmp_path, channels):
+    values = painted().astype(np.uint16) * 257
+    if channels == 4:
+        values = np.dstack([values, np.full((HEIGHT, WIDTH), 65535, np.uint16)])
+    (tmp_path / "a.png").write_bytes(png16(values))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), painted() / 255.0, atol=1 / 255)
+
+
+def test_16_bit_tiff(tmp_path):
+    values = (np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) * 170).astype(np.uint16)
+    Image.fromarray(values).save(tmp_path / "a.tif")
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif")[..., 1], values / 65535.0, atol=1e-6)
+
+
+def test_grey_is_the_same_in_all_channels(tmp_path):
+    Image.fromarray(painted()[..., 2]).save(tmp_path / "a.png")
+    np.testing.assert_allclose(
+        read_image(tmp_path / "a.png"), (painted()[..., 2:] / 255.0).repeat(3, 2), atol=1e-6
+    )
+
+
+def test_black_and_white(tmp_path):
+    bits = painted()[..., 0] > 100
+    Image.fromarray(bits).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[..., 0], bits.astype(np.float32))
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.png"), bits)
+
+
+def test_a_palette_and_its_transparent_colour(tmp_path):
+    picture = Image.fromarray((painted()[..., 0] > 100).astype(np.uint8), mode=None).convert("P")
+    picture.putpalette([200, 100, 50, 10, 20, 30] + [0] * 762)
+    picture.save(tmp_path / "a.png")
+    second = painted()[..., 0] > 100
+    expected = np.where(second[..., None], [10, 20, 30], [200, 100, 50]) / 255.0
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), expected, atol=1e-6)
+    picture.save(tmp_path / "b.png", transparency=1)
+    expected = np.where(second[..., None], 1.0, expected)
+    np.testing.assert_allclose(read_image(tmp_path / "b.png", (1.0, 1.0, 1.0)), expected, atol=1e-6)
+
+
+def test_a_cmyk_jpeg_shows_its_colours(tmp_path):
+    blocks = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    blocks[:, : WIDTH // 2], blocks[:, WIDTH // 2 :] = (220, 40, 30), (30, 60, 200)
+    Image.fromarray(blocks).convert("CMYK").save(tmp_path / "a.jpg", quality=100)
+    with open_image(tmp_path / "a.jpg") as image:
+        assert image.mode == "CMYK"
+    np.testing.assert_allclose(
+        read_image(tmp_path / "a.jpg")[2:-2, 2:8], 1 / 255 * blocks[2:-2, 2:8], atol=0.03
+    )
+    np.testing.assert_allclose(
+        read_image(tmp_path / "a.jpg")[2:-2, -8:-2], 1 / 255 * blocks[2:-2, -8:-2], atol=0.03
+    )
+
+
+@pytest.mark.parametrize("options", [{"progressive": True}, {"progressive": False}, {"subsampling": 2}])
+def test_jpegs_of_all_kinds(tmp_path, options):
+    Image.fromarray(painted()).save(tmp_path / "a.jpg", quality=98, **options)
+    np.testing.assert_allclose(read_image(tmp_path / "a.jpg"), painted() / 255.0, atol=0.06)
+
+
+@pytest.mark.parametrize("ending", [".webp", ".tif", ".bmp"])
+def test_other_formats(tmp_path, ending):
+    Image.fromarray(painted()).save(
+        tmp_path / f"a{ending}", **({"lossless": True} if ending == ".webp" else {})
+    )
+    np.testing.assert_allclose(read_image(tmp_path / f"a{ending}"), painted() / 255.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_taken_as_they_are_stored(tmp_path, orientation):
+    """Cameras that come with a capture belong to the stored pixels; photos without cameras are turned on the way to
+    structure from motion (test_scenes_photos.py)."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(painted()).save(tmp_path / "a.png", exif=exif)
+    assert image_size(tmp_path / "a.png") == (WIDTH, HEIGHT)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), painted() / 255.0, atol=1e-6)
+
+
+def test_heic_photos_are_read(tmp_path):
+    heif = pytest.importorskip("pillow_heif", reason="HEIC needs pillow-heif")
+    heif.register_heif_opener()
+    Image.fromarray(painted()).save(tmp_path / "a.HEIC", format="HEIF", quality=-1)
+    assert image_size(tmp_path / "a.HEIC") == (WIDTH, HEIGHT)
+    np.testing.assert_allclose(read_image(tmp_path / "a.HEIC"), painted() / 255.0, atol=0.05)
+
+
+def test_heic_without_the_library_says_which_extra_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    with pytest.raises(CaptureError, match=r'pip install "lexsplat\[heic\]"'):
+        image_size(tmp_path / "a.heic")
+
+
+def test_a_damaged_heic_is_told(tmp_path):
+    pytest.importorskip("pillow_heif", reason="HEIC needs pillow-heif")
+    for content in (b"", b"\0\0\0\x18ftypheic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\xff" * 200):
+        (tmp_path / "a.heic").write_bytes(content)
+        with pytest.raises(CaptureError, match=r"a\.heic"):
+            read_image(tmp_path / "a.heic")
+
+
+# -- pictures that are larger than they look
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A PNG of a few bytes that claims to be huge."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 1000))
+        + chunk(b"IEND", b"")
+    )
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (2**31 - 1, 1), (2**31 - 1, 2**31 - 1), (0, 5), (5, 0)])
+def test_gigantic_and_empty_pictures_are_refused_by_their_headers(tmp_path, size):
+    (tmp_path / "a.png").write_bytes(bomb(*size))
+    with pytest.raises(CaptureError, match=r"a\.png"):
+        read_image(tmp_path / "a.png")
+
+
+def test_a_damaged_length_does_not_become_memory(tmp_path):
+    import tracemalloc
+
+    Image.fromarray(painted()).save(tmp_path / "a.png")
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    place = data.index(b"IDAT") - 4
+    data[place : place + 4] = b"\x7f\xff\xff\xff"
+    (tmp_path / "a.png").write_bytes(bytes(data))
+    tracemalloc.start()
+    found = read_image(tmp_path / "a.png")  # all of the pixels are there, only the length after them is not
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(found, painted() / 255.0, atol=1e-6)
+    assert peak < 10_000_000
