@@ -6,6 +6,7 @@ W / w).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 
 from lexsplat.cameras import Camera
 from lexsplat.codebook import MAX_CODES, Codebook
+from lexsplat.divergence import KEEP_EVERY, Guard
 from lexsplat.errors import TrainingError
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import TrainedField
@@ -172,6 +174,9 @@ class EmbeddingTrainer:
         self.config = config
         self.seed = seed
         self.iteration = 0
+        self.rate_factor = 1.0
+        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.divergence`)."""
+        self._first_loss = math.nan
         self.generator = torch.Generator().manual_seed(seed)
         self.gaussians = gaussians.detach()
         self.field = field or TrainedField.initial(
@@ -217,7 +222,7 @@ class EmbeddingTrainer:
         config, field = self.config, self.field
         for group in self.optimizer.param_groups:
             progress = self.iteration / max(config.iterations, 1)
-            group["lr"] = group["base_lr"] * config.final_lr_factor ** min(progress, 1.0)
+            group["lr"] = group["base_lr"] * config.final_lr_factor ** min(progress, 1.0) * self.rate_factor
         self.optimizer.zero_grad(set_to_none=True)
         semantics, uncertainty = field.render_semantics(self.gaussians, camera, prepared=prepared)
         losses = self._semantic_terms(semantics, uncertainty, code_map)
@@ -323,7 +328,30 @@ class EmbeddingTrainer:
                 state[f"optimizer.{name}.{key}"] = value
         state["generator"] = self.generator.get_state()
         state["iteration"] = torch.tensor(self.iteration)
+        state["rate_factor"] = torch.tensor(self.rate_factor, dtype=torch.float64)
+        state["first_loss"] = torch.tensor(self._first_loss, dtype=torch.float64)
         return {name: value.detach().clone() for name, value in state.items()}
+
+    def damage(self) -> str:
+        """What is wrong with the parameters; nothing where all is well."""
+        broken = [n for n, p in self.field.named_parameters() if not bool(torch.isfinite(p).all())]
+        return f"NaN or Inf in {broken[0]}" if broken else ""
+
+    def check_loss(self, loss: float) -> None:
+        """Compare a loss with the first one.
+
+        Raises:
+            TrainingError: If it is not finite or ten times as large.
+        """
+        if math.isnan(self._first_loss):
+            self._first_loss = loss
+        if not loss <= 10 * self._first_loss + 10:
+            raise TrainingError(
+                "language field",
+                expected="a loss that falls",
+                found=f"a loss of {loss:.3g} at step {self.iteration}",
+                remedy="lower the learning rates or set clip_decoder_grad",
+            )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """The inverse of `state_dict`, for a trainer made with the same geometry and settings.
@@ -337,8 +365,10 @@ class EmbeddingTrainer:
             self.field.load_state_dict(own)
             self.generator.set_state(state["generator"].cpu())
             self.iteration = int(state["iteration"])
-            if self.iteration < 0:
-                raise ValueError(f"iteration {self.iteration}")
+            self.rate_factor = float(state.get("rate_factor", 1.0))
+            self._first_loss = float(state.get("first_loss", math.nan))
+            if not (0 <= self.iteration <= self.config.iterations and 0 < self.rate_factor <= 1):
+                raise ValueError(f"iteration {self.iteration}, learning rates times {self.rate_factor:g}")
         except (KeyError, RuntimeError, TypeError) as error:
             raise ValueError(f"the training state does not fit: {error}") from error
         self.optimizer.state.clear()
@@ -347,7 +377,10 @@ class EmbeddingTrainer:
             moments = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
             check_moments(moments, parameter)
             if moments:
-                self.optimizer.state[parameter] = {key: value.clone() for key, value in moments.items()}
+                self.optimizer.state[parameter] = {
+                    key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
+                    for key, value in moments.items()
+                }
 
 
 def train_field(
@@ -377,7 +410,7 @@ def train_field(
 
     Raises:
         ValueError: If there is no view, or a view has no index map.
-        TrainingError: If the loss stops being finite.
+        TrainingError: If the training diverges again and again.
     """
     names = sorted(cameras)
     check_views(names, code_maps)
@@ -385,24 +418,21 @@ def train_field(
     if checkpoint is not None:
         checkpoint.resume(trainer)
     views = _prepare_views(trainer.gaussians, cameras, config)
+    guard = Guard(trainer, "language field", every=KEEP_EVERY[gaussians.device.type])
     with nullcontext() if checkpoint is None else checkpoint.guarding():
         while trainer.iteration < config.iterations:
-            name = trainer.view_of_step(names)
-            camera, prepared = views[name]
-            losses = trainer.step(camera, code_maps[name], prepared=prepared)
-            done = trainer.iteration
-            if done % REPORT_EVERY == 0 or done == config.iterations:
-                metrics = {key: float(value) for key, value in losses.items()}
-                if not np.isfinite(metrics["loss"]):
-                    raise TrainingError(
-                        "language field",
-                        expected="a finite loss",
-                        found=f"{metrics['loss']} at step {done}",
-                        remedy="lower the learning rates or set clip_decoder_grad",
-                    )
-                listener(Event("embed", done, config.iterations, metrics))
-            if checkpoint is not None:
-                checkpoint.after_step(trainer)
+            with guard:
+                name = trainer.view_of_step(names)
+                camera, prepared = views[name]
+                losses = trainer.step(camera, code_maps[name], prepared=prepared)
+                done = trainer.iteration
+                if done % REPORT_EVERY == 0 or done == config.iterations:
+                    metrics = {key: float(value) for key, value in losses.items()}
+                    trainer.check_loss(metrics["loss"])
+                    listener(Event("embed", done, config.iterations, metrics))
+                guard.after_step(done == config.iterations)
+                if checkpoint is not None:
+                    checkpoint.after_step(trainer)
     return trainer.field
 
 

@@ -52,4 +52,5 @@ class Exposures:
             raise ValueError("the state of the exposures does not fit")
         with torch.no_grad():
             self.matrices.copy_(tensors["matrices"])
+        self.matrices.grad = None
         load_optimizer_tensors(self._optimizer, below_prefix("optimizer/", tensors))

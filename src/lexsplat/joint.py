@@ -18,8 +18,8 @@ from torch import Tensor
 from lexsplat.cameras import Camera
 from lexsplat.checkpoints import Checkpoint
 from lexsplat.codebook import Codebook
+from lexsplat.divergence import KEEP_EVERY, Guard
 from lexsplat.embedding import EmbeddingConfig, EmbeddingTrainer, check_views
-from lexsplat.errors import TrainingError
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import TrainedField
 from lexsplat.optimizers import below_prefix, with_prefix
@@ -82,24 +82,35 @@ class JointTrainer:
         name = self.reconstructor.last_view
         losses = self.language.step(self.cameras[name], self.code_maps[name])
         values = {key: float(value) for key, value in losses.items()}
-        if not np.isfinite(values["loss"]):
-            raise TrainingError(
-                "language field",
-                expected="a finite loss",
-                found=f"{values['loss']} at step {self.reconstructor.steps_done}",
-                remedy="lower the learning rates or set clip_decoder_grad",
-            )
+        self.language.check_loss(values["loss"])
         return values
+
+    @property
+    def rate_factor(self) -> float:
+        """Factor of all learning rates (`lexsplat.divergence`)."""
+        return self.reconstructor.rate_factor
+
+    @rate_factor.setter
+    def rate_factor(self, factor: float) -> None:
+        self.reconstructor.rate_factor = self.language.rate_factor = factor
+
+    def damage(self) -> str:
+        """What is wrong with the parameters; nothing where all is well."""
+        return self.reconstructor.damage() or self.language.damage()
 
     def run(self, listener: Listener = silent, checkpoint: Checkpoint | None = None) -> None:
         """Run the iterations that are left."""
         total = self.reconstructor.config.iterations
+        guard = Guard(self, "joint training", every=KEEP_EVERY[self.reconstructor.device.type])
+        losses = {"loss": float("nan")}
         with nullcontext() if checkpoint is None else checkpoint.guarding():
             while not self.done:
-                losses = self.step()
+                with guard:
+                    losses = self.step()
+                    guard.after_step(self.done)
+                    if checkpoint is not None:
+                        checkpoint.after_step(self)
                 done = self.reconstructor.steps_done
-                if checkpoint is not None:
-                    checkpoint.after_step(self)
                 if done % EVENT_EVERY == 0 or self.done:
                     metrics = {**self.reconstructor.metrics, "language": losses["loss"]}
                     listener(Event(STAGE, done, total, metrics))

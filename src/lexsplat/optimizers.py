@@ -88,6 +88,8 @@ def check_moments(tensors: Mapping[str, Tensor], parameter: Tensor) -> None:
         return
     if not {"step", "exp_avg", "exp_avg_sq"} <= tensors.keys() or tensors["step"].numel() != 1:
         raise ValueError("the state of an optimiser lacks something")
+    if not 0 <= float(tensors["step"]) < 1e9:
+        raise ValueError(f"the state of an optimiser is of step {float(tensors['step']):g}")
     for name in ("exp_avg", "exp_avg_sq"):
         if tensors[name].shape != parameter.shape or tensors[name].dtype != parameter.dtype:
             raise ValueError(

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from lexsplat.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
+from lexsplat.divergence import KEEP_EVERY, Guard
 from lexsplat.errors import TrainingError
 from lexsplat.exposures import Exposures
 from lexsplat.gaussians import Gaussians, gaussians_from_points
@@ -243,7 +244,8 @@ class Reconstructor:
         self._background = torch.tensor(scene.background, dtype=torch.float32, device=self.device)
         self._generator = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.int64)
-        self._recent_error = float("nan")
+        self._recent_error = self._nothing_error = float("nan")
+        self._rate_factor = 1.0
         self._parameters = self._initial_parameters(points)
         self._optimizers = self._new_optimizers()
         self._exposures = None
@@ -279,6 +281,17 @@ class Reconstructor:
         return self.steps_done >= self.config.iterations
 
     @property
+    def rate_factor(self) -> float:
+        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.divergence`)."""
+        return self._rate_factor
+
+    @rate_factor.setter
+    def rate_factor(self, factor: float) -> None:
+        self._rate_factor = factor
+        for name, rate in self._rates().items():
+            self._optimizers[GSPLAT_NAMES[name]].param_groups[0]["lr"] = rate
+
+    @property
     def metrics(self) -> dict[str, float]:
         """Numbers for progress: PSNR of recent training views and the count of Gaussians."""
         psnr = -10.0 * math.log10(max(self._recent_error, 1e-12)) if self.steps_done else float("nan")
@@ -287,11 +300,14 @@ class Reconstructor:
     def run(self, listener: Listener = silent, checkpoint: Checkpoint | None = None) -> None:
         """Run the iterations that are left; ``checkpoint`` saves the training between them."""
         total = self.config.iterations
+        guard = Guard(self, "reconstruction", every=KEEP_EVERY[self.device.type])
         with nullcontext() if checkpoint is None else checkpoint.guarding():
             while not self.done:
-                self.step()
-                if checkpoint is not None:
-                    checkpoint.after_step(self)
+                with guard:
+                    self.step()
+                    guard.after_step(self.done)
+                    if checkpoint is not None:
+                        checkpoint.after_step(self)
                 if self.steps_done % EVENT_EVERY == 0 or self.done:
                     listener(Event(STAGE, self.steps_done, total, self.metrics))
 
@@ -394,6 +410,8 @@ class Reconstructor:
         tensors = {
             "steps_done": torch.tensor(self.steps_done),
             "recent_error": torch.tensor(self._recent_error, dtype=torch.float64),
+            "nothing_error": torch.tensor(self._nothing_error, dtype=torch.float64),
+            "rate_factor": torch.tensor(self.rate_factor, dtype=torch.float64),
             "views/order": self._order.clone(),
             "views/generator": self._generator.get_state(),
         }
@@ -404,6 +422,13 @@ class Reconstructor:
         if self._exposures is not None:
             tensors.update(with_prefix("exposures/", self._exposures.state_tensors()))
         return tensors
+
+    def damage(self) -> str:
+        """What is wrong with the parameters, such as "NaN or Inf in means"; nothing where all is well."""
+        damage = self.gaussians().damage()
+        if not damage and self._exposures is not None and not bool(self._exposures.matrices.isfinite().all()):
+            return "NaN or Inf in the exposures"
+        return damage
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Go on where `state_dict` was called; scene, config and device must be the same.
@@ -426,8 +451,12 @@ class Reconstructor:
             raise ValueError("the statistics of density control are of other Gaussians")
         if not 0 <= int(tensors["steps_done"]) <= self.config.iterations:
             raise ValueError(f"{int(tensors['steps_done'])} of {self.config.iterations} iterations")
+        if not 0 < float(tensors.get("rate_factor", 1.0)) <= 1:
+            raise ValueError(f"learning rates times {float(tensors['rate_factor']):g}")
         self.steps_done = int(tensors["steps_done"])
         self._recent_error = float(tensors["recent_error"])
+        self._nothing_error = float(tensors.get("nothing_error", math.nan))
+        self._rate_factor = float(tensors.get("rate_factor", 1.0))
         self._order = tensors["views/order"].clone()
         self._generator.set_state(tensors["views/generator"])
         for ours, theirs in GSPLAT_NAMES.items():
@@ -462,8 +491,11 @@ class Reconstructor:
         return {theirs: torch.nn.Parameter(tensors[ours]) for ours, theirs in GSPLAT_NAMES.items()}
 
     def _new_optimizers(self) -> dict[str, Adam]:
-        rates = self.config.rates(self._extent)
+        rates = self._rates()
         return {theirs: Adam(self._parameters[theirs], rates[ours]) for ours, theirs in GSPLAT_NAMES.items()}
+
+    def _rates(self) -> dict[str, float]:
+        return {name: rate * self._rate_factor for name, rate in self.config.rates(self._extent).items()}
 
     def _as_gaussians(self) -> Gaussians:
         tensors = {ours: self._parameters[theirs] for ours, theirs in GSPLAT_NAMES.items()}
@@ -476,7 +508,7 @@ class Reconstructor:
     def _means_rate(self) -> float:
         config = self.config
         decay = (config.means_rate_final / config.means_rate) ** (self.steps_done / config.iterations)
-        return config.rates(self._extent)["means"] * decay
+        return self._rates()["means"] * decay
 
     def _next_view(self) -> int:
         """Views come in random permutations, so each is seen equally often."""
@@ -511,10 +543,26 @@ class Reconstructor:
         return self.device.type == "cpu" or self.steps_done % EVENT_EVERY == EVENT_EVERY - 1
 
     def _follow(self, image: Tensor, target: Tensor) -> None:
-        if self._checks_now():
-            error = float(torch.mean((image.detach() - target) ** 2))
-            old = self._recent_error
-            self._recent_error = error if math.isnan(old) else 0.95 * old + 0.05 * error
+        """Mean squared errors of recent views, and those that a picture of nothing but background would have.
+
+        Raises:
+            TrainingError: If the pictures are much worse than that, which no healthy training is.
+        """
+        if not self._checks_now():
+            return
+        errors = torch.mean((image.detach() - target) ** 2), torch.mean((self._background - target) ** 2)
+        olds = self._recent_error, self._nothing_error
+        self._recent_error, self._nothing_error = (
+            float(error) if math.isnan(old) else 0.95 * old + 0.05 * float(error)
+            for old, error in zip(olds, errors)
+        )
+        if self._recent_error > 4 * self._nothing_error + 0.5:
+            raise TrainingError(
+                "reconstruction",
+                expected="pictures that come closer to the photos",
+                found=f"a mean squared error of {self._recent_error:.3g} at iteration {self.steps_done + 1}",
+                remedy="check the cameras, or lower the learning rates",
+            )
 
     def _optimize(self) -> None:
         self._optimizers["means"].param_groups[0]["lr"] = self._means_rate()
