@@ -18,6 +18,7 @@ import resource
 import shutil
 import signal
 import sys
+import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -452,11 +453,12 @@ def checkpoints() -> Reader:
             name: tuple(t.shape) for name, t in fresh.items()
         }
         if resumed:
-            finite(*state.values())
-            assert int(state["iteration"]) == 1
+            finite(*(tensor for name, tensor in state.items() if name != "first_loss"))
+            assert 0 <= int(state["iteration"]) <= 10
         else:
             assert state.keys() == fresh.keys()
-            assert all(torch.equal(state[name], fresh[name]) for name in fresh), "half a state was taken up"
+            same = all(torch.equal(state[name].nan_to_num(), fresh[name].nan_to_num()) for name in fresh)
+            assert same, "half a state was taken up"
 
     return Reader(
         make, read, check,
@@ -481,7 +483,7 @@ def reconstruction_checkpoints() -> Reader:
     def trainer(folder: Path) -> Any:
         if "scene" not in kept:
             kept["scene"] = load_scene(write_capture(folder / "capture", views=3, width=16, height=12))
-        start = InitialPoints(points, np.full_like(points, 0.5), "sfm", 0.0, None)
+        start = InitialPoints(points, np.full_like(points, 0.5), "capture", "")
         return Reconstructor(kept["scene"], config, start)
 
     def make(folder: Path) -> None:
@@ -501,7 +503,7 @@ def reconstruction_checkpoints() -> Reader:
         if resumed:
             finite(*(t for name, t in state.items() if "parameters" in name or "matrices" in name))
             assert len({len(t) for name, t in state.items() if name.startswith("parameters/")}) == 1
-            assert int(state["steps_done"]) == 1
+            assert 0 <= int(state["steps_done"]) <= 10
         else:
             same = all(
                 torch.equal(state[n].nan_to_num(), kept["fresh"][n].nan_to_num()) for n in kept["fresh"]
@@ -901,6 +903,7 @@ class Report:
     right: int = 0
     failures: list[str] = field(default_factory=list)
     peak: int = 0
+    seconds: float = 0.0
 
     def data(self) -> dict[str, Any]:
         return {**vars(self), "errors": dict(self.errors), "kinds": dict(self.kinds)}
@@ -996,9 +999,11 @@ def main() -> None:
     signal.signal(signal.SIGALRM, _interrupt)
     reports: dict[str, Any] = {}
     for name in names:
+        start = time.process_time()
         with contextlib.redirect_stdout(sys.stderr):
             report = run_reader(name, Path(work), Path(output).with_suffix(".current"))
         report.peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        report.seconds = round(time.process_time() - start, 2)
         reports[name] = report.data()
         Path(output).write_text(json.dumps(reports, indent=1))
 

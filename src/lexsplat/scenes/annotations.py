@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from lexsplat.errors import CaptureError, FileFormatError
-from lexsplat.scenes.images import IMAGE_SUFFIXES
+from lexsplat.scenes.capture import checked_name
+from lexsplat.scenes.images import IMAGE_SUFFIXES, MAX_PIXELS
 from lexsplat.scenes.masks import load_masks
 from lexsplat.scenes.scene import Scene, View, stem_of
 from lexsplat.scenes.splits import mask_folders, match_stem
 from lexsplat.scenes.transforms_json import read_json
+from lexsplat.scenes.undistortion import MAX_SIDE
 
 LAYOUTS = ("segmentations", "3d-ovs", "lerf-ovs")
 """Names of the layouts."""
@@ -139,8 +141,7 @@ def load_annotations(scene: Scene, folder: Path | None = None) -> Annotations:
 
 
 def _read_3d_ovs(scene: Scene, folder: Path) -> Annotations:
-    lines = (folder / CLASSES_FILE).read_text(encoding="utf-8").splitlines()
-    classes = tuple(line.strip() for line in lines if line.strip())
+    classes = _read_classes(folder / CLASSES_FILE)
     masks: dict[str, dict[str, Path]] = {}
     for view_folder in mask_folders(folder):
         stem = view_folder.relative_to(folder).as_posix()
@@ -159,6 +160,23 @@ def _read_3d_ovs(scene: Scene, folder: Path) -> Annotations:
             prompts[name] = path
     ordered = {name: dict(sorted(masks[name].items())) for name in sorted(masks)}
     return Annotations("3d-ovs", folder, ordered, classes=tuple(sorted(classes)))
+
+
+def _read_classes(path: Path) -> tuple[str, ...]:
+    """The names of ``classes.txt``, each one of a file in a view's folder.
+
+    Raises:
+        CaptureError: If a name leads elsewhere.
+        FileFormatError: If it is no text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileFormatError(path, expected="names of classes, one a line", found=str(error)) from error
+    classes = tuple(checked_name(line.strip(), path) for line in lines if line.strip())
+    if any("/" in name for name in classes):
+        raise FileFormatError(path, expected="names of classes", found="names of folders")
+    return classes
 
 
 def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: Path) -> list[str]:
@@ -228,16 +246,19 @@ def _read_labels(
             )
             for entry in content["objects"]
         ]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(
             path,
             expected="info (name, width, height) and objects (category, bbox, segmentation)",
-            found=repr(error),
+            found=repr(error)[:200],
             remedy="use LangSplat's label files",
         ) from error
     numbers = [part for _, box, polygon in objects for part in (box, polygon)]
-    if min(size) < 1 or not all(np.isfinite(part).all() for part in numbers):
-        raise FileFormatError(path, expected="finite coordinates", found=f"size {size[0]}x{size[1]}")
+    if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
+        raise FileFormatError(path, expected="the size of a photo", found=f"{size[0]}x{size[1]}"[:60])
+    # Beyond the picture a corner may lie, but not where whole numbers end or a line takes minutes to draw.
+    if not all((np.abs(part) <= 10 * MAX_SIDE).all() for part in numbers):
+        raise FileFormatError(path, expected="finite coordinates in and around the photo", found="others")
     return name, size, objects
 
 

@@ -22,6 +22,9 @@ HEIC_SUFFIXES = (".heic", ".heif")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIC_SUFFIXES)
 """Suffixes taken for pictures, in the order in which they are tried where a capture names none."""
 
+MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+"""Largest picture that is opened: 179 million pixels. What claims more is a decompression bomb."""
+
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
@@ -48,7 +51,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     except Image.DecompressionBombError as error:
         raise CaptureError(
             path,
-            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels",
+            expected=f"at most {MAX_PIXELS:,} pixels",
             found="more",
             remedy="scale the image down before building",
         ) from error
