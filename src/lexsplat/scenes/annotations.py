@@ -255,7 +255,9 @@ def _read_labels(
         ) from error
     numbers = [part for _, box, polygon in objects for part in (box, polygon)]
     if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
-        raise FileFormatError(path, expected="the size of a photo", found=f"{size[0]}x{size[1]}"[:60])
+        raise FileFormatError(
+            path, expected="a size and finite coordinates", found=f"size {size[0]}x{size[1]}"[:60]
+        )
     # Beyond the picture a corner may lie, but not where whole numbers end or a line takes minutes to draw.
     if not all((np.abs(part) <= 10 * MAX_SIDE).all() for part in numbers):
         raise FileFormatError(path, expected="finite coordinates in and around the photo", found="others")
