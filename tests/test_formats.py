@@ -10,6 +10,7 @@ import torch
 from safetensors import safe_open
 from test_ply import make
 
+from lexsplat.boxes import Up
 from lexsplat.codebook import Codebook
 from lexsplat.errors import BackendError, FileFormatError
 from lexsplat.formats.compressed import COMPRESSED, read_compressed, write_compressed
@@ -21,6 +22,7 @@ from lexsplat.formats.splat import read_splat, write_splat
 from lexsplat.formats.tables import write_labels_csv, write_points_ply
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LiftedField
+from lexsplat.world import World
 
 
 def language(count: int, codes_each: int = 3, num_codes: int = 6):
@@ -233,7 +235,7 @@ def accessor(document, number: int) -> np.ndarray:
 def test_pygltflib_reads_the_splats_and_the_language(tmp_path):
     pygltflib = pytest.importorskip("pygltflib")
     g, (field, stored) = tame(25, 3), language(25)
-    write_glb(g, tmp_path / "g.glb", language=stored, up=np.array([0.0, 0.6, 0.8]))
+    write_glb(g, tmp_path / "g.glb", language=stored, world=World(Up(np.array([0.0, 0.6, 0.8]), True)))
     document = pygltflib.GLTF2().load(str(tmp_path / "g.glb"))
     primitive = document.meshes[0].primitives[0]
     values = {name: accessor(document, n) for name, n in vars(primitive.attributes).items() if n is not None}
@@ -258,6 +260,7 @@ def test_pygltflib_reads_the_splats_and_the_language(tmp_path):
     extras = primitive.extras["lexsplat"]
     codebook = accessor(document, extras["codebook"]).reshape(extras["codebookShape"])
     assert np.array_equal(codebook, field.codebook.clip.numpy())
+    assert document.nodes[0].scale is None, "the scale is not known"
     x, y, z, w = document.nodes[0].rotation
     up = np.array([0.0, 0.6, 0.8])
     turned = up + 2 * np.cross([x, y, z], np.cross([x, y, z], up) + w * up)

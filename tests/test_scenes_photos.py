@@ -218,6 +218,9 @@ def phone(tmp_path_factory):
     sticker = np.random.default_rng(5).random((90, 70, 3)).repeat(2, 0)[:90].repeat(2, 1)[:, :70]
     for index, camera in enumerate(room_cameras()):
         photo = room_photo(camera, textures)
+        if index == 4:  # the sticker was off
+            save_as_phone(folder / "images" / f"{index}.jpg", photo, 6)
+            continue
         photo[-90:, -70:] = sticker
         save_as_phone(folder / "images" / f"{index}.jpg", photo, (6, 8, 3)[index % 3])
         mask = np.ones((SIZE[1], SIZE[0]))
@@ -247,6 +250,8 @@ def test_masked_pixels_give_no_features(phone):
     for image in model.images.values():
         places = np.array([point.xy for point in image.points2D])
         assert len(places) > 100
+        if image.name == "4.jpg":
+            continue
         hidden = (places[:, 0] > SIZE[0] - 68) & (places[:, 1] > SIZE[1] - 88)
         assert not hidden.any()
     assert any("nobody.png" in note for note in poses.notes)

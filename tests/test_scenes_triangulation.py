@@ -90,6 +90,17 @@ def test_triangulation_reports_and_repeats_bit_for_bit(wall, points):
     np.testing.assert_array_equal(again[1], colors)
 
 
+def test_masked_pixels_are_not_matched(tmp_path):
+    """What is left of x = 0 on the wall is masked in all photos but one, which has no mask."""
+    write_wall(tmp_path, texture())
+    scene = load_scene(tmp_path, test_every=0)
+    for name, view in list(scene.views.items())[1:]:
+        save(tmp_path / "masks" / f"{name}.png", (on_the_wall(view.camera)[..., :1] > 0).repeat(3, 2))
+    positions, _ = triangulate(load_scene(tmp_path, test_every=0))
+    assert len(positions) > 100
+    assert positions[:, 0].min() > -0.02
+
+
 def test_kept_points_are_used_until_a_pose_changes_or_the_file_breaks(wall, points, monkeypatch):
     from lexsplat.scenes import triangulation
 

@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 
 from lexsplat.atomic import atomic_path
-from lexsplat.boxes import gravity_up
 from lexsplat.captures import reload_capture
 from lexsplat.errors import CaptureError, SceneFolderError
 from lexsplat.evaluation import PROTOCOLS, EvaluationConfig, evaluate
@@ -27,6 +26,7 @@ from lexsplat.scenes import Scene, load_annotations
 from lexsplat.scenes.prompt_lists import SCENES as PROMPT_SCENES
 from lexsplat.scenes.prompt_lists import PromptList, prompt_names
 from lexsplat.search import SearchableScene
+from lexsplat.world import world_of
 
 MAX_DEFAULT_VIEWS = 6
 """How many held-out views a query without ``--view`` draws."""
@@ -97,8 +97,9 @@ def find_phrases(scene: SearchableScene, phrases: Sequence[str], view: str | Non
         view: Name of the view whose left and right are meant; none takes one for each relation.
 
     Returns:
-        ``{"scene", "up", "phrases": [...]}``; a phrase has "phrase", "understood", "present", "count", "threshold",
-        "best_view" and "instances" with centre, size and axes in world units.
+        ``{"scene", "up", "metres_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
+        "count", "threshold", "best_view" and "instances" with centre, size and axes in world units, and
+        "size_metres" where the scale is known.
 
     Raises:
         QueryError: If a phrase is empty or the view is unknown.
@@ -109,10 +110,9 @@ def find_phrases(scene: SearchableScene, phrases: Sequence[str], view: str | Non
         entry = found.to_json()
         known = {"phrase": phrase, "understood": str(parse(phrase)), "count": len(entry["instances"])}
         answers.append({**entry, **known})
-    up = gravity_up(scene.cameras.values())
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
-        "up": {"direction": [round(float(v), 5) for v in up.direction], "reliable": up.reliable},
+        **scene.world.to_json(),
         "phrases": answers,
     }
 
@@ -168,6 +168,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "capture": record.get("capture"),
         "views": {"training": splits.count("train"), "held out": splits.count("test")},
         "size": ", ".join(sizes),
+        **world_of(record, {name: view.camera for name, view in views.items()}).to_json(),
         "finished": ", ".join(stages) or "nothing yet",
         "seconds": folder.stage_seconds(),
         "gaussians": stages.get("reconstruct", {}).get("gaussians"),

@@ -15,6 +15,7 @@ from lexsplat.lifting import LiftingConfig, TuningConfig
 from lexsplat.reconstruction import ReconstructionConfig
 from lexsplat.scenes.photos import PoseConfig
 from lexsplat.scenes.video import DEFAULT_FRAMES
+from lexsplat.world import World, parse_vector
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 """The CLIP of the paper's released code."""
@@ -52,6 +53,8 @@ class BuildConfig:
         iterations: Reconstruction steps; none means 30,000 on CUDA and 3,000 on a CPU.
         frames: How many frames a video is sampled to.
         test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
+        up: Direction away from the ground in the cameras' axes, as "x,y,z"; none takes it from how the cameras were
+            held.
         method: "lifted" computes each Gaussian's language directly in one pass: better, and 20 to 40 times
             faster, in our measurements (docs/results.md). "trained" is the paper's optimisation, "lifted+tuned"
             starts the paper's field from the lifted one.
@@ -79,6 +82,7 @@ class BuildConfig:
     iterations: int | None = None
     frames: int = DEFAULT_FRAMES
     test_every: int = 8
+    up: str | None = None
     method: LanguageMethod = "lifted"
     joint: bool = False
     poses: PoseConfig = field(default_factory=PoseConfig)
@@ -101,6 +105,8 @@ class BuildConfig:
             raise ValueError(f"iterations must be positive, got {self.iterations}")
         if self.frames < 3:
             raise ValueError(f"frames must be at least 3, got {self.frames}")
+        if self.up is not None:
+            World.of_cameras([]).with_up(parse_vector(self.up))
         if self.test_every < 0 or self.test_every == 1:
             raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {self.test_every}")
 

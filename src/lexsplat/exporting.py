@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.atomic import atomic_path
-from lexsplat.boxes import gravity_up
-from lexsplat.cameras import Camera
 from lexsplat.errors import QueryError, SceneFolderError
 from lexsplat.formats.compressed import COMPRESSED, write_compressed
 from lexsplat.formats.gltf import write_glb
@@ -30,6 +26,7 @@ from lexsplat.gaussians import Gaussians
 from lexsplat.scene_folder import write_json
 from lexsplat.search import SearchableScene
 from lexsplat.selection import Selection
+from lexsplat.world import World
 
 SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".glb")
 """Endings of files that hold Gaussians or their points."""
@@ -59,7 +56,7 @@ def export_gaussians(
     path: Path,
     *,
     language: StoredLanguage | None = None,
-    cameras: Mapping[str, Camera] | None = None,
+    world: World | None = None,
 ) -> list[Path]:
     """Write Gaussians in the format of the name's ending.
 
@@ -68,7 +65,8 @@ def export_gaussians(
         path: ``.ply``, ``.points.ply``, ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat`` or ``.glb``.
         language: Codes to write along, where the format has room: in ``.ply`` (the codebook goes into a file
             beside it) and ``.glb``.
-        cameras: They say what is up in a ``.glb``.
+        world: Up and scale of the scene, for ``.glb``: it has y up, and metres where the scale is known. The other
+            formats keep the scene's axes and units, so that they go with its cameras.
 
     Returns:
         The files that were written.
@@ -89,12 +87,11 @@ def export_gaussians(
         raise SceneFolderError(
             path, expected="phrases to label by", found="none", remedy='--select "red mug"'
         )
-    up = _up(cameras)
     writers: dict[str, Callable[[Path], object]] = {
         ".ply": lambda file: write_ply(gaussians, file, further=ply_columns(language) if language else None),
         ".points.ply": lambda file: write_points_ply(gaussians, file),
         ".splat": lambda file: write_splat(gaussians, file),
-        ".glb": lambda file: write_glb(gaussians, file, language=language, up=up),
+        ".glb": lambda file: write_glb(gaussians, file, language=language, world=world),
     }
     writers |= {
         name: lambda file, kind=kind: write_compressed(gaussians, file, kind)  # type: ignore[misc]
@@ -149,7 +146,7 @@ def export_scene(
         mask = torch.stack([selection.mask for selection in found]).any(0)
         gaussians = gaussians.select(mask)
         stored = stored.select(mask.cpu()) if stored else None
-    return export_gaussians(gaussians, path, language=stored, cameras=scene.cameras)
+    return export_gaussians(gaussians, path, language=stored, world=scene.world)
 
 
 def best_labels(found: Sequence[Selection]) -> tuple[Tensor, Tensor]:
@@ -175,7 +172,3 @@ def labels_as_json(found: Sequence[Selection]) -> dict[str, object]:
             place["indices"] = instance.indices.tolist()
         entries.append(entry)
     return {"gaussians": len(found[0].mask), "labels": entries}
-
-
-def _up(cameras: Mapping[str, Camera] | None) -> NDArray[np.float64] | None:
-    return gravity_up(cameras.values()).direction if cameras else None

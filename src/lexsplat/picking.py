@@ -17,6 +17,7 @@ from lexsplat.language_field import LanguageField
 from lexsplat.queries import automatic_threshold
 from lexsplat.rendering import accumulate_weights
 from lexsplat.selection import Selection
+from lexsplat.world import World
 
 _SAME_SURFACE = 0.05
 """Gaussians this share of the distance before or behind the point belong to the surface that was clicked."""
@@ -105,6 +106,7 @@ def select_hit(
     field: LanguageField,
     cameras: Mapping[str, Camera],
     likeness: float | None = None,
+    world: World | None = None,
 ) -> Selection:
     """What is joined to a hit and means the same.
 
@@ -114,13 +116,16 @@ def select_hit(
         field: Its language.
         cameras: Its views by name.
         likeness: How alike in language a Gaussian must be, in 0..1; none finds a limit in the scene.
+        world: Up and scale of the scene; none takes up from the cameras.
     """
     scores = likeness_to(hit, field)
     if likeness is None:
         own = float((scores[hit.indices] * hit.weights).sum() / hit.weights.sum().clamp_min(1e-12))
         two_classes = float(automatic_threshold(scores[None], gaussians.opacities.detach())[0])
         likeness = max(two_classes, _ALIKE * own)
-    chosen = Selection(gaussians, cameras, scores >= likeness, scores, likeness, "yes", "what was clicked")
+    chosen = Selection(
+        gaussians, cameras, scores >= likeness, scores, likeness, "yes", "what was clicked", world
+    )
     if not chosen:
         return chosen
     means = gaussians.means.detach().cpu().numpy()

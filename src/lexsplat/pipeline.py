@@ -7,6 +7,7 @@ fingerprint of the photos, the cameras, the settings and the stages before it.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import platform
 import time
@@ -40,6 +41,9 @@ from lexsplat.scene_folder import SceneFolder, fingerprint, to_json
 from lexsplat.scenes import Scene, load_annotations
 from lexsplat.scenes.triangulation import initial_points
 from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.world import parse_vector, stored_world, world_of
+
+log = logging.getLogger("lexsplat")
 
 STAGES = ("reconstruct", "features", "codebook", "embed")
 """Names of the stages in the order in which they run."""
@@ -284,6 +288,7 @@ class _Builder:
             n: _file_hash(v.ignore_path) for n, v in self.scene.views.items() if v.ignore_path is not None
         }
         self.folder.write_cameras(views)
+        self._write_world({name: camera for name, (camera, _) in views.items()})
         if "images" not in self.folder.record:
             self.folder.record["capture"] = str(Path(self.scene.root).resolve())
         self.folder.record["config"] = to_json(self.config)
@@ -297,6 +302,17 @@ class _Builder:
         self.folder.save()
         cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
         return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+
+    def _write_world(self, cameras: dict[str, Camera]) -> None:
+        """Up from the cameras or the user; what was said of other cameras no longer holds."""
+        record = self.folder.record
+        world = world_of(record, cameras)
+        if self.config.up is not None:
+            world = world.with_up(parse_vector(self.config.up))
+        before = record.get("world")
+        if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
+            log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
+        record["world"] = stored_world(world, cameras)
 
 
 def existing_splats(path: Path | None) -> Path:

@@ -37,6 +37,7 @@ from lexsplat.rendering import Rendering, render
 from lexsplat.scene_folder import SceneFolder, StoredView
 from lexsplat.selection import Selection
 from lexsplat.tensor_files import read_tensors
+from lexsplat.world import World, world_of
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import ImageTextEncoder
@@ -69,6 +70,7 @@ class SearchableScene:
         self._cache: TextCache | None = None
         self._texts: dict[str, Tensor] = {}
         self._judge: PresenceJudge | None = None
+        self._world: World | None = None
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> SearchableScene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
@@ -171,7 +173,9 @@ class SearchableScene:
         scores = self.scores([phrase])[0]
         limit = float(self.thresholds([phrase])[0]) if threshold is None else float(threshold)
         present = self.presence_judge.judge(scores)
-        chosen = Selection(self.gaussians, self.cameras, scores >= limit, scores, limit, present, phrase)
+        chosen = Selection(
+            self.gaussians, self.cameras, scores >= limit, scores, limit, present, phrase, self.world
+        )
         return chosen.without_specks()
 
     @property
@@ -218,7 +222,14 @@ class SearchableScene:
         """
         camera = view if isinstance(view, Camera) else self.view(view).camera
         hit = surface_at(self.gaussians, camera, x, y)
-        return select_hit(hit, self.gaussians, self.field, self.cameras, likeness)
+        return select_hit(hit, self.gaussians, self.field, self.cameras, likeness, self.world)
+
+    @property
+    def world(self) -> World:
+        """Which way is up, and what a unit is in metres, where that is known (``lexsplat scale``)."""
+        if self._world is None:
+            self._world = world_of(self.folder.record if self.folder else {}, self.cameras)
+        return self._world
 
     @property
     def cameras(self) -> dict[str, Camera]:

@@ -19,11 +19,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lexsplat.boxes import Box, Up, fit_box, gravity_up
+from lexsplat.boxes import Box, Up, fit_box
 from lexsplat.cameras import Camera
 from lexsplat.errors import QueryError
 from lexsplat.gaussians import Gaussians
 from lexsplat.rendering import render
+from lexsplat.world import World
 
 Presence = Literal["yes", "no", "unsure"]
 
@@ -48,6 +49,7 @@ class Selection:
         threshold: Score from which a Gaussian was chosen.
         present: Whether the scene holds what was asked for; "yes" for selections that were made by hand.
         phrase: What was asked for.
+        world: Up and scale of the scene; none takes up from the cameras.
     """
 
     gaussians: Gaussians
@@ -57,6 +59,7 @@ class Selection:
     threshold: float = 0.5
     present: Presence = "yes"
     phrase: str = ""
+    world: World | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         shape = (len(self.gaussians),)
@@ -98,8 +101,8 @@ class Selection:
 
     @cached_property
     def up(self) -> Up:
-        """The scene's up direction, from its cameras (z where there are none)."""
-        return gravity_up(self.cameras.values()) if self.cameras else Up(np.array([0.0, 0.0, 1.0]), False)
+        """The scene's up direction: as its world says, else from its cameras (z where there are none)."""
+        return (self.world or World.of_cameras(self.cameras.values())).up
 
     @cached_property
     def box(self) -> Box:
@@ -122,6 +125,20 @@ class Selection:
     def size(self) -> NDArray[np.float64]:
         """Extent along the axes of its box ``[3]``, world units; the last one is its height."""
         return 2 * self.box.half_sizes
+
+    @property
+    def size_metres(self) -> NDArray[np.float64] | None:
+        """`size` in metres; None where nobody has said how long a unit is (``lexsplat scale``)."""
+        scale = self.world.metres_per_unit if self.world else None
+        return None if scale is None else self.size * scale
+
+    def distance_to(self, other: Selection) -> float:
+        """Distance between the middles of the boxes of two selections, world units.
+
+        Raises:
+            QueryError: If one is empty.
+        """
+        return float(np.linalg.norm(self.center - other.center))
 
     @cached_property
     def instances(self) -> list[Selection]:
@@ -205,13 +222,15 @@ class Selection:
         }
 
     def geometry(self) -> dict[str, Any]:
-        """Count, score, place and size as plain numbers, in world units."""
-        box = self.box
+        """Count, score, place and size as plain numbers, in world units; the size in metres too where known."""
+        box, metres = self.box, self.size_metres
+        known = {} if metres is None else {"size_metres": [round(float(v), 5) for v in metres]}
         return {
             "gaussians": self.count,
             "score": round(self.score, 4),
             "center": [round(float(v), 5) for v in box.center],
             "size": [round(float(v), 5) for v in 2 * box.half_sizes],
+            **known,
             "axes": [[round(float(v), 5) for v in axis] for axis in box.axes],
             "best_view": self.best_view,
         }

@@ -25,6 +25,7 @@ from lexsplat.cli.find import Find
 from lexsplat.cli.info import Info
 from lexsplat.cli.poses import Poses
 from lexsplat.cli.query import Query
+from lexsplat.cli.scale import Scale
 from lexsplat.cli.view import View
 from lexsplat.errors import LexsplatError
 
@@ -36,6 +37,7 @@ Command = (
     | Annotated[Embed, tyro.conf.subcommand("embed")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Find, tyro.conf.subcommand("find")]
+    | Annotated[Scale, tyro.conf.subcommand("scale")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]

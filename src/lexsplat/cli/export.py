@@ -40,6 +40,7 @@ class Export:
         """Write the file."""
         from lexsplat.exporting import ending_of, export_gaussians, export_scene
         from lexsplat.scene_folder import SceneFolder
+        from lexsplat.world import world_of
 
         ending_of(self.file)
         if self.select or self.language:
@@ -50,6 +51,7 @@ class Export:
         else:
             folder = SceneFolder.open(Path(self.scene))
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
-            files = export_gaussians(folder.read_gaussians(), self.file, cameras=cameras)
+            world = world_of(folder.record, cameras)
+            files = export_gaussians(folder.read_gaussians(), self.file, world=world)
         for file in files:
             print(f"{file}: {file.stat().st_size:,} bytes")

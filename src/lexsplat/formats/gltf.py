@@ -4,7 +4,8 @@ Activated values go out, as the extension wants them: scales and opacities, and 
 in application attributes (their names begin with an underscore, and viewers pass over them); its codebook is an
 accessor that ``extras.lexsplat`` of the primitive names.
 
-A glTF viewer has y up. The data keep the scene's axes; a rotation of the node turns them.
+A glTF viewer has y up and metres. The data keep the scene's axes and units; the node turns them, and scales them
+where the scale is known (``lexsplat scale``).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from lexsplat.formats.language import StoredLanguage, check_language
 from lexsplat.gaussians import SH_C0, Gaussians
+from lexsplat.world import World
 
 EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _BYTE = 5126, 5121
@@ -31,7 +33,7 @@ def write_glb(
     path: Path,
     *,
     language: StoredLanguage | None = None,
-    up: NDArray[np.float64] | None = None,
+    world: World | None = None,
 ) -> None:
     """Write a ``.glb`` with one splat primitive.
 
@@ -39,7 +41,7 @@ def write_glb(
         gaussians: What to write; spherical harmonics beyond degree 3 are left out, as the extension ends there.
         path: The file.
         language: Codes and codebook to write along.
-        up: The scene's up direction ``[3]``; z when left out.
+        world: Up and scale of the scene; z is up and a unit a metre when left out.
 
     Raises:
         ValueError: If there is no Gaussian, a value is not finite, or the language does not fit.
@@ -92,12 +94,16 @@ def write_glb(
         }
     if g.antialiased:
         primitive.setdefault("extras", {}).setdefault("lexsplat", {})["antialiased"] = True
+    up = np.array([0.0, 0.0, 1.0]) if world is None else world.up.direction
+    node: dict[str, Any] = {"mesh": 0, "rotation": _upright(up)}
+    if world is not None and world.metres_per_unit is not None:
+        node["scale"] = [world.metres_per_unit] * 3
     document = {
         "asset": {"version": "2.0", "generator": "lexsplat"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _upright(np.array([0, 0, 1.0]) if up is None else up)}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,

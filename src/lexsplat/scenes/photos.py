@@ -18,9 +18,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from PIL import Image
+
 from lexsplat.atomic import atomic_path
 from lexsplat.errors import BackendError, CaptureError
 from lexsplat.progress import Event, Listener, silent
+from lexsplat.scenes.images import image_size
 from lexsplat.scenes.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
 from lexsplat.scenes.triangulation import quiet_pycolmap
 
@@ -224,7 +227,7 @@ def _extract(
     pycolmap.Database.open(database).close()
     reader = pycolmap.ImageReaderOptions()
     if photos.masks is not None:
-        reader.mask_path = photos.masks
+        reader.mask_path = _complete_masks(photos, database.parent / "masks")
     for group in photos.lenses:
         # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
         single = pycolmap.CameraMode.SINGLE
@@ -243,6 +246,21 @@ def _extract(
             device=pycolmap.Device.cpu,
         )
         listener(Event(STAGE, start + len(batch), total))
+
+
+def _complete_masks(photos: PreparedPhotos, folder: Path) -> Path:
+    """A folder with a mask for every photo: white where there is none, for pycolmap leaves such photos out."""
+    for name in photos.names:
+        target = folder / f"{name}.png"
+        if target.is_file() or photos.masks is None:
+            continue
+        source = photos.masks / f"{name}.png"
+        with atomic_path(target) as temporary:
+            if source.is_file():
+                shutil.copyfile(source, temporary)
+            else:
+                Image.new("L", image_size(photos.images / name), 255).save(temporary, format="PNG")
+    return folder
 
 
 def _match(database: Path, count: int, config: PoseConfig, seed: int) -> None:

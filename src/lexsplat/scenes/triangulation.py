@@ -123,9 +123,12 @@ def triangulate(
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
         folder = Path(temporary)
         sizes = []
+        masked = any(view.ignore_path is not None for view in views)
         for done, view in enumerate(views):
             listener(Event(STAGE, done, total))
             sizes.append(_write_image(view, folder / "images" / _file_name(done)))
+            if masked:
+                _write_mask(view, sizes[-1], folder / "masks" / f"{_file_name(done)}.png")
         points, colors = _run_pycolmap(views, sizes, folder, seed, len(views), total, listener)
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
@@ -247,6 +250,14 @@ def _write_image(view: View, path: Path) -> tuple[int, int]:
     return size
 
 
+def _write_mask(view: View, size: tuple[int, int], path: Path) -> None:
+    """Write what pycolmap may find features in: white where nothing is masked, else it would leave the image out."""
+    valid = view.load_valid(size)
+    pixels = np.full((size[1], size[0]), 255, np.uint8) if valid is None else valid.astype(np.uint8) * 255
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, compress_level=1)
+
+
 def _run_pycolmap(
     views: tuple[View, ...],
     sizes: list[tuple[int, int]],
@@ -265,6 +276,8 @@ def _run_pycolmap(
     pycolmap.Database.open(database).close()
     # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
     reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
+    if any(view.ignore_path is not None for view in views):
+        reader.mask_path = folder / "masks"
     pycolmap.import_images(database, images, pycolmap.CameraMode.PER_IMAGE, names, reader)
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = MAX_FEATURES
@@ -360,7 +373,10 @@ def _cache_key(views: tuple[View, ...], seed: int) -> str:
     for view in views:
         status = view.image_path.stat()
         lens = [view.lens.model, view.lens.width, view.lens.height, *view.lens.params]
-        about = [view.name, status.st_size, status.st_mtime_ns, lens, view.background]
+        about: list[Any] = [view.name, status.st_size, status.st_mtime_ns, lens, view.background]
+        if view.ignore_path is not None:
+            mask = view.ignore_path.stat()
+            about += [mask.st_size, mask.st_mtime_ns]
         digest.update(json.dumps(about).encode())
         digest.update(view.camera.viewmat.tobytes())
     return digest.hexdigest()[:16]

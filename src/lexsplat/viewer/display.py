@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.boxes import gravity_up
 from lexsplat.cameras import Camera
 from lexsplat.scene_folder import StoredView
 from lexsplat.search import SearchableScene
@@ -39,7 +38,7 @@ class Display:
         self.splats = SplatBlocks(scene.gaussians, budget)
         self._handles: list[Any] = []
         cameras = [view.camera for view in scene.views.values()]
-        self.up = gravity_up(cameras).direction if cameras else np.array([0.0, 0.0, 1.0])
+        self.up = scene.world.up.direction
         self.center = np.median(scene.gaussians.means.detach().cpu().numpy(), axis=0).astype(np.float64)
         self._frustums: list[Any] = []
         server.scene.set_up_direction(self.up)

@@ -203,7 +203,7 @@ class Session:
         """
         scene = self.scene
         hit = surface_at(scene.gaussians, camera, x, y)
-        selection = select_hit(hit, scene.gaussians, scene.field, scene.cameras)
+        selection = select_hit(hit, scene.gaussians, scene.field, scene.cameras, world=scene.world)
         shares = hit.weights.float() / hit.weights.sum().clamp_min(1e-12)
         blended = shares @ scene.field.select(hit.indices).code_probabilities()
         vocabulary = self.memory.vocabulary
@@ -287,7 +287,7 @@ class Session:
             raise QueryError("selection", expected="something selected", found="nothing")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"selection{ending}"
-            export_gaussians(selection.selected, path, cameras=self.scene.cameras)
+            export_gaussians(selection.selected, path, world=self.scene.world)
             return f"{file_name(selection.phrase)}{ending}", path.read_bytes()
 
 
