@@ -31,8 +31,7 @@ class Scale:
         between: Two phrases: it is that between the middles of these things.
         height_of: A phrase: it is the height of this thing.
         points: Two places as x,y,z: it is that between them.
-        up: Direction away from the ground, as x,y,z in the scene's axes (write --up=-1,0,0 where it begins with a
-            minus).
+        up: Direction away from the ground, as x,y,z in the scene's axes.
         clip: Text encoder, if it is not where the build found it.
         device: Where to compute.
         json: Print one JSON document on standard output.
