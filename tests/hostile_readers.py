@@ -19,6 +19,7 @@ import shutil
 import signal
 import sys
 import time
+import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -33,6 +34,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 SECONDS = 5.0
 GIGABYTE = 1 << 30
+BASE_BYTES = 3 << 28
+"""What the process takes before any input: torch, Numba's kernels, the other libraries."""
 
 
 @dataclass
@@ -996,6 +999,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     logging.getLogger("lexsplat").setLevel(logging.CRITICAL)
+    warnings.simplefilter("ignore")
     signal.signal(signal.SIGALRM, _interrupt)
     reports: dict[str, Any] = {}
     for name in names:

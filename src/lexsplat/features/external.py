@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tokenize
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -133,16 +135,21 @@ def _read_segments(path: Path) -> FeatureMap:
 
 def _read_npy(path: Path) -> NDArray:
     try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FileFormatError(
-            path, expected="a .npy array without pickled objects", found=str(error)
-        ) from error
+        # Mapped first: a header that promises more than the file holds must not become memory.
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError) as error:
+        raise _no_array(path, error) from error
+    except (SyntaxError, RecursionError, tokenize.TokenError, zipfile.BadZipFile) as error:
+        raise _no_array(path, error) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise FileFormatError(
             path, expected="an array of numbers", found=str(getattr(array, "dtype", type(array)))
         )
-    return array
+    return np.array(array)
+
+
+def _no_array(path: Path, error: Exception) -> FileFormatError:
+    return FileFormatError(path, expected="a .npy array without pickled objects", found=str(error)[:200])
 
 
 def _unit(array: NDArray, path: Path) -> torch.Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,13 @@ def is_model_folder(folder: Path) -> bool:
         return False
     index = folder / "model.safetensors.index.json"
     if index.is_file():
-        shards = set(read_json(index).get("weight_map", {}).values())
-        return bool(shards) and all((folder / shard).is_file() for shard in shards)
+        table = read_json(index).get("weight_map")
+        shards = list(table.values()) if isinstance(table, dict) else []
+        # Only files of the folder itself: a name that leads elsewhere is no shard.
+        plain = all(
+            isinstance(shard, str) and "\0" not in shard and Path(shard).name == shard for shard in shards
+        )
+        return bool(shards) and plain and all((folder / shard).is_file() for shard in set(shards))
     return (folder / "model.safetensors").is_file()
 
 
@@ -72,8 +78,10 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ModelError(path, expected="JSON", found=str(error), remedy="fetch the model again") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ModelError(
+            path, expected="JSON", found=str(error)[:200], remedy="fetch the model again"
+        ) from error
     if not isinstance(content, dict):
         raise ModelError(path, expected="a JSON object", found=type(content).__name__)
     return content

@@ -13,7 +13,7 @@ from lexsplat.scenes.capture import Capture, Photo
 from lexsplat.scenes.colmap import find_model, read_colmap
 from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, sizes_agree
 from lexsplat.scenes.masks import IGNORE_FOLDER, find_ignore_masks
-from lexsplat.scenes.scene import Scene, View
+from lexsplat.scenes.scene import Scene, View, stem_of
 from lexsplat.scenes.splits import choose_test_names, mask_folders
 from lexsplat.scenes.transforms_json import find_transforms, read_transforms
 from lexsplat.scenes.undistortion import pinhole_of
@@ -85,6 +85,7 @@ def load_scene(
             found=f"{doubled} twice",
             remedy="remove one of the two from the file",
         )
+    _check_stems(list(views), capture.origin)
     root = capture.root if beside is None else Path(beside)
     segmentations = root / SEGMENTATIONS
     has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
@@ -111,6 +112,24 @@ def load_scene(
         source=capture.source,
         background=capture.background,
     )
+
+
+def _check_stems(names: list[str], origin: Path) -> None:
+    """Refuse images whose names differ in their endings only: index maps, masks and heatmaps are named by stems.
+
+    Raises:
+        CaptureError: If there are two.
+    """
+    stems: dict[str, str] = {}
+    for name in names:
+        other = stems.setdefault(stem_of(name), name)
+        if other != name:
+            raise CaptureError(
+                origin,
+                expected="names of images that differ in more than their endings",
+                found=f"{other} and {name}",
+                remedy="rename or remove one of the two",
+            )
 
 
 def _annotated(root: Path, names: list[str]) -> set[str]:
