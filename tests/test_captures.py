@@ -96,6 +96,8 @@ def test_an_output_that_is_the_photos_folder_is_refused(photos, capsys):
     assert run("reconstruct", photos, photos) == 1
     assert "--output" in capsys.readouterr().err
     assert not (photos / "poses").exists()
+    assert run("reconstruct", photos / "walk.mp4", photos.parent / "nothing") == 1
+    assert "walk.mp4: expected a video, found no such file" in capsys.readouterr().err
 
 
 def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):

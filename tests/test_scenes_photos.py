@@ -8,7 +8,7 @@ from test_scenes_triangulation import texture
 
 from lexsplat.cameras import look_at
 from lexsplat.errors import CaptureError
-from lexsplat.scenes import PoseConfig, load_scene, poses_from_photos
+from lexsplat.scenes import PoseConfig, load_scene, photos, poses_from_photos
 from lexsplat.scenes.photos import find_photos
 from lexsplat.scenes.preparation import prepare_photos, turned_upright
 
@@ -258,6 +258,23 @@ def test_masked_pixels_give_no_features(phone):
     valid = load_scene(poses.root, images=poses.images, test_every=0).views["0.jpg"].load_valid()
     assert not valid[-88:, -68:].any()
     assert valid[:80].all()
+
+
+def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch):
+    """Each photo is compared with the next one alone, and that shows nothing: every second one is blank."""
+    monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
+    monkeypatch.setattr(photos, "SEQUENTIAL_OVERLAP", 1)
+    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+    cameras = room_cameras()
+    for index, camera in enumerate(cameras):
+        save(tmp_path / "photos" / f"{index}.png", room_photo(camera, textures))
+        save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
+    with pytest.raises(CaptureError, match="none could be placed"):
+        poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
+    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
+    assert poses.placed == tuple(f"{index}.png" for index in range(COUNT))
+    views = load_scene(poses.root, images=poses.images, test_every=0).views
+    assert_same_up_to_a_similarity([views[f"{index}.png"].camera for index in range(COUNT)], cameras)
 
 
 def test_a_mask_of_another_shape_is_told_before_anything_is_done(tmp_path):

@@ -70,6 +70,8 @@ def _photos_fingerprint(capture: Path, photos: Path, output: Path, config: Build
     """What estimated cameras depend on: photos by name and size, masks also by time, and the settings."""
     about: list[Any] = [config.poses, config.seed]
     if is_video(capture):
+        if not capture.is_file():
+            raise CaptureError(capture, expected="a video", found="no such file", remedy="check the path")
         return fingerprint(about, capture.name, capture.stat().st_size, config.frames)
     masks = [path for folder in mask_places(photos) for path in sorted(folder.rglob("*")) if path.is_file()]
     names = find_photos(photos, output)
