@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,10 @@ from numpy.typing import NDArray
 
 from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.evaluation import EvaluationConfig
-from lexsplat.experiments import Bench, with_seed
+from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
-from lexsplat.pipeline import machine_facts, make_field
+from lexsplat.pipeline import make_field
 from lexsplat.progress import Listener, silent
-from lexsplat.report import table_rows, write_rows
-from lexsplat.scene_folder import to_json, write_json
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "w/o DINO": {"codebook": {"use_dino": False}},
@@ -102,7 +101,7 @@ def ablate(
     evaluation: EvaluationConfig | None = None,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
-    """Measure the variants; writes ``ablation.json``, ``.csv`` and ``.tex`` into ``output``.
+    """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``report.html`` into ``output``.
 
     A stopped run goes on where it was; the tables are written anew after every run.
 
@@ -130,17 +129,14 @@ def ablate(
         raise ValueError("an ablation needs at least one seed")
     with_wrong_labels({}, wrong_labels, 1, 0)  # a wrong share is told before anything is made
     bench = Bench(capture, output, config, evaluation or paper_evaluation(), listener)
-    results: dict[str, list[dict[str, Any]]] = {}
-    rows: list[dict[str, Any]] = []
+    results = Results(bench, "ablation", [name for name, _, _ in plan], seeds, COLUMNS)
     for seed in seeds:  # one seed for all variants first: a stopped run leaves whole tables of fewer seeds
         for name, method, variant in plan:
             settings = with_seed(changed(replace(bench.config, method=method), variant), seed)
             made_from = [*language_settings(settings), *([wrong_labels] if wrong_labels else [])]
-            run = bench.run(name, seed, made_from, lambda: make_language(bench, settings, wrong_labels))  # noqa: B023
-            results.setdefault(name, []).append(run.result)
-            rows = table_rows({name: results[name] for name, _, _ in plan if name in results})
-            _write(output, rows, bench, results)
-    return rows
+            make = partial(make_language, bench, settings, wrong_labels)
+            results.add(bench.run(name, seed, made_from, make, pictures=seed == seeds[0]))
+    return results.rows()
 
 
 def _plan(
@@ -179,15 +175,3 @@ def make_language(
 def language_settings(config: BuildConfig) -> list[Any]:
     """Everything a language depends on beside Gaussians, features and seed."""
     return [config.method, config.codebook, config.embedding, config.lifting, config.tuning]
-
-
-def _write(output: Path, rows: list[dict[str, Any]], bench: Bench, results: Mapping[str, Any]) -> None:
-    write_rows(output, "ablation", rows, COLUMNS)
-    content = {
-        "rows": rows,
-        "config": to_json(bench.config),
-        "evaluation": to_json(bench.evaluation),
-        "machine": machine_facts(),
-        "runs": {name: [result["language"]["strict"] for result in runs] for name, runs in results.items()},
-    }
-    write_json(output / "ablation.json", content)

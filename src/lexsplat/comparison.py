@@ -13,13 +13,10 @@ from lexsplat.ablation import language_settings, make_language
 from lexsplat.config import BuildConfig
 from lexsplat.evaluation import EvaluationConfig
 from lexsplat.evaluation.methods import Method
-from lexsplat.experiments import Bench, with_seed
+from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
-from lexsplat.pipeline import machine_facts
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import embed_prompts
-from lexsplat.report import table_rows, write_rows
-from lexsplat.scene_folder import to_json, write_json
 
 OURS = ("lifted", "trained", "lifted+tuned")
 """Our fields; with "-feature" behind, answered in the paper's form of relevancy."""
@@ -42,7 +39,7 @@ def compare(
     lpips: bool = True,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
-    """Measure the methods; writes ``comparison.json``, ``.csv`` and ``.tex`` into ``output``.
+    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``report.html`` into ``output``.
 
     A stopped run goes on where it was; the tables are written anew after every run. Memory is the peak while a
     method's language is made, where the system can tell (Linux), and includes what the process holds anyway;
@@ -69,24 +66,14 @@ def compare(
         raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown) or 'too few'}")
     bench = Bench(capture, output, config, EvaluationConfig(lpips=lpips), listener)
     shared = bench.evaluation
-    results: dict[str, list[dict[str, Any]]] = {}
-    rows: list[dict[str, Any]] = []
+    results = Results(bench, "comparison", methods, seeds)
     for seed in seeds:
         for name in methods:
             form = "feature" if name.endswith("-feature") else shared.query.form
             bench.evaluation = replace(shared, query=replace(shared.query, form=form))
             settings, make = _method(bench, name, seed)
-            results.setdefault(name, []).append(bench.run(name, seed, settings, make).result)
-            rows = table_rows({name: results[name] for name in methods if name in results})
-            write_rows(output, "comparison", rows)
-            content = {
-                "rows": rows,
-                "config": to_json(bench.config),
-                "evaluation": to_json(shared),
-                "machine": machine_facts(),
-            }
-            write_json(output / "comparison.json", content)
-    return rows
+            results.add(bench.run(name, seed, settings, make, pictures=seed == seeds[0]))
+    return results.rows()
 
 
 def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[], Made]]:

@@ -10,7 +10,7 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,31 @@ from lexsplat.captures import reload_capture
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.errors import CaptureError, FileFormatError
-from lexsplat.evaluation import EvaluationConfig, Metrics, evaluate, forget_peak_memory, peak_memory
+from lexsplat.evaluation import (
+    EvaluationConfig,
+    Metrics,
+    ViewPictures,
+    evaluate,
+    forget_peak_memory,
+    peak_memory,
+)
 from lexsplat.evaluation.methods import Method
+from lexsplat.evaluation.results import plain
 from lexsplat.features import FeatureMaps, TextCache, load_level_maps
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
 from lexsplat.masking import MaskedCodeMaps
 from lexsplat.pipeline import build, feature_maps, machine_facts
 from lexsplat.progress import Listener, silent
-from lexsplat.scene_folder import SceneFolder, fingerprint, read_json, write_json
+from lexsplat.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
+from lexsplat.scene_folder import SceneFolder, fingerprint, read_json, to_json, write_json
 from lexsplat.scenes import Annotations, Scene, load_annotations
 from lexsplat.tensor_files import read_tensors, write_tensors
 
 log = logging.getLogger("lexsplat")
+
+PICTURE_WIDTH = 240
+"""Pixels across of the pictures that are kept of a run."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +57,16 @@ class Run:
         seed: Of the language; the Gaussians are shared.
         result: The content of its ``metrics.json``.
         kept: Whether it was measured earlier.
+        detail: "curves" and "cases" as `report.MeasuredMethod` has them.
+        pictures: Where its pictures are, if they were kept.
     """
 
     name: str
     seed: int
     result: dict[str, Any]
     kept: bool
+    detail: dict[str, Any] = field(default_factory=dict)
+    pictures: Path | None = None
 
 
 class Bench:
@@ -168,6 +184,8 @@ class Bench:
         seed: int,
         settings: Sequence[Any],
         make: Callable[[], tuple[LanguageField | Method, dict[str, float]]],
+        *,
+        pictures: bool = False,
     ) -> Run:
         """Make a language and measure it, unless that was done before with the same settings.
 
@@ -176,6 +194,7 @@ class Bench:
             seed: Of the language.
             settings: Everything the language depends on beside the shared stages: dataclasses and plain data.
             make: Makes it; returns it with the seconds of its stages.
+            pictures: Whether to keep pictures of every prompt in every view.
         """
         made_from = fingerprint(
             [self._stage("reconstruct"), self._stage("features")],
@@ -185,25 +204,38 @@ class Bench:
             self._truth_identity(),
         )
         path = self.output / "runs" / _folder_name(name) / f"seed-{seed}.json"
+        drawn = path.with_name(f"seed-{seed}.pictures.safetensors")
         if path.is_file():
             try:
                 stored = read_json(path)
                 if stored["fingerprint"] == made_from:
-                    return Run(name, seed, stored["metrics"], kept=True)
+                    shown = drawn if drawn.is_file() else None
+                    return Run(name, seed, stored["metrics"], True, stored.get("detail", {}), shown)
             except (FileFormatError, KeyError, TypeError) as error:
                 log.warning("%s is damaged and measured anew (%s)", path, error)
         gc.collect()
         forget_peak_memory()
         language, seconds = make()
         peak = peak_memory()
-        metrics = self._measure(name, language, seconds)
+        gallery = Gallery(width=PICTURE_WIDTH)
+        metrics = self._measure(name, language, seconds, gallery.add if pictures else None)
         result = metrics.to_json()
         result["size"]["peak_rss_bytes"] = peak
         result["config"]["seed"] = seed
-        write_json(path, {"fingerprint": made_from, "name": name, "seed": seed, "metrics": result})
-        return Run(name, seed, result, kept=False)
+        if pictures:
+            write_tensors(drawn, gallery.tensors(), {"fingerprint": made_from})
+        detail = detail_of(metrics)
+        stored = {"fingerprint": made_from, "name": name, "seed": seed, "metrics": result, "detail": detail}
+        write_json(path, stored)
+        return Run(name, seed, result, False, detail, drawn if pictures else None)
 
-    def _measure(self, name: str, language: LanguageField | Method, seconds: dict[str, float]) -> Metrics:
+    def _measure(
+        self,
+        name: str,
+        language: LanguageField | Method,
+        seconds: dict[str, float],
+        observer: Callable[[ViewPictures], None] | None,
+    ) -> Metrics:
         shared = self.folder.stage_seconds()
         stages = {stage: shared[stage] for stage in ("reconstruct", "features")}
         return evaluate(
@@ -214,6 +246,7 @@ class Bench:
             self.evaluation,
             masks=self.truth.masks,
             boxes=self.truth.boxes,
+            observer=observer,
             listener=self.listener,
             stage_seconds={**stages, **seconds},
             settings={"name": name},
@@ -225,6 +258,97 @@ class Bench:
             return []
         files = sorted(file for file in self.truth.origin.rglob("*") if file.is_file())
         return [[str(f.relative_to(self.truth.origin)), f.stat().st_size] for f in files]
+
+
+class Results:
+    """The runs of an experiment as they come in, and the files made of them.
+
+    Args:
+        bench: On which they are measured.
+        stem: "comparison" or "ablation": the name of the files.
+        names: Of all rows, in the order of the table.
+        seeds: Of all runs; pictures are those of the first.
+        columns: Keys of the table; none takes those of the paper's Table 1 and ours.
+    """
+
+    def __init__(
+        self, bench: Bench, stem: str, names: Sequence[str], seeds: Sequence[int], columns: Sequence[str] = ()
+    ) -> None:
+        self.bench, self.stem, self.columns = bench, stem, tuple(columns)
+        self.names, self.seeds = list(names), list(seeds)
+        self.runs: dict[str, list[Run]] = {}
+        self.evaluation = bench.evaluation
+
+    def add(self, run: Run) -> None:
+        """Take a run in and write all files anew, so that a stopped experiment has whole tables."""
+        self.runs.setdefault(run.name, []).append(run)
+        rows, folder = self.rows(), self.bench.output
+        write_rows(folder, self.stem, rows, self.columns)
+        write_json(folder / f"{self.stem}.json", self._content(rows))
+        write_comparison(
+            folder / "report.html",
+            [self._measured(name) for name in self.names if name in self.runs],
+            rows,
+            title=f"lexsplat {'ablate' if self.stem == 'ablation' else 'compare'}: {self.bench.scene.root.name}",
+            subtitle="The same Gaussians and the same features, measured on held-out views",
+            columns=self.columns,
+            config={
+                **to_json(self.bench.config),
+                "seeds": self.seeds,
+                "evaluation": to_json(self.evaluation),
+            },
+            machine=machine_facts(),
+        )
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of the table so far (`report.table_rows`)."""
+        found = {name: [run.result for run in self.runs[name]] for name in self.names if name in self.runs}
+        return table_rows(found)
+
+    def _content(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
+        words = {name: [run.result["language"] for run in runs] for name, runs in self.runs.items()}
+        return {
+            "rows": rows,
+            "seeds": self.seeds,
+            "config": to_json(self.bench.config),
+            "evaluation": to_json(self.evaluation),
+            "machine": machine_facts(),
+            "runs": {name: [language["strict"] for language in found] for name, found in words.items()},
+            "per_prompt": {
+                name: [language["per_prompt"] for language in found] for name, found in words.items()
+            },
+        }
+
+    def _measured(self, name: str) -> MeasuredMethod:
+        runs = self.runs[name]
+        first, gallery = runs[0], Gallery()
+        if first.pictures is not None:
+            try:
+                gallery = Gallery.from_tensors(read_tensors(first.pictures)[0])
+            except (FileFormatError, ValueError) as error:
+                log.warning("%s is damaged and left out of the report (%s)", first.pictures, error)
+        detail = first.detail
+        results = [run.result for run in runs]
+        return MeasuredMethod(name, results, detail.get("curves", {}), detail.get("cases", {}), gallery)
+
+
+def detail_of(metrics: Metrics) -> dict[str, Any]:
+    """Curves and numbers of every prompt in every view, for a report that compares."""
+    return {
+        "curves": {prompt: [round(float(v), 4) for v in curve] for prompt, curve in metrics.curves.items()},
+        "cases": {
+            view: {
+                prompt: plain(
+                    {
+                        "IoU": pair.counts.at(metrics.thresholds[prompt]["auto"]).iou,
+                        "AP": pair.average_precision,
+                    }
+                )
+                for prompt, pair in prompts.items()
+            }
+            for view, prompts in metrics.pairs.items()
+        },
+    }
 
 
 def _folder_name(name: str) -> str:

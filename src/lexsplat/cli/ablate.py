@@ -17,8 +17,8 @@ from lexsplat.config import BuildConfig, LanguageMethod
 class Ablate:
     """Measure the method without its parts, as in the paper's Table 2, over several seeds.
 
-    Gaussians and features are made once, codebooks once a setting and seed. Writes ablation.json, .csv and .tex.
-    Run it again with the same output to go on where it stopped.
+    Gaussians and features are made once, codebooks once a setting and seed. Writes ablation.json, .csv, .tex and
+    report.html. Run it again with the same output to go on where it stopped.
 
     Args:
         capture: Folder with photos, cameras and masks; "demo" or "second" for the scenes that ship.
@@ -89,4 +89,4 @@ class Ablate:
             print_json_file(self.output / "ablation.json")
             return
         print(format_rows(rows, ablation.COLUMNS))
-        print(f"{self.output}: ablation.json, ablation.csv, ablation.tex")
+        print(f"{self.output}: ablation.json, ablation.csv, ablation.tex, report.html")

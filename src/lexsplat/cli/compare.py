@@ -18,7 +18,7 @@ class Compare:
     """Measure several methods on the same Gaussians and the same features, in the columns of the paper's Table 1.
 
     Ours, and what the paper compares with, rebuilt from the ideas of their papers (docs/evaluation.md says how).
-    Writes comparison.json, .csv and .tex. Run it again with the same output to go on where it stopped.
+    Writes comparison.json, .csv, .tex and report.html. Run it again with the same output to go on where it stopped.
 
     Args:
         capture: Folder with photos, cameras and masks; "demo" or "second" for the scenes that ship.
@@ -68,4 +68,4 @@ class Compare:
             print_json_file(self.output / "comparison.json")
             return
         print(format_rows(rows))
-        print(f"{self.output}: comparison.json, comparison.csv, comparison.tex")
+        print(f"{self.output}: comparison.json, comparison.csv, comparison.tex, report.html")

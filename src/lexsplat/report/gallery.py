@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from lexsplat.evaluation import ViewPictures
 from lexsplat.heatmaps import overlay_heatmap, overlay_mask
@@ -42,6 +45,33 @@ class Gallery:
                 "mask": self._jpeg(overlay_mask(image, relevancy >= pictures.thresholds[prompt])),
                 "truth": self._jpeg(overlay_mask(photo, pictures.truth[prompt], color=(64, 200, 140))),
             }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every JPEG by name, for safetensors."""
+        stored = {
+            f"view/{kind}/{view}": jpeg for view, kinds in self.views.items() for kind, jpeg in kinds.items()
+        }
+        for (view, prompt), kinds in self.cases.items():
+            stored |= {f"case/{kind}/{view}\n{prompt}": jpeg for kind, jpeg in kinds.items()}
+        return {name: torch.frombuffer(bytearray(jpeg), dtype=torch.uint8) for name, jpeg in stored.items()}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Gallery:
+        """The inverse of `tensors`.
+
+        Raises:
+            ValueError: If a name is not one of ours.
+        """
+        gallery = cls()
+        for name, tensor in tensors.items():
+            part, kind, place = name.split("/", 2)
+            jpeg = tensor.numpy().tobytes()
+            if part == "view":
+                gallery.views.setdefault(place, {})[kind] = jpeg
+            else:
+                view, prompt = place.split("\n", 1)
+                gallery.cases.setdefault((view, prompt), {})[kind] = jpeg
+        return gallery
 
     def _jpeg(self, picture: NDArray[np.uint8]) -> bytes:
         height = max(1, round(picture.shape[0] * self.width / picture.shape[1]))

@@ -6,9 +6,7 @@ policy forbids any request. Worst cases come first, because they are what a read
 
 from __future__ import annotations
 
-import base64
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -19,11 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lexsplat.atomic import atomic_path
 from lexsplat.evaluation import Metrics
 from lexsplat.heatmaps import color_scale
 from lexsplat.report.gallery import Gallery
-from lexsplat.report.style import PAGE, STYLE
+from lexsplat.report.markup import (
+    cards,
+    curve_points,
+    data_uri,
+    header,
+    image,
+    meter,
+    plot,
+    provenance,
+    section,
+    table,
+    write_page,
+)
 from lexsplat.report.tables import COLUMNS, number, prompts_worst_first, protocol_rows, size_text
 
 MAX_CASES = 120
@@ -55,21 +64,15 @@ def write_report(
     sections = [
         _header(title, subtitle, data),
         _hero(cases, gallery),
-        _section("Words", _language_table(data)),
-        _section("Prompts, worst first", _prompt_table(data)),
-        _section("Precision over recall, all views", _curves(metrics)),
-        _section("Cases, worst first", _cases(cases, gallery, max_cases)),
-        _section("Pictures", _quality_table(data)),
-        _section("Speed and size", _resources(data)),
-        _section("Settings and machine", _settings(data)),
+        section("Words", _language_table(data)),
+        section("Prompts, worst first", _prompt_table(data)),
+        section("Precision over recall, all views", _curves(metrics)),
+        section("Cases, worst first", _cases(cases, gallery, max_cases)),
+        section("Pictures", _quality_table(data)),
+        section("Speed and size", _resources(data)),
+        section("Settings and machine", provenance(data["config"], data["machine"])),
     ]
-    page = PAGE.format(
-        title=escape(title),
-        style=STYLE + _view_styles(gallery, {case.view for case in cases[:max_cases]}),
-        body="\n".join(section for section in sections if section),
-    )
-    with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_page(path, title, sections, view_styles(gallery, {case.view for case in cases[:max_cases]}))
 
 
 @dataclass(frozen=True)
@@ -107,13 +110,7 @@ def _header(title: str, subtitle: str, data: Mapping[str, Any]) -> str:
             ("mAP", number(strict["mAP"]), ""),
             ("localisation", number(strict["localization"]), ""),
         ]
-    cards = "".join(
-        f'<div class="card"><b>{value}</b><span>{name}</span><small>{note}</small></div>'
-        for name, value, note in facts
-    )
-    return (
-        f'<header><h1>{escape(title)}</h1><p>{escape(subtitle)}</p><div class="cards">{cards}</div></header>'
-    )
+    return header(title, subtitle, cards(facts))
 
 
 def _hero(cases: Sequence[_Case], gallery: Gallery) -> str:
@@ -121,9 +118,9 @@ def _hero(cases: Sequence[_Case], gallery: Gallery) -> str:
         return ""
     view = cases[-1].view
     prompts = [case.prompt for case in reversed(cases) if case.view == view][:3]
-    tiles = [_image(gallery.views[view]["render"], f"rendering of {view}", "novel view")]
+    tiles = [image(gallery.views[view]["render"], f"rendering of {view}", "novel view")]
     tiles += [
-        _image(gallery.cases[view, prompt]["heatmap"], f"relevancy of {prompt}", prompt) for prompt in prompts
+        image(gallery.cases[view, prompt]["heatmap"], f"relevancy of {prompt}", prompt) for prompt in prompts
     ]
     stops = ", ".join(f"rgb({r} {g} {b})" for r, g, b in color_scale()[::15])
     scale = f'<i style="background:linear-gradient(90deg,{stops})"></i>'
@@ -149,7 +146,7 @@ def _language_table(data: Mapping[str, Any]) -> str:
     form, method = (escape(str(data["language"].get(key))) for key in ("form", "method"))
     kind = f"<p>Relevancy: form <code>{form}</code>; language field: <code>{method}</code>.</p>"
     names = ["", *COLUMNS, "localisation", "Acc@0.25", "Acc@0.5"]
-    return _table(names, rows) + _kind_table(data["language"].get("per_kind") or {}) + kind + note
+    return table(names, rows) + _kind_table(data["language"].get("per_kind") or {}) + kind + note
 
 
 def _with_localization(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,7 +164,7 @@ def _kind_table(kinds: Mapping[str, Mapping[str, Any]]) -> str:
         [f"{escape(kind)} ({row['prompts']})", *(number(row[name]) for name in names)]
         for kind, row in kinds.items()
     ]
-    return _table(["kind of prompt", "mIoU auto", "oracle", "mAP", "localisation"], rows)
+    return table(["kind of prompt", "mIoU auto", "oracle", "mAP", "localisation"], rows)
 
 
 def _prompt_table(data: Mapping[str, Any]) -> str:
@@ -175,13 +172,11 @@ def _prompt_table(data: Mapping[str, Any]) -> str:
         return ""
     rows = []
     for prompt, row in prompts_worst_first(data["language"]["per_prompt"]):
-        share = max(0.0, min(1.0, row["IoU_auto"] or 0.0))
-        meter = f'<span class="meter"><i style="width:{100 * share:.1f}%"></i></span>'
         limits = row["thresholds"]
         rows.append(
             [
                 f"{escape(prompt)}",
-                f"{meter}{number(row['IoU_auto'])}",
+                f"{meter(row['IoU_auto'])}{number(row['IoU_auto'])}",
                 *(number(row[key]) for key in ("IoU_fixed", "IoU_oracle", "PA", "P", "AP", "localization")),
                 number(limits["auto"]),
                 number(limits["oracle"]),
@@ -191,7 +186,7 @@ def _prompt_table(data: Mapping[str, Any]) -> str:
             ]
         )
     names = "prompt,IoU,fixed,oracle,PA,P,AP,localisation,threshold,best threshold,lerf-2d,lerf-3d,views"
-    return _table(names.split(","), rows)
+    return table(names.split(","), rows)
 
 
 def _curves(metrics: Metrics) -> str:
@@ -204,15 +199,9 @@ def _curves(metrics: Metrics) -> str:
 
 
 def _plot(name: str, curve: NDArray[np.float64], kind: str) -> str:
-    points = " ".join(f"{10 + 1.2 * i:.1f},{86 - 80 * float(value):.1f}" for i, value in enumerate(curve))
-    area = f"10,86 {points} 130,86"
-    return (
-        f'<figure class="plot {kind}">'
-        f'<svg viewBox="0 0 140 96" role="img" aria-label="precision over recall of {escape(name)}">'
-        f'<path d="M10 6V86H130M10 46H130M70 6V86" class="grid"/>'
-        f'<polygon points="{area}"/><polyline points="{points}"/></svg>'
-        f"<figcaption>{escape(name)} <b>{float(curve.mean()):.3f}</b></figcaption></figure>"
-    )
+    points = curve_points(curve)
+    lines = f'<polygon points="10,86 {points} 130,86"/><polyline points="{points}"/>'
+    return plot(name, lines, f"<b>{float(curve.mean()):.3f}</b>", kind)
 
 
 def _cases(cases: Sequence[_Case], gallery: Gallery, limit: int) -> str:
@@ -228,7 +217,7 @@ def _cases(cases: Sequence[_Case], gallery: Gallery, limit: int) -> str:
             f'aria-label="{kind} of {escape(case.view)}"></div>'
             for kind in ("photo", "render")
         ]
-        tiles += [_image(pictures[kind], f"{kind} of {case.prompt}") for kind in ("heatmap", "mask", "truth")]
+        tiles += [image(pictures[kind], f"{kind} of {case.prompt}") for kind in ("heatmap", "mask", "truth")]
         words = f"<b>{escape(case.prompt)}</b> in {escape(case.view)}"
         numbers = f"IoU {number(case.iou)} · AP {number(case.average_precision)}"
         rows.append(f'<div class="case"><p>{words}<span>{numbers}</span></p>{"".join(tiles)}</div>')
@@ -247,7 +236,7 @@ def _quality_table(data: Mapping[str, Any]) -> str:
     ]
     reason = data["quality"].get("lpips_reason")
     note = f"<p>LPIPS was not measured: {escape(reason)}.</p>" if reason else ""
-    return _table(["view", "PSNR", "SSIM", "LPIPS"], rows) + note
+    return table(["view", "PSNR", "SSIM", "LPIPS"], rows) + note
 
 
 def _resources(data: Mapping[str, Any]) -> str:
@@ -265,49 +254,10 @@ def _resources(data: Mapping[str, Any]) -> str:
     rows += [
         [f"seconds of {escape(name)}", number(value, 1)] for name, value in speed["stage_seconds"].items()
     ]
-    return _table(["", ""], rows)
+    return table(["", ""], rows)
 
 
-def _settings(data: Mapping[str, Any]) -> str:
-    parts = [_provenance(data)]
-    for name in ("machine", "config"):
-        text = escape(json.dumps(data[name], indent=2, ensure_ascii=False))
-        parts.append(f"<details><summary>{name}</summary><pre>{text}</pre></details>")
-    return "".join(parts)
-
-
-_PROVENANCE = (
-    "seed", "device", "method", "clip", "dino", "downscale", "iterations", "platform", "cpu", "cores", "gpu",
-)  # fmt: skip
-
-
-def _provenance(data: Mapping[str, Any]) -> str:
-    """What somebody needs who wants to repeat the numbers: seed, models, machine, versions."""
-    known = {**data["config"], **data["machine"]}
-    rows = [[name, escape(str(known[name]))] for name in _PROVENANCE if known.get(name) is not None]
-    versions = data["machine"].get("versions") or {}
-    if versions:
-        rows.append(["versions", escape(", ".join(f"{name} {value}" for name, value in versions.items()))])
-    return _table(["", ""], rows) if rows else ""
-
-
-def _section(heading: str, content: str) -> str:
-    return f"<section><h2>{heading}</h2>{content}</section>" if content else ""
-
-
-def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{name}</th>" for name in names)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def _image(jpeg: bytes, description: str, caption: str = "") -> str:
-    text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    picture = f'<img src="{_data_uri(jpeg)}" alt="{escape(description)}">'
-    return f"<figure>{picture}{text}</figure>"
-
-
-def _view_styles(gallery: Gallery, used: set[str]) -> str:
+def view_styles(gallery: Gallery, used: set[str]) -> str:
     """Photo and rendering of a view stand beside each of its prompts: stored once, as backgrounds."""
     rules = []
     for place, (view, pictures) in enumerate(gallery.views.items()):
@@ -315,10 +265,6 @@ def _view_styles(gallery: Gallery, used: set[str]) -> str:
             width, height = Image.open(io.BytesIO(pictures["photo"])).size
             for kind, jpeg in pictures.items():
                 rules.append(
-                    f".{kind}-{place}{{background-image:url({_data_uri(jpeg)});aspect-ratio:{width}/{height}}}"
+                    f".{kind}-{place}{{background-image:url({data_uri(jpeg)});aspect-ratio:{width}/{height}}}"
                 )
     return "\n".join(rules)
-
-
-def _data_uri(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")

@@ -56,6 +56,30 @@ th:first-child,td:first-child{text-align:left}
 .plot polygon{fill:var(--accent);opacity:.12}
 .plot.mean polyline{stroke:var(--ink);stroke-width:2.2}
 .plot b{color:var(--ink);float:right}
+.legend{display:flex;flex-wrap:wrap;gap:6px 18px;font-size:13px;margin-bottom:14px}
+.legend i{display:inline-block;width:18px;height:3px;border-radius:2px;background:var(--c);
+  margin-right:7px;vertical-align:middle}
+.plot polyline[class]{stroke:var(--c);stroke-width:1.4}
+.plot.mean polyline[class]{stroke-width:1.8}
+.s0{--c:#c2410c}
+.s1{--c:#2563eb}
+.s2{--c:#15803d}
+.s3{--c:#9333ea}
+.s4{--c:#b45309}
+.s5{--c:#0e7490}
+.s6{--c:#be185d}
+.s7{--c:#4d7c0f}
+.s8{--c:#475569}
+.s9{--c:#7c2d12}
+@media(prefers-color-scheme:dark){.s0{--c:#fb923c}.s1{--c:#60a5fa}.s2{--c:#4ade80}.s3{--c:#c084fc}.s4{--c:#fbbf24}
+  .s5{--c:#22d3ee}.s6{--c:#f472b6}.s7{--c:#a3e635}.s8{--c:#94a3b8}.s9{--c:#fda4af}}
+.versus{border-top:1px solid var(--line);padding:14px 0 22px}
+.versus p{margin:0 0 8px;color:var(--ink);max-width:none}
+.row{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(130px,1fr);gap:8px;overflow-x:auto}
+.row.shared{max-width:560px;margin-bottom:12px}
+.answer p{font-size:13px;margin:0 0 6px}
+.answer p span{display:block;color:var(--soft);font-variant-numeric:tabular-nums}
+.answer figure+figure{margin-top:6px}
 .case{display:grid;grid-template-columns:repeat(5,1fr);gap:8px;margin-bottom:20px}
 .case p{grid-column:1/-1;margin:0;color:var(--ink);max-width:none}
 .case p span{float:right;color:var(--soft);font-variant-numeric:tabular-nums}

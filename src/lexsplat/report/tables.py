@@ -28,6 +28,21 @@ _HONEST = {
 }  # fmt: skip
 """Columns that the paper does not have."""
 
+_OTHERS = {
+    "official_mIoU": ("official mIoU", 3), "official_mPA": ("mPA", 3), "official_mP": ("mP", 3),
+    "official_mAP": ("mAP", 3), "lerf_2d_mIoU": ("lerf-2d mIoU", 3), "lerf_2d_localization": ("localisation", 3),
+    "lerf_3d_mIoU": ("lerf-3d mIoU", 3), "lerf_3d_acc_25": ("Acc@0.25", 3), "lerf_3d_acc_50": ("Acc@0.5", 3),
+}  # fmt: skip
+
+OTHER_PROTOCOLS = tuple(_OTHERS)
+"""Columns of other people's protocols."""
+
+_HEADINGS = {**_PAPER, **_HONEST, **_OTHERS}
+
+_LESS_IS_BETTER = {
+    "lpips", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
+}  # fmt: skip
+
 Row = Mapping[str, Any]
 """One line of a table: "name", and numbers by key; several runs give a list of numbers."""
 
@@ -140,12 +155,37 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
     }
 
 
+def row_cells(rows: Sequence[Row], keys: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
+    """What of some rows is shown: the keys that are known, and a text for each of them in each row.
+
+    Args:
+        rows: As `table_rows` makes them.
+        keys: Which numbers; none takes the columns of the paper's Table 1 and ours.
+    """
+    shown = [key for key in keys or (*_PAPER, *_HONEST) if any(_known(row.get(key)) for row in rows)]
+    return shown, [[_cell(row.get(key), _HEADINGS[key][1]) for key in shown] for row in rows]
+
+
+def heading(key: str) -> str:
+    """What stands above a column."""
+    return _HEADINGS[key][0]
+
+
+def best_rows(rows: Sequence[Row], key: str) -> set[int]:
+    """Places of the rows with the best mean of a number; empty when all are alike."""
+    means = {place: mean_and_spread(row.get(key))[0] for place, row in enumerate(rows)}
+    known = {place: mean for place, mean in means.items() if mean is not None}
+    if len(set(known.values())) < 2:
+        return set()
+    best = (min if key in _LESS_IS_BETTER else max)(known.values())
+    return {place for place, mean in known.items() if mean == best}
+
+
 def format_rows(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
     """Rows as a table for the terminal, mean and spread where there were several runs."""
-    shown = [key for key in keys or (*_PAPER, *_HONEST) if any(_known(row.get(key)) for row in rows)]
-    headings = {**_PAPER, **_HONEST}
-    cells = [["", *(headings[key][0] for key in shown)]]
-    cells += [[str(row["name"]), *(_cell(row.get(key), headings[key][1]) for key in shown)] for row in rows]
+    shown, texts_of_rows = row_cells(rows, keys)
+    cells = [["", *map(heading, shown)]]
+    cells += [[str(row["name"]), *line] for row, line in zip(rows, texts_of_rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
     lines = []
     for line in cells:
@@ -183,17 +223,16 @@ def csv_text(rows: Sequence[Row]) -> str:
 
 def latex_text(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
     """Rows as a LaTeX table."""
-    shown = [key for key in keys or _PAPER if any(_known(row.get(key)) for row in rows)]
-    headings = {**_PAPER, **_HONEST}
+    shown, texts_of_rows = row_cells(rows, keys or tuple(_PAPER))
     lines = [
         "% mPA, mP and mIoU at the automatic threshold, strict protocol",
         rf"\begin{{tabular}}{{l{'c' * len(shown)}}}",
         r"\toprule",
-        " & ".join(["Method", *(headings[key][0] for key in shown)]) + r" \\",
+        " & ".join(["Method", *map(heading, shown)]) + r" \\",
         r"\midrule",
     ]
-    for row in rows:
-        texts = [_cell(row.get(key), headings[key][1]).replace("±", r"$\pm$") for key in shown]
+    for row, line in zip(rows, texts_of_rows):
+        texts = [text.replace("±", r"$\pm$") for text in line]
         lines.append(" & ".join([_latex(str(row["name"])), *texts]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
