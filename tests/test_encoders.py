@@ -39,6 +39,26 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.fixture(autouse=True)
+def full_precision(request, monkeypatch):
+    """Bfloat16 is tested by itself; everything else is compared to the last digits."""
+    if "bfloat16" not in request.node.name:
+        monkeypatch.setattr("lexsplat.features.encoders._computes_in_bfloat16", lambda: False)
+
+
+def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatch):
+    clip = load_clip("embedded")
+    crops = torch.rand(12, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+    found = []
+    for on in (False, True):
+        monkeypatch.setattr("lexsplat.features.encoders._computes_in_bfloat16", lambda on=on: on)
+        found.append((clip.encode_images(crops), clip.encode_text(PROMPTS)))
+    cosines = (found[0][0] * found[1][0]).sum(-1)
+    assert cosines.min() > 0.999
+    assert not torch.equal(found[0][0], found[1][0]), "bfloat16 was used"
+    assert torch.equal(found[0][1], found[1][1])
+
+
 def _seeded(build):
     torch.manual_seed(0)
     model = build()

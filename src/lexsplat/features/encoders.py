@@ -8,6 +8,7 @@ for them.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import logging
 import re
@@ -35,6 +36,7 @@ _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.2613
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
+_FEW_TOKENS = 64
 
 
 class ImageTextEncoder(Protocol):
@@ -115,6 +117,10 @@ class ClipEncoder:
             )
         self._siglip = config.model_type.startswith("siglip")
         self.image_size = _image_size(config.vision_config)
+        if self.device.type == "cpu":
+            _plain_attention(
+                self._model.vision_model, (self.image_size // config.vision_config.patch_size) ** 2
+            )
         self._text_length = int(config.text_config.max_position_embeddings)
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
         self._mean, self._std = _normalisation(folder, default, self.device)
@@ -137,7 +143,7 @@ class ClipEncoder:
         _check_images(images)
         images = resize_images(images.to(self.device, torch.float32), self.image_size, self.image_size)
         pixels = (images - self._mean) / self._std
-        with _precision(self.device):
+        with _precision(self.device, crops=True):
             features = _pooled(self._model.get_image_features(**self._vision_inputs(pixels)))
         return F.normalize(features.float(), dim=-1).cpu()
 
@@ -366,9 +372,31 @@ def _pooled(output: Any) -> Tensor:
     return output if isinstance(output, Tensor) else output.pooler_output
 
 
-def _precision(device: torch.device) -> AbstractContextManager:
-    """Half precision on CUDA, where it is many times faster; the angles change by about 1e-3."""
-    return torch.autocast("cuda", dtype=torch.float16) if device.type == "cuda" else nullcontext()
+def _precision(device: torch.device, *, crops: bool = False) -> AbstractContextManager:
+    """Half precision where the device computes in it and gains by it; the angles change by less than 1e-2.
+
+    Float16 on CUDA. Bfloat16 on processors with instructions for it, for many small crops only (1.8 times as fast;
+    dense images gain nothing). Texts are always encoded in float32.
+    """
+    if device.type == "cuda":
+        return torch.autocast("cuda", dtype=torch.float16)
+    return torch.autocast("cpu", dtype=torch.bfloat16) if crops and _computes_in_bfloat16() else nullcontext()
+
+
+@functools.cache
+def _computes_in_bfloat16() -> bool:
+    """Whether the processor has instructions for bfloat16; without them it is emulated, and slow."""
+    names = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+    return any(getattr(torch.cpu, name, bool)() for name in names)
+
+
+def _plain_attention(model: Any, tokens: int) -> None:
+    """For a handful of tokens on a CPU, attention written out takes less time than the fused kernel."""
+    if tokens > _FEW_TOKENS:
+        return
+    for module in model.modules():
+        if hasattr(module, "config"):
+            module.config._attn_implementation = "eager"
 
 
 def _image_size(vision_config: Any) -> int:
