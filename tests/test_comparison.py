@@ -2,11 +2,13 @@
 
 import csv
 import json
+import re
 import time
 
 import pytest
 from colour_encoder import ColourClip, ColourDino
 from test_ablation import CONFIG
+from test_report import Page
 
 from lexsplat import baselines, comparison
 from lexsplat.cli.captures import capture_and_settings
@@ -83,6 +85,33 @@ def test_forms_are_those_of_the_names_and_a_second_run_measures_nothing(compared
         "stage_seconds"
     ]
     assert set(stages) == {"reconstruct", "features", "dff"}
+
+
+def test_the_report_shows_every_method_beside_the_others_and_loads_nothing(compared):
+    folder, _ = compared
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert not {"script", "link", "iframe"} & set(page.tags)
+    assert not re.search(r"https?:|@import|srcset", text)
+    record = json.loads((folder / "comparison.json").read_text())
+    names = [row["name"] for row in record["rows"]]
+    rows = [row for row in page.rows if row]
+    table = {row[0]: row for row in rows[1 : 1 + len(names)]}
+    assert list(table) == names
+    column = rows[0].index("mIoU")
+    for row in record["rows"]:
+        assert table[row["name"]][column] == f"{row['mIoU'][0]:.3f}"
+    cases = re.findall(r'<div class="versus">.*?(?=<div class="versus">|</section>)', text)
+    prompts = record["per_prompt"]["dff"][0]
+    assert len(cases) == sum(row["views"] for row in prompts.values())
+    for case in cases:
+        assert case.count('class="answer"') == len(names), "one column for each method"
+        assert case.count("<img") == 1 + 2 * len(names), "truth once; heatmap and mask of each method"
+    means = [sum(map(float, re.findall(r"IoU ([0-9.]+)", case))) for case in cases]
+    assert means == sorted(means), "worst first"
+    assert text.count("<polyline") == len(names) * (1 + len(prompts))
+    assert record["seeds"] == [0]
+    assert {"seeds", "cpu", "versions"} <= {row[0] for row in rows}
 
 
 def test_unknown_methods_are_refused_before_anything_is_made(tiny_capture, tmp_path):
