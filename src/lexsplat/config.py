@@ -46,7 +46,8 @@ class BuildConfig:
         dino: Dense encoder, in the same way, or "none" (the paper's ablation without DINO).
         device: "auto" takes CUDA where there is a GPU.
         seed: Seed of all randomness.
-        memory: Host memory to stay within, such as "4GB".
+        memory: Host memory that photos, features and projections kept by any stage may take, such as "4GB"; beside
+            it comes what the libraries, the encoders and the Gaussians themselves need (docs/conventions.md).
         checkpoint_seconds: Seconds between two savings of a training that is under way.
         downscale: Factor by which photos are made smaller for reconstruction and language; none chooses one
             that suits the device.
@@ -109,6 +110,23 @@ class BuildConfig:
             World.of_cameras([]).with_up(parse_vector(self.up))
         if self.test_every < 0 or self.test_every == 1:
             raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {self.test_every}")
+
+    def within_memory(self) -> BuildConfig:
+        """The same settings with the store of every stage bounded by a quarter of `memory`.
+
+        What does not fit is read or computed again when it is needed: results do not depend on the bound.
+        """
+        whole = parse_bytes(self.memory)
+        photos = min(self.reconstruction.image_memory, whole // 4)
+        projections = min(self.embedding.memory_bytes, whole // 4)
+        histogram = max(1, min(self.lifting.memory_bytes, whole // 4))
+        return replace(
+            self,
+            reconstruction=replace(self.reconstruction, image_memory=photos),
+            features=replace(self.features, memory=whole),
+            embedding=replace(self.embedding, memory_bytes=projections),
+            lifting=replace(self.lifting, memory_bytes=histogram),
+        )
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
         """The same settings with nothing left open.

@@ -101,6 +101,8 @@ class _Builder:
         splats: Path | None = None,
     ) -> None:
         self.scene, self.folder, self.config = scene, folder, config
+        # How much is kept in memory decides nothing about a result: stages use it, fingerprints leave it out.
+        self.bounded = config.within_memory()
         self.device, self.listener, self.splats = device, listener, splats
         self.made_from: dict[str, str] = {}
         self.clip_hash = ""
@@ -169,7 +171,7 @@ class _Builder:
     def _reconstruct(self) -> dict[str, Any]:
         gaussians = reconstruct(
             self.scene,
-            self.config.reconstruction,
+            self.bounded.reconstruction,
             device=self.device,
             seed=self.config.seed,
             cache_dir=self.folder.root / "checkpoints" / "points",
@@ -180,7 +182,7 @@ class _Builder:
         return {"gaussians": len(gaussians)}
 
     def _train_jointly(self) -> dict[str, Any]:
-        config, scene = self.config, self.scene
+        config, scene = self.bounded, self.scene
         cache = self.folder.root / "checkpoints" / "points"
         points = initial_points(scene, seed=config.seed, cache_dir=cache, listener=self.listener)
         reconstructor = Reconstructor(
@@ -249,7 +251,7 @@ class _Builder:
         )
         codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
         field = make_field(
-            gaussians, cameras, code_maps, codebook, self.config, self.listener, self.checkpoint
+            gaussians, cameras, code_maps, codebook, self.bounded, self.listener, self.checkpoint
         )
         metadata = {**field.metadata(), "reconstruction": self.made_from["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)

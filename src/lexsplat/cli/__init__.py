@@ -75,6 +75,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:  # whoever read our output has seen enough, as in `lexsplat info SCENE | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (MemoryError, RuntimeError) as error:
+        # torch says with a RuntimeError what Python says with a MemoryError.
+        wants_memory = any(
+            words in str(error) for words in ("allocate memory", "not enough memory", "out of memory")
+        )
+        if not (isinstance(error, MemoryError) or wants_memory):
+            raise
+        remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
+        print(f"error: memory: expected more of it, found the end of it; {remedy}", file=sys.stderr)
+        return 1
     except OSError as error:
         # A full disk or a folder without permission: the system's words and the file are the whole story.
         print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)

@@ -42,6 +42,8 @@ from lexsplat.progress import Event, Listener, silent
 if TYPE_CHECKING:
     from lexsplat.scenes import Scene, View
 
+_PHOTO_BYTES = 32
+"""Bytes a pixel of a photo takes while a worker makes a picture of it: decoded, as floats, and resized."""
 _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15 % slower at 256
 _MAX_WORKERS = 4  # beyond this, threads inside an operation pay better than more images in flight
 
@@ -161,6 +163,8 @@ def extract_features(
     workers = (
         1 if clip.device.type == "cuda" else min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing)))
     )
+    largest = max((view.lens.width * view.lens.height for view in scene.views.values()), default=1)
+    workers = max(1, min(workers, config.memory // 2 // (_PHOTO_BYTES * largest)))
     pictures: dict[tuple[Path, Path | None], list[str]] = {}  # views with the same picture share their files
     for name in missing:
         pictures.setdefault((entries[name].clip, entries[name].dino), []).append(name)

@@ -63,9 +63,7 @@ def is_model_folder(folder: Path) -> bool:
         table = read_json(index).get("weight_map")
         shards = list(table.values()) if isinstance(table, dict) else []
         # Only files of the folder itself: a name that leads elsewhere is no shard.
-        plain = all(
-            isinstance(shard, str) and "\0" not in shard and Path(shard).name == shard for shard in shards
-        )
+        plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in shards)
         return bool(shards) and plain and all((folder / shard).is_file() for shard in set(shards))
     return (folder / "model.safetensors").is_file()
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
+from lexsplat.tensor_files import save_tensors
 
 CODES = 4
 """Codes of each Gaussian that go into files."""
@@ -81,17 +82,13 @@ def codebook_path(path: Path) -> Path:
 
 def write_codebook(language: StoredLanguage, path: Path) -> None:
     """Write ``codewords`` ``[K, D]`` as safetensors, with the encoder's name and hash as metadata."""
-    from safetensors.torch import save_file
-
-    save_file({"codewords": language.codewords.contiguous()}, path, metadata=dict(language.encoder))
+    save_tensors({"codewords": language.codewords.contiguous()}, path, language.encoder)
 
 
 def write_field(field: LanguageField, metadata: Mapping[str, str], path: Path) -> None:
     """Write a whole language field as safetensors, as scene folders hold it, with further metadata."""
-    from safetensors.torch import save_file
-
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in field.tensors().items()}
-    save_file(tensors, path, metadata={**field.metadata(), **metadata})
+    save_tensors(tensors, path, {**field.metadata(), **metadata})
 
 
 def check_language(gaussians: Gaussians, language: StoredLanguage | None) -> None:
