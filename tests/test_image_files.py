@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from lexsplat.errors import CaptureError
-from lexsplat.scenes.images import image_size, open_image, read_image, read_mask
+from lexsplat.scenes.images import image_size, open_image, read_image, read_mask, resize_image
 
 WIDTH, HEIGHT = 24, 16
 
@@ -173,6 +173,17 @@ def test_a_damaged_heic_is_told(tmp_path):
         (tmp_path / "a.heic").write_bytes(content)
         with pytest.raises(CaptureError, match=r"a\.heic"):
             read_image(tmp_path / "a.heic")
+
+
+@pytest.mark.parametrize("size", [(24, 16), (12, 8), (7, 5), (23, 15), (1, 1), (24, 3)])
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+def test_large_photos_made_smaller_in_bands_are_as_if_made_smaller_at_once(tmp_path, monkeypatch, size, mode):
+    Image.fromarray(painted()).convert(mode).save(tmp_path / "a.png")
+    whole = resize_image(read_image(tmp_path / "a.png"), size)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png", size=size), whole)
+    monkeypatch.setattr("lexsplat.scenes.images.LARGE_PIXELS", 0)
+    monkeypatch.setattr("lexsplat.scenes.images.BAND_ROWS", 4)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png", size=size), whole, atol=1e-6)
 
 
 # -- pictures that are larger than they look

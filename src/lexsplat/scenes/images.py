@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import struct
 import warnings
@@ -24,6 +25,12 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HE
 
 MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
 """Largest picture that is opened: 179 million pixels. What claims more is a decompression bomb."""
+
+BAND_ROWS = 256
+"""Rows of a large picture that are made smaller at a time."""
+
+LARGE_PIXELS = 24_000_000
+"""Pictures beyond are made smaller a band at a time, where they can be: as floats they take twelve bytes a pixel."""
 
 
 @contextmanager
@@ -131,29 +138,68 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def read_image(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> NDArray[np.float32]:
+def read_image(
+    path: Path,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    size: tuple[int, int] | None = None,
+) -> NDArray[np.float32]:
     """A picture as ``[H, W, 3]`` float32 in 0..1; alpha is composited on ``background``.
+
+    Args:
+        path: The file.
+        background: Colour behind transparent pixels.
+        size: Width and height of the result, as by :func:`resize_image`; a large photo never is in memory as
+            floats then. None keeps the picture's.
 
     Raises:
         CaptureError: As :func:`open_image`.
     """
     with open_image(path) as image:
-        image.load()
-        if image.mode.startswith("I") or image.mode == "F":
-            values = np.asarray(image, dtype=np.float32)
-            # Pillow hands out 16-bit grey as I or I;16; float pictures hold 0..1 by convention.
-            grey = values if image.mode == "F" else values / 65535.0
-            grey = np.clip(np.nan_to_num(grey, nan=0.0), 0.0, 1.0)
-            return np.repeat(grey[..., None], 3, axis=2)
-        if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
-            rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
-            alpha = rgba[..., 3:]
-            return rgba[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1.0 - alpha)
-        pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
-        if not pixels.flags.writeable:
-            pixels = pixels.copy()
-        pixels /= np.float32(255.0)  # in place: a large photo takes enough memory as it is
-        return pixels
+        shrinks = size is not None and size[0] <= image.width and size[1] <= image.height
+        plain = image.mode in ("L", "RGB", "YCbCr", "CMYK") and "transparency" not in image.info
+        if size is not None and shrinks and plain and image.width * image.height > LARGE_PIXELS:
+            return _reduced(image, size)
+        whole = _as_floats(image, background)
+    return whole if size is None else resize_image(whole, size)
+
+
+def _reduced(image: Image.Image, size: tuple[int, int]) -> NDArray[np.float32]:
+    """The mean over the area of each new pixel, a band of the picture at a time: a tenth of the memory."""
+    image.load()
+    step = image.height / size[1]
+    rows = max(1, int(BAND_ROWS / step))
+    found = np.empty((size[1], size[0], 3), dtype=np.float32)
+    for top in range(0, size[1], rows):
+        bottom = min(top + rows, size[1])
+        first, last = int(top * step), min(image.height, math.ceil(bottom * step))
+        band = np.asarray(image.crop((0, first, image.width, last)).convert("RGB"), dtype=np.float32) / 255.0
+        box = (0.0, top * step - first, float(image.width), min(bottom * step - first, float(last - first)))
+        for channel in range(3):
+            plane = Image.fromarray(np.ascontiguousarray(band[..., channel]))
+            resized = plane.resize((size[0], bottom - top), Image.Resampling.BOX, box=box)
+            found[top:bottom, :, channel] = np.asarray(resized)
+    return found
+
+
+def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> NDArray[np.float32]:
+    """All pixels of a picture, whatever its mode."""
+    image.load()
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image, dtype=np.float32)
+        # Pillow hands out 16-bit grey as I or I;16; float pictures hold 0..1 by convention.
+        grey = values if image.mode == "F" else values / 65535.0
+        grey = np.clip(np.nan_to_num(grey, nan=0.0), 0.0, 1.0)
+        return np.repeat(grey[..., None], 3, axis=2)
+    if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+        alpha = rgba[..., 3:]
+        return rgba[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1.0 - alpha)
+    pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
+    if not pixels.flags.writeable:
+        pixels = pixels.copy()
+    pixels /= np.float32(255.0)  # in place: a large photo takes enough memory as it is
+    return pixels
 
 
 def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:

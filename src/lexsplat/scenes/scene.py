@@ -65,8 +65,7 @@ class View:
             ValueError: If ``size`` is not positive.
         """
         size = self._checked_size(size)
-        image = read_image(self.image_path, self.background)
-        found = (image.shape[1], image.shape[0])
+        found = image_size(self.image_path)
         if found != (self.lens.width, self.lens.height):
             raise CaptureError(
                 self.image_path,
@@ -74,6 +73,9 @@ class View:
                 found=f"{found[0]}x{found[1]}",
                 remedy="the file changed since the capture was loaded; load it again",
             )
+        if self.ignore_path is None and not self.lens.distorts:
+            return read_image(self.image_path, self.background, size=size)
+        image = read_image(self.image_path, self.background)
         mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
         if mask is not None and self._is_undistorted(mask):
             image = undistort(image, self.lens, self.capture_size)
