@@ -237,13 +237,22 @@ def test_plain_otsu_is_scikit_images():
 
     samples = two_groups(0.3, spread=0.1)
     expected = threshold_otsu(samples.numpy().ravel(), nbins=512)
-    found = float(queries.automatic_threshold(samples, tempering=1.0))
+    found = float(queries.automatic_threshold(samples, tempering=1.0, pull=0.0))
     assert found == pytest.approx(expected, abs=0.6 * float(samples.max() - samples.min()) / 512 + 1e-6)
 
 
 def test_the_threshold_lies_in_the_middle_of_a_gap():
     samples = torch.tensor([[0.1] * 90 + [0.8] * 10])
-    assert float(queries.automatic_threshold(samples)) == pytest.approx(0.45, abs=2e-3)
+    assert float(queries.automatic_threshold(samples, pull=0.0)) == pytest.approx(0.45, abs=2e-3)
+
+
+def test_the_threshold_moves_halfway_to_half_where_the_classes_lie_on_either_side_of_it():
+    assert float(queries.automatic_threshold(torch.tensor([[0.1] * 90 + [0.8] * 10]))) == pytest.approx(
+        0.475, abs=2e-3
+    )
+    below, above = torch.tensor([[0.1] * 90 + [0.4] * 10]), torch.tensor([[0.6] * 90 + [0.9] * 10])
+    assert float(queries.automatic_threshold(below)) == pytest.approx(0.25, abs=2e-3)
+    assert float(queries.automatic_threshold(above)) == pytest.approx(0.75, abs=2e-3)
 
 
 @pytest.mark.parametrize("level", [0.05, 0.5, 0.9])

@@ -347,13 +347,19 @@ def masks(relevancy: Tensor, thresholds: float | Tensor) -> Tensor:
 
 
 def automatic_threshold(
-    samples: Tensor, weights: Tensor | None = None, *, tempering: float = 0.5, min_contrast: float = 0.05
+    samples: Tensor,
+    weights: Tensor | None = None,
+    *,
+    tempering: float = 0.5,
+    min_contrast: float = 0.05,
+    pull: float = 0.5,
 ) -> Tensor:
     """A threshold for each prompt from relevancies all over the scene; it never sees the truth.
 
     Otsu's method on a histogram whose counts are raised to ``tempering``. Otsu wants classes of like size and
     splits the background when an object covers a percent of the scene; the square root lets the object count
-    (1 is plain Otsu). Where a gap separates the classes, the middle of the gap is taken.
+    (1 is plain Otsu). Where a gap separates the classes, the middle of the gap is taken. If the means of the two
+    classes lie on either side of 0.5, where relevancy itself puts the border, the cut is moved halfway there.
 
     A prompt without contrast (the 99.8th percentile less than ``min_contrast`` above the median: an absent
     object, or one that is everywhere) has no two classes. It gets 0.5, where relevancy itself says whether
@@ -364,6 +370,7 @@ def automatic_threshold(
         weights: Weight of each sample ``[S]``, such as the visibility of Gaussians; all equal when left out.
         tempering: Exponent on the histogram in 0..1.
         min_contrast: Least contrast that is split.
+        pull: How far the cut is moved towards 0.5, in 0..1.
 
     Returns:
         Thresholds ``[P]`` in 0..1, float32 on the CPU, for `masks`.
@@ -374,7 +381,7 @@ def automatic_threshold(
     if shares.shape != samples.shape[1:] or not bool((shares >= 0).all()) or float(shares.sum()) == 0:
         raise ValueError(f"weights must be [{samples.shape[1]}], not negative, and not all zero")
     rows = samples.detach().cpu().double()
-    return torch.tensor([_tempered_otsu(row, shares.double(), tempering, min_contrast) for row in rows])
+    return torch.tensor([_tempered_otsu(row, shares.double(), tempering, min_contrast, pull) for row in rows])
 
 
 def scene_threshold(
@@ -410,7 +417,7 @@ def scene_threshold(
     return automatic_threshold(torch.cat(maps, dim=1))
 
 
-def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: float) -> float:
+def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: float, pull: float) -> float:
     bins = 512
     seen = row[shares > 0]
     low, high = float(seen.min()), float(seen.max())
@@ -428,10 +435,13 @@ def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: 
     below = heights.cumsum(0)[:-1]
     above = heights.sum() - below
     first = (heights * centres).cumsum(0)[:-1]
-    between = below * above * (first / below - ((heights * centres).sum() - first) / above) ** 2
+    lower, upper = first / below, ((heights * centres).sum() - first) / above
+    between = below * above * (lower - upper) ** 2
     # All cuts inside a gap are equally good: take the middle of the best run.
     best = torch.nonzero(between >= between.max() * (1 - 1e-12)).flatten()
-    return low + width * (float(best.double().mean()) + 1)
+    cut = low + width * (float(best.double().mean()) + 1)
+    place = int(best[0])
+    return cut + pull * (0.5 - cut) if float(lower[place]) < 0.5 < float(upper[place]) else cut
 
 
 def ranking(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
