@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument(
         "--test-scenes", type=int, default=20, help="scenes for each of the two sets of scores"
     )
-    parser.add_argument("--clip-steps", type=int, default=5500)
+    parser.add_argument("--clip-steps", type=int, default=7000)
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lexsplat.answers import evaluate_scene
-from lexsplat.codebook import CodebookConfig
 from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.pipeline import build
 from lexsplat.progress import Listener, silent
@@ -18,12 +17,7 @@ SceneName = Literal["tabletop", "second"]
 SCENES = Path(__file__).parent / "scenes"
 """Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
 
-DEMO_CONFIG = BuildConfig(
-    clip="embedded",
-    dino="embedded",
-    # As in the paper for a scene with few kinds of things (bonsai); not compared with other numbers.
-    codebook=CodebookConfig(num_codes=64),
-)
+DEMO_CONFIG = BuildConfig(clip="embedded", dino="embedded")
 """Settings of the demo; docs/results.md says on which views which setting was chosen."""
 
 

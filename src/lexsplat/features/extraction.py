@@ -117,8 +117,8 @@ class FeatureConfig:
     def embedded(cls) -> FeatureConfig:
         """Settings for the small encoders that ship with the package, chosen by measurement."""
         return cls(
-            crop_sizes=(32 / 240, 48 / 240, 72 / 240),
-            crop_strides=(0.375, 0.375, 0.375),
+            crop_sizes=(18 / 240, 44 / 240),
+            crop_strides=(0.5, 0.35),
             map_cells=60,
             max_short_side=360,
             dino_short_side=320,
