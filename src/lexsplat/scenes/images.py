@@ -18,7 +18,7 @@ from PIL import Image
 from lexsplat.errors import CaptureError
 
 HEIC_SUFFIXES = (".heic", ".heif")
-"""Suffixes of what phones of Apple write; it takes the library pillow-heif to read it."""
+"""Suffixes of what phones of Apple write; it takes the library pi-heif to read it."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIC_SUFFIXES)
 """Suffixes taken for pictures, in the order in which they are tried where a capture names none."""
@@ -112,11 +112,11 @@ class _BoundedFile(io.BufferedReader):
 
 def _register_heic(path: Path) -> None:
     try:
-        from pillow_heif import register_heif_opener
+        from pi_heif import register_heif_opener
     except ImportError as error:
         raise CaptureError(
             path,
-            expected="the library pillow-heif, which reads HEIC pictures",
+            expected="the library pi-heif, which reads HEIC pictures",
             found="it is not installed",
             remedy='pip install "lexsplat[heic]", or save the photos as JPEG',
         ) from error
