@@ -4,9 +4,11 @@ import json
 import shutil
 
 import pytest
+import torch
 from conftest import QUICK_BUILD
 
 from lexsplat import cli
+from lexsplat.tensor_files import read_tensors
 
 pytestmark = pytest.mark.xdist_group("built")
 
@@ -28,6 +30,24 @@ def test_the_same_seed_gives_the_same_metrics_times_aside(built, tiny_capture, t
         results.append(without_times(json.loads((scene / "metrics.json").read_text())))
     assert results[0] == results[1]
     assert set(results[0]["language"]) >= {"strict", "official", "lerf_2d", "lerf_3d"}
+
+
+def test_a_trained_field_is_the_same_to_the_last_bit_too(built, tiny_capture, tmp_path):
+    results, fields = [], []
+    for name in ("one", "two"):
+        scene = tmp_path / name
+        # Geometry and features are shared; codebook and language are made anew.
+        shutil.copytree(
+            built, scene, ignore=shutil.ignore_patterns("codes", "codebook.safetensors", "language*")
+        )
+        arguments = ["build", str(tiny_capture), "--output", str(scene), *QUICK_BUILD, "--method", "trained"]
+        assert cli.main(arguments) == 0
+        assert cli.main(["evaluate", str(scene)]) == 0
+        fields.append(read_tensors(scene / "language.safetensors")[0])
+        results.append(without_times(json.loads((scene / "metrics.json").read_text())))
+    assert fields[0].keys() == fields[1].keys()
+    assert all(torch.equal(tensor, fields[1][name]) for name, tensor in fields[0].items())
+    assert results[0] == results[1]
 
 
 def test_evaluate_writes_rows_for_tables(built, tmp_path):

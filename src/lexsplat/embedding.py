@@ -241,14 +241,15 @@ class EmbeddingTrainer:
         """Eq. 8 to 12 for rendered maps ``[H, W, 8]`` and ``[H, W]``."""
         config = self.config
         pixels, codes = self._sample_pixels(semantics.shape[0], semantics.shape[1], code_map)
-        logits = self.field.decode(semantics.flatten(0, 1)[pixels])
+        # Not [pixels]: its gradient adds what repeats in the order in which threads run (index_select: in its own).
+        logits = self.field.decode(semantics.flatten(0, 1).index_select(0, pixels))
         if len(pixels) == 0:  # a view whose cells are all ignored teaches nothing
             nothing = semantics.sum() * 0
             return {"cross_entropy": nothing, "semantic": nothing}
         if not config.use_uncertainty:
             cross_entropy = cross_entropy_loss(logits, codes)
             return {"cross_entropy": cross_entropy, "semantic": config.lambda_ce * cross_entropy}
-        cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten()[pixels])
+        cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten().index_select(0, pixels))
         regulariser = uncertainty_loss(self._not_masked(uncertainty, code_map), config.uncertainty_form)
         semantic = semantic_loss(cross_entropy, regulariser, config.lambda_ce, config.lambda_u)
         return {"cross_entropy": cross_entropy, "uncertainty": regulariser, "semantic": semantic}
@@ -283,7 +284,7 @@ class EmbeddingTrainer:
         logits: Tensor = field.uncertainty_logits
         if config.smoothing_sample and config.smoothing_sample < count:
             rows = torch.randint(count, (config.smoothing_sample,), generator=self.generator).to(means.device)
-            means, semantics, logits = means[rows], semantics[rows], logits[rows]
+            means, semantics, logits = (t.index_select(0, rows) for t in (means, semantics, logits))
         uncertainties = logits.sigmoid() if config.use_uncertainty else torch.zeros_like(logits)
         return smoothing_loss(
             field.smoother(means),

@@ -371,10 +371,11 @@ def fit_semantics(
         rows = known[torch.searchsorted(cumulative, draws).clamp_max(len(known) - 1).to(known.device)]
         for group in optimizer.param_groups:
             group["lr"] = group["base_lr"] * 0.1 ** (step / config.fit_steps)
-        log_p = field.decode(field.semantics[rows]).log_softmax(-1)
+        semantics = field.semantics.index_select(0, rows)  # rows repeat; see `embedding`
+        log_p = field.decode(semantics).log_softmax(-1)
         loss = -(lifted.weights[rows] * log_p.gather(1, lifted.codes[rows].long())).sum(1).mean()
         smoothed = field.smoother(gaussians.means[rows])
-        loss = loss + torch.linalg.vector_norm(smoothed - field.semantics[rows].detach(), dim=-1).mean()
+        loss = loss + torch.linalg.vector_norm(smoothed - semantics.detach(), dim=-1).mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

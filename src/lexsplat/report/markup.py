@@ -37,7 +37,7 @@ def table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def cards(facts: Sequence[tuple[str, str, str]]) -> str:
-    """Large numbers: value, name and a note for each."""
+    """Large numbers: name, value and a note for each."""
     inner = "".join(
         f'<div class="card"><b>{value}</b><span>{name}</span><small>{note}</small></div>'
         for name, value, note in facts

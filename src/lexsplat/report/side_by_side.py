@@ -124,11 +124,11 @@ def _facts(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[tuple
         best = sorted(best_rows(rows, key))
         if best:
             value = mean_and_spread(rows[best[0]].get(key))[0]
-            facts.append((number(value), name, escape(str(rows[best[0]]["name"]))))
+            facts.append((name, number(value), escape(str(rows[best[0]]["name"]))))
     prompts = {prompt for method in methods for views in method.cases.values() for prompt in views}
     views = {view for method in methods for view in method.cases}
     if prompts:
-        facts += [(str(len(prompts)), "prompts", ""), (str(len(views)), "held-out views", "")]
+        facts += [("prompts", str(len(prompts)), ""), ("held-out views", str(len(views)), "")]
     return facts
 
 

@@ -65,13 +65,13 @@ th:first-child,td:first-child{text-align:left}
 .s1{--c:#2563eb}
 .s2{--c:#15803d}
 .s3{--c:#9333ea}
-.s4{--c:#b45309}
+.s4{--c:#0f172a}
 .s5{--c:#0e7490}
 .s6{--c:#be185d}
 .s7{--c:#4d7c0f}
 .s8{--c:#475569}
 .s9{--c:#7c2d12}
-@media(prefers-color-scheme:dark){.s0{--c:#fb923c}.s1{--c:#60a5fa}.s2{--c:#4ade80}.s3{--c:#c084fc}.s4{--c:#fbbf24}
+@media(prefers-color-scheme:dark){.s0{--c:#fb923c}.s1{--c:#60a5fa}.s2{--c:#4ade80}.s3{--c:#c084fc}.s4{--c:#fde68a}
   .s5{--c:#22d3ee}.s6{--c:#f472b6}.s7{--c:#a3e635}.s8{--c:#94a3b8}.s9{--c:#fda4af}}
 .versus{border-top:1px solid var(--line);padding:14px 0 22px}
 .versus p{margin:0 0 8px;color:var(--ink);max-width:none}

@@ -39,9 +39,10 @@ OTHER_PROTOCOLS = tuple(_OTHERS)
 
 _HEADINGS = {**_PAPER, **_HONEST, **_OTHERS}
 
-_LESS_IS_BETTER = {
-    "lpips", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
+_MEASURED_ONCE = {
+    "fps", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
 }  # fmt: skip
+"""Columns whose small differences are those of the machine: none of them is named the best."""
 
 Row = Mapping[str, Any]
 """One line of a table: "name", and numbers by key; several runs give a list of numbers."""
@@ -143,7 +144,7 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
     for protocol in ("official", "lerf_2d", "lerf_3d"):
         numbers |= {f"{protocol}_{name}": v for name, v in (language.get(protocol) or {}).items()}
     seconds = speed.get("stage_seconds") or {}
-    language_stages = [seconds[stage] for stage in ("codebook", "embed") if stage in seconds]
+    language_stages = [value for stage, value in seconds.items() if stage not in ("reconstruct", "features")]
     return numbers | {
         "fps": speed.get("render_fps"),
         "query_ms": speed.get("query_ms"),
@@ -172,12 +173,12 @@ def heading(key: str) -> str:
 
 
 def best_rows(rows: Sequence[Row], key: str) -> set[int]:
-    """Places of the rows with the best mean of a number; empty when all are alike."""
+    """Places of the rows with the best mean of a score; empty when all are alike, and for times and sizes."""
     means = {place: mean_and_spread(row.get(key))[0] for place, row in enumerate(rows)}
     known = {place: mean for place, mean in means.items() if mean is not None}
-    if len(set(known.values())) < 2:
+    if len(set(known.values())) < 2 or key in _MEASURED_ONCE:
         return set()
-    best = (min if key in _LESS_IS_BETTER else max)(known.values())
+    best = (min if key == "lpips" else max)(known.values())
     return {place for place, mean in known.items() if mean == best}
 
 
