@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lexsplat.answers import evaluate_scene
+from lexsplat.codebook import CodebookConfig
 from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.pipeline import build
 from lexsplat.progress import Listener, silent
@@ -17,7 +18,7 @@ SceneName = Literal["tabletop", "second"]
 SCENES = Path(__file__).parent / "scenes"
 """Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
 
-DEMO_CONFIG = BuildConfig(clip="embedded", dino="embedded")
+DEMO_CONFIG = BuildConfig(clip="embedded", dino="embedded", codebook=CodebookConfig(num_codes=256))
 """Settings of the demo; docs/results.md says on which views which setting was chosen."""
 
 
