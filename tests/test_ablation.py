@@ -103,7 +103,8 @@ def test_wrong_labels_differ_in_every_view_and_keep_their_share():
     wrong = ablation.with_wrong_labels(maps, 0.25, 10, seed=3)
     assert np.mean(wrong["a"] != 0) == pytest.approx(0.25 * 0.9, abs=0.02)
     assert (wrong["a"] != wrong["b"]).any()
-    assert wrong["a"].dtype == np.uint8 and wrong["a"].max() == 9
+    assert wrong["a"].dtype == np.uint8
+    assert wrong["a"].max() == 9
     again = ablation.with_wrong_labels(maps, 0.25, 10, seed=3)
     assert all((again[name] == wrong[name]).all() for name in maps)
     with pytest.raises(ValueError, match="share"):
@@ -176,6 +177,6 @@ def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkey
     from lexsplat import experiments
 
     empty = experiments.Annotations("segmentations", tiny_capture, {})
-    monkeypatch.setattr(experiments, "load_annotations", lambda scene: empty)
+    monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
         ablation.ablate(tiny_capture, ablated, replace(CONFIG, seed=0))

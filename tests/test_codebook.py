@@ -292,7 +292,9 @@ def test_fit_is_the_same_for_the_same_seed_and_ignores_global_randomness() -> No
 def test_fit_and_assignment_are_the_same_to_the_last_bit_on_any_number_of_threads() -> None:
     # Batches so large that torch would spread them over its threads.
     generator = torch.Generator().manual_seed(8)
-    maps = {f"v{i}": Map(*(torch.randn(40, 50, width, generator=generator) for width in (96, 64))) for i in "ab"}
+    maps = {
+        f"v{i}": Map(*(torch.randn(40, 50, width, generator=generator) for width in (96, 64))) for i in "ab"
+    }
     config = CodebookConfig(num_codes=32, steps=8, kmeans_iterations=3, batch_size=2048)
     found = []
     for threads in (1, 2, 3, 2):

@@ -150,9 +150,11 @@ def test_learning_rates_that_are_too_high_end_in_finite_numbers_or_one_line(tmp_
     try:
         trainer = reconstructed(capture(tmp_path, "sound"), config)
     except TrainingError as error:
-        assert "lower the learning rates" in str(error)
+        told = str(error)
     else:
+        told = "lower the learning rates"
         assert not trainer.damage()
+    assert "lower the learning rates" in told
     assert all("diverged" in record.getMessage() for record in caplog.records)
 
 
@@ -206,11 +208,14 @@ def test_language_trained_with_any_rates_is_finite_or_told(times, caplog):
     config = EmbeddingConfig(iterations=60, pixel_sample=128, smoothing_sample=32, clip_decoder_grad=None)
     names = ("semantics_lr", "uncertainty_lr", "decoder_lr", "smoothing_lr")
     config = replace(config, **{name: getattr(config, name) * times for name in names})
+    field, told = None, ""
     try:
         field = train_field(scene.gaussians, scene.cameras, scene.code_maps, scene.codebook, config)
     except TrainingError as error:
+        told = str(error)
+    if field is None:
         assert times > 10
-        assert "lower the learning rates" in str(error)
+        assert "lower the learning rates" in told
     else:
         assert all(bool(torch.isfinite(t).all()) for t in field.tensors().values() if t.is_floating_point())
     if times == 1.0:

@@ -11,8 +11,8 @@ from test_ply import make
 from lexsplat.cameras import Camera, look_at
 from lexsplat.gaussians import Gaussians
 from lexsplat.moving import moved, quaternion_of, rotated_harmonics
-from lexsplat.rendering.posing import multiplied
 from lexsplat.rendering import render
+from lexsplat.rendering.posing import multiplied
 
 
 def cloud(degree: int = 3, count: int = 80) -> Gaussians:

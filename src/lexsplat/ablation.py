@@ -23,6 +23,7 @@ from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
 from lexsplat.pipeline import make_field
 from lexsplat.progress import Listener, silent
+from lexsplat.scenes.prompt_lists import PromptList
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "w/o DINO": {"codebook": {"use_dino": False}},
@@ -99,6 +100,8 @@ def ablate(
     methods: Sequence[LanguageMethod] = (),
     wrong_labels: float = 0.0,
     evaluation: EvaluationConfig | None = None,
+    masks: Path | None = None,
+    prompt_list: PromptList | None = None,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
     """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``report.html`` into ``output``.
@@ -115,6 +118,8 @@ def ablate(
             "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
         evaluation: How to measure; by default in the form of the paper, without LPIPS.
+        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
         listener: Told how far each stage is.
 
     Returns:
@@ -122,13 +127,14 @@ def ablate(
 
     Raises:
         ValueError: If a variant is unknown, or there is no seed.
-        CaptureError: If the capture has no masks.
+        CaptureError: If there is no truth of held-out views, or no prompt list for the capture.
     """
     plan = _plan(config, list(methods) or [config.method], variants)
     if not seeds:
         raise ValueError("an ablation needs at least one seed")
     with_wrong_labels({}, wrong_labels, 1, 0)  # a wrong share is told before anything is made
-    bench = Bench(capture, output, config, evaluation or paper_evaluation(), listener)
+    measure = evaluation or paper_evaluation()
+    bench = Bench(capture, output, config, measure, listener, masks=masks, prompt_list=prompt_list)
     results = Results(bench, "ablation", [name for name, _, _ in plan], seeds, COLUMNS)
     for seed in seeds:  # one seed for all variants first: a stopped run leaves whole tables of fewer seeds
         for name, method, variant in plan:

@@ -23,8 +23,7 @@ from lexsplat.queries import check_prompts
 from lexsplat.report import Gallery, table_rows, write_report, write_rows
 from lexsplat.scene_folder import SceneFolder, read_json, write_json
 from lexsplat.scenes import Scene, load_annotations
-from lexsplat.scenes.prompt_lists import SCENES as PROMPT_SCENES
-from lexsplat.scenes.prompt_lists import PromptList, prompt_names
+from lexsplat.scenes.prompt_lists import PromptList
 from lexsplat.search import SearchableScene
 from lexsplat.world import world_of
 
@@ -227,11 +226,7 @@ def evaluate_scene(
             remedy="make your own copy of it with: lexsplat demo",
         )
     photos = load_photos(scene, capture)
-    if masks is not None and not masks.is_dir():
-        raise CaptureError(masks, expected="a folder with masks or labels", found="no such folder")
-    truth = load_annotations(photos, masks)
-    if prompt_list is not None:
-        truth = truth.renamed(_prompt_names(photos.root, prompt_list))
+    truth = load_annotations(photos, masks, prompt_list)
     gallery = Gallery()
     metrics = evaluate(
         photos,
@@ -262,18 +257,6 @@ def evaluate_scene(
         with atomic_path(path) as temporary:
             temporary.write_bytes(pictures["heatmap"])
     return result
-
-
-def _prompt_names(root: Path, prompt_list: PromptList) -> dict[str, str]:
-    name = root.resolve().name
-    if name not in PROMPT_SCENES:
-        raise CaptureError(
-            root,
-            expected=f"a capture called {', '.join(PROMPT_SCENES)}, which have prompt lists",
-            found=repr(name),
-            remedy="leave the prompt list out: prompts are then what the masks are called",
-        )
-    return prompt_names(name, prompt_list)
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:

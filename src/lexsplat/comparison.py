@@ -11,12 +11,13 @@ from typing import Any
 from lexsplat import baselines
 from lexsplat.ablation import language_settings, make_language
 from lexsplat.config import BuildConfig
-from lexsplat.evaluation import EvaluationConfig
+from lexsplat.evaluation import PROTOCOLS, EvaluationConfig
 from lexsplat.evaluation.methods import Method
 from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import embed_prompts
+from lexsplat.scenes.prompt_lists import PromptList
 
 OURS = ("lifted", "trained", "lifted+tuned")
 """Our fields; with "-feature" behind, answered in the paper's form of relevancy."""
@@ -37,6 +38,9 @@ def compare(
     methods: Sequence[str] = ("lifted", "trained-feature", *BASELINES),
     seeds: Sequence[int] = (0,),
     lpips: bool = True,
+    masks: Path | None = None,
+    prompt_list: PromptList | None = None,
+    protocols: Sequence[str] = PROTOCOLS,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
     """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``report.html`` into ``output``.
@@ -52,19 +56,23 @@ def compare(
         methods: Names out of `METHODS`.
         seeds: Seeds of codebook and language; one is enough for methods without chance.
         lpips: Measure LPIPS if it is installed.
+        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
+        protocols: Names out of `evaluation.PROTOCOLS`; "strict" is always measured.
         listener: Told how far each stage is.
 
     Returns:
         Rows as `report.table_rows` makes them.
 
     Raises:
-        ValueError: If a method is unknown, or there is no method or seed.
-        CaptureError: If the capture has no masks.
+        ValueError: If a method or protocol is unknown, or there is no method or seed.
+        CaptureError: If there is no truth of held-out views, or no prompt list for the capture.
     """
     unknown = [name for name in methods if name not in METHODS]
     if unknown or not methods or not seeds:
         raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown) or 'too few'}")
-    bench = Bench(capture, output, config, EvaluationConfig(lpips=lpips), listener)
+    evaluation = EvaluationConfig(lpips=lpips, protocols=tuple(protocols))
+    bench = Bench(capture, output, config, evaluation, listener, masks=masks, prompt_list=prompt_list)
     shared = bench.evaluation
     results = Results(bench, "comparison", methods, seeds)
     for seed in seeds:

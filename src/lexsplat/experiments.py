@@ -7,10 +7,12 @@ once for each setting and seed, and every measured run is kept, so that a stoppe
 from __future__ import annotations
 
 import gc
+import hashlib
 import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +41,8 @@ from lexsplat.pipeline import build, feature_maps, machine_facts
 from lexsplat.progress import Listener, silent
 from lexsplat.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
 from lexsplat.scene_folder import SceneFolder, fingerprint, read_json, to_json, write_json
-from lexsplat.scenes import Annotations, Scene, load_annotations
+from lexsplat.scenes import Annotations, Scene, check_truth_wishes, load_annotations
+from lexsplat.scenes.prompt_lists import PromptList
 from lexsplat.tensor_files import read_tensors, write_tensors
 
 log = logging.getLogger("lexsplat")
@@ -78,9 +81,11 @@ class Bench:
         config: Settings; ``config.seed`` is the seed of the Gaussians.
         evaluation: How runs are measured.
         listener: Told how far each stage is.
+        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
 
     Raises:
-        CaptureError: If the capture has no truth to measure against.
+        CaptureError: If there is no truth to measure against.
     """
 
     def __init__(
@@ -90,7 +95,11 @@ class Bench:
         config: BuildConfig,
         evaluation: EvaluationConfig,
         listener: Listener = silent,
+        *,
+        masks: Path | None = None,
+        prompt_list: PromptList | None = None,
     ) -> None:
+        check_truth_wishes(capture, masks, prompt_list)
         self.output, self.listener = output, listener
         self.folder: SceneFolder = build(
             capture, output / "scene", config, until="features", listener=listener
@@ -99,14 +108,17 @@ class Bench:
         self.scene, resolved = self._load_scene(config)
         self.config = resolved
         self.evaluation = evaluation
-        self.truth: Annotations = load_annotations(self.scene)
+        self.prompt_list = prompt_list
+        self.truth: Annotations = load_annotations(self.scene, masks, prompt_list)
         held_out = set(self.scene.test_names)
         if not any(prompts for view, prompts in self.truth.masks.items() if view in held_out):
+            draw = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
+            rename = "leave the prompt list out, or call the masks as the released code does"
             raise CaptureError(
-                capture,
+                masks or capture,
                 expected="masks of held-out views to measure against",
-                found="none",
-                remedy="draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)",
+                found=f"none in the words of the list {prompt_list!r}" if prompt_list else "none",
+                remedy=rename if prompt_list else draw,
             )
         self.gaussians: Gaussians = self.folder.read_gaussians().to(self.device)
         self._maps: FeatureMaps | None = None
@@ -201,7 +213,7 @@ class Bench:
             list(settings),
             seed,
             asdict(self.evaluation),
-            self._truth_identity(),
+            self._truth_identity,
         )
         path = self.output / "runs" / _folder_name(name) / f"seed-{seed}.json"
         drawn = path.with_name(f"seed-{seed}.pictures.safetensors")
@@ -253,11 +265,13 @@ class Bench:
             machine=machine_facts(),
         )
 
+    @cached_property
     def _truth_identity(self) -> list[Any]:
-        if not self.truth.origin.is_dir():
-            return []
-        files = sorted(file for file in self.truth.origin.rglob("*") if file.is_file())
-        return [[str(f.relative_to(self.truth.origin)), f.stat().st_size] for f in files]
+        """Words and truth as they are measured, by content: wherever it lies, and whatever its files are called."""
+        masks = {
+            view: {p: _digest(m) for p, m in prompts.items()} for view, prompts in self.truth.masks.items()
+        }
+        return [masks, self.truth.boxes]
 
 
 class Results:
@@ -296,6 +310,7 @@ class Results:
                 **to_json(self.bench.config),
                 "seeds": self.seeds,
                 "evaluation": to_json(self.evaluation),
+                "truth": self._truth(),
             },
             machine=machine_facts(),
         )
@@ -312,11 +327,20 @@ class Results:
             "seeds": self.seeds,
             "config": to_json(self.bench.config),
             "evaluation": to_json(self.evaluation),
+            "truth": self._truth(),
             "machine": machine_facts(),
             "runs": {name: [language["strict"] for language in found] for name, found in words.items()},
             "per_prompt": {
                 name: [language["per_prompt"] for language in found] for name, found in words.items()
             },
+        }
+
+    def _truth(self) -> dict[str, Any]:
+        truth = self.bench.truth
+        return {
+            "folder": str(truth.origin),
+            "layout": truth.layout,
+            "prompt_list": self.bench.prompt_list,
         }
 
     def _measured(self, name: str) -> MeasuredMethod:
@@ -349,6 +373,14 @@ def detail_of(metrics: Metrics) -> dict[str, Any]:
             for view, prompts in metrics.pairs.items()
         },
     }
+
+
+def _digest(mask: Path | np.ndarray) -> str:
+    """A hash of a mask's file, or of an array's shape and values."""
+    if isinstance(mask, Path):
+        return hashlib.blake2b(mask.read_bytes(), digest_size=12).hexdigest()
+    content = repr(mask.shape).encode() + np.ascontiguousarray(mask).tobytes()
+    return hashlib.blake2b(content, digest_size=12).hexdigest()
 
 
 def _folder_name(name: str) -> str:

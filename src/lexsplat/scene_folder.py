@@ -361,7 +361,9 @@ class SceneFolder:
                 if image.mode != "L":
                     raise FileFormatError(path, expected="an 8-bit grey PNG", found=f"mode {image.mode}")
                 if len(_pixel_data(content, image.size)) != image.height * (image.width + 1):
-                    raise FileFormatError(path, expected=f"{image.width}x{image.height} codes", found="others")
+                    raise FileFormatError(
+                        path, expected=f"{image.width}x{image.height} codes", found="others"
+                    )
                 return np.array(image)
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, zlib.error) as error:
             raise FileFormatError(path, expected="a code index map", found=str(error)) from error

@@ -1,4 +1,4 @@
-"""Makes quadrants.heic, the picture that `test_heic_photos_are_read` reads: ``pip install pillow-heif; python make_heic.py``.
+"""Makes quadrants.heic, which `test_heic_photos_are_read` reads: ``pip install pillow-heif; python make_heic.py``.
 
 The library that reads HEIC for us (pi-heif) writes none; the one that does carries an encoder under the GPL, so it is
 needed for making this file only.

@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.cli.options import Settings, check_seeds, print_json_file
+from lexsplat.cli.options import PromptListName, Settings, check_seeds, print_json_file
 from lexsplat.config import BuildConfig, LanguageMethod
 
 
@@ -28,6 +28,9 @@ class Ablate:
         methods: Which ways to the language, beside each other; none takes that of the settings (trained).
         wrong_labels: Stress test: replace the code of this share of the pixels by a random one, others in every
             view.
+        masks: Folder with truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
+            the capture.
+        prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
         form: How codes and text are compared; the paper's is "feature".
         as_in_paper: Fit and train as the paper does (30,000 steps) instead of our short settings.
         json: Print ablation.json on standard output.
@@ -52,6 +55,8 @@ class Ablate:
     ] = ()
     methods: tuple[LanguageMethod, ...] = ()
     wrong_labels: float = 0.0
+    masks: Path | None = None
+    prompt_list: PromptListName | None = None
     form: Literal["feature", "code"] = "feature"
     as_in_paper: bool = False
     json: bool = False
@@ -83,6 +88,8 @@ class Ablate:
                 methods=self.methods,
                 wrong_labels=self.wrong_labels,
                 evaluation=dataclasses.replace(evaluation, query=query),
+                masks=self.masks,
+                prompt_list=self.prompt_list,
                 listener=bars,
             )
         if self.json:

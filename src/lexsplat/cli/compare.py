@@ -9,7 +9,14 @@ from typing import Literal
 import tyro
 
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.cli.options import Settings, check_seeds, print_json_file
+from lexsplat.cli.options import (
+    ALL_PROTOCOLS,
+    PromptListName,
+    ProtocolName,
+    Settings,
+    check_seeds,
+    print_json_file,
+)
 from lexsplat.config import BuildConfig
 
 
@@ -25,6 +32,10 @@ class Compare:
         output: Where everything goes; that of ``ablate`` shares its Gaussians and features.
         methods: Which rows. "-feature" is the paper's form of relevancy in place of our default.
         seeds: Seeds of codebook and language.
+        masks: Folder with truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
+            the capture.
+        prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
+        protocols: How to measure (docs/evaluation.md).
         lpips: Measure LPIPS if it is installed.
         json: Print comparison.json on standard output.
         settings: What is made and how; ``--seed`` is the seed of the Gaussians.
@@ -40,6 +51,9 @@ class Compare:
         ...,
     ] = ("lifted", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
     seeds: tuple[int, ...] = (0,)
+    masks: Path | None = None
+    prompt_list: PromptListName | None = None
+    protocols: tuple[ProtocolName, ...] = ALL_PROTOCOLS
     lpips: bool = True
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
@@ -62,6 +76,9 @@ class Compare:
                 methods=self.methods,
                 seeds=self.seeds,
                 lpips=self.lpips,
+                masks=self.masks,
+                prompt_list=self.prompt_list,
+                protocols=self.protocols,
                 listener=bars,
             )
         if self.json:

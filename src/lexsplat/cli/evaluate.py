@@ -8,7 +8,15 @@ from typing import Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene, print_evaluation, print_json
+from lexsplat.cli.options import (
+    ALL_PROTOCOLS,
+    Device,
+    PromptListName,
+    ProtocolName,
+    open_scene,
+    print_evaluation,
+    print_json,
+)
 
 
 @dataclasses.dataclass
@@ -32,13 +40,8 @@ class Evaluate:
 
     scene: tyro.conf.Positional[str]
     masks: Path | None = None
-    prompt_list: Literal["paper", "released"] | None = None
-    protocols: tuple[Literal["strict", "official", "lerf-2d", "lerf-3d"], ...] = (
-        "strict",
-        "official",
-        "lerf-2d",
-        "lerf-3d",
-    )
+    prompt_list: PromptListName | None = None
+    protocols: tuple[ProtocolName, ...] = ALL_PROTOCOLS
     capture: Path | None = None
     form: Literal["feature", "code"] | None = None
     clip: str | None = None

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 Settings = Annotated[BuildConfig, tyro.conf.arg(name="")]
 Device = Literal["auto", "cpu", "cuda"]
+PromptListName = Literal["paper", "released"]
+ProtocolName = Literal["strict", "official", "lerf-2d", "lerf-3d"]
+ALL_PROTOCOLS: tuple[ProtocolName, ...] = ("strict", "official", "lerf-2d", "lerf-3d")
 
 
 def open_scene(path: str, device: str, clip: str | None) -> SearchableScene:

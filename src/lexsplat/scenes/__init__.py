@@ -1,6 +1,6 @@
 """Captures: photos with cameras in, views with pinhole cameras out, everything keyed by image name."""
 
-from lexsplat.scenes.annotations import Annotations, load_annotations
+from lexsplat.scenes.annotations import Annotations, check_truth_wishes, load_annotations
 from lexsplat.scenes.loading import is_photo_folder, load_scene
 from lexsplat.scenes.masks import load_mask, load_masks
 from lexsplat.scenes.photos import PhotoPoses, PoseConfig, poses_from_photos
@@ -16,6 +16,7 @@ __all__ = [
     "PoseConfig",
     "Scene",
     "View",
+    "check_truth_wishes",
     "initial_points",
     "is_photo_folder",
     "load_annotations",

@@ -23,6 +23,7 @@ from lexsplat.errors import CaptureError, FileFormatError
 from lexsplat.scenes.capture import checked_name
 from lexsplat.scenes.images import IMAGE_SUFFIXES, MAX_PIXELS
 from lexsplat.scenes.masks import load_masks
+from lexsplat.scenes.prompt_lists import PromptList, capture_prompt_names
 from lexsplat.scenes.scene import Scene, View, stem_of
 from lexsplat.scenes.splits import mask_folders, match_stem
 from lexsplat.scenes.transforms_json import read_json
@@ -105,20 +106,48 @@ def annotated_names(layout: str, folder: Path, names: Collection[str], image_fol
     return {matches[0] for matches in found if len(matches) == 1}
 
 
-def load_annotations(scene: Scene, folder: Path | None = None) -> Annotations:
+def check_truth_wishes(root: Path, folder: Path | None, prompt_list: PromptList | None) -> None:
+    """Refuse what `load_annotations` could not use, before hours are spent on a scene.
+
+    Args:
+        root: The folder of the capture.
+        folder: Where the truth is said to be, if not in or beside the capture.
+        prompt_list: Whose words are to be asked, if not what the masks are called.
+
+    Raises:
+        CaptureError: If the folder is none, or the capture is called like no scene that has prompt lists.
+    """
+    if folder is not None and not folder.is_dir():
+        raise CaptureError(folder, expected="a folder with masks or labels", found="no such folder")
+    if prompt_list is not None:
+        capture_prompt_names(root, prompt_list)
+
+
+def load_annotations(
+    scene: Scene, folder: Path | None = None, prompt_list: PromptList | None = None
+) -> Annotations:
     """The truth of a capture, in whichever layout it is.
 
     Args:
         scene: The capture.
         folder: Where the truth is; None looks in and beside the capture (`find_annotations`).
+        prompt_list: Ask the words of the paper or of the released code, for captures called like its scenes;
+            None asks what the masks are called.
 
     Returns:
         Masks and boxes; empty where the capture has none.
 
     Raises:
-        CaptureError: If a file belongs to no view or several, does not fit its photo, or a class is missing.
+        CaptureError: If a file belongs to no view or several, does not fit its photo, a class is missing, the
+            folder is none, or the capture has no prompt lists.
         FileFormatError: If a label file is not what LangSplat's reader expects.
     """
+    check_truth_wishes(scene.root, folder, prompt_list)
+    truth = _read_truth(scene, folder)
+    return truth.renamed(capture_prompt_names(scene.root, prompt_list)) if prompt_list else truth
+
+
+def _read_truth(scene: Scene, folder: Path | None) -> Annotations:
     if folder is None:
         found = find_annotations(scene.root)
         if scene.segmentations is not None:

@@ -6,7 +6,10 @@ the released code, so its words are what a file name says; `prompt_names` maps t
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
+
+from lexsplat.errors import CaptureError
 
 PromptList = Literal["paper", "released"]
 
@@ -134,6 +137,23 @@ def prompt_names(scene: str, prompt_list: PromptList) -> dict[str, str]:
         released or paper: paper if prompt_list == "paper" else released or paper
         for paper, released in table.items()
     }
+
+
+def capture_prompt_names(root: Path, prompt_list: PromptList) -> dict[str, str]:
+    """`prompt_names` of the scene that a capture's folder is called after.
+
+    Raises:
+        CaptureError: If the folder is called like no scene of the paper.
+    """
+    name = root.resolve().name
+    if name not in SCENES:
+        raise CaptureError(
+            root,
+            expected=f"a capture called {', '.join(SCENES)}, which have prompt lists",
+            found=repr(name),
+            remedy="leave the prompt list out: prompts are then what the masks are called",
+        )
+    return prompt_names(name, prompt_list)
 
 
 def evaluation_views(scene: str) -> tuple[str, ...]:
