@@ -23,7 +23,6 @@ import torch
 from PIL import Image
 
 import lexsplat
-from lexsplat.answers import capture_of
 from lexsplat.boxes import box_iou, gravity_up
 from lexsplat.cameras import camera_from_opengl
 from lexsplat.presence import CALIBRATION, fit_calibration
@@ -71,10 +70,15 @@ def main() -> None:
     print(json.dumps(result, indent=1))
 
 
+def capture_folder(scene: lexsplat.SearchableScene) -> Path:
+    """Where the photos, prompts and masks of a scene are."""
+    return Path(scene.folder.record["capture"])
+
+
 def evidence(folder: Path, truth: Path) -> tuple[dict, dict, dict]:
     """Evidence of prompts that are there, that are not, and that are but for their colour."""
     scene = lexsplat.open_scene(folder)
-    prompts = list(json.loads((capture_of(scene, None) / "prompts.json").read_text()))
+    prompts = list(json.loads((capture_folder(scene) / "prompts.json").read_text()))
     things = list(json.loads((truth / "things.json").read_text()).values())
     kinds = {thing["kind"] for thing in things}
     known = kinds | {ALIASES.get(kind, kind) for kind in kinds}
@@ -122,7 +126,7 @@ def accuracy(folder: Path, truth: Path, stride: int) -> dict:
     """F1 of Gaussians and IoU of boxes for every prompt that masks of the capture tell the meaning of."""
     scene = lexsplat.open_scene(folder)
     views = load_truth(truth, stride)
-    meanings = meaning_of_prompts(capture_of(scene, None) / "segmentations", truth)
+    meanings = meaning_of_prompts(capture_folder(scene) / "segmentations", truth)
     lifted = lift_labels(scene.gaussians, views, 256)
     up = gravity_up(scene.cameras.values()).direction
     rows = {}

@@ -93,7 +93,7 @@ class Calibration:
         return "yes" if probability >= self.yes else "no" if probability <= self.no else "unsure"
 
 
-CALIBRATION = Calibration(bias=0.602, height=0.0, rank=0.0, yes=0.455, no=0.455, peak=1.305)
+CALIBRATION = Calibration(bias=-0.816, height=0.0, rank=0.24, yes=0.504, no=0.504, peak=2.731)
 
 
 class PresenceJudge:
