@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from colour_encoder import ColourClip, ColourDino
+from PIL import Image
 from test_report import Page
 
-from lexsplat import ablation
+from lexsplat import ablation, cli
 from lexsplat.codebook import CodebookConfig
 from lexsplat.config import BuildConfig
 from lexsplat.embedding import EmbeddingConfig
@@ -180,3 +181,80 @@ def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkey
     monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
         ablation.ablate(tiny_capture, ablated, replace(CONFIG, seed=0))
+
+
+def test_truth_from_elsewhere_is_asked_in_the_words_of_either_list_and_runs_are_kept_for_equal_truth_only(
+    tiny_capture, tmp_path, monkeypatch
+):
+    capture, truth = tmp_path / "counter", tmp_path / "truth"
+    shutil.copytree(tiny_capture, capture)
+    for folder in (
+        capture / "segmentations"
+    ).iterdir():  # not compressed: masks of one size have files of one size
+        (truth / folder.name).mkdir(parents=True)
+        for old, new in (("red apple", "stale bread"), ("blue ball", "blue ball")):
+            mask = Image.open(folder / f"{old}.png")
+            mask.save(truth / folder.name / f"{new}.png", compress_level=0)
+    made, original = [], ablation.make_field
+    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(1) or original(*a))
+
+    def measure(**wishes):
+        before = len(made)
+        rows = ablation.ablate(
+            capture, tmp_path / "out", CONFIG, seeds=(0,), methods=("lifted",), variants=("full",), **wishes
+        )
+        record = json.loads((tmp_path / "out" / "ablation.json").read_text())
+        return list(record["per_prompt"]["full"][0]), len(made) - before, rows[0]["mIoU"][0], record["truth"]
+
+    released = measure(masks=truth, prompt_list="released")
+    assert released[:2] == (["stale bread"], 1), "the blue ball is in no list"
+    assert released[3] == {"folder": str(truth), "layout": "segmentations", "prompt_list": "released"}
+    assert measure(masks=truth, prompt_list="paper")[:2] == (["stable bread"], 1)
+    everything = measure(masks=truth)
+    assert everything[:2] == (["blue ball", "stale bread"], 1)
+    moved = truth.rename(tmp_path / "moved")
+    assert measure(masks=moved)[:3] == (everything[0], 0, everything[2]), (
+        "equal truth elsewhere is no other truth"
+    )
+    for path in moved.rglob("stale bread.png"):
+        size = path.stat().st_size
+        Image.fromarray(255 - np.asarray(Image.open(path))).save(path, compress_level=0)
+        assert path.stat().st_size == size
+    redrawn = measure(masks=moved)
+    assert redrawn[1] == 1, "other masks of the same names and sizes are other truth"
+    assert redrawn[2] != everything[2]
+    own = measure()
+    assert own[:2] == (["blue ball", "red apple"], 1)
+    with pytest.raises(CaptureError, match="words of the list 'paper'"):
+        measure(prompt_list="paper")
+
+
+@pytest.mark.parametrize("command", ["ablate", "compare"])
+@pytest.mark.parametrize(
+    ("wish", "told"),
+    [(("--prompt-list", "paper"), "bonsai, counter"), (("--masks", "nowhere"), "no such folder")],
+)
+def test_truth_that_cannot_be_had_is_told_before_anything_is_made(
+    tiny_capture, tmp_path, capsys, command, wish, told
+):
+    output = tmp_path / "out"
+    assert cli.main([command, str(tiny_capture), "--output", str(output), *wish]) == 1
+    assert told in capsys.readouterr().err
+    assert not output.exists()
+
+
+@pytest.mark.parametrize("command", ["ablate", "compare"])
+def test_the_command_line_hands_on_which_truth_and_protocols_are_meant(
+    tiny_capture, tmp_path, monkeypatch, command
+):
+    from lexsplat import comparison
+
+    module = {"ablate": ablation, "compare": comparison}[command]
+    wishes = {}
+    monkeypatch.setattr(module, command, lambda *a, **k: wishes.update(k) or [])
+    arguments = ["--masks", str(tmp_path), "--prompt-list", "released"]
+    arguments += ["--protocols", "strict", "lerf-2d"] if command == "compare" else []
+    assert cli.main([command, str(tiny_capture), "--output", str(tmp_path / "out"), *arguments]) == 0
+    assert (wishes["masks"], wishes["prompt_list"]) == (tmp_path, "released")
+    if command == "compare":
+        assert wishes["protocols"] == ("strict", "lerf-2d")

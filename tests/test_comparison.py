@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 import time
 
 import pytest
@@ -117,6 +118,25 @@ def test_the_report_shows_every_method_beside_the_others_and_loads_nothing(compa
 def test_unknown_methods_are_refused_before_anything_is_made(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="nerf"):
         comparison.compare(tiny_capture, tmp_path / "a", CONFIG, methods=("nerf",))
+    assert not (tmp_path / "a").exists()
+
+
+def test_protocols_are_those_asked_for_and_measured_anew(compared, tiny_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.features.encoders.load_clip", lambda *a: ColourClip())
+    folder, _ = compared
+    for part in ("scene", "codebooks", "runs"):
+        shutil.copytree(folder / part, tmp_path / part)
+    before = rows_of(folder)["lifted"]
+    comparison.compare(
+        tiny_capture, tmp_path, CONFIG, methods=("lifted",), lpips=False, protocols=("lerf-2d",)
+    )
+    (row,) = rows_of(tmp_path).values()
+    language = json.loads((tmp_path / "runs" / "lifted" / "seed-0.json").read_text())["metrics"]["language"]
+    assert "lerf_2d" in language
+    assert not {"official", "lerf_3d"} & set(language)
+    assert row["mIoU"] == before["mIoU"], "strict is always measured, with the same result"
+    with pytest.raises(ValueError, match="lerf-4d"):
+        comparison.compare(tiny_capture, tmp_path / "a", CONFIG, protocols=("lerf-4d",))
     assert not (tmp_path / "a").exists()
 
 

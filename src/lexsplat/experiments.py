@@ -112,13 +112,16 @@ class Bench:
         self.truth: Annotations = load_annotations(self.scene, masks, prompt_list)
         held_out = set(self.scene.test_names)
         if not any(prompts for view, prompts in self.truth.masks.items() if view in held_out):
-            draw = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
-            rename = "leave the prompt list out, or call the masks as the released code does"
+            remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
+            if masks is not None:
+                remedy = "hold out the views that have masks: list them in test_views.json of the capture"
+            if prompt_list is not None:
+                remedy = "leave the prompt list out, or call the masks as the released code does"
             raise CaptureError(
                 masks or capture,
                 expected="masks of held-out views to measure against",
                 found=f"none in the words of the list {prompt_list!r}" if prompt_list else "none",
-                remedy=rename if prompt_list else draw,
+                remedy=remedy,
             )
         self.gaussians: Gaussians = self.folder.read_gaussians().to(self.device)
         self._maps: FeatureMaps | None = None
