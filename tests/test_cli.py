@@ -54,6 +54,61 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
         assert after[kept] == before[kept], kept
 
 
+def test_an_edit_by_words_is_undone_done_again_saved_and_the_new_scene_answers_rightly(
+    built, tiny_capture, tmp_path, capsys
+):
+    copy, saved = tmp_path / "copy", tmp_path / "saved"
+    shutil.copytree(built, copy)
+    before = modified(copy)
+    original = open_scene(built, device="cpu")
+    answering = original.scores(["blue ball"])[0] >= 0.13
+    rest = ~original.find("blue ball", threshold=0.13).mask  # without the strays that belong to no thing
+    assert 20 < int((~rest).sum()) < len(rest) / 2
+    strays = int((answering & rest).sum())
+    assert strays < 0.3 * int(answering.sum())
+    everything = f"{len(rest):,} Gaussians"
+
+    def edit(*arguments: str) -> str:
+        capsys.readouterr()
+        assert cli.main(["edit", str(copy), *arguments]) == 0
+        return capsys.readouterr().out.splitlines()[-1]
+
+    less = f"{int(rest.sum()):,} Gaussians"
+    assert edit("delete", "--select", "blue ball", "--threshold", "0.13") == f"{less}, 0 steps undone"
+    assert edit("undo") == f"{everything}, 1 steps undone"
+    assert edit("redo") == f"{less}, 0 steps undone"
+    edit("save", "--output", str(saved))
+    assert edit("discard") == f"{everything}, 0 steps undone"
+    assert modified(copy) == before, "the scene itself stays as it was built"
+
+    arguments = [
+        "query",
+        str(saved),
+        "red apple",
+        "blue ball",
+        "--view",
+        "view_06.png",
+        "--threshold",
+        "0.13",
+        "--json",
+    ]
+    assert cli.main([*arguments, "--output", str(tmp_path / "answers")]) == 0
+    apple, ball = json.loads(capsys.readouterr().out)["prompts"]
+    assert ball["gaussians"] == strays
+    column, row = apple["views"]["view_06.png"]["peak_pixel"]
+    truth = tiny_capture / "segmentations" / "view_06"
+    assert np.asarray(Image.open(truth / "red apple.png"))[row, column], (
+        "the apple is still found where it is"
+    )
+    reopened = open_scene(saved, device="cpu")
+    assert np.array_equal(reopened.gaussians.means, original.gaussians.means[rest])
+    there = np.asarray(Image.open(truth / "blue ball.png")) > 0
+    with_ball, without = (
+        s.relevancy(["blue ball"], "view_06.png")[0].numpy()[there].mean() for s in (original, reopened)
+    )
+    assert without < 0.67 * with_ball, "what stood behind answers less"
+
+
 @pytest.mark.parametrize("method", ["lifted", "lifted+tuned"])
 def test_every_method_makes_a_scene_that_answers(built, tiny_capture, tmp_path, method):
     copy = tmp_path / "copy"
