@@ -83,6 +83,8 @@ class GridEncoder:
 @dataclasses.dataclass(frozen=True)
 class FakeLens:
     params: tuple[float, ...] = (40.0, 24.0, 16.0)
+    width: int = WIDTH
+    height: int = HEIGHT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +95,7 @@ class FakeView:
     loads: list
     lens: FakeLens = FakeLens()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ignore_path: Path | None = None
 
     @property
     def stem(self):
