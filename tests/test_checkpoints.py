@@ -14,6 +14,14 @@ from lexsplat.errors import TrainingError
 from lexsplat.pipeline import build
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard():
+    """Tests started in the background of a shell inherit a Ctrl-C that is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Counter:
     """The smallest training: counts."""
 
