@@ -54,12 +54,17 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
         assert after[kept] == before[kept], kept
 
 
+def without_texts(times):
+    """Without the cache of texts, which every question may add to."""
+    return {name: time for name, time in times.items() if not name.startswith("checkpoints/texts/")}
+
+
 def test_an_edit_by_words_is_undone_done_again_saved_and_the_new_scene_answers_rightly(
     built, tiny_capture, tmp_path, capsys
 ):
     copy, saved = tmp_path / "copy", tmp_path / "saved"
     shutil.copytree(built, copy)
-    before = modified(copy)
+    before = without_texts(modified(copy))
     original = open_scene(built, device="cpu")
     answering = original.scores(["blue ball"])[0] >= 0.13
     rest = ~original.find("blue ball", threshold=0.13).mask  # without the strays that belong to no thing
@@ -79,7 +84,7 @@ def test_an_edit_by_words_is_undone_done_again_saved_and_the_new_scene_answers_r
     assert edit("redo") == f"{less}, 0 steps undone"
     edit("save", "--output", str(saved))
     assert edit("discard") == f"{everything}, 0 steps undone"
-    assert modified(copy) == before, "the scene itself stays as it was built"
+    assert without_texts(modified(copy)) == before, "the scene itself stays as it was built"
 
     arguments = [
         "query",
