@@ -19,6 +19,7 @@ from lexsplat.features import hub
 from lexsplat.features.encoders import (
     ClipEncoder,
     DinoEncoder,
+    _plain_attention,
     _ramp,
     _window_starts,
     load_clip,
@@ -57,6 +58,16 @@ def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatc
     assert cosines.min() > 0.999
     assert not torch.equal(found[0][0], found[1][0]), "bfloat16 was used"
     assert torch.equal(found[0][1], found[1][1])
+
+
+def test_only_the_image_tower_of_few_patches_gets_plain_attention():
+    clip = load_clip("embedded")
+    assert clip._model.vision_model.config._attn_implementation == "eager"
+    assert clip._model.text_model.config._attn_implementation == "sdpa"
+    clip._model.vision_model.config._attn_implementation = "sdpa"
+    _plain_attention(clip._model, clip._model.config.vision_config, 8 * 14)
+    assert clip._model.vision_model.config._attn_implementation == "sdpa", "14 x 14 patches are not few"
+    _plain_attention(torch.nn.Linear(2, 2), object(), 48)  # a model that is built otherwise is left alone
 
 
 def _seeded(build):

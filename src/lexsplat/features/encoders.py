@@ -36,7 +36,7 @@ _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.2613
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
-_FEW_TOKENS = 64
+_FEW_PATCHES = 64
 
 
 class ImageTextEncoder(Protocol):
@@ -118,9 +118,7 @@ class ClipEncoder:
         self._siglip = config.model_type.startswith("siglip")
         self.image_size = _image_size(config.vision_config)
         if self.device.type == "cpu":
-            _plain_attention(
-                self._model.vision_model, (self.image_size // config.vision_config.patch_size) ** 2
-            )
+            _plain_attention(self._model, config.vision_config, self.image_size)
         self._text_length = int(config.text_config.max_position_embeddings)
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
         self._mean, self._std = _normalisation(folder, default, self.device)
@@ -390,11 +388,15 @@ def _computes_in_bfloat16() -> bool:
     return any(getattr(torch.cpu, name, bool)() for name in names)
 
 
-def _plain_attention(model: Any, tokens: int) -> None:
-    """For a handful of tokens on a CPU, attention written out takes less time than the fused kernel."""
-    if tokens > _FEW_TOKENS:
+def _plain_attention(model: Any, vision_config: Any, image_size: int) -> None:
+    """For a handful of patches on a CPU, attention written out takes less time than the fused kernel.
+
+    Only the image tower changes; a model whose tower or patches are not where CLIP's are stays as it is.
+    """
+    tower, patch = getattr(model, "vision_model", None), getattr(vision_config, "patch_size", None)
+    if tower is None or not isinstance(patch, int) or (image_size // patch) ** 2 > _FEW_PATCHES:
         return
-    for module in model.modules():
+    for module in tower.modules():
         if hasattr(module, "config"):
             module.config._attn_implementation = "eager"
 
