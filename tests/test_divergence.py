@@ -147,14 +147,15 @@ def test_captures_that_show_nothing_give_finite_gaussians(tmp_path, name):
 def test_learning_rates_that_are_too_high_end_in_finite_numbers_or_one_line(tmp_path, times, caplog):
     rates = ("means_rate", "scales_rate", "quats_rate", "opacities_rate", "sh0_rate", "shN_rate")
     config = replace(CONFIG, **{name: getattr(CONFIG, name) * times for name in rates})
+    trainer, told = None, ""
     try:
         trainer = reconstructed(capture(tmp_path, "sound"), config)
     except TrainingError as error:
         told = str(error)
+    if trainer is None:
+        assert "lower the learning rates" in told
     else:
-        told = "lower the learning rates"
         assert not trainer.damage()
-    assert "lower the learning rates" in told
     assert all("diverged" in record.getMessage() for record in caplog.records)
 
 

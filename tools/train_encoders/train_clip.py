@@ -83,7 +83,7 @@ class ClipTraining:
         seed: Of everything random.
     """
 
-    steps: int = 9000
+    steps: int = 7000
     batch: int = 96
     rate: float = 1e-3
     image_size: int = 48
