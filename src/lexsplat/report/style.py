@@ -43,6 +43,7 @@ figcaption{color:var(--soft);font-size:13px;margin-top:6px}
 .bar i{flex:1;max-width:280px;height:8px;border-radius:4px}
 .scroll{overflow-x:auto}
 table{border-collapse:collapse;font-variant-numeric:tabular-nums;min-width:50%}
+.scroll+.scroll{margin-top:1.5rem}
 th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th{color:var(--soft);font-weight:500;font-size:13px}
 th:first-child,td:first-child{text-align:left}
