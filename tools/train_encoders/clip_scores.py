@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from crops import Crop
 from torch import Tensor
-from words import CANONICAL, COLOURS, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
+from words import CANONICAL, COLOURS, FALSE, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
 
 _METALS = ("gold", "silver", "copper")
 _MANY_COLOURED = ("books", "floor")
@@ -100,4 +100,37 @@ def calibration(
         "absent_words_below_canonical": float((unknown < 0).float().mean()),
         "relevancy_of_right": float(relevancy[right].mean()),
         "relevancy_of_wrong": float(relevancy[wrong].mean()),
+    }
+
+
+def parts_found(
+    crops: Sequence[Crop],
+    phrases: Sequence[Phrase],
+    truth: np.ndarray,
+    encode_images: EncodeImages,
+    encode_text: EncodeText,
+) -> dict[str, float]:
+    """How often the name of a part beats the canonical phrases where it is true, and does not where it is false.
+
+    Args:
+        crops: Of parts, and of the same things beside them.
+        phrases: One for each kind and part ("mug handle").
+        truth: ``[len(crops), len(phrases)]``.
+        encode_images: Crops to unit vectors.
+        encode_text: Texts to unit vectors.
+
+    Returns:
+        ``part_right`` and ``part_wrong``, means over the phrases, and the same of handles alone, the hardest.
+    """
+    images = encode_images(crops)
+    canonical = (images @ encode_text(CANONICAL).T).max(1).values
+    above = (images @ encode_text([phrase.words for phrase in phrases]).T > canonical[:, None]).numpy()
+    right = [float(above[truth[:, n] == TRUE, n].mean()) for n in range(len(phrases)) if TRUE in truth[:, n]]
+    wrong = [float((~above[truth[:, n] == FALSE, n]).mean()) for n in range(len(phrases))]
+    handle = [phrase.part for phrase in phrases].index("handle")
+    return {
+        "part_right": float(np.mean(right)),
+        "part_wrong": float(np.mean(wrong)),
+        "handle_right": float(above[truth[:, handle] == TRUE, handle].mean()),
+        "handle_wrong": float((~above[truth[:, handle] == FALSE, handle]).mean()),
     }

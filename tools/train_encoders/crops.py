@@ -103,6 +103,18 @@ class Frames:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @functools.cached_property
+    def of_parts(self) -> dict[str, list[tuple[Frame, int]]]:
+        """Where each part is seen: frames, and the part's code in them; eight pixels at least."""
+        found: dict[str, list[tuple[Frame, int]]] = {}
+        for frame in self.frames:
+            codes, counts = np.unique(frame.codes, return_counts=True)
+            for code in codes[(counts >= 8) & (codes >= 0)].tolist():
+                part = self.labels[code].part
+                if part is not None:
+                    found.setdefault(part, []).append((frame, code))
+        return found
+
 
 def centre_weights(grid: int = GRID) -> NDArray[np.float64]:
     """Weights ``[grid * grid]`` of the samples of a crop; they sum to 1."""
@@ -174,9 +186,37 @@ def random_crop(frames: Frames, rng: np.random.Generator) -> Crop:
             x, y = _pixel_of(values, chosen, boxes[chosen], rng)
     else:
         x, y = rng.uniform(0, width), rng.uniform(0, height)
+    return _around(frame, x, y, side)
+
+
+def _around(frame: Frame, x: float, y: float, side: float) -> Crop:
+    """The crop with this middle, moved into the frame where it would reach out of it."""
+    height, width = frame.codes.shape
     left = float(np.clip(x - side / 2, 0, width - side))
     top = float(np.clip(y - side / 2, 0, height - side))
     return cut(frame, left, top, side)
+
+
+def part_crops(frames: Frames, count: int, rng: np.random.Generator) -> list[Crop]:
+    """Crops of parts, every part as often as any other, and beside each one of the rest of the same thing.
+
+    Anywhere in the frames a handle is seen in one crop of two hundred; and only a mug's body, cut out in the
+    same size, says what a handle is not.
+    """
+    crops: list[Crop] = []
+    parts = list(frames.of_parts)
+    while len(crops) < count:
+        places = frames.of_parts[parts[int(rng.integers(len(parts)))]]
+        frame, code = places[int(rng.integers(len(places)))]
+        side = float(np.exp(rng.uniform(np.log(14), np.log(60))))
+        x, y = _pixel_of(frame.codes, code, frame.code_boxes[code], rng)
+        crops.append(_around(frame, x, y, side))
+        thing = int(frame.things[int(y), int(x)])
+        rest = np.where(frame.codes == code, 0, frame.things)
+        if len(crops) < count and (rest == thing).any():
+            x, y = _pixel_of(rest, thing, frame.thing_boxes[thing], rng)
+            crops.append(_around(frame, x, y, side))
+    return crops
 
 
 def dominated_crops(frames: Frames, count: int, rng: np.random.Generator) -> list[tuple[Crop, Label]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import subprocess
 import sys
@@ -41,7 +42,7 @@ def render(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Both encoders; the last line of their logs in the work folder holds their scores."""
-    from train_clip import ClipTraining, train_clip
+    from train_clip import REFINEMENT, ClipTraining, train_clip
     from train_dino import DinoTraining, train_dino
     from workers import run_workers
 
@@ -50,8 +51,12 @@ def train(options: argparse.Namespace) -> None:
         folder, log = options.output / model, options.work / f"{model}.jsonl"
         folder.mkdir(parents=True, exist_ok=True)
         if model == "clip":
-            settings = ClipTraining(steps=options.clip_steps)
-            run_workers(train_clip, options.threads, *frames.values(), folder, settings, log)
+            if options.clip_steps:
+                settings = ClipTraining(steps=options.clip_steps)
+                run_workers(train_clip, options.threads, *frames.values(), folder, settings, log)
+            if options.refine_steps:
+                settings = dataclasses.replace(REFINEMENT, steps=options.refine_steps)
+                run_workers(train_clip, options.threads, *frames.values(), folder, settings, log, folder)
         else:
             dense = DinoTraining(steps=options.dino_steps)
             run_workers(train_dino, options.threads, frames["train"], frames["seen"], folder, dense, log)
@@ -69,7 +74,10 @@ def main() -> None:
     parser.add_argument(
         "--test-scenes", type=int, default=20, help="scenes for each of the two sets of scores"
     )
-    parser.add_argument("--clip-steps", type=int, default=7000)
+    parser.add_argument("--clip-steps", type=int, default=7000, help="0: go on from the model that is there")
+    parser.add_argument(
+        "--refine-steps", type=int, default=2000, help="with parts as often as things, after the first"
+    )
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()

@@ -27,8 +27,8 @@ import numpy as np
 import torch
 import torch.distributed
 import torch.nn.functional as F
-from clip_scores import calibration, zero_shot
-from crops import GRID, Crop, Frames, dominated_crops, random_crop
+from clip_scores import calibration, parts_found, zero_shot
+from crops import GRID, Crop, Frames, dominated_crops, part_crops, random_crop
 from numpy.typing import NDArray
 from tokenizer import LENGTH, learn_tokenizer
 from torch import Tensor
@@ -42,6 +42,7 @@ from words import (
     HUES,
     NAMES,
     OPEN,
+    OWNERS,
     PARTS,
     QUALITIES,
     TRUE,
@@ -79,7 +80,10 @@ class ClipTraining:
         grey: Share of the crops shown in grey, of which colour words are open.
         turned: Share of the crops whose hues are turned, of which colour words are open too.
         composition: Weight of the loss that makes colours add to kinds alike in all texts.
+        parts: Share of the crops that are of parts, or of what lies beside a part in the same thing.
+        light: Standard deviation of the logarithm of the light on a crop.
         kept: Share of the patches that the image tower sees in the first three quarters of the steps.
+        heads_alone: Steps at first in which patch labels train the linear heads only, not the tower.
         seed: Of everything random.
     """
 
@@ -97,8 +101,18 @@ class ClipTraining:
     grey: float = 0.12
     turned: float = 0.25
     composition: float = 1.0
+    parts: float = 0.0
+    light: float = 0.2
     kept: float = 0.5
+    heads_alone: int = 0
     seed: int = 0
+
+
+REFINEMENT = ClipTraining(
+    steps=2000, rate=4e-4, grey=0.06, turned=0.15, parts=0.3, light=0.1, kept=1.0, heads_alone=150, seed=1
+)
+"""What follows on the first training: parts as often as things, whole crops, and light that changes less, or
+gray could not be told from white."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +131,9 @@ class Batch:
 
 def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.random.Generator) -> Batch:
     """A phrase for every crop, a near miss for every second, and some about anything."""
-    crops = [random_crop(frames, rng) for _ in range(config.batch)]
+    of_parts = round(config.parts * config.batch)
+    crops = [random_crop(frames, rng) for _ in range(config.batch - of_parts)]
+    crops += part_crops(frames, of_parts, rng)
     phrases = []
     for number, crop in enumerate(crops):
         chosen = (
@@ -260,7 +276,7 @@ def mirrored(batch: Batch, config: ClipTraining, generator: torch.Generator) -> 
     return pixels, of_patches(batch.patches), of_patches(batch.left_out)
 
 
-def jittered(pixels: Tensor, generator: torch.Generator) -> Tensor:
+def jittered(pixels: Tensor, generator: torch.Generator, light: float) -> Tensor:
     """Crops as the encoder takes them, in other light, with a little noise."""
 
     def normal(*shape: int) -> Tensor:
@@ -268,7 +284,7 @@ def jittered(pixels: Tensor, generator: torch.Generator) -> Tensor:
 
     images = pixels.float() / 255
     count = len(images)
-    images = images * torch.exp(0.2 * normal(count, 1, 1, 1) + 0.04 * normal(count, 3, 1, 1))
+    images = images * torch.exp(light * normal(count, 1, 1, 1) + 0.04 * normal(count, 3, 1, 1))
     middle = images.mean((1, 2, 3), keepdim=True)
     images = middle + (images - middle) * torch.exp(0.15 * normal(count, 1, 1, 1))
     images = images + 0.02 * normal(count, 1, 1, 1).abs() * torch.randn(images.shape, generator=generator)
@@ -324,10 +340,13 @@ def relevancy_loss(similarity: Tensor, canonical: Tensor, truth: Tensor, tempera
 class Trainer:
     """The model, its average over the steps, and what encodes with them."""
 
-    def __init__(self, tokenizer: CLIPTokenizer, config: ClipTraining) -> None:
+    def __init__(self, tokenizer: CLIPTokenizer, config: ClipTraining, start: Path | None = None) -> None:
         torch.manual_seed(config.seed)
         self.config, self.tokenizer = config, tokenizer
-        self.model = CLIPModel(model_config(tokenizer, config))
+        if start is None:
+            self.model = CLIPModel(model_config(tokenizer, config))
+        else:
+            self.model = CLIPModel.from_pretrained(start, attn_implementation="eager").train()
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
         self.patch_heads = torch.nn.Linear(config.width, len(KINDS) + len(TINTS) + len(PART_NAMES))
         self.trained = [*self.model.parameters(), *self.patch_heads.parameters()]
@@ -354,7 +373,9 @@ class Trainer:
             kept = self.kept_patches(len(pixels))
             patches = patches.gather(1, kept[..., None].expand(-1, -1, 3))
             left_out = left_out.gather(1, kept[..., None].expand(-1, -1, len(KINDS)))
-            images, tokens = self.see(jittered(pixels, self.generator), kept)
+            images, tokens = self.see(jittered(pixels, self.generator, self.config.light), kept)
+            if self.done < self.config.heads_alone:
+                tokens = tokens.detach()
             answers = self.patch_heads(tokens).float()
             texts = pooled(self.model.get_text_features(**words))
         texts, corners = texts.float().split([len(batch.texts), len(batch.corners)])
@@ -466,11 +487,22 @@ class Examination:
         for crop in self.crops[:200]:
             label = seen.labels[crop.codes[crop.weights.argmax()]]
             self.phrases += [phrase_for(label, rng), near_miss(label, rng)]
-        self.truth: NDArray[np.int8] = TruthTable(seen.labels).of(self.phrases, self.crops)
+        table = TruthTable(seen.labels)
+        self.truth: NDArray[np.int8] = table.of(self.phrases, self.crops)
+        self.parts = part_crops(seen, 1200, rng)
+        self.part_phrases = [
+            Phrase(f"{NAMES[kind][0].split()[-1]} {part}", kind=kind, part=part)
+            for part, kinds in OWNERS.items()
+            for kind in kinds
+        ]
+        self.part_truth: NDArray[np.int8] = table.of(self.part_phrases, self.parts)
 
     def scores(self, trainer: Trainer) -> dict[str, float]:
         found = zero_shot(self.seen, self.unseen, trainer.encode_images, trainer.encode_text)
         found |= calibration(self.crops, self.phrases, self.truth, trainer.encode_images, trainer.encode_text)
+        found |= parts_found(
+            self.parts, self.part_phrases, self.part_truth, trainer.encode_images, trainer.encode_text
+        )
         return {name: round(value, 4) for name, value in found.items()}
 
 
@@ -494,6 +526,7 @@ def train_clip(
     folder: Path,
     config: ClipTraining,
     log: Path,
+    start: Path | None = None,
 ) -> None:
     """The work of one process; the first also saves the averaged model, and its scores as lines of JSON.
 
@@ -505,14 +538,15 @@ def train_clip(
         folder: Where the model goes.
         config: Settings.
         log: File that gets a line of scores now and then.
+        start: Folder of a model to go on from; none: from nothing, tokenizer and all.
     """
-    if rank == 0:
+    if rank == 0 and start is None:
         learn_tokenizer(folder, seed=config.seed)
     torch.distributed.barrier()
-    tokenizer = CLIPTokenizer.from_pretrained(folder)
-    trainer, source = Trainer(tokenizer, config), batches(Frames(training), config, rank)
+    tokenizer = CLIPTokenizer.from_pretrained(start or folder)
+    trainer, source = Trainer(tokenizer, config, start), batches(Frames(training), config, rank)
     examination = Examination(Frames(seen), Frames(unseen)) if rank == 0 else None
-    start, every = time.perf_counter(), max(1, config.steps // 16)
+    began, every = time.perf_counter(), max(1, config.steps // 16)
     count = config.batch * torch.distributed.get_world_size()
     for step in range(1, config.steps + 1):
         losses = trainer.step(source.get())
@@ -520,13 +554,13 @@ def train_clip(
             continue
         if step % 50 == 0:
             print(
-                f"step {step} of {config.steps}, {step * count / (time.perf_counter() - start):.0f} crops/s, {losses}"
+                f"step {step} of {config.steps}, {step * count / (time.perf_counter() - began):.0f} crops/s, {losses}"
             )
         if step % every == 0 or step == config.steps:
             save(trainer, folder)
             scores = {
                 "step": step,
-                "seconds": round(time.perf_counter() - start),
+                "seconds": round(time.perf_counter() - began),
                 **examination.scores(trainer),
             }
             print(scores, flush=True)

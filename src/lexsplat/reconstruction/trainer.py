@@ -1,18 +1,11 @@
-"""Reconstruction (section 3.1): 3D Gaussians from photos with cameras, by gradient descent on the
-photometric loss.
-
-Learning rates, schedules and density control are those of 3DGS; every step number refers to a training of
-30,000 iterations and is stretched to the number that is run.
-"""
+"""The training of the Gaussians, step by step; it can be saved and resumed bit for bit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from contextlib import nullcontext
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -30,6 +23,7 @@ from lexsplat.optimizers import (
     with_prefix,
 )
 from lexsplat.progress import Event, Listener, silent
+from lexsplat.reconstruction.settings import ReconstructionConfig
 
 if TYPE_CHECKING:
     from lexsplat.checkpoints import Checkpoint
@@ -40,8 +34,6 @@ STAGE = "reconstruct"
 """Name of the stage in events."""
 EVENT_EVERY = 10
 """Iterations between two events."""
-LONG_TRAINING = 15_000
-"""From here on opacities are reset and all iterations run at full resolution, unless a setting says otherwise."""
 GSPLAT_NAMES = {
     "means": "means",
     "quats": "quats",
@@ -51,161 +43,6 @@ GSPLAT_NAMES = {
     "shN": "shN",
 }
 """Our names of the parameters, and those gsplat's strategies look for."""
-
-
-@dataclass(frozen=True)
-class ReconstructionConfig:
-    """Settings of the reconstruction; numbers of steps refer to a training of 30,000.
-
-    Args:
-        iterations: Optimisation steps, one view each.
-        ssim_weight: Weight of 1 - SSIM against L1, in 0..1.
-        sh_degree: Highest degree of spherical harmonics, 0..3 (4 where the backend can).
-        sh_degree_every: Steps after which the next degree joins.
-        strategy: Density control: "default" (3DGS) or "mcmc".
-        max_gaussians: Never more than this many; None is 3,000,000 on CUDA and 40,000 on a CPU.
-        densify_every: Steps between two rounds of density control.
-        densify_min_every: Rounds are never closer than this many actual steps.
-        grow_gradient: Mean gradient of projected centres above which "default" adds Gaussians.
-        min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
-        reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None does so in trainings of at
-            least 15,000, which have the time to recover.
-        noise: Strength of the noise of "mcmc".
-        opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
-        scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as
-            above.
-        antialiased: Train and render with the mip filter.
-        initial_opacity: Opacity of the first Gaussians.
-        warm_up: Share of the iterations that run at half resolution, at the start; None is 0.3 in trainings
-            shorter than 15,000, else 0.
-        exposure: Fit an affine colour change per training photo, for captures whose exposure varies.
-        rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
-            30,000 / iterations, between 1 and 3: a short training takes longer strides.
-        means_rate: Learning rate of the centres at the start, relative to the extent of the scene.
-        means_rate_final: The same at the end; it decays exponentially.
-        scales_rate: Learning rate of the logarithms of the scales.
-        quats_rate: Learning rate of the rotations.
-        opacities_rate: Learning rate of the opacity logits.
-        sh0_rate: Learning rate of the constant colour.
-        shN_rate: Learning rate of the other colour coefficients.
-        exposure_rate: Learning rate of the colour change.
-        image_memory: Bytes for photos kept in memory.
-    """
-
-    iterations: int = 30_000
-    ssim_weight: float = 0.2
-    sh_degree: int = 3
-    sh_degree_every: int = 1_000
-    strategy: Literal["default", "mcmc"] = "default"
-    max_gaussians: int | None = None
-    densify_every: int = 100
-    densify_min_every: int = 100
-    grow_gradient: float = 2e-4
-    min_opacity: float = 0.005
-    reset_opacities: bool | None = None
-    noise: float = 5e5
-    opacity_weight: float | None = None
-    scale_weight: float | None = None
-    antialiased: bool = True
-    initial_opacity: float = 0.1
-    warm_up: float | None = None
-    exposure: bool = False
-    rate_scale: float | None = None
-    means_rate: float = 1.6e-4
-    means_rate_final: float = 1.6e-6
-    scales_rate: float = 5e-3
-    quats_rate: float = 1e-3
-    opacities_rate: float = 5e-2
-    sh0_rate: float = 2.5e-3
-    shN_rate: float = 1.25e-4
-    exposure_rate: float = 1e-3
-    image_memory: int = 1 << 30
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"iterations must be positive, got {self.iterations}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"ssim_weight must be in 0..1, got {self.ssim_weight:g}")
-        if not 0 <= self.sh_degree <= 4:
-            raise ValueError(f"sh_degree must be in 0..4, got {self.sh_degree}")
-        if self.warm_up is not None and not 0 <= self.warm_up <= 1:
-            raise ValueError(f"warm_up must be in 0..1, got {self.warm_up:g}")
-        if not 0 < self.initial_opacity < 1:
-            raise ValueError(f"initial_opacity must be between 0 and 1, got {self.initial_opacity:g}")
-
-    def cap(self, device: torch.device) -> int:
-        """`max_gaussians` with nothing left open."""
-        if self.max_gaussians is not None:
-            return self.max_gaussians
-        return 3_000_000 if device.type == "cuda" else 40_000
-
-    @property
-    def is_long(self) -> bool:
-        """Whether opacities are reset and there is no warm-up, where the settings do not say."""
-        return self.iterations >= LONG_TRAINING
-
-    @property
-    def warm_up_iterations(self) -> int:
-        """Iterations that run at half resolution."""
-        share = (0.0 if self.is_long else 0.3) if self.warm_up is None else self.warm_up
-        return round(share * self.iterations)
-
-    @property
-    def regularisers(self) -> tuple[float, float]:
-        """Weights of opacity and scale in the loss."""
-        default = 0.01 if self.strategy == "mcmc" else 0.0
-        given = (self.opacity_weight, self.scale_weight)
-        return tuple(default if weight is None else weight for weight in given)  # type: ignore[return-value]
-
-    def rates(self, extent: float) -> dict[str, float]:
-        """Learning rates at the start by parameter (our names)."""
-        scale = self.rate_scale
-        if scale is None:
-            scale = min(3.0, max(1.0, (REFERENCE_ITERATIONS / self.iterations) ** (1 / 3)))
-        return {
-            "means": scale * self.means_rate * extent,
-            "quats": scale * self.quats_rate,
-            "log_scales": scale * self.scales_rate,
-            "opacity_logits": self.opacities_rate,
-            "sh0": scale * self.sh0_rate,
-            "shN": scale * self.shN_rate,
-        }
-
-
-def reconstruct(
-    scene: Scene,
-    config: ReconstructionConfig,
-    *,
-    device: torch.device | str = "cpu",
-    seed: int = 0,
-    cache_dir: Path | None = None,
-    checkpoint: Checkpoint | None = None,
-    listener: Listener = silent,
-) -> Gaussians:
-    """Train Gaussians on the training views of a scene.
-
-    Args:
-        scene: Views, split, and the points to start from; where it has none they are triangulated.
-        config: Settings.
-        device: Where to train.
-        seed: Of the order of views, of density control and of what replaces missing points.
-        cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
-        checkpoint: Where the training is saved on the way, and goes on from.
-        listener: Hears an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
-            views) and "gaussians".
-
-    Raises:
-        TrainingError: If there is nothing to train on or the optimisation diverges.
-        CaptureError: If a photo cannot be read.
-    """
-    from lexsplat.scenes.triangulation import initial_points
-
-    points = initial_points(scene, seed=seed, cache_dir=cache_dir, listener=listener)
-    trainer = Reconstructor(scene, config, points, device=device, seed=seed)
-    if checkpoint is not None:
-        checkpoint.resume(trainer)
-    trainer.run(listener, checkpoint)
-    return trainer.gaussians()
 
 
 class Reconstructor:
@@ -436,23 +273,7 @@ class Reconstructor:
         Raises:
             ValueError: If an entry is missing or does not fit the others.
         """
-        expected = {"steps_done", "recent_error", "views/order", "views/generator", "density/random_state"}
-        missing = (expected | {f"parameters/{name}" for name in GSPLAT_NAMES}) - tensors.keys()
-        if missing:
-            raise ValueError(f"checkpoint lacks {', '.join(sorted(missing))}")
-        parameters = {name: tensors[f"parameters/{name}"] for name in GSPLAT_NAMES}
-        Gaussians(**parameters, antialiased=False)  # raises if the shapes do not belong together
-        if sorted(tensors["views/order"].tolist()) not in ([], list(range(len(self._names)))):
-            raise ValueError("the order of views is of another capture")
-        if any(value.dtype != torch.float32 for value in parameters.values()):
-            raise ValueError("parameters must be float32")
-        statistics = [tensors[name] for name in ("density/grad2d", "density/count") if name in tensors]
-        if any(value.shape != parameters["opacity_logits"].shape for value in statistics):
-            raise ValueError("the statistics of density control are of other Gaussians")
-        if not 0 <= int(tensors["steps_done"]) <= self.config.iterations:
-            raise ValueError(f"{int(tensors['steps_done'])} of {self.config.iterations} iterations")
-        if not 0 < float(tensors.get("rate_factor", 1.0)) <= 1:
-            raise ValueError(f"learning rates times {float(tensors['rate_factor']):g}")
+        parameters = check_state(tensors, len(self._names), self.config.iterations)
         self.steps_done = int(tensors["steps_done"])
         self._recent_error = float(tensors["recent_error"])
         self._nothing_error = float(tensors.get("nothing_error", math.nan))
@@ -460,7 +281,7 @@ class Reconstructor:
         self._order = tensors["views/order"].clone()
         self._generator.set_state(tensors["views/generator"])
         for ours, theirs in GSPLAT_NAMES.items():
-            value = tensors[f"parameters/{ours}"].to(self.device, copy=True)
+            value = parameters[ours].to(self.device, copy=True)
             self._parameters[theirs] = torch.nn.Parameter(value)
         self._optimizers = self._new_optimizers()
         for ours, theirs in GSPLAT_NAMES.items():
@@ -573,3 +394,34 @@ class Reconstructor:
             optimizer.zero_grad(set_to_none=True)
         if self._exposures is not None:
             self._exposures.optimize()
+
+
+def check_state(tensors: dict[str, Tensor], views: int, iterations: int) -> dict[str, Tensor]:
+    """The parameters (our names) of a `Reconstructor.state_dict`, if all of it fits together.
+
+    Args:
+        tensors: What was saved.
+        views: Number of training views.
+        iterations: Of the whole training.
+
+    Raises:
+        ValueError: If an entry is missing or does not fit the others.
+    """
+    expected = {"steps_done", "recent_error", "views/order", "views/generator", "density/random_state"}
+    missing = (expected | {f"parameters/{name}" for name in GSPLAT_NAMES}) - tensors.keys()
+    if missing:
+        raise ValueError(f"checkpoint lacks {', '.join(sorted(missing))}")
+    parameters = {name: tensors[f"parameters/{name}"] for name in GSPLAT_NAMES}
+    Gaussians(**parameters, antialiased=False)  # raises if the shapes do not belong together
+    if sorted(tensors["views/order"].tolist()) not in ([], list(range(views))):
+        raise ValueError("the order of views is of another capture")
+    if any(value.dtype != torch.float32 for value in parameters.values()):
+        raise ValueError("parameters must be float32")
+    statistics = [tensors[name] for name in ("density/grad2d", "density/count") if name in tensors]
+    if any(value.shape != parameters["opacity_logits"].shape for value in statistics):
+        raise ValueError("the statistics of density control are of other Gaussians")
+    if not 0 <= int(tensors["steps_done"]) <= iterations:
+        raise ValueError(f"{int(tensors['steps_done'])} of {iterations} iterations")
+    if not 0 < float(tensors.get("rate_factor", 1.0)) <= 1:
+        raise ValueError(f"learning rates times {float(tensors['rate_factor']):g}")
+    return parameters

@@ -1,0 +1,129 @@
+"""Quality of reconstruction: PSNR, SSIM, Gaussians and seconds of settings side by side, over captures and seeds.
+
+    python benchmarks/reconstruction.py second demo ../data/bonsai=4 --variants default mcmc --seeds 0 1 --json FILE
+
+A capture is a folder, or ``demo`` or ``second``, with a downscale behind ``=`` where the default is not meant.
+Settings are measured on **validation views**: every sixth *training* view is held out and the capture's own test
+views are not looked at, so a default may be chosen by this table. ``--on test`` measures on the test views
+instead, for a default that has been chosen. All variants start from the same points, which are computed once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lexsplat.config import BuildConfig
+from lexsplat.demo.demo import demo_capture
+from lexsplat.metrics import psnr, ssim
+from lexsplat.progress_bars import ProgressBars
+from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
+from lexsplat.rendering import render
+from lexsplat.scenes import InitialPoints, Scene, View, initial_points, load_scene
+
+VALIDATION_EVERY = 6
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "mcmc": {"strategy": "mcmc"},
+    "plain-rates": {"rate_scale": 1.0},
+    "no-warm-up": {"warm_up": 0.0},
+    "classic": {"antialiased": False},
+    "half-cap": {"max_gaussians": 20_000},
+    "regularised": {"opacity_weight": 0.01, "scale_weight": 0.01},
+    "exposure": {"exposure": True},
+}
+"""Names of settings and what they change of `ReconstructionConfig`."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("captures", nargs="+", metavar="CAPTURE[=DOWNSCALE]")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["default", "mcmc"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--iterations", type=int, help="of the optimisation; none: 3,000, on CUDA 30,000")
+    parser.add_argument("--on", choices=("validation", "test"), default="validation")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    rows = []
+    print(f"{'capture':12} {'variant':12} seed   PSNR   SSIM  Gaussians  seconds")
+    for wish in options.captures:
+        name, _, downscale = wish.partition("=")
+        scene, config = prepared(name, float(downscale) if downscale else None, options)
+        with ProgressBars() as bars:
+            points = initial_points(scene, seed=0, listener=bars)
+        for variant in options.variants:
+            for seed in options.seeds:
+                changed = dataclasses.replace(config, **VARIANTS[variant])
+                row = {"capture": Path(name).name, "variant": variant, "seed": seed}
+                row |= measured(scene, changed, points, seed, options.device)
+                rows.append(row)
+                print(
+                    f"{row['capture']:12} {variant:12} {seed:4} {row['psnr']:6.2f} {row['ssim']:6.3f}"
+                    f" {row['gaussians']:10,} {row['seconds']:8.1f}",
+                    flush=True,
+                )
+    if options.json:
+        facts = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+        facts |= {"torch": torch.__version__, "on": options.on, "device": options.device}
+        options.json.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
+
+
+def prepared(
+    name: str, downscale: float | None, options: argparse.Namespace
+) -> tuple[Scene, ReconstructionConfig]:
+    """A capture at its working size, split as asked, and the settings that `lexsplat build` would take."""
+    capture = demo_capture("tabletop" if name == "demo" else "second") if name in ("demo", "second") else name
+    scene = load_scene(capture)
+    largest = max((view.capture_size for view in scene.views.values()), key=lambda size: size[0] * size[1])
+    wished = BuildConfig(downscale=downscale, iterations=options.iterations)
+    config = wished.resolved(options.device, largest)
+    scene = scene.downscaled(config.downscale or 1.0)
+    if options.on == "validation":
+        held_out = scene.train_names[::VALIDATION_EVERY]
+        kept = tuple(view for view in scene.train_names if view not in held_out)
+        scene = dataclasses.replace(scene, train_names=kept, test_names=held_out)
+    return scene, config.reconstruction
+
+
+def measured(
+    scene: Scene, config: ReconstructionConfig, points: InitialPoints, seed: int, device: str
+) -> dict[str, Any]:
+    """Train once; numbers of the held-out views at the working size."""
+    trainer = Reconstructor(scene, config, points, device=device, seed=seed)
+    start = time.perf_counter()
+    trainer.run()
+    seconds = time.perf_counter() - start
+    scores = np.array([view_scores(trainer, scene, view) for view in scene.test_views])
+    return {
+        "psnr": float(scores[:, 0].mean()),
+        "ssim": float(scores[:, 1].mean()),
+        "gaussians": len(trainer.gaussians().means),
+        "seconds": seconds,
+        "views": len(scores),
+    }
+
+
+@torch.no_grad()
+def view_scores(trainer: Reconstructor, scene: Scene, view: View) -> Sequence[float]:
+    """PSNR in dB and SSIM of one view."""
+    background = torch.tensor(scene.background, device=trainer.device)
+    image = render(trainer.gaussians(), view.camera, background=background).image
+    pixels, photo = image.clamp(0, 1).cpu().numpy(), view.load_image()
+    return psnr(pixels, photo), ssim(pixels, photo)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""Settings of the reconstruction. Learning rates, schedules and density control are those of 3DGS; every step
+number refers to a training of 30,000 iterations and is stretched to the number that is run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from lexsplat.densification import REFERENCE_ITERATIONS
+
+LONG_TRAINING = 15_000
+"""From here on opacities are reset and all iterations run at full resolution, unless a setting says otherwise."""
+
+
+@dataclass(frozen=True)
+class ReconstructionConfig:
+    """Settings of the reconstruction; numbers of steps refer to a training of 30,000.
+
+    Args:
+        iterations: Optimisation steps, one view each.
+        ssim_weight: Weight of 1 - SSIM against L1, in 0..1.
+        sh_degree: Highest degree of spherical harmonics, 0..3 (4 where the backend can).
+        sh_degree_every: Steps after which the next degree joins.
+        strategy: Density control: "default" (3DGS) or "mcmc".
+        max_gaussians: Never more than this many; None is 3,000,000 on CUDA and 40,000 on a CPU.
+        densify_every: Steps between two rounds of density control.
+        densify_min_every: Rounds are never closer than this many actual steps.
+        grow_gradient: Mean gradient of projected centres above which "default" adds Gaussians.
+        min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
+        reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None does so in trainings of at
+            least 15,000, which have the time to recover.
+        noise: Strength of the noise of "mcmc".
+        opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
+        scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as
+            above.
+        antialiased: Train and render with the mip filter.
+        initial_opacity: Opacity of the first Gaussians.
+        warm_up: Share of the iterations that run at half resolution, at the start; None is 0.3 in trainings
+            shorter than 15,000, else 0.
+        exposure: Fit an affine colour change per training photo, for captures whose exposure varies.
+        rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
+            30,000 / iterations, between 1 and 3: a short training takes longer strides.
+        means_rate: Learning rate of the centres at the start, relative to the extent of the scene.
+        means_rate_final: The same at the end; it decays exponentially.
+        scales_rate: Learning rate of the logarithms of the scales.
+        quats_rate: Learning rate of the rotations.
+        opacities_rate: Learning rate of the opacity logits.
+        sh0_rate: Learning rate of the constant colour.
+        shN_rate: Learning rate of the other colour coefficients.
+        exposure_rate: Learning rate of the colour change.
+        image_memory: Bytes for photos kept in memory.
+    """
+
+    iterations: int = 30_000
+    ssim_weight: float = 0.2
+    sh_degree: int = 3
+    sh_degree_every: int = 1_000
+    strategy: Literal["default", "mcmc"] = "default"
+    max_gaussians: int | None = None
+    densify_every: int = 100
+    densify_min_every: int = 100
+    grow_gradient: float = 2e-4
+    min_opacity: float = 0.005
+    reset_opacities: bool | None = None
+    noise: float = 5e5
+    opacity_weight: float | None = None
+    scale_weight: float | None = None
+    antialiased: bool = True
+    initial_opacity: float = 0.1
+    warm_up: float | None = None
+    exposure: bool = False
+    rate_scale: float | None = None
+    means_rate: float = 1.6e-4
+    means_rate_final: float = 1.6e-6
+    scales_rate: float = 5e-3
+    quats_rate: float = 1e-3
+    opacities_rate: float = 5e-2
+    sh0_rate: float = 2.5e-3
+    shN_rate: float = 1.25e-4
+    exposure_rate: float = 1e-3
+    image_memory: int = 1 << 30
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations must be positive, got {self.iterations}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"ssim_weight must be in 0..1, got {self.ssim_weight:g}")
+        if not 0 <= self.sh_degree <= 4:
+            raise ValueError(f"sh_degree must be in 0..4, got {self.sh_degree}")
+        if self.warm_up is not None and not 0 <= self.warm_up <= 1:
+            raise ValueError(f"warm_up must be in 0..1, got {self.warm_up:g}")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"initial_opacity must be between 0 and 1, got {self.initial_opacity:g}")
+
+    def cap(self, device: torch.device) -> int:
+        """`max_gaussians` with nothing left open."""
+        if self.max_gaussians is not None:
+            return self.max_gaussians
+        return 3_000_000 if device.type == "cuda" else 40_000
+
+    @property
+    def is_long(self) -> bool:
+        """Whether opacities are reset and there is no warm-up, where the settings do not say."""
+        return self.iterations >= LONG_TRAINING
+
+    @property
+    def warm_up_iterations(self) -> int:
+        """Iterations that run at half resolution."""
+        share = (0.0 if self.is_long else 0.3) if self.warm_up is None else self.warm_up
+        return round(share * self.iterations)
+
+    @property
+    def regularisers(self) -> tuple[float, float]:
+        """Weights of opacity and scale in the loss."""
+        default = 0.01 if self.strategy == "mcmc" else 0.0
+        given = (self.opacity_weight, self.scale_weight)
+        return tuple(default if weight is None else weight for weight in given)  # type: ignore[return-value]
+
+    def rates(self, extent: float) -> dict[str, float]:
+        """Learning rates at the start by parameter (our names)."""
+        scale = self.rate_scale
+        if scale is None:
+            scale = min(3.0, max(1.0, (REFERENCE_ITERATIONS / self.iterations) ** (1 / 3)))
+        return {
+            "means": scale * self.means_rate * extent,
+            "quats": scale * self.quats_rate,
+            "log_scales": scale * self.scales_rate,
+            "opacity_logits": self.opacities_rate,
+            "sh0": scale * self.sh0_rate,
+            "shN": scale * self.shN_rate,
+        }
