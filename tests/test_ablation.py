@@ -99,6 +99,28 @@ def test_several_methods_stand_beside_each_other_with_wrong_labels(
     assert rows[1]["mAP"] != clean[1]["mAP"]
 
 
+def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, monkeypatch):
+    shutil.copytree(ablated / "scene", tmp_path / "scene")
+    made, original = [], ablation.make_field
+    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(1) or original(*a))
+    rows = ablation.ablate(
+        tiny_capture, tmp_path, CONFIG, seeds=(0, 1), variants=("full",), forms=("feature", "code")
+    )
+    assert [row["name"] for row in rows] == ["full, feature", "full, code"]
+    assert len(made) == 2, "one for each seed"
+    for form in ("feature", "code"):
+        record = json.loads((tmp_path / "runs" / f"full__{form}" / "seed-0.json").read_text())
+        assert record["metrics"]["language"]["form"] == form
+    known = json.loads((ablated / "runs" / "full" / "seed-0.json").read_text())["metrics"]["language"]
+    assert rows[0]["mAP"] != rows[1]["mAP"]
+    again = json.loads((tmp_path / "runs" / "full__feature" / "seed-0.json").read_text())["metrics"][
+        "language"
+    ]
+    assert again["strict"] == known["strict"], "as if it stood alone"
+    with pytest.raises(ValueError, match="form"):
+        ablation.ablate(tiny_capture, tmp_path, CONFIG, forms=())
+
+
 def test_wrong_labels_differ_in_every_view_and_keep_their_share():
     maps = {name: np.zeros((80, 90), np.uint8) for name in "ab"}
     wrong = ablation.with_wrong_labels(maps, 0.25, 10, seed=3)

@@ -23,6 +23,7 @@ from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
 from lexsplat.pipeline import make_field
 from lexsplat.progress import Listener, silent
+from lexsplat.queries import QueryForm
 from lexsplat.scenes.prompt_lists import PromptList
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -99,6 +100,7 @@ def ablate(
     variants: Sequence[str] = (),
     methods: Sequence[LanguageMethod] = (),
     wrong_labels: float = 0.0,
+    forms: Sequence[QueryForm] = ("feature",),
     evaluation: EvaluationConfig | None = None,
     masks: Path | None = None,
     prompt_list: PromptList | None = None,
@@ -117,7 +119,9 @@ def ablate(
         methods: "trained", "lifted", "lifted+tuned"; none takes that of the settings. Rows of several are called
             "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
-        evaluation: How to measure; by default in the form of the paper, without LPIPS.
+        forms: How codes and text are compared, each beside the others: "feature" as in the paper, "code". Names of
+            rows end in the form where there are several.
+        evaluation: How to measure; by default as `paper_evaluation`.
         masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
         prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
         listener: Told how far each stage is.
@@ -130,18 +134,22 @@ def ablate(
         CaptureError: If there is no truth of held-out views, or no prompt list for the capture.
     """
     plan = _plan(config, list(methods) or [config.method], variants)
-    if not seeds:
-        raise ValueError("an ablation needs at least one seed")
+    if not seeds or not forms:
+        raise ValueError("an ablation needs at least one seed and one form")
     with_wrong_labels({}, wrong_labels, 1, 0)  # a wrong share is told before anything is made
-    measure = evaluation or paper_evaluation()
+    measure = in_form(evaluation or paper_evaluation(), forms[0])
     bench = Bench(capture, output, config, measure, listener, masks=masks, prompt_list=prompt_list)
-    results = Results(bench, "ablation", [name for name, _, _ in plan], seeds, COLUMNS)
+    names = [_row(name, form, forms) for name, _, _ in plan for form in forms]
+    results = Results(bench, "ablation", names, seeds, COLUMNS)
     for seed in seeds:  # one seed for all variants first: a stopped run leaves whole tables of fewer seeds
         for name, method, variant in plan:
             settings = with_seed(changed(replace(bench.config, method=method), variant), seed)
             made_from = [*language_settings(settings), *([wrong_labels] if wrong_labels else [])]
             make = partial(make_language, bench, settings, wrong_labels)
-            results.add(bench.run(name, seed, made_from, make, pictures=seed == seeds[0]))
+            for form in forms:
+                bench.evaluation = in_form(measure, form)
+                row = _row(name, form, forms)
+                results.add(bench.run(row, seed, made_from, make, pictures=seed == seeds[0]))
     return results.rows()
 
 
@@ -159,10 +167,18 @@ def _plan(
     return rows
 
 
+def _row(name: str, form: QueryForm, forms: Sequence[QueryForm]) -> str:
+    return name if len(forms) == 1 else f"{name}, {form}"
+
+
+def in_form(evaluation: EvaluationConfig, form: QueryForm) -> EvaluationConfig:
+    """The same measures of relevancies compared in another form."""
+    return replace(evaluation, query=replace(evaluation.query, form=form))
+
+
 def paper_evaluation() -> EvaluationConfig:
-    """Strict and official numbers of the paper's form of relevancy."""
-    config = EvaluationConfig(lpips=False, timing_views=1, protocols=("strict", "official"))
-    return replace(config, query=replace(config.query, form="feature"))
+    """Strict and official numbers, without LPIPS, which a language does not change."""
+    return EvaluationConfig(lpips=False, timing_views=1, protocols=("strict", "official"))
 
 
 def make_language(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lexsplat import baselines
-from lexsplat.ablation import language_settings, make_language
+from lexsplat.ablation import in_form, language_settings, make_language
 from lexsplat.config import BuildConfig
 from lexsplat.evaluation import PROTOCOLS, EvaluationConfig
 from lexsplat.evaluation.methods import Method
@@ -77,8 +77,7 @@ def compare(
     results = Results(bench, "comparison", methods, seeds)
     for seed in seeds:
         for name in methods:
-            form = "feature" if name.endswith("-feature") else shared.query.form
-            bench.evaluation = replace(shared, query=replace(shared.query, form=form))
+            bench.evaluation = in_form(shared, "feature") if name.endswith("-feature") else shared
             settings, make = _method(bench, name, seed)
             results.add(bench.run(name, seed, settings, make, pictures=seed == seeds[0]))
     return results.rows()

@@ -50,6 +50,8 @@ PHOTO_TEMPLATES = (
 _CHUNK = 1 << 13  # pixels at a time; small enough that a block stays in the cache
 _MIN_COVERAGE = 0.05
 
+QueryForm = Literal["feature", "code"]
+"""Whether the blended feature or each code is compared with the text."""
 TextEncoder = Callable[[list[str]], Tensor]
 """Texts to embeddings ``[T, D]``; they need not be of unit length."""
 
@@ -69,7 +71,7 @@ class QueryConfig:
     """
 
     temperature: float = 10.0
-    form: Literal["feature", "code"] = "code"
+    form: QueryForm = "code"
     negatives: tuple[str, ...] = CANONICAL_PHRASES
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5

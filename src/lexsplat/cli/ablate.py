@@ -31,7 +31,7 @@ class Ablate:
         masks: Folder with truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
             the capture.
         prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
-        form: How codes and text are compared; the paper's is "feature".
+        forms: How codes and text are compared, each beside the others; the paper's is "feature".
         as_in_paper: Fit and train as the paper does (30,000 steps) instead of our short settings.
         json: Print ablation.json on standard output.
         settings: What is made and how; ``--seed`` is the seed of the Gaussians.
@@ -57,13 +57,15 @@ class Ablate:
     wrong_labels: float = 0.0
     masks: Path | None = None
     prompt_list: PromptListName | None = None
-    form: Literal["feature", "code"] = "feature"
+    forms: tuple[Literal["feature", "code"], ...] = ("feature",)
     as_in_paper: bool = False
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
+        if not self.forms:
+            raise ValueError("--forms takes at least one of feature, code")
         if not 0 <= self.wrong_labels <= 1:
             raise ValueError(f"--wrong-labels must be in 0..1, got {self.wrong_labels:g}")
 
@@ -76,8 +78,6 @@ class Ablate:
         capture, settings = capture_and_settings(self.capture, self.settings)
         if self.as_in_paper:
             settings = ablation.as_in_paper(settings)
-        evaluation = ablation.paper_evaluation()
-        query = dataclasses.replace(evaluation.query, form=self.form)
         with ProgressBars() as bars:
             rows = ablation.ablate(
                 capture,
@@ -87,7 +87,7 @@ class Ablate:
                 variants=self.variants,
                 methods=self.methods,
                 wrong_labels=self.wrong_labels,
-                evaluation=dataclasses.replace(evaluation, query=query),
+                forms=self.forms,
                 masks=self.masks,
                 prompt_list=self.prompt_list,
                 listener=bars,

@@ -1,0 +1,101 @@
+"""Peak memory and time of the feature stage on many large views, each memory setting in a process of its own.
+
+    python benchmarks/memory.py [--views 300] [--size 1297x840] [--memory 1GB 4GB] [--json FILE]
+
+The views are photographs of noise (the count and size of crops do not depend on what is seen) with cameras around
+nothing; the encoders are the embedded ones, whose maps are as large as any of their width. `photos` is what all
+photos would take together, `maps` what all maps take on disk: neither may be held. `peak` counts everything, Python,
+torch and weights included, of which `bare` is what a process takes that has only loaded the encoders.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+GIB = 1 << 30
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--views", type=int, default=300)
+    parser.add_argument("--size", default="1297x840")
+    parser.add_argument("--memory", nargs="+", default=["1GB", "4GB"])
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--child", nargs=2, metavar=("CAPTURE", "MEMORY"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        print(json.dumps(extract(Path(options.child[0]), options.child[1])))
+        return
+    width, height = map(int, options.size.split("x"))
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        make_capture(Path(folder), options.views, width, height)
+        print(f"photos {options.views * width * height * 12 / GIB:.1f} GiB as float32")
+        for memory in options.memory:
+            command = [sys.executable, __file__, "--child", folder, memory]
+            result = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
+            rows.append({"memory": memory, **json.loads(result.stdout.splitlines()[-1])})
+            print(
+                "memory {memory}: peak {peak:.2f} GiB (bare {bare:.2f}), maps {maps:.2f} GiB, "
+                "{seconds:.0f} s".format(**rows[-1])
+            )
+    if options.json:
+        options.json.write_text(
+            json.dumps({"views": options.views, "size": options.size, "rows": rows}) + "\n"
+        )
+
+
+def make_capture(folder: Path, views: int, width: int, height: int) -> None:
+    """JPEGs of blurred noise, a few different ones linked under many names would be encoded once: all differ."""
+    (folder / "images").mkdir()
+    rng = np.random.default_rng(0)
+    frames = []
+    for number in range(views):
+        small = Image.fromarray(rng.integers(0, 256, (24, 36, 3), dtype=np.uint8))
+        name = f"images/{number:04d}.jpg"
+        small.resize((width, height), Image.Resampling.BICUBIC).save(folder / name, quality=90)
+        pose = np.eye(4)
+        pose[0, 3] = number / views
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    intrinsics = {"fl_x": width, "fl_y": width, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+
+
+def extract(capture: Path, memory: str) -> dict[str, float]:
+    """The feature stage at full size; GiB and seconds."""
+    from lexsplat.config import BuildConfig
+    from lexsplat.features.encoders import load_clip, load_dino
+    from lexsplat.pipeline import feature_maps
+    from lexsplat.scenes import load_scene
+
+    load_clip("embedded"), load_dino("embedded")
+    bare = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    scene = load_scene(capture)
+    view = next(iter(scene.views.values()))
+    config = BuildConfig(clip="embedded", dino="embedded", memory=memory, downscale=1.0)
+    config = config.resolved("cpu", view.capture_size).within_memory()
+    with tempfile.TemporaryDirectory() as cache:
+        start = time.perf_counter()
+        maps, _ = feature_maps(scene, config, Path(cache), "cpu")
+        for name in maps:
+            maps[name]
+        seconds = time.perf_counter() - start
+        size = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return {"bare": bare, "peak": peak, "maps": size / GIB, "seconds": seconds}
+
+
+if __name__ == "__main__":
+    main()
