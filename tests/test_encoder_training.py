@@ -201,3 +201,66 @@ def test_a_crop_shows_what_lies_around_its_middle():
         in_mug = crop.box[0] + (np.arange(24) + 0.5) * 20 / 24 < 30
         expected = line[in_mug].sum() / line.sum()
         assert float(crop.weights[crop.codes == 0].sum()) == pytest.approx(expected)
+
+
+def frames_with_a_handle():
+    """A red mug with a handle of three by five pixels, on a blue table."""
+    from crops import Frame, Frames
+    from words import Label
+
+    frames = object.__new__(Frames)
+    frames.labels = [Label("mug", "red"), Label("mug", "red", part="handle"), Label("table", "blue")]
+    codes = np.full((60, 80), 2, np.int32)
+    codes[20:40, 30:50] = 0
+    codes[27:32, 50:53] = 1
+    things = np.where(codes == 2, 2, 1).astype(np.uint8)
+    frames.frames = [Frame("scene", Image.new("RGB", (80, 60)), codes, things)]
+    return frames
+
+
+def test_crops_of_parts_come_with_the_rest_of_the_thing_and_with_what_is_near():
+    from crops import part_crops
+
+    frames = frames_with_a_handle()
+    assert list(frames.of_parts) == ["handle"], "the table and the mug's body are no parts"
+
+    def middles(near):
+        crops = part_crops(frames, 60, np.random.default_rng(0), near=near)
+        return crops, [int(crop.grid[12, 12]) for crop in crops]
+
+    crops, shown = middles(near=True)
+    assert len(crops) == 60
+    assert shown[0::3].count(1) >= 15, (
+        "handles, unless the crop was moved into the frame or sampled beside it"
+    )
+    assert shown[1::3].count(0) >= 15, "bodies"
+    assert shown[2::3].count(2) >= 8, "what is near"
+    _, pairs = middles(near=False)
+    assert pairs[0::2].count(1) >= 20
+    assert pairs[1::2].count(0) >= 20
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_phrase_about_any_part_is_true_of_that_part_alone(seed):
+    from words import TRUE, any_part
+
+    phrase = any_part(np.random.default_rng(seed))
+    true = [label for label in labels() if phrase.of(label) == TRUE]
+    assert true
+    assert {label.part for label in true} == {phrase.part}
+
+
+def test_a_thin_part_in_the_very_middle_counts_as_shown_if_asked_for():
+    from crops import cut
+    from truth import TruthTable
+    from words import OPEN, TRUE, Phrase
+
+    frames = frames_with_a_handle()
+    handle = [Phrase("mug handle", kind="mug", part="handle")]
+    # Both crops give the handle about a sixth of the weight; only the first has it in the middle.
+    crops = [cut(frames.frames[0], left, 21.5, 16.0) for left in (43.5, 45.5)]
+    weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
+    assert all(0.1 < weight < 0.25 for weight in weights)
+    assert TruthTable(frames.labels).of(handle, crops).tolist() == [[OPEN], [OPEN]]
+    assert TruthTable(frames.labels, centre=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]

@@ -197,11 +197,11 @@ def _around(frame: Frame, x: float, y: float, side: float) -> Crop:
     return cut(frame, left, top, side)
 
 
-def part_crops(frames: Frames, count: int, rng: np.random.Generator) -> list[Crop]:
-    """Crops of parts, every part as often as any other, and beside each one of the rest of the same thing.
+def part_crops(frames: Frames, count: int, rng: np.random.Generator, *, near: bool = False) -> list[Crop]:
+    """Crops of a part, every part as often as any other, of the rest of the same thing, and of what is ``near``.
 
-    Anywhere in the frames a handle is seen in one crop of two hundred; and only a mug's body, cut out in the
-    same size, says what a handle is not.
+    Anywhere in the frames a handle is seen in one crop of two hundred; and only a mug's body and the edge of a
+    table, cut out in the same size, say what a handle is not.
     """
     crops: list[Crop] = []
     parts = list(frames.of_parts)
@@ -213,10 +213,14 @@ def part_crops(frames: Frames, count: int, rng: np.random.Generator) -> list[Cro
         crops.append(_around(frame, x, y, side))
         thing = int(frame.things[int(y), int(x)])
         rest = np.where(frame.codes == code, 0, frame.things)
-        if len(crops) < count and (rest == thing).any():
+        left, top, right, bottom = frame.thing_boxes[thing]
+        if (rest == thing).any():
             x, y = _pixel_of(rest, thing, frame.thing_boxes[thing], rng)
             crops.append(_around(frame, x, y, side))
-    return crops
+        if near:
+            x, y = rng.uniform(left - 1.5 * side, right + 1.5 * side), rng.uniform(top - side, bottom + side)
+            crops.append(_around(frame, float(x), float(y), side))
+    return crops[:count]
 
 
 def dominated_crops(frames: Frames, count: int, rng: np.random.Generator) -> list[tuple[Crop, Label]]:

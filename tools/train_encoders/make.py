@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import subprocess
 import sys
@@ -42,7 +41,7 @@ def render(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Both encoders; the last line of their logs in the work folder holds their scores."""
-    from train_clip import REFINEMENT, ClipTraining, train_clip
+    from train_clip import PHASES, train_clip
     from train_dino import DinoTraining, train_dino
     from workers import run_workers
 
@@ -51,12 +50,9 @@ def train(options: argparse.Namespace) -> None:
         folder, log = options.output / model, options.work / f"{model}.jsonl"
         folder.mkdir(parents=True, exist_ok=True)
         if model == "clip":
-            if options.clip_steps:
-                settings = ClipTraining(steps=options.clip_steps)
-                run_workers(train_clip, options.threads, *frames.values(), folder, settings, log)
-            if options.refine_steps:
-                settings = dataclasses.replace(REFINEMENT, steps=options.refine_steps)
-                run_workers(train_clip, options.threads, *frames.values(), folder, settings, log, folder)
+            for phase in options.phases:
+                start = None if phase == "first" else folder
+                run_workers(train_clip, options.threads, *frames.values(), folder, PHASES[phase], log, start)
         else:
             dense = DinoTraining(steps=options.dino_steps)
             run_workers(train_dino, options.threads, frames["train"], frames["seen"], folder, dense, log)
@@ -74,9 +70,12 @@ def main() -> None:
     parser.add_argument(
         "--test-scenes", type=int, default=20, help="scenes for each of the two sets of scores"
     )
-    parser.add_argument("--clip-steps", type=int, default=7000, help="0: go on from the model that is there")
     parser.add_argument(
-        "--refine-steps", type=int, default=2000, help="with parts as often as things, after the first"
+        "--phases",
+        nargs="+",
+        choices=("first", "refine", "parts"),
+        default=["first", "refine", "parts"],
+        help="of the image-text encoder; all but the first go on from the model in OUTPUT",
     )
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)

@@ -15,6 +15,7 @@ Four losses on a batch of crops and phrases, of which `truth.py` knows which are
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import math
 import queue
@@ -48,6 +49,7 @@ from words import (
     TRUE,
     Label,
     Phrase,
+    any_part,
     any_phrase,
     in_sentence,
     near_miss,
@@ -80,7 +82,9 @@ class ClipTraining:
         grey: Share of the crops shown in grey, of which colour words are open.
         turned: Share of the crops whose hues are turned, of which colour words are open too.
         composition: Weight of the loss that makes colours add to kinds alike in all texts.
-        parts: Share of the crops that are of parts, or of what lies beside a part in the same thing.
+        parts: Share of the crops that are of parts and of the rest of their things.
+        near: Whether what is near the things belongs to these crops, and as many phrases ask for parts.
+        centre: Whether a part also counts as shown where it lies in the very middle (`truth.TruthTable`).
         light: Standard deviation of the logarithm of the light on a crop.
         kept: Share of the patches that the image tower sees in the first three quarters of the steps.
         heads_alone: Steps at first in which patch labels train the linear heads only, not the tower.
@@ -102,6 +106,8 @@ class ClipTraining:
     turned: float = 0.25
     composition: float = 1.0
     parts: float = 0.0
+    near: bool = False
+    centre: bool = False
     light: float = 0.2
     kept: float = 0.5
     heads_alone: int = 0
@@ -113,6 +119,12 @@ REFINEMENT = ClipTraining(
 )
 """What follows on the first training: parts as often as things, whole crops, and light that changes less, or
 gray could not be told from white."""
+PARTS_AGAIN = dataclasses.replace(
+    REFINEMENT, steps=1200, rate=3e-4, parts=0.4, near=True, centre=True, seed=2
+)
+"""The end: parts against what only looks like them."""
+PHASES = {"first": ClipTraining(), "refine": REFINEMENT, "parts": PARTS_AGAIN}
+"""The whole training, in this order; each phase goes on from the averaged weights of the one before."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +145,7 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     """A phrase for every crop, a near miss for every second, and some about anything."""
     of_parts = round(config.parts * config.batch)
     crops = [random_crop(frames, rng) for _ in range(config.batch - of_parts)]
-    crops += part_crops(frames, of_parts, rng)
+    crops += part_crops(frames, of_parts, rng, near=config.near)
     phrases = []
     for number, crop in enumerate(crops):
         chosen = (
@@ -146,6 +158,7 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
         if number % 2:
             phrases.append(near_miss(label, rng))
     phrases += [any_phrase(rng) for _ in range(config.batch // 4)]
+    phrases += [any_part(rng) for _ in range(of_parts // 3 if config.near else 0)]
     truth = table.of(phrases, crops)
     pixels = np.stack([crop.pixels(config.image_size) for crop in crops])
     draw = rng.random(len(crops))
@@ -253,7 +266,7 @@ def patch_answers(
 def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batch]:
     """Batches made ahead by a thread of their own; every process makes others."""
     ready: queue.Queue[Batch] = queue.Queue(4)
-    table, rng = TruthTable(frames.labels), np.random.default_rng([config.seed, rank])
+    table, rng = TruthTable(frames.labels, centre=config.centre), np.random.default_rng([config.seed, rank])
 
     def work() -> None:
         while True:
@@ -387,7 +400,7 @@ class Trainer:
         contrast = contrastive_loss(scale * similarity, with_canonical) + contrastive_loss(
             scale * phrases.T, batch.truth.T
         )
-        relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature)
+        relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature, self.config.hard)
         named = patch_loss(answers, patches, left_out)
         composition = composition_loss(F.normalize(corners, dim=-1))
         loss = 0.5 * contrast + relevancy + named + self.config.composition * composition

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from crops import Crop
+from crops import GRID, Crop
 from numpy.typing import NDArray
 from words import FALSE, OPEN, TRUE, Label, Phrase
 
@@ -15,11 +15,22 @@ LACKS, LACKS_PART = 0.15, 0.04
 """It is false if what it names, or may name, has less than this; between the two it is open."""
 
 
-class TruthTable:
-    """Truth of phrases over the labels of some frames; equal meanings are worked out once."""
+CENTRE = 0.1
+"""With this share of the weight a part is shown if it also lies in the very middle."""
 
-    def __init__(self, labels: Sequence[Label]) -> None:
+
+class TruthTable:
+    """Truth of phrases over the labels of some frames; equal meanings are worked out once.
+
+    Args:
+        labels: All labels that occur.
+        centre: Whether a part is also true of a crop whose middle it is, with ``CENTRE`` of the weight. A handle
+            is thin: in a crop that also shows what it belongs to, it never has a quarter of the weight.
+    """
+
+    def __init__(self, labels: Sequence[Label], *, centre: bool = False) -> None:
         self.labels = list(labels)
+        self.centre = centre
         self._known: dict[tuple, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
 
     def _columns(self, phrase: Phrase) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -41,4 +52,9 @@ class TruthTable:
         is_part = np.array([phrase.part is not None for phrase in phrases])
         shows = np.where(is_part, SHOWS_PART, SHOWS)
         lacks = np.where(is_part, LACKS_PART, LACKS)
+        if self.centre:
+            middle = np.array([crop.grid[GRID // 2, GRID // 2] for crop in crops])
+            answers = np.stack([column[0] for column in columns], 1)
+            centred = is_part & answers[middle] & (middle >= 0)[:, None]
+            shows = np.where(centred, CENTRE, shows)
         return np.where(true >= shows, TRUE, np.where(possible < lacks, FALSE, OPEN)).astype(np.int8)

@@ -412,6 +412,12 @@ def _part_phrase(kind: str, part: str, rng: np.random.Generator) -> Phrase:
     return Phrase(f"{word} of {with_article(name, rng)}", kind=kind, part=part)
 
 
+def any_part(rng: np.random.Generator) -> Phrase:
+    """A phrase about any part of anything that has it."""
+    part = _pick(tuple(OWNERS), rng)
+    return _part_phrase(_pick(OWNERS[part], rng), part, rng)
+
+
 _ONSETS = (*"bcdfghklmnprstvw", "br", "cl", "dr", "fl", "gr", "pl", "sh", "st", "tr")
 _VOWELS, _CODAS = (*"aeiou", "ea", "oo", "ai"), tuple("nrltkms")
 
