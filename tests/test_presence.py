@@ -9,8 +9,14 @@ from hypothesis import strategies as st
 from language_scene import make_scene
 
 from lexsplat.language_field import LiftedField
-from lexsplat.presence import Calibration, Evidence, PresenceJudge, fit_calibration
-from lexsplat.queries import gaussian_relevancy
+from lexsplat.presence import (
+    Calibration,
+    Evidence,
+    PresenceJudge,
+    fit_calibration,
+    found_thresholds,
+)
+from lexsplat.queries import gaussian_relevancy, scene_threshold
 
 
 @pytest.fixture(scope="module")
@@ -100,3 +106,24 @@ def test_an_empty_scene_holds_nothing(parts):
     nothing = torch.zeros(500, dtype=torch.bool)
     judge = PresenceJudge(gaussians.select(nothing), field.select(nothing), references, negatives, 10.0)
     assert judge.judge(torch.zeros(0)) == "no"
+
+
+@pytest.mark.parametrize(("verdict", "settled"), [("no", True), ("unsure", False), ("yes", False)])
+def test_only_what_is_judged_absent_falls_back_to_half(parts, verdict, settled):
+    gaussians, field, references, negatives = parts
+    cameras = list(make_scene(per_ball=100).cameras.values())[:2]
+    texts = torch.nn.functional.normalize(field.codebook.clip[:2], dim=1)
+    judge = PresenceJudge(gaussians, field, references, negatives, 10.0)
+    peaks = [judge.evidence(row).peak for row in gaussian_relevancy(field, texts, negatives)]
+
+    class Judged(PresenceJudge):
+        def judge(self, scores):  # of the second prompt only
+            return verdict if self.evidence(scores).peak == peaks[1] else "yes"
+
+    cut = scene_threshold(field, gaussians, cameras, texts, negatives)
+    found = found_thresholds(
+        Judged(gaussians, field, references, negatives, 10.0), gaussians, cameras, texts, negatives
+    )
+    assert peaks[0] != peaks[1]
+    assert abs(float(cut[1]) - 0.5) > 0.01
+    assert found.tolist() == [cut[0], 0.5 if settled else cut[1]]

@@ -255,6 +255,24 @@ def test_the_threshold_moves_halfway_to_half_where_the_classes_lie_on_either_sid
     assert float(queries.automatic_threshold(above)) == pytest.approx(0.75, abs=2e-3)
 
 
+def test_what_is_over_half_is_told_apart_from_what_is_only_a_little_alike():
+    # Asked for a nose: the room says 0.02, the bear 0.3, its nose 0.7. Otsu alone parts bear and room.
+    row = torch.tensor([[0.02] * 18_000 + [0.3] * 1_900 + [0.7] * 100])
+    assert 0.3 < float(queries.automatic_threshold(row)) <= 0.5
+    lower = torch.tensor([[0.02] * 18_000 + [0.3] * 1_900 + [0.45] * 100])
+    assert 0.02 < float(queries.automatic_threshold(lower)) < 0.3, (
+        "nothing is over 0.5: the widest gap counts"
+    )
+
+
+def test_the_cut_above_half_weighs_samples_like_repetitions():
+    samples = torch.tensor([[0.02, 0.3, 0.7]])
+    weights = torch.tensor([18_000, 1_900, 100])
+    found = queries.automatic_threshold(samples, weights.float())
+    torch.testing.assert_close(found, queries.automatic_threshold(samples.repeat_interleave(weights, dim=1)))
+    assert float(found) > 0.3
+
+
 @pytest.mark.parametrize("level", [0.05, 0.5, 0.9])
 def test_a_flat_prompt_falls_back_to_half(level):
     noise = 0.01 * torch.rand(1, 1000, generator=torch.Generator().manual_seed(0))

@@ -16,14 +16,16 @@ A logistic function of the three gives the probability; `CALIBRATION` was fitted
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
-from lexsplat.queries import code_relevancy
+from lexsplat.queries import BORDER, QueryConfig, code_relevancy, gaussian_relevancy, scene_threshold
 from lexsplat.selection import Presence
 
 REFERENCE_PHRASES = (
@@ -115,7 +117,7 @@ class PresenceJudge:
         negatives: Tensor,
         temperature: float,
     ) -> None:
-        self._language = language
+        self.language = language
         self._shown = (gaussians.opacities >= _FAINT).detach().nonzero()[:, 0]
         codewords = language.codebook.clip.to(gaussians.device)
         self._table = code_relevancy(codewords, references, negatives, temperature)
@@ -130,7 +132,7 @@ class PresenceJudge:
             return Evidence(-5.0, 0.0, 0.0)
         best = scores[self._shown].topk(self._peak_count())
         region = self._shown[best.indices]
-        there = (self._language.select(region).code_probabilities() @ self._table).mean(0)
+        there = (self.language.select(region).code_probabilities() @ self._table).mean(0)
         peak = float(best.values.mean())
         height = (peak - self._middle) / max(self._spread, 1e-4)
         return Evidence(height, float((there < peak).float().mean()), peak)
@@ -149,9 +151,40 @@ class PresenceJudge:
         count = self._peak_count()
         best = self._table.new_zeros(0, self._table.shape[1])
         for block in self._shown.split(1 << 16):
-            scores = self._language.select(block).code_probabilities() @ self._table
+            scores = self.language.select(block).code_probabilities() @ self._table
             best = torch.cat([best, scores]).topk(min(count, len(best) + len(scores)), dim=0).values
         return best.mean(0)
+
+
+def found_thresholds(
+    judge: PresenceJudge,
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    positives: Tensor,
+    negatives: Tensor,
+    config: QueryConfig | None = None,
+) -> Tensor:
+    """The automatic threshold ``[P]`` of each prompt: `queries.scene_threshold`, and 0.5 for what is not there.
+
+    What is not in the scene has no two classes that could be told apart: an automatic cut would mark whatever is a
+    little less unlike the prompt than the rest, such as the whole table for a mug's handle that the encoder does
+    not see. At 0.5, where a canonical phrase is as near as the prompt, next to nothing is marked. What the judge
+    is "unsure" of keeps its cut: a guess that is shown with the doubt beside it helps more than an empty picture.
+
+    Every mask and selection of lexsplat takes its threshold from here: query, find, edit, export, viewer, evaluation.
+
+    Args:
+        judge: Says what is in the scene; it holds the scene's language.
+        gaussians: The scene.
+        cameras: See `queries.scene_threshold`: views that are not evaluated.
+        positives: Text embeddings of the prompts ``[P, D]``.
+        negatives: Text embeddings of the canonical phrases ``[M, D]``.
+        config: Form, temperature, coverage.
+    """
+    found = scene_threshold(judge.language, gaussians, cameras, positives, negatives, config)
+    scores = gaussian_relevancy(judge.language, positives, negatives, config)
+    absent = torch.tensor([judge.judge(row) == "no" for row in scores], dtype=torch.bool)
+    return torch.where(absent, torch.full_like(found, BORDER), found)
 
 
 def fit_calibration(

@@ -47,6 +47,12 @@ PHOTO_TEMPLATES = (
 )
 """A small ensemble of sentences; their embeddings are averaged."""
 
+BORDER = 0.5
+"""Relevancy at which a prompt and a canonical phrase are equally near; the paper's threshold."""
+
+_TOP_SHARE = 5e-4
+"""What samples reach is the mean of the best 0.05 percent of them."""
+
 _CHUNK = 1 << 13  # pixels at a time; small enough that a block stays in the cache
 _MIN_COVERAGE = 0.05
 
@@ -363,6 +369,10 @@ def automatic_threshold(
     (1 is plain Otsu). Where a gap separates the classes, the middle of the gap is taken. If the means of the two
     classes lie on either side of 0.5, where relevancy itself puts the border, the cut is moved halfway there.
 
+    Where something is over 0.5, the class above the cut has to be so on average, too: otherwise the cut has parted
+    what is a little like the prompt from what is not like it at all (half of a bear, asked for its nose), and what
+    lies above is split again.
+
     A prompt without contrast (the 99.8th percentile less than ``min_contrast`` above the median: an absent
     object, or one that is everywhere) has no two classes. It gets 0.5, where relevancy itself says whether
     the prompt or a canonical phrase is nearer.
@@ -420,18 +430,44 @@ def scene_threshold(
 
 
 def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: float, pull: float) -> float:
+    """The cut through one prompt's samples; samples above a cut that reach 0.5 only in part are cut again."""
+    reached = _top_mean(row, shares) > BORDER
+    while True:
+        found = _best_cut(row, shares, tempering, min_contrast)
+        if found is None:
+            return BORDER
+        cut, lower, upper = found
+        if not (reached and upper < BORDER):
+            return cut + pull * (BORDER - cut) if lower < BORDER < upper else cut
+        above = row >= cut
+        row, shares = row[above], shares[above]
+
+
+def _top_mean(row: Tensor, shares: Tensor) -> float:
+    """The mean of the best `_TOP_SHARE` of weighted samples."""
+    values, order = row.sort(descending=True)
+    weights = shares[order]
+    limit = float(weights.sum()) * _TOP_SHARE
+    taken = torch.minimum(weights, (limit - weights.cumsum(0) + weights).clamp_min(0))
+    return float((values * taken).sum()) / limit
+
+
+def _best_cut(
+    row: Tensor, shares: Tensor, tempering: float, min_contrast: float
+) -> tuple[float, float, float] | None:
+    """Otsu's cut on the tempered histogram and the means on either side; None where there is no contrast."""
     bins = 512
     seen = row[shares > 0]
     low, high = float(seen.min()), float(seen.max())
     if high - low < min_contrast:
-        return 0.5
+        return None
     width = (high - low) / bins
     index = ((row - low) / width).long().clamp(0, bins - 1)
     counts = torch.zeros(bins, dtype=torch.float64).index_add_(0, index, shares)
     share = counts.cumsum(0) / counts.sum()
     median, top = (int(torch.searchsorted(share, torch.tensor(q, dtype=share.dtype))) for q in (0.5, 0.998))
     if (top - median) * width < min_contrast:
-        return 0.5
+        return None
     centres = low + width * (torch.arange(bins, dtype=torch.float64) + 0.5)
     heights = counts**tempering * (counts > 0)
     below = heights.cumsum(0)[:-1]
@@ -443,7 +479,7 @@ def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: 
     best = torch.nonzero(between >= between.max() * (1 - 1e-12)).flatten()
     cut = low + width * (float(best.double().mean()) + 1)
     place = int(best[0])
-    return cut + pull * (0.5 - cut) if float(lower[place]) < 0.5 < float(upper[place]) else cut
+    return cut, float(lower[place]), float(upper[place])
 
 
 def ranking(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField, field_from_tensors
 from lexsplat.phrases import parse
 from lexsplat.picking import select_hit, surface_at
-from lexsplat.presence import REFERENCE_PHRASES, PresenceJudge
+from lexsplat.presence import REFERENCE_PHRASES, PresenceJudge, found_thresholds
 from lexsplat.queries import (
     CANONICAL_PHRASES,
     QueryConfig,
@@ -30,7 +30,6 @@ from lexsplat.queries import (
     embed_prompts,
     gaussian_relevancy,
     render_relevancy,
-    scene_threshold,
 )
 from lexsplat.relations import answer
 from lexsplat.rendering import Rendering, render
@@ -155,9 +154,9 @@ class SearchableScene:
         return gaussian_relevancy(self.field, self.embed(prompts), self._negatives(), self.query)
 
     def thresholds(self, prompts: Sequence[str]) -> Tensor:
-        """An automatic threshold ``[P]`` for each prompt, from the scene alone."""
-        return scene_threshold(self.field, self.gaussians, self._threshold_cameras(), self.embed(prompts),
-                               self._negatives(), self.query)  # fmt: skip
+        """An automatic threshold ``[P]`` for each prompt, from the scene alone; 0.5 for what is not there."""
+        return found_thresholds(self.presence_judge, self.gaussians, self._threshold_cameras(),
+                                self.embed(prompts), self._negatives(), self.query)  # fmt: skip
 
     def select(self, phrase: str, threshold: float | None = None) -> Selection:
         """The Gaussians that answer to a phrase, as a set with instances, boxes and a best view.

@@ -1,7 +1,7 @@
 """Measuring a scene on its held-out views: pictures, words, speed and size, as in the paper's Table 1.
 
 Nothing is chosen on the views it is reported on. Three thresholds stand side by side: ``fixed`` (0.5, the
-paper), ``auto`` (per prompt, from renderings of training views, `queries.scene_threshold`) and ``oracle``
+paper), ``auto`` (per prompt, from renderings of training views, `presence.found_thresholds`) and ``oracle``
 (per prompt, the best one for the truth: an upper bound, never a result).
 
 Relevancy is rendered at the size of the truth, so that neither has to be resized; only masks larger than
@@ -40,6 +40,7 @@ from lexsplat.metrics import (
     ssim,
     threshold_counts,
 )
+from lexsplat.presence import REFERENCE_PHRASES
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.queries import QueryConfig, TextEncoder, embed_prompts
 
@@ -178,7 +179,10 @@ class _Evaluation:
         self.negatives = embed_prompts(query.negatives, encode_text, query.templates)
         views = [self.scene.views[name] for name in self.scene.train_names] or self.views
         cameras = [view.camera for view in _spread(views, self.config.threshold_views)]
-        found = method_thresholds(self.method, self.gaussians, cameras, embeddings, self.negatives, query)
+        references = embed_prompts(REFERENCE_PHRASES, encode_text, query.templates)
+        found = method_thresholds(
+            self.method, self.gaussians, cameras, embeddings, self.negatives, references, query
+        )
         for prompt, value in zip(self.prompts, found.tolist()):
             self.thresholds[prompt] = {"auto": round(value, 3), "fixed": query.threshold}
         if "lerf-3d" in self.config.protocols:

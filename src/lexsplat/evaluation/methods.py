@@ -13,13 +13,8 @@ from torch import Tensor
 
 from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
-from lexsplat.queries import (
-    QueryConfig,
-    automatic_threshold,
-    gaussian_relevancy,
-    render_relevancy,
-    scene_threshold,
-)
+from lexsplat.presence import PresenceJudge, found_thresholds
+from lexsplat.queries import QueryConfig, automatic_threshold, gaussian_relevancy, render_relevancy
 
 if TYPE_CHECKING:
     from lexsplat.language_field import LanguageField
@@ -73,10 +68,12 @@ class FieldMethod:
         cameras: Sequence[Camera],
         positives: Tensor,
         negatives: Tensor,
+        references: Tensor,
         config: QueryConfig,
     ) -> Tensor:
-        """See `queries.scene_threshold`: what a user of the scene gets."""
-        return scene_threshold(self.field, gaussians, cameras, positives, negatives, config)
+        """See `presence.found_thresholds`: what a user of the scene gets."""
+        judge = PresenceJudge(gaussians, self.field, references, negatives, config.temperature)
+        return found_thresholds(judge, gaussians, cameras, positives, negatives, config)
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything the field stores."""
@@ -89,13 +86,18 @@ def method_thresholds(
     cameras: Sequence[Camera],
     positives: Tensor,
     negatives: Tensor,
+    references: Tensor,
     config: QueryConfig,
     *,
     long_side: int = 320,
 ) -> Tensor:
-    """Automatic thresholds ``[P]`` from maps of views that are not evaluated, the same rule for every method."""
+    """Automatic thresholds ``[P]`` from maps of views that are not evaluated, the same rule for every method.
+
+    Language fields say in addition what is not in the scene (`presence.found_thresholds`), by ``references``
+    ``[V, D]``, the embeddings of `presence.REFERENCE_PHRASES`; its masks are then all but empty.
+    """
     if isinstance(method, FieldMethod):
-        return method.thresholds(gaussians, cameras, positives, negatives, config)
+        return method.thresholds(gaussians, cameras, positives, negatives, references, config)
     if not cameras:
         raise ValueError("an automatic threshold needs at least one camera")
     maps = []
