@@ -175,6 +175,7 @@ class _Builder:
             device=self.device,
             seed=self.config.seed,
             cache_dir=self.folder.root / "checkpoints" / "points",
+            memory=parse_bytes(self.config.memory),
             checkpoint=self.checkpoint,
             listener=self.listener,
         )
@@ -184,7 +185,10 @@ class _Builder:
     def _train_jointly(self) -> dict[str, Any]:
         config, scene = self.bounded, self.scene
         cache = self.folder.root / "checkpoints" / "points"
-        points = initial_points(scene, seed=config.seed, cache_dir=cache, listener=self.listener)
+        memory = parse_bytes(config.memory)
+        points = initial_points(
+            scene, seed=config.seed, cache_dir=cache, memory=memory, listener=self.listener
+        )
         reconstructor = Reconstructor(
             scene, config.reconstruction, points, device=self.device, seed=config.seed
         )
@@ -229,7 +233,12 @@ class _Builder:
         maps = self._feature_maps()
         names = self.scene.train_names
         codebook = fit_codebook(
-            maps, names, self.config.codebook, seed=self.config.seed, listener=self.listener
+            maps,
+            names,
+            self.config.codebook,
+            seed=self.config.seed,
+            memory=parse_bytes(self.config.memory),
+            listener=self.listener,
         )
         code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
         for name, code_map in code_maps.items():

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from lexsplat import budget
 from lexsplat.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
 from lexsplat.divergence import KEEP_EVERY, Guard
 from lexsplat.errors import TrainingError
@@ -179,6 +180,7 @@ def reconstruct(
     device: torch.device | str = "cpu",
     seed: int = 0,
     cache_dir: Path | None = None,
+    memory: int = budget.DEFAULT_MEMORY,
     checkpoint: Checkpoint | None = None,
     listener: Listener = silent,
 ) -> Gaussians:
@@ -190,6 +192,7 @@ def reconstruct(
         device: Where to train.
         seed: Of the order of views, of density control and of what replaces missing points.
         cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
+        memory: Bytes of host memory that the triangulation, and then the Gaussians, may take.
         checkpoint: Where the training is saved on the way, and goes on from.
         listener: Hears an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
             views) and "gaussians".
@@ -197,10 +200,22 @@ def reconstruct(
     Raises:
         TrainingError: If there is nothing to train on or the optimisation diverges.
         CaptureError: If a photo cannot be read.
+        MemoryBudgetError: If the Gaussians, or the photos while they are triangulated, do not fit into ``memory``.
     """
     from lexsplat.scenes.triangulation import initial_points
 
-    points = initial_points(scene, seed=seed, cache_dir=cache_dir, listener=listener)
+    cap = config.cap(torch.device(device))
+    if torch.device(device).type == "cpu":
+        room = memory // 2 // budget.GAUSSIAN_BYTES
+        what = f"{cap:,} Gaussians beside the photos"
+        budget.require(
+            "reconstruct",
+            2 * budget.gaussian_bytes(cap),
+            memory,
+            what,
+            f"reconstruction.max-gaussians {room}",
+        )
+    points = initial_points(scene, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
     trainer = Reconstructor(scene, config, points, device=device, seed=seed)
     if checkpoint is not None:
         checkpoint.resume(trainer)
