@@ -24,7 +24,7 @@ from lexsplat.atomic import atomic_path
 from lexsplat.errors import CaptureError
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.scenes.feature_budget import check_photo
-from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, open_image, read_image, read_mask, sizes_agree
+from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, open_image, read_bytes, read_mask, sizes_agree
 from lexsplat.scenes.masks import IGNORE_FOLDER, find_ignore_masks
 
 STAGE = "photos"
@@ -251,8 +251,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _write_upright(photo: _Photo, source: Path, target: Path) -> None:
-    pixels = (turned_upright(read_image(source), photo.orientation) * 255.0).round().astype(np.uint8)
-    image = Image.fromarray(np.ascontiguousarray(pixels))
+    image = Image.fromarray(np.ascontiguousarray(turned_upright(read_bytes(source), photo.orientation)))
     exif = Image.Exif()
     for tag in (_MAKE, _MODEL):
         if tag in photo.exif:
