@@ -12,11 +12,20 @@ from lexsplat.errors import MemoryBudgetError
 DEFAULT_MEMORY = 4 << 30
 """Bytes that stages may take where nobody says otherwise."""
 
-PHOTO_BYTES = 12
-"""A photo on its way, a pixel: four bytes as it is decoded, and what is made of it, a band at a time."""
+PHOTO_BYTES = 10
+"""A large photo on its way, a pixel: four bytes as it is decoded, and its mask or a turned copy."""
+
+SMALL_PHOTO_BYTES = 32
+"""A photo that is worked on at once, a pixel: decoded, as floats, the map of its lens, and the result."""
+
+MADE_BYTES = 24
+"""A picture that is made of a photo, a pixel: as floats, and once more while it is handed on."""
 
 BAND_BYTES = 24 << 20
-"""The band of a large photo that is in work as floats, and libraries' scratch."""
+"""The band of a large photo that is in work as floats (`lexsplat.scenes.bands`)."""
+
+FRAMES_HELD = 17
+"""Frames that a decoder of videos refers to at most, beside one a thread."""
 
 SIFT_BYTES = 350
 """Bytes a pixel of a photo in which features are sought: 17 levels of a scale space of twice the size, in floats."""
@@ -37,9 +46,20 @@ GAUSSIAN_BYTES = 1_700
 """A Gaussian in training, with gradient, two moments of the optimiser and the last good state."""
 
 
-def photo_bytes(width: int, height: int) -> int:
-    """One photo of this size read, made smaller, undistorted or masked."""
-    return width * height * PHOTO_BYTES + BAND_BYTES
+def photo_bytes(photo: tuple[int, int], made: tuple[int, int] = (0, 0)) -> int:
+    """One photo read, turned, undistorted, masked, and made into a picture of another size.
+
+    Args:
+        photo: Width and height of the photo.
+        made: Of the picture.
+    """
+    pixels, result = photo[0] * photo[1], made[0] * made[1] * MADE_BYTES
+    return min(pixels * SMALL_PHOTO_BYTES, pixels * PHOTO_BYTES + BAND_BYTES) + result
+
+
+def video_bytes(frame: tuple[int, int], threads: int) -> int:
+    """Reading a video: frames that the decoder holds, of up to 10 bits, and one as a picture."""
+    return frame[0] * frame[1] * (3 * (FRAMES_HELD + threads) + 14) + threads * THREAD_BYTES
 
 
 def extraction_bytes(
@@ -112,6 +132,16 @@ def require(stage: str, need: int, memory: int, what: str, remedy: str) -> None:
             found=f"--memory {size_text(memory)}",
             remedy=f"give --memory {size_text(need, up=True)}, or {remedy}",
         )
+
+
+def check_photo(photo: tuple[int, int], memory: int, made: tuple[int, int] = (0, 0)) -> None:
+    """Refuse a photo that cannot be read, and made into a picture, within the budget.
+
+    Raises:
+        MemoryBudgetError: With the memory it takes.
+    """
+    what = f"a photo of {photo[0]}x{photo[1]} pixels"
+    require("photos", photo_bytes(photo, made), memory, what, "scale the photos down first")
 
 
 def size_text(count: int, *, up: bool = False) -> str:

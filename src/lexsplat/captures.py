@@ -47,7 +47,7 @@ def load_capture(
         start = time.perf_counter()
         folder.reopen("poses")
         if is_video(capture):
-            sample_video(capture, photos, config.frames, listener=listener)
+            sample_video(capture, photos, config.frames, memory=parse_bytes(config.memory), listener=listener)
         found = poses_from_photos(
             photos,
             poses,

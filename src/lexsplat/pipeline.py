@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lexsplat import __version__
+from lexsplat import __version__, budget
 from lexsplat.cameras import Camera
 from lexsplat.captures import load_capture
 from lexsplat.checkpoints import Checkpoint
@@ -35,7 +35,7 @@ from lexsplat.language_field import LanguageField
 from lexsplat.lifting import lift, tune
 from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
 from lexsplat.progress import Event, Listener, silent
-from lexsplat.reconstruction import Reconstructor, reconstruct
+from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
 from lexsplat.scene_folder import SceneFolder, fingerprint, to_json
 from lexsplat.scenes import Scene, load_annotations
@@ -85,6 +85,7 @@ def build(
         sizes = [view.capture_size for view in scene.views.values()]
         config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
         scene = scene.downscaled(config.downscale or 1.0)
+        _check_photos(scene, parse_bytes(config.memory))
         return _Builder(scene, folder, config, device, listener, splats).run(until)
 
 
@@ -189,6 +190,7 @@ class _Builder:
         points = initial_points(
             scene, seed=config.seed, cache_dir=cache, memory=memory, listener=self.listener
         )
+        check_gaussians(config.reconstruction, self.device, memory)
         reconstructor = Reconstructor(
             scene, config.reconstruction, points, device=self.device, seed=config.seed
         )
@@ -324,6 +326,13 @@ class _Builder:
         if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
             log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
         record["world"] = stored_world(world, cameras)
+
+
+def _check_photos(scene: Scene, memory: int) -> None:
+    """Refuse photos that do not fit into the budget one by one, before anything is done."""
+    for view in scene.views.values():
+        made = (view.camera.width, view.camera.height)
+        budget.check_photo((view.lens.width, view.lens.height), memory, made)
 
 
 def existing_splats(path: Path | None) -> Path:

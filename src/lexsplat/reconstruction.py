@@ -204,23 +204,28 @@ def reconstruct(
     """
     from lexsplat.scenes.triangulation import initial_points
 
-    cap = config.cap(torch.device(device))
-    if torch.device(device).type == "cpu":
-        room = memory // 2 // budget.GAUSSIAN_BYTES
-        what = f"{cap:,} Gaussians beside the photos"
-        budget.require(
-            "reconstruct",
-            2 * budget.gaussian_bytes(cap),
-            memory,
-            what,
-            f"reconstruction.max-gaussians {room}",
-        )
+    check_gaussians(config, device, memory)
     points = initial_points(scene, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
     trainer = Reconstructor(scene, config, points, device=device, seed=seed)
     if checkpoint is not None:
         checkpoint.resume(trainer)
     trainer.run(listener, checkpoint)
     return trainer.gaussians()
+
+
+def check_gaussians(config: ReconstructionConfig, device: torch.device | str, memory: int) -> None:
+    """Refuse to train more Gaussians on the host than half of the budget holds: the rest is for photos.
+
+    Raises:
+        MemoryBudgetError: With the number that it holds.
+    """
+    cap = config.cap(torch.device(device))
+    if torch.device(device).type != "cpu":
+        return
+    room = memory // 2 // budget.GAUSSIAN_BYTES
+    need = 2 * budget.gaussian_bytes(cap)
+    what, remedy = f"{cap:,} Gaussians beside the photos", f"reconstruction.max-gaussians {room}"
+    budget.require("reconstruct", need, memory, what, remedy)
 
 
 class Reconstructor:

@@ -52,7 +52,8 @@ class Poses:
         with ProgressBars() as bars:
             if is_video(photos):
                 photos = self.output / "images"
-                sample_video(self.photos, photos, self.frames, listener=bars)
+                memory = parse_bytes(self.memory)
+                sample_video(self.photos, photos, self.frames, memory=memory, listener=bars)
             result = poses_from_photos(
                 photos,
                 self.output,

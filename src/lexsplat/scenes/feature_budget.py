@@ -23,17 +23,6 @@ HELD_AT_MOST = 1225
 _STAGE = "structure from motion"
 
 
-def check_photo(size: tuple[int, int], memory: int) -> None:
-    """Refuse photos that cannot be read within the budget.
-
-    Raises:
-        MemoryBudgetError: With the memory it takes.
-    """
-    need = budget.photo_bytes(*size)
-    what = f"a photo of {size[0]}x{size[1]} pixels"
-    budget.require("photos", need, memory, what, "scale the photos down first")
-
-
 def extraction_threads(
     photo: tuple[int, int], max_side: int, max_features: int, memory: int, *, masked: bool = False
 ) -> int:

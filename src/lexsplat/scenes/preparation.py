@@ -23,7 +23,6 @@ from lexsplat import budget
 from lexsplat.atomic import atomic_path
 from lexsplat.errors import CaptureError
 from lexsplat.progress import Event, Listener, silent
-from lexsplat.scenes.feature_budget import check_photo
 from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, open_image, read_bytes, read_mask, sizes_agree
 from lexsplat.scenes.masks import IGNORE_FOLDER, find_ignore_masks
 
@@ -127,7 +126,7 @@ def prepare_photos(
     names = _checked_names(folder, output)
     photos = [_look_at(folder, name) for name in names]
     largest = max((photo.size for photo in photos), key=lambda size: size[0] * size[1])
-    check_photo(largest, memory)
+    budget.check_photo(largest, memory)
     notes: list[str] = []
     found, strays = find_ignore_masks(mask_places(folder), names)
     notes += strays
