@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "src" / "lexsplat"
 
 # The order in which data flow. A module may import only what stands before it (or its own folder).
 ORDER = """
-    errors atomic tensor_files threads progress checkpoints divergence metrics cameras boxes world
+    errors budget atomic tensor_files threads progress checkpoints divergence metrics cameras boxes world
     scenes gaussians rendering moving image_losses training_images optimizers exposures densification
     reconstruction features codebook language_field losses embedding joint lifting masking queries
     selection presence truth picking phrases relations heatmaps baselines evaluation report formats

@@ -182,14 +182,20 @@ def test_a_damaged_heic_is_told(tmp_path):
 
 
 @pytest.mark.parametrize("size", [(24, 16), (12, 8), (7, 5), (23, 15), (1, 1), (24, 3)])
-@pytest.mark.parametrize("mode", ["RGB", "L"])
+@pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "P", "CMYK", "I;16"])
 def test_large_photos_made_smaller_in_bands_are_as_if_made_smaller_at_once(tmp_path, monkeypatch, size, mode):
-    Image.fromarray(painted()).convert(mode).save(tmp_path / "a.png")
-    whole = resize_image(read_image(tmp_path / "a.png"), size)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png", size=size), whole)
-    monkeypatch.setattr("lexsplat.scenes.images.LARGE_PIXELS", 0)
-    monkeypatch.setattr("lexsplat.scenes.images.BAND_ROWS", 4)
-    np.testing.assert_allclose(read_image(tmp_path / "a.png", size=size), whole, atol=1e-6)
+    image = Image.fromarray(painted())
+    if mode == "I;16":
+        image = Image.fromarray(painted()[..., 0].astype(np.uint16) * 257)
+    elif mode == "RGBA":
+        image.putalpha(Image.fromarray(painted()[..., 1]))
+    name = "a.tif" if mode == "CMYK" else "a.png"
+    (image if mode == "I;16" else image.convert(mode)).save(tmp_path / name)
+    whole = resize_image(read_image(tmp_path / name), size)
+    np.testing.assert_array_equal(read_image(tmp_path / name, size=size), whole)
+    monkeypatch.setattr("lexsplat.scenes.bands.LARGE_PIXELS", 0)
+    monkeypatch.setattr("lexsplat.scenes.bands.BAND_PIXELS", 4 * 48)
+    np.testing.assert_allclose(read_image(tmp_path / name, size=size), whole, atol=1e-6)
 
 
 # -- pictures that are larger than they look

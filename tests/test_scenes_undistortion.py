@@ -1,9 +1,13 @@
 import numpy as np
 import pycolmap
 import pytest
-from captures import picture
+from captures import picture, save
+from PIL import Image
 
+from lexsplat.budget import BAND_BYTES
+from lexsplat.cameras import Camera
 from lexsplat.scenes.images import resize_image
+from lexsplat.scenes.scene import View
 from lexsplat.scenes.undistortion import Lens, pinhole_of, undistort
 
 SIZE = (96, 72)
@@ -122,3 +126,67 @@ def test_shrinking_is_the_mean_of_the_covered_area():
 def test_shrinking_by_a_fraction_keeps_the_mean():
     image = np.random.default_rng(0).random((11, 17, 3)).astype(np.float32)
     assert resize_image(image, (7, 5)).mean() == pytest.approx(image.mean(), abs=1e-3)
+
+
+# -- large photos, in bands
+
+
+def view_of(folder, lens: Lens, mask: np.ndarray | None) -> View:
+    save(folder / "a.png", photo_through(lens))
+    ignored = None if mask is None else folder / "mask.png"
+    if ignored is not None:
+        save(ignored, mask)
+    width, height, K = pinhole_of(lens)
+    camera = Camera(width, height, K, np.eye(4))
+    return View(
+        "a.png",
+        folder / "a.png",
+        camera,
+        (width, height),
+        lens,
+        ignore_path=mask if mask is None else folder / "mask.png",
+    )
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
+@pytest.mark.parametrize("masked", [None, "photo", "half", "undistorted"])
+def test_large_photos_and_masks_come_out_of_bands_as_they_come_at_once(tmp_path, monkeypatch, model, masked):
+    lens = Lens(model, *SIZE, LENSES[model])
+    width, height, _ = pinhole_of(lens)
+    shape = {None: None, "photo": SIZE, "half": (SIZE[0] // 2, SIZE[1] // 2), "undistorted": (width, height)}[
+        masked
+    ]
+    mask = None if shape is None else np.ones(shape[::-1])
+    if mask is not None:
+        mask[len(mask) // 3 : len(mask) // 2, 5:30] = 0
+    view = view_of(tmp_path, lens, mask)
+    sizes = [
+        (width, height),
+        (width // 2, height // 2),
+        (width // 5, height // 5),
+        (width - 7, height // 3),
+        (width + 9, height + 4),
+    ]
+    at_once = [(view.load_image(size), view.valid_share(size)) for size in sizes]
+    monkeypatch.setattr("lexsplat.scenes.bands.LARGE_PIXELS", 0)
+    monkeypatch.setattr("lexsplat.scenes.bands.BAND_PIXELS", 5 * width)
+    for size, (image, share) in zip(sizes, at_once):
+        np.testing.assert_allclose(view.load_image(size), image, atol=2e-5)
+        if share is not None:
+            np.testing.assert_allclose(view.valid_share(size), share, atol=2e-5)
+
+
+def test_a_large_photo_with_a_lens_takes_a_fraction_of_its_floats(tmp_path):
+    """Traced by Python, so without what Pillow decodes into: that is four bytes a pixel."""
+    import tracemalloc
+
+    lens = Lens("SIMPLE_RADIAL", 3000, 2400, (2600.0, 1500.0, 1200.0, -0.05))
+    Image.new("RGB", (3000, 2400), (90, 120, 30)).save(tmp_path / "a.jpg")
+    width, height, K = pinhole_of(lens)
+    view = View("a.jpg", tmp_path / "a.jpg", Camera(width, height, K, np.eye(4)), (width, height), lens)
+    for size in ((width // 2, height // 2), (width // 8, height // 8)):
+        tracemalloc.start()
+        view.load_image(size)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 24 * size[0] * size[1] + BAND_BYTES

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, parse_bytes
 from lexsplat.errors import CaptureError, SceneFolderError
 from lexsplat.progress import Listener
 from lexsplat.scene_folder import SceneFolder, fingerprint
@@ -47,8 +47,15 @@ def load_capture(
         start = time.perf_counter()
         folder.reopen("poses")
         if is_video(capture):
-            sample_video(capture, photos, config.frames, listener=listener)
-        found = poses_from_photos(photos, poses, config.poses, seed=config.seed, listener=listener)
+            sample_video(capture, photos, config.frames, memory=parse_bytes(config.memory), listener=listener)
+        found = poses_from_photos(
+            photos,
+            poses,
+            config.poses,
+            seed=config.seed,
+            memory=parse_bytes(config.memory),
+            listener=listener,
+        )
         for note in (*found.notes, found.note):
             logging.getLogger("lexsplat").warning(note)
         inside = found.images.resolve().is_relative_to(folder.root.resolve())

@@ -64,6 +64,10 @@ class BackendError(LexsplatError):
     """A device or rasterizer that is not available here."""
 
 
+class MemoryBudgetError(LexsplatError):
+    """A stage that cannot be done within the memory that it is given."""
+
+
 class QueryError(LexsplatError):
     """A question that cannot be asked, such as an empty prompt."""
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lexsplat import __version__
+from lexsplat import __version__, budget
 from lexsplat.cameras import Camera
 from lexsplat.captures import load_capture
 from lexsplat.checkpoints import Checkpoint
@@ -35,7 +35,7 @@ from lexsplat.language_field import LanguageField
 from lexsplat.lifting import lift, tune
 from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
 from lexsplat.progress import Event, Listener, silent
-from lexsplat.reconstruction import Reconstructor, reconstruct
+from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
 from lexsplat.scene_folder import SceneFolder, fingerprint, to_json
 from lexsplat.scenes import Scene, load_annotations
@@ -85,6 +85,7 @@ def build(
         sizes = [view.capture_size for view in scene.views.values()]
         config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
         scene = scene.downscaled(config.downscale or 1.0)
+        _check_photos(scene, parse_bytes(config.memory))
         return _Builder(scene, folder, config, device, listener, splats).run(until)
 
 
@@ -175,6 +176,7 @@ class _Builder:
             device=self.device,
             seed=self.config.seed,
             cache_dir=self.folder.root / "checkpoints" / "points",
+            memory=parse_bytes(self.config.memory),
             checkpoint=self.checkpoint,
             listener=self.listener,
         )
@@ -184,7 +186,11 @@ class _Builder:
     def _train_jointly(self) -> dict[str, Any]:
         config, scene = self.bounded, self.scene
         cache = self.folder.root / "checkpoints" / "points"
-        points = initial_points(scene, seed=config.seed, cache_dir=cache, listener=self.listener)
+        memory = parse_bytes(config.memory)
+        points = initial_points(
+            scene, seed=config.seed, cache_dir=cache, memory=memory, listener=self.listener
+        )
+        check_gaussians(config.reconstruction, self.device, memory)
         reconstructor = Reconstructor(
             scene, config.reconstruction, points, device=self.device, seed=config.seed
         )
@@ -229,7 +235,12 @@ class _Builder:
         maps = self._feature_maps()
         names = self.scene.train_names
         codebook = fit_codebook(
-            maps, names, self.config.codebook, seed=self.config.seed, listener=self.listener
+            maps,
+            names,
+            self.config.codebook,
+            seed=self.config.seed,
+            memory=parse_bytes(self.config.memory),
+            listener=self.listener,
         )
         code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
         for name, code_map in code_maps.items():
@@ -315,6 +326,13 @@ class _Builder:
         if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
             log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
         record["world"] = stored_world(world, cameras)
+
+
+def _check_photos(scene: Scene, memory: int) -> None:
+    """Refuse photos that do not fit into the budget one by one, before anything is done."""
+    for view in scene.views.values():
+        made = (view.camera.width, view.camera.height)
+        budget.check_photo((view.lens.width, view.lens.height), memory, made)
 
 
 def existing_splats(path: Path | None) -> Path:

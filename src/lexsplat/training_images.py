@@ -1,7 +1,6 @@
 """The photos a scene is trained on: loaded when first needed, kept as bytes while they fit into a budget.
 
-What fits stays, nothing is thrown out: views are visited in random order, where a cache that evicts the
-    oldest would
+What fits stays, nothing is thrown out: views are visited in random order, where a cache that evicts the oldest would
 miss almost always. A photo is the same (8 bits a channel) whether it comes from the cache or from its file.
 """
 
@@ -26,8 +25,8 @@ class TrainingImages:
 
     Args:
         views: The views that may be asked for.
-        memory: Bytes of host or device memory that the cache may take. Photos go first; moments, which are
-            eight times as large and quick to recompute, take what is left.
+        memory: Bytes of host or device memory that the cache may take. Photos and their masks go first; moments,
+            which are eight times as large and quick to recompute, take what is left.
         shrink: Factor by which images are smaller than the views' cameras.
         device: Where targets are needed.
     """
@@ -73,15 +72,21 @@ class TrainingImages:
         if name not in self._valid:
             camera = self._cameras[name]
             mask = self._views[name].load_valid((camera.width, camera.height))
-            # A byte a pixel, and only where a capture masks its photos: not counted in the budget.
-            self._valid[name] = None if mask is None else torch.from_numpy(mask).to(self._device)
+            valid = None if mask is None else torch.from_numpy(mask).to(self._device)
+            size = 0 if valid is None else valid.nbytes
+            if size > self._photo_room:
+                return valid
+            self._photo_room -= size
+            self._moment_room = max(0, self._moment_room - size)
+            self._valid[name] = valid
         return self._valid[name]
 
     @property
     def cached_bytes(self) -> int:
         """Memory the cache takes now."""
         moments = sum(mean.nbytes + variance.nbytes for mean, variance in self._moments.values())
-        return moments + sum(photo.nbytes for photo in self._photos.values())
+        masks = sum(valid.nbytes for valid in self._valid.values() if valid is not None)
+        return moments + masks + sum(photo.nbytes for photo in self._photos.values())
 
     def _photo(self, name: str) -> Tensor:
         if name in self._photos:

@@ -400,7 +400,7 @@ class Trainer:
         contrast = contrastive_loss(scale * similarity, with_canonical) + contrastive_loss(
             scale * phrases.T, batch.truth.T
         )
-        relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature, self.config.hard)
+        relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature)
         named = patch_loss(answers, patches, left_out)
         composition = composition_loss(F.normalize(corners, dim=-1))
         loss = 0.5 * contrast + relevancy + named + self.config.composition * composition

@@ -26,6 +26,7 @@ class Poses:
         output: Folder to write into.
         frames: How many frames a video is sampled to.
         seed: Seed of all randomness.
+        memory: Host memory that may be taken, beside the libraries: decides how much is done at once.
         settings: How photos are compared and placed.
     """
 
@@ -33,6 +34,7 @@ class Poses:
     output: Path
     frames: int = DEFAULT_FRAMES
     seed: int = 0
+    memory: str = "4GB"
     settings: Annotated[PoseConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=PoseConfig)
 
     def __post_init__(self) -> None:
@@ -41,6 +43,7 @@ class Poses:
 
     def run(self) -> None:
         """Write the model and say how many photos were placed, and which were not."""
+        from lexsplat.config import parse_bytes
         from lexsplat.progress_bars import ProgressBars
         from lexsplat.scenes import poses_from_photos
         from lexsplat.scenes.video import is_video, sample_video
@@ -49,8 +52,16 @@ class Poses:
         with ProgressBars() as bars:
             if is_video(photos):
                 photos = self.output / "images"
-                sample_video(self.photos, photos, self.frames, listener=bars)
-            result = poses_from_photos(photos, self.output, self.settings, seed=self.seed, listener=bars)
+                memory = parse_bytes(self.memory)
+                sample_video(self.photos, photos, self.frames, memory=memory, listener=bars)
+            result = poses_from_photos(
+                photos,
+                self.output,
+                self.settings,
+                seed=self.seed,
+                memory=parse_bytes(self.memory),
+                listener=bars,
+            )
         for note in result.notes:
             print(note)
         print(f"{self.output / 'sparse' / '0'}: {result.note}")

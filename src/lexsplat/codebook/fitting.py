@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from lexsplat import budget
 from lexsplat.codebook.losses import quantization_loss
 from lexsplat.codebook.settings import CodebookConfig
 from lexsplat.codebook.space import BLOCK_ROWS, Codebook
@@ -32,6 +33,7 @@ def fit_codebook(
     *,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> Codebook:
     """Fit the discrete feature space S by Eq. 7 to a bounded sample of the named views.
@@ -44,15 +46,18 @@ def fit_codebook(
         config: Settings.
         seed: Of the sample, the start and the batches.
         device: Where the fit runs and the codebook lies.
+        memory: Bytes that the sample and the fit may take, three quarters of which are theirs: the rest is for maps.
         listener: Hears of stage "codebook", with the mean CLIP cosine between features and codes at the end.
 
     Raises:
         ValueError: If `names` is empty, or a feature is not finite.
         TrainingError: If the loss stops being finite.
+        MemoryBudgetError: If the sample does not fit into ``memory``.
     """
     if not names:
         raise ValueError("a codebook needs at least one training view")
     generator = torch.Generator(device="cpu").manual_seed(seed)
+    _check_sample(feature_maps[names[0]], len(names), config, memory * 3 // 4)
     clip, dino = sample_features(feature_maps, names, config, generator=generator)
     clip, dino = clip.to(device), None if dino is None else dino.to(device)
     lambda_dino = config.lambda_dino
@@ -108,27 +113,73 @@ def sample_features(
         ValueError: If a feature is not finite, or none is left.
     """
     quota = -(-config.sample_size // len(names))
-    clips, dinos = [], []
+    clips, dinos = _Rows(quota, len(names)), _Rows(quota, len(names))
     for name in names:
         feature_map = feature_maps[name]
         clip = torch.as_tensor(feature_map.clip).flatten(0, 1)
         rows = torch.randperm(len(clip), generator=generator)[:quota]
-        clips.append(clip[rows].float())
+        finite = clips.add(clip[rows])
         if config.use_dino and feature_map.dino is not None:
-            dinos.append(torch.as_tensor(feature_map.dino).flatten(0, 1)[rows].float())
-        if not all(bool(torch.isfinite(part[-1]).all()) for part in (clips, dinos) if part):
+            finite = dinos.add(torch.as_tensor(feature_map.dino).flatten(0, 1)[rows]) and finite
+        if not finite:
             raise ValueError(f"features of {name} have a number that is not finite")
-    if dinos and len(dinos) != len(clips):
+    if dinos.count not in (0, clips.count):
         raise ValueError("some views have DINO features and some have none")
-    clip = torch.cat(clips)
-    dino = torch.cat(dinos) if dinos else None
-    keep = (clip.norm(dim=-1) > 0).nonzero()[:, 0]
+    keep = (clips.rows().norm(dim=-1) > 0).nonzero()[:, 0]
     if len(keep) == 0:
         raise ValueError("the training views have no features that are not zero")
     if len(keep) > config.sample_size:
         keep = keep[torch.randperm(len(keep), generator=generator)[: config.sample_size]]
-    clip = functional.normalize(clip[keep], dim=-1)
-    return clip, None if dino is None else functional.normalize(dino[keep], dim=-1)
+    return clips.take(keep), dinos.take(keep) if dinos.count else None
+
+
+class _Rows:
+    """Vectors that come in parts, put where they stay: joining parts at the end would take twice the memory."""
+
+    def __init__(self, quota: int, views: int) -> None:
+        self._most, self._views = quota * views, views
+        self._store, self.count = torch.empty(0, 0), 0
+
+    def add(self, part: Tensor) -> bool:
+        """Append rows ``[n, D]``; says whether they are finite."""
+        if not self.count:
+            self._store = torch.empty(min(self._most, self._views * len(part)), part.shape[1])
+        if self.count + len(part) > len(self._store):  # maps of several sizes
+            larger = torch.empty(self._most, part.shape[1])
+            larger[: self.count] = self.rows()
+            self._store = larger
+        self._store[self.count : self.count + len(part)] = part
+        self.count += len(part)
+        return bool(torch.isfinite(part).all())
+
+    def rows(self) -> Tensor:
+        """All rows so far ``[count, D]``."""
+        return self._store[: self.count]
+
+    def take(self, keep: Tensor) -> Tensor:
+        """The rows ``keep``, of unit length; the store is given up."""
+        whole = len(keep) == self.count and bool((keep.diff() == 1).all())
+        kept = self.rows() if whole else self.rows()[keep]
+        self._store = torch.empty(0, 0)
+        return kept.div_(kept.norm(dim=-1, keepdim=True).clamp_min(1e-12))
+
+
+def _check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory: int) -> None:
+    """Refuse a sample of ``views`` maps like the first that does not fit.
+
+    Raises:
+        MemoryBudgetError: With the sample size that would.
+    """
+    cells, dimensions = first.clip.shape[0] * first.clip.shape[1], first.clip.shape[-1]
+    if config.use_dino and first.dino is not None:
+        dimensions += first.dino.shape[-1]
+    rows = min(-(-config.sample_size // views), cells) * views
+    batch = min(config.batch_size, rows)
+    need = budget.sample_bytes(rows, dimensions, config.num_codes, batch)
+    least = budget.sample_bytes(0, dimensions, config.num_codes, batch)
+    fewer = max(1, (memory - least) // budget.sample_bytes(1, dimensions, 0, 0))
+    what = f"a sample of {rows:,} features"
+    budget.require("codebook", need, memory, what, f"codebook.sample-size {fewer}")
 
 
 @torch.no_grad()
@@ -182,7 +233,8 @@ def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> 
     """k-means++: the next seed is drawn in proportion to the squared distance from the seeds so far."""
     count = len(joint)
     seeds = [int(torch.randint(count, (1,), generator=generator))]
-    norms = joint.square().sum(-1)
+    blocks = (joint[i : i + BLOCK_ROWS] for i in range(0, count, BLOCK_ROWS))
+    norms = torch.cat([block.square().sum(-1) for block in blocks])
     nearest = torch.full((count,), torch.inf, device=joint.device)
     for _ in range(1, num_codes):
         seed = joint[seeds[-1]]

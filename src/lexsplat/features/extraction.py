@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lexsplat import budget
 from lexsplat.features.cache import (
     FeatureMap,
     FeatureMaps,
@@ -42,8 +43,6 @@ from lexsplat.progress import Event, Listener, silent
 if TYPE_CHECKING:
     from lexsplat.scenes import Scene, View
 
-_PHOTO_BYTES = 32
-"""Bytes a pixel of a photo takes while a worker makes a picture of it: decoded, as floats, and resized."""
 _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15 % slower at 256
 _MAX_WORKERS = 4  # beyond this, threads inside an operation pay better than more images in flight
 
@@ -153,6 +152,7 @@ def extract_features(
 
     Raises:
         CaptureError: If an image cannot be read.
+        MemoryBudgetError: If a photo is too large for the memory of the settings.
     """
     config = config or FeatureConfig()
     cache_dir = Path(cache_dir)
@@ -163,8 +163,12 @@ def extract_features(
     workers = (
         1 if clip.device.type == "cuda" else min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing)))
     )
-    largest = max((view.lens.width * view.lens.height for view in scene.views.values()), default=1)
-    workers = max(1, min(workers, config.memory // 2 // (_PHOTO_BYTES * largest)))
+    largest = 1
+    for name, entry in entries.items():
+        photo = scene.views[name].lens.width, scene.views[name].lens.height
+        budget.check_photo(photo, config.memory, entry.image_size)
+        largest = max(largest, budget.photo_bytes(photo, entry.image_size))
+    workers = max(1, min(workers, config.memory // 2 // largest))
     pictures: dict[tuple[Path, Path | None], list[str]] = {}  # views with the same picture share their files
     for name in missing:
         pictures.setdefault((entries[name].clip, entries[name].dino), []).append(name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 import struct
 import warnings
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lexsplat.errors import CaptureError
+from lexsplat.scenes.bands import band_ranges, is_large, reduced
 
 HEIC_SUFFIXES = (".heic", ".heif")
 """Suffixes of what phones of Apple write; it takes the library pi-heif to read it."""
@@ -25,12 +25,6 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HE
 
 MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
 """Largest picture that is opened: 179 million pixels. What claims more is a decompression bomb."""
-
-BAND_ROWS = 256
-"""Rows of a large picture that are made smaller at a time."""
-
-LARGE_PIXELS = 24_000_000
-"""Pictures beyond are made smaller a band at a time, where they can be: as floats they take twelve bytes a pixel."""
 
 
 @contextmanager
@@ -150,35 +144,52 @@ def read_image(
         path: The file.
         background: Colour behind transparent pixels.
         size: Width and height of the result, as by :func:`resize_image`; a large photo never is in memory as
-            floats then. None keeps the picture's.
+            floats then (`lexsplat.scenes.bands`). None keeps the picture's.
 
     Raises:
         CaptureError: As :func:`open_image`.
     """
     with open_image(path) as image:
         shrinks = size is not None and size[0] <= image.width and size[1] <= image.height
-        plain = image.mode in ("L", "RGB", "YCbCr", "CMYK") and "transparency" not in image.info
-        if size is not None and shrinks and plain and image.width * image.height > LARGE_PIXELS:
-            return _reduced(image, size)
+        if size is not None and shrinks and is_large(*image.size):
+            return reduced(PhotoRows(image, background), size)
         whole = _as_floats(image, background)
     return whole if size is None else resize_image(whole, size)
 
 
-def _reduced(image: Image.Image, size: tuple[int, int]) -> NDArray[np.float32]:
-    """The mean over the area of each new pixel, a band of the picture at a time: a tenth of the memory."""
-    image.load()
-    step = image.height / size[1]
-    rows = max(1, int(BAND_ROWS / step))
-    found = np.empty((size[1], size[0], 3), dtype=np.float32)
-    for top in range(0, size[1], rows):
-        bottom = min(top + rows, size[1])
-        first, last = int(top * step), min(image.height, math.ceil(bottom * step))
-        band = np.asarray(image.crop((0, first, image.width, last)).convert("RGB"), dtype=np.float32) / 255.0
-        box = (0.0, top * step - first, float(image.width), min(bottom * step - first, float(last - first)))
-        for channel in range(3):
-            plane = Image.fromarray(np.ascontiguousarray(band[..., channel]))
-            resized = plane.resize((size[0], bottom - top), Image.Resampling.BOX, box=box)
-            found[top:bottom, :, channel] = np.asarray(resized)
+class PhotoRows:
+    """An opened picture as a source of rows, composited on ``background``."""
+
+    def __init__(self, image: Image.Image, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        image.load()
+        self._image, self._background = image, background
+        self.width, self.height = image.size
+
+    def rows(self, first: int, last: int) -> NDArray[np.float32]:
+        """Rows ``[last - first, W, 3]``, in 0..1."""
+        return _as_floats(self._image.crop((0, first, self.width, last)), self._background)
+
+
+def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PhotoRows:
+    """A picture as a source of rows: in memory as it is decoded, three or four bytes a pixel.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    with open_image(path) as image:
+        return PhotoRows(image, background)
+
+
+def read_bytes(path: Path) -> NDArray[np.uint8]:
+    """A picture as ``[H, W, 3]`` bytes, as `read_image` gives it on black, rounded.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    source = read_rows(path)
+    found = np.empty((source.height, source.width, 3), np.uint8)
+    for first, last in band_ranges(source.height, source.width):
+        found[first:last] = (source.rows(first, last) * 255.0).round()
     return found
 
 

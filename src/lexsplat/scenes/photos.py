@@ -20,9 +20,11 @@ from typing import TYPE_CHECKING, Literal
 
 from PIL import Image
 
+from lexsplat import budget
 from lexsplat.atomic import atomic_path
 from lexsplat.errors import BackendError, CaptureError
 from lexsplat.progress import Event, Listener, silent
+from lexsplat.scenes.feature_budget import check_mapping, extraction_threads, matching_plan
 from lexsplat.scenes.images import image_size
 from lexsplat.scenes.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
 from lexsplat.scenes.triangulation import quiet_pycolmap
@@ -119,6 +121,7 @@ def poses_from_photos(
     config: PoseConfig | None = None,
     *,
     seed: int = 0,
+    memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> PhotoPoses:
     """Estimate the cameras of a folder of photos and write them as a COLMAP model.
@@ -128,29 +131,33 @@ def poses_from_photos(
         output: Where ``sparse/0`` is written, whole or not at all; one that is there is replaced.
         config: Settings.
         seed: Seed for pycolmap.
+        memory: Bytes of host memory that may be taken: decides how much is done at once, and no result.
         listener: Hears of stage ``"poses"``: a unit a photo whose features are found, then one for the matches, then
             one a photo that is placed.
 
     Raises:
         CaptureError: If there are fewer than three photos, one is unreadable, or none can be placed.
         BackendError: If this pycolmap has no global mapper, and it was asked for.
+        MemoryBudgetError: If ``memory`` is too little for photos of this size and number.
     """
     folder, output, config = photo_folder(Path(folder)), Path(output), config or PoseConfig()
     _check_mapper(config)
-    photos = prepare_photos(folder, output, listener=listener)
+    photos = prepare_photos(folder, output, memory=memory, listener=listener)
     names, total = photos.names, 2 * len(photos.names) + 1
     work = _work_folder(output, photos, config, seed)
     with quiet_pycolmap(seed):
         database = work / "database.db"
         listener(Event(STAGE, 0, total))
-        _extract(database, photos, config, total, listener)
-        _match(database, len(names), config, seed)
+        _extract(database, photos, config, memory, total, listener)
+        _match(database, len(names), config, seed, memory)
         listener(Event(STAGE, len(names) + 1, total))
+        check_mapping(database, memory)
         models = _map(database, photos, work / "models", config, seed, listener)
         best = _best(models)
         outsiders = _not_placed(names, best)
         if outsiders and config.pairs == "auto" and not config.compares_all(len(names)):
-            _match_further(database, names, outsiders, work, seed)
+            _match_further(database, names, outsiders, work, seed, memory)
+            check_mapping(database, memory)
             models = _map(database, photos, work / "models", config, seed, listener) or models
             best = _best(models)
         if best is None:
@@ -219,7 +226,7 @@ def _discard(work: Path, output: Path) -> None:
 
 
 def _extract(
-    database: Path, photos: PreparedPhotos, config: PoseConfig, total: int, listener: Listener
+    database: Path, photos: PreparedPhotos, config: PoseConfig, memory: int, total: int, listener: Listener
 ) -> None:
     """SIFT features of all photos, one camera for each lens; what the database has already is kept."""
     from lexsplat.scenes.pycolmap_import import pycolmap
@@ -232,7 +239,9 @@ def _extract(
         # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
         single = pycolmap.CameraMode.SINGLE
         pycolmap.import_images(database, photos.images, single, list(group), reader)
-    options = pycolmap.FeatureExtractionOptions(max_image_size=config.max_side)
+    masked = photos.masks is not None
+    threads = extraction_threads(photos.largest, config.max_side, config.max_features, memory, masked=masked)
+    options = pycolmap.FeatureExtractionOptions(max_image_size=config.max_side, num_threads=threads)
     options.sift.max_num_features = config.max_features
     for start in range(0, len(photos.names), BATCH):
         batch = list(photos.names[start : start + BATCH])
@@ -263,23 +272,39 @@ def _complete_masks(photos: PreparedPhotos, folder: Path) -> Path:
     return folder
 
 
-def _match(database: Path, count: int, config: PoseConfig, seed: int) -> None:
+def _match(database: Path, count: int, config: PoseConfig, seed: int, memory: int) -> None:
     from lexsplat.scenes.pycolmap_import import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     if config.compares_all(count):
-        pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+        matching, held = matching_plan(database, memory, least=2 * budget.CACHED_BLOCKS)
+        pycolmap.match_exhaustive(
+            database,
+            matching_options=matching,
+            pairing_options=pycolmap.ExhaustivePairingOptions(
+                block_size=min(50, held // budget.CACHED_BLOCKS)
+            ),
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
         return
     # Quadratic overlap adds photos 2, 4, 8, ... further on, which closes the loops of a walk around.
     pairing = pycolmap.SequentialPairingOptions(overlap=SEQUENTIAL_OVERLAP, quadratic_overlap=True)
+    if hasattr(pairing, "loop_detection_num_images"):  # not used, but pycolmap keeps features by it
+        pairing.loop_detection_num_images = 1
+    matching, _ = matching_plan(database, memory, least=budget.SEQUENTIAL_BLOCKS * SEQUENTIAL_OVERLAP)
     pycolmap.match_sequential(
-        database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+        database,
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
     )
 
 
 def _match_further(
-    database: Path, names: tuple[str, ...], outsiders: tuple[str, ...], work: Path, seed: int
+    database: Path, names: tuple[str, ...], outsiders: tuple[str, ...], work: Path, seed: int, memory: int
 ) -> None:
     """Compare photos that follow no other with all, or with as many, evenly spread, as is affordable."""
     from lexsplat.scenes.pycolmap_import import pycolmap
@@ -291,9 +316,11 @@ def _match_further(
     listed.write_text("".join(f"{first} {second}\n" for first, second in sorted(pairs)), encoding="utf-8")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    matching, held = matching_plan(database, memory)
     pycolmap.match_image_pairs(
         database,
-        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+        matching_options=matching,
+        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=held),
         verification_options=verification,
         device=pycolmap.Device.cpu,
     )

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat import budget
 from lexsplat.atomic import atomic_path
 from lexsplat.errors import CaptureError
 from lexsplat.progress import Event, Listener, silent
-from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, open_image, read_image, read_mask, sizes_agree
+from lexsplat.scenes.images import IMAGE_SUFFIXES, image_size, open_image, read_bytes, read_mask, sizes_agree
 from lexsplat.scenes.masks import IGNORE_FOLDER, find_ignore_masks
 
 STAGE = "photos"
@@ -43,6 +44,7 @@ class PreparedPhotos:
         names: Names of the photos in it, with "/", sorted.
         lenses: The same names in groups that share a lens: one size and one focal length each.
         masks: Folder with ``NAME.png`` as COLMAP wants it, or None where no photo is masked.
+        largest: Width and height of the photo with the most pixels.
         notes: What people should know, one line each.
     """
 
@@ -50,6 +52,7 @@ class PreparedPhotos:
     names: tuple[str, ...]
     lenses: tuple[tuple[str, ...], ...]
     masks: Path | None
+    largest: tuple[int, int]
     notes: tuple[str, ...] = ()
 
 
@@ -102,7 +105,9 @@ def mask_places(folder: Path) -> list[Path]:
     ]
 
 
-def prepare_photos(folder: Path, output: Path, *, listener: Listener = silent) -> PreparedPhotos:
+def prepare_photos(
+    folder: Path, output: Path, *, memory: int = budget.DEFAULT_MEMORY, listener: Listener = silent
+) -> PreparedPhotos:
     """Look at a folder of photos, and write upright copies and masks where they are needed.
 
     Args:
@@ -110,14 +115,18 @@ def prepare_photos(folder: Path, output: Path, *, listener: Listener = silent) -
             holds masks (black where pixels do not count).
         output: Folder for ``images/`` (only where a photo has to be copied) and ``masks/`` (only where there are
             some). Copies that are there from an earlier call and still fit are kept.
+        memory: Bytes of host memory that a photo on its way may take.
         listener: Hears of stage "photos" while photos are copied.
 
     Raises:
         CaptureError: If there are fewer than three photos, one is unreadable, a mask does not fit its photo, or
             the output would come to lie among the photos.
+        MemoryBudgetError: If a photo is too large for ``memory``.
     """
     names = _checked_names(folder, output)
     photos = [_look_at(folder, name) for name in names]
+    largest = max((photo.size for photo in photos), key=lambda size: size[0] * size[1])
+    budget.check_photo(largest, memory)
     notes: list[str] = []
     found, strays = find_ignore_masks(mask_places(folder), names)
     notes += strays
@@ -138,7 +147,7 @@ def prepare_photos(folder: Path, output: Path, *, listener: Listener = silent) -
     for photo in photos:
         groups.setdefault((photo.size, photo.focal), []).append(renamed[photo.name])
     lenses = tuple(tuple(sorted(group)) for group in groups.values())
-    return PreparedPhotos(images, tuple(sorted(renamed.values())), lenses, masks, tuple(notes))
+    return PreparedPhotos(images, tuple(sorted(renamed.values())), lenses, masks, largest, tuple(notes))
 
 
 def _checked_names(folder: Path, output: Path) -> list[str]:
@@ -241,8 +250,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _write_upright(photo: _Photo, source: Path, target: Path) -> None:
-    pixels = (turned_upright(read_image(source), photo.orientation) * 255.0).round().astype(np.uint8)
-    image = Image.fromarray(np.ascontiguousarray(pixels))
+    image = Image.fromarray(np.ascontiguousarray(turned_upright(read_bytes(source), photo.orientation)))
     exif = Image.Exif()
     for tag in (_MAKE, _MODEL):
         if tag in photo.exif:

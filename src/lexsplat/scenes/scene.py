@@ -12,8 +12,16 @@ from scipy.ndimage import binary_dilation
 
 from lexsplat.cameras import Camera, camera_extent
 from lexsplat.errors import CaptureError
-from lexsplat.scenes.images import image_size, read_image, read_mask, resize_image, sizes_agree
-from lexsplat.scenes.undistortion import Lens, undistort
+from lexsplat.scenes.bands import FilledRows, MaskRows, Rows, is_large, reduced, whole
+from lexsplat.scenes.images import (
+    image_size,
+    read_image,
+    read_mask,
+    read_rows,
+    resize_image,
+    sizes_agree,
+)
+from lexsplat.scenes.undistortion import Lens, RemappedRows, undistort, undistort_large
 
 
 def stem_of(name: str) -> str:
@@ -75,6 +83,8 @@ class View:
             )
         if self.ignore_path is None and not self.lens.distorts:
             return read_image(self.image_path, self.background, size=size)
+        if is_large(*found):
+            return self._load_large(size)
         image = read_image(self.image_path, self.background)
         mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
         if mask is not None and self._is_undistorted(mask):
@@ -86,6 +96,22 @@ class View:
         if self.lens.distorts:
             return undistort(image, self.lens, size)
         return resize_image(image, size)
+
+    def _load_large(self, size: tuple[int, int]) -> NDArray[np.float32]:
+        """A photo that is masked or distorted, in bands."""
+        source: Rows = read_rows(self.image_path, self.background)
+        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
+        if mask is not None and self._is_undistorted(mask):
+            source = FilledRows(RemappedRows(source, self.lens, self.capture_size), mask)
+        else:
+            if mask is not None:
+                self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
+                source = FilledRows(source, _resize_nearest(mask, (source.width, source.height)))
+            if self.lens.distorts:
+                return undistort_large(source, self.lens, size)
+        if size[0] <= source.width and size[1] <= source.height:
+            return reduced(source, size)
+        return resize_image(whole(source), size)
 
     def load_mask(self, path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
         """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, nearest pixel.
@@ -154,6 +180,12 @@ class View:
         masked = ~_resize_nearest(
             mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
         )
+        large = is_large(masked.shape[1], masked.shape[0])
+        shrinks = size[0] <= masked.shape[1] and size[1] <= masked.shape[0]
+        if large and (undistorted or not self.lens.distorts) and shrinks:
+            return 1.0 - reduced(MaskRows(masked), size)[..., 0]
+        if large and not undistorted and self.lens.distorts:
+            return 1.0 - undistort_large(MaskRows(masked, reach=2), self.lens, size)[..., 0]
         if undistorted or not self.lens.distorts:
             return 1.0 - resize_image(masked[..., None].astype(np.float32), size)[..., 0]
         # Bicubic interpolation reaches two pixels far.

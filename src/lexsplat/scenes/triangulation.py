@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat import budget
 from lexsplat.atomic import atomic_path
 from lexsplat.errors import CaptureError
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.scenes.capture import MAX_COORDINATE
+from lexsplat.scenes.feature_budget import check_mapping, extraction_threads, matching_plan
 from lexsplat.scenes.scene import Scene, View
 
 if TYPE_CHECKING:
@@ -64,6 +66,7 @@ def initial_points(
     count: int = 20_000,
     seed: int = 0,
     cache_dir: Path | None = None,
+    memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> InitialPoints:
     """The best points to start a reconstruction from.
@@ -76,6 +79,7 @@ def initial_points(
         count: How many random points.
         seed: Seed of all that is random here.
         cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
+        memory: Bytes of host memory that a triangulation may take.
         listener: Hears the progress of the triangulation.
 
     Raises:
@@ -84,7 +88,7 @@ def initial_points(
     if len(scene.points) >= ENOUGH_POINTS:
         note = f"{len(scene.points):,} points of the capture"
         return InitialPoints(scene.points, scene.point_colors, "capture", note)
-    points, colors = triangulate(scene, cache_dir=cache_dir, seed=seed, listener=listener)
+    points, colors = triangulate(scene, cache_dir=cache_dir, seed=seed, memory=memory, listener=listener)
     if len(points) >= ENOUGH_POINTS:
         return InitialPoints(points, colors, "triangulated", f"{len(points):,} points triangulated")
     found = len(points)
@@ -94,7 +98,12 @@ def initial_points(
 
 
 def triangulate(
-    scene: Scene, *, cache_dir: Path | None = None, seed: int = 0, listener: Listener = silent
+    scene: Scene,
+    *,
+    cache_dir: Path | None = None,
+    seed: int = 0,
+    memory: int = budget.DEFAULT_MEMORY,
+    listener: Listener = silent,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points matched between training views and triangulated under their poses.
 
@@ -104,6 +113,7 @@ def triangulate(
         scene: The capture.
         cache_dir: Folder for the result, keyed by photos, cameras and settings; None keeps nothing.
         seed: Seed for pycolmap.
+        memory: Bytes of host memory that may be taken: decides how much is done at once, and no result.
         listener: Hears of stage ``"triangulate"``: one unit an image, then matching and triangulation.
 
     Returns:
@@ -129,7 +139,7 @@ def triangulate(
             sizes.append(_write_image(view, folder / "images" / _file_name(done)))
             if masked:
                 _write_mask(view, sizes[-1], folder / "masks" / f"{_file_name(done)}.png")
-        points, colors = _run_pycolmap(views, sizes, folder, seed, len(views), total, listener)
+        points, colors = _run_pycolmap(views, sizes, folder, seed, memory, total, listener)
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
         _write_cache(cached, points, colors)
@@ -263,7 +273,7 @@ def _run_pycolmap(
     sizes: list[tuple[int, int]],
     folder: Path,
     seed: int,
-    done: int,
+    memory: int,
     total: int,
     listener: Listener,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -271,15 +281,18 @@ def _run_pycolmap(
     from lexsplat.scenes.pycolmap_import import pycolmap
 
     database, images = folder / "database.db", folder / "images"
-    names = [_file_name(index) for index in range(len(views))]
+    done, names = len(views), [_file_name(index) for index in range(len(views))]
     listener(Event(STAGE, done, total))
     pycolmap.Database.open(database).close()
     # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
     reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
-    if any(view.ignore_path is not None for view in views):
+    masked = any(view.ignore_path is not None for view in views)
+    if masked:
         reader.mask_path = folder / "masks"
     pycolmap.import_images(database, images, pycolmap.CameraMode.PER_IMAGE, names, reader)
-    extraction = pycolmap.FeatureExtractionOptions()
+    largest = max(sizes, key=lambda size: size[0] * size[1])
+    threads = extraction_threads(largest, MAX_SIDE, MAX_FEATURES, memory, masked=masked)
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
     extraction.sift.max_num_features = MAX_FEATURES
     pycolmap.extract_features(
         database,
@@ -294,11 +307,13 @@ def _run_pycolmap(
     listener(Event(STAGE, done + 1, total))
     pairs = folder / "pairs.txt"
     pairs.write_text("\n".join(f"{names[a]} {names[b]}" for a, b in matching_pairs(views)) + "\n")
-    matching = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True)
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=pairs)
+    matching, held = matching_plan(database, memory)
+    matching.skip_geometric_verification = True
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=pairs, block_size=held)
     pycolmap.match_image_pairs(database, matching, pairing, device=pycolmap.Device.cpu)
     # Matches are kept where they obey the epipolar geometry of the known poses; nothing is estimated.
     pycolmap.guided_geometric_verification(known, database)
+    check_mapping(database, memory)
     listener(Event(STAGE, done + 2, total))
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
     (folder / "model").mkdir()

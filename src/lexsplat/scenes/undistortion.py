@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.scenes.bands import ArrayRows, Rows, reduced, whole
 from lexsplat.scenes.images import resize_image
 
 if TYPE_CHECKING:
@@ -146,20 +147,58 @@ def undistort(
     return remapped if between == tuple(size) else resize_image(remapped, size)
 
 
+def undistort_large(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
+    """As `undistort`, of a photo that is never in memory as floats but for a band of it and the result."""
+    width, height, _ = pinhole_of(lens)
+    shrink = max(1, int(min(width / size[0], height / size[1]) / 2))
+    if shrink > 1:
+        smaller = (max(1, source.width // shrink), max(1, source.height // shrink))
+        source = ArrayRows(reduced(source, smaller))
+    enlarges = size[0] > width or size[1] > height
+    between = size if enlarges else (max(1, round(width / shrink)), max(1, round(height / shrink)))
+    remapped = RemappedRows(source, lens, between)
+    shrinks = between[0] >= size[0] and between[1] >= size[1]
+    return reduced(remapped, size) if shrinks else resize_image(whole(remapped), size)
+
+
+class RemappedRows:
+    """The pinhole image of a source, of which only the rows of the photo are read that a band looks at."""
+
+    def __init__(self, source: Rows, lens: Lens, size: tuple[int, int]) -> None:
+        self._source, self._lens = source, lens
+        self.width, self.height = size
+
+    def rows(self, first: int, last: int) -> NDArray[np.float32]:
+        """Rows of the pinhole image."""
+        grid = _grid_rows(self._lens, (self.width, self.height), first, last)
+        height = self._source.height
+        y = (grid[..., 1].astype(np.float64) + 1.0) * (height / 2)  # pixels from the upper edge of the photo
+        # Bicubic interpolation reaches two pixels far; beyond the photo its edge goes on.
+        top = int(np.clip(np.floor(y.min()) - 3, 0, height - 1))
+        bottom = int(np.clip(np.ceil(y.max()) + 3, top + 1, height))
+        grid[..., 1] = (y - top) * (2.0 / (bottom - top)) - 1.0
+        return _remap(self._source.rows(top, bottom), grid, nearest=False)
+
+
 @lru_cache(maxsize=2)
 def _sampling_grid(lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
     """Where in the photo each pinhole pixel lies: ``[h, w, 2]``, x and y from -1 to 1 edge to edge."""
+    return _grid_rows(lens, size, 0, size[1])
+
+
+def _grid_rows(lens: Lens, size: tuple[int, int], first: int, last: int) -> NDArray[np.float32]:
+    """Rows ``first`` to ``last`` of the sampling grid."""
     width, height, K = pinhole_of(lens)
     camera = lens.to_pycolmap()
     x = ((np.arange(size[0]) + 0.5) * (width / size[0]) - K[0, 2]) / K[0, 0]
     y = ((np.arange(size[1]) + 0.5) * (height / size[1]) - K[1, 2]) / K[1, 1]
-    grid = np.empty((size[1], size[0], 2), dtype=np.float32)
+    grid = np.empty((last - first, size[0], 2), dtype=np.float32)
     scale = 2.0 / np.array([lens.width, lens.height])
     rays = np.ones((size[0], 3))
     rays[:, 0] = x
-    for row in range(size[1]):  # by rows: a large photo's rays in float64 would take more than the photo
+    for row in range(first, last):  # a large photo's rays in float64 would take more than the photo
         rays[:, 1] = y[row]
-        grid[row] = np.asarray(camera.img_from_cam(rays)) * scale - 1.0
+        grid[row - first] = np.asarray(camera.img_from_cam(rays)) * scale - 1.0
     if not np.isfinite(grid).all():
         raise ValueError(f"distortion of {lens.model} {list(lens.params)} that maps a pixel nowhere")
     return grid

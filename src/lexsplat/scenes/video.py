@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import itertools
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat import budget
 from lexsplat.atomic import atomic_path
 from lexsplat.errors import BackendError, CaptureError
 from lexsplat.progress import Event, Listener, silent
@@ -60,7 +62,12 @@ def is_video(path: Path) -> bool:
 
 
 def sample_video(
-    video: Path, folder: Path, count: int = DEFAULT_FRAMES, *, listener: Listener = silent
+    video: Path,
+    folder: Path,
+    count: int = DEFAULT_FRAMES,
+    *,
+    memory: int = budget.DEFAULT_MEMORY,
+    listener: Listener = silent,
 ) -> list[str]:
     """Write frames of a video as ``frame_NUMBER.jpg``, NUMBER being the frame's place in the video.
 
@@ -70,6 +77,7 @@ def sample_video(
         video: The file.
         folder: Where the frames go; other ``frame_*.jpg`` there are removed.
         count: How many are wanted; a video with fewer gives all it has.
+        memory: Bytes of host memory that decoding may take: decides how many threads it has.
         listener: Hears of stage "video": a unit a frame read.
 
     Returns:
@@ -78,6 +86,7 @@ def sample_video(
     Raises:
         BackendError: If PyAV is not installed.
         CaptureError: If the file is missing, no video, damaged, or has fewer than three frames.
+        MemoryBudgetError: If ``memory`` is too little for frames of this size.
         ValueError: If ``count`` is below 3.
     """
     if count < 3:
@@ -88,20 +97,22 @@ def sample_video(
     kept = _written_before(folder, made_from)
     if kept is not None:
         return kept
-    measures = measure_frames(video, listener)
+    measures = measure_frames(video, listener, memory=memory)
     chosen = choose_frames(measures, count)
     names = [f"frame_{index:06d}.jpg" for index in chosen]
     (folder / _MANIFEST).unlink(missing_ok=True)
     for stale in folder.glob("frame_*.jpg"):
         if stale.name not in names:
             stale.unlink()
-    _write_frames(video, folder, dict(zip(chosen, names)), len(measures.motion), listener)
+    _write_frames(video, folder, dict(zip(chosen, names)), len(measures.motion), memory, listener)
     with atomic_path(folder / _MANIFEST) as temporary:
         temporary.write_text(json.dumps({**made_from, "names": names}, indent=1), encoding="utf-8")
     return names
 
 
-def measure_frames(video: Path, listener: Listener = silent) -> FrameMeasures:
+def measure_frames(
+    video: Path, listener: Listener = silent, *, memory: int = budget.DEFAULT_MEMORY
+) -> FrameMeasures:
     """Read a video once and measure its frames.
 
     Raises:
@@ -112,7 +123,7 @@ def measure_frames(video: Path, listener: Listener = silent) -> FrameMeasures:
     motion: list[float] = []
     before: NDArray[np.float32] | None = None
     expected = 0
-    with _open(video) as (stream, frames):
+    with _open(video, memory) as (stream, frames):
         expected = stream.frames
         for frame in frames:
             sharpness.append(_sharpness(_small_grey(frame, _SHARPNESS_SIDE)))
@@ -168,7 +179,7 @@ def _fill_widest_gap(chosen: list[int], place: NDArray, score: NDArray) -> int:
 
 
 @contextlib.contextmanager
-def _open(video: Path) -> Iterator[tuple[Any, Iterator[Any]]]:
+def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
     """The picture stream of a video and its frames, decoded one after the other.
 
     Raises:
@@ -190,6 +201,7 @@ def _open(video: Path) -> Iterator[tuple[Any, Iterator[Any]]]:
                 raise CaptureError(video, expected="a video", found="a file without pictures")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
+            stream.codec_context.thread_count = _threads(video, (stream.width, stream.height), memory)
             yield stream, container.decode(stream)
     except av.error.FFmpegError as error:
         raise CaptureError(
@@ -198,6 +210,20 @@ def _open(video: Path) -> Iterator[tuple[Any, Iterator[Any]]]:
             found=f"damaged data ({error.strerror or error})",
             remedy="copy the file again, or convert it to an MP4",
         ) from error
+
+
+def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
+    """How many threads decode, so that the frames they hold fit.
+
+    Raises:
+        MemoryBudgetError: If one is too many.
+    """
+    need = {
+        threads: budget.video_bytes(frame, threads) for threads in range(1, min(16, os.cpu_count() or 1) + 1)
+    }
+    what = f"frames of {frame[0]}x{frame[1]} pixels"
+    budget.require(str(video), need[1], memory, what, "scale the video down first")
+    return budget.most_within(memory, need)
 
 
 def _small_grey(frame: Any, side: int) -> NDArray[np.float32]:
@@ -229,10 +255,12 @@ def _upright(frame: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.rot90(pixels, quarters))
 
 
-def _write_frames(video: Path, folder: Path, names: dict[int, str], total: int, listener: Listener) -> None:
+def _write_frames(
+    video: Path, folder: Path, names: dict[int, str], total: int, memory: int, listener: Listener
+) -> None:
     last = max(names)
     written = 0
-    with _open(video) as (_, frames):
+    with _open(video, memory) as (_, frames):
         for index, frame in enumerate(frames):
             if index in names:
                 with atomic_path(folder / names[index]) as temporary:
