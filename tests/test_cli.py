@@ -13,6 +13,7 @@ from PIL import Image
 from tiny_capture import write_capture
 
 from lexsplat import cli, open_scene
+from lexsplat.features import hub
 
 pytestmark = pytest.mark.xdist_group("built")
 
@@ -52,6 +53,24 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
     assert after["language.safetensors"] != before["language.safetensors"]
     for kept in ("gaussians.ply", "checkpoints/codebook.safetensors", "codes/view_01.png"):
         assert after[kept] == before[kept], kept
+
+
+def test_other_encoders_under_the_name_embedded_make_features_anew(
+    built, tiny_capture, tmp_path, monkeypatch, capsys
+):
+    # As after an update of lexsplat: the scene was built with the encoders of the version before.
+    copy, encoders = tmp_path / "copy", tmp_path / "encoders"
+    shutil.copytree(built, copy)
+    shutil.copytree(hub.EMBEDDED_ENCODERS, encoders)
+    monkeypatch.setattr(hub, "EMBEDDED_ENCODERS", encoders)
+    config = json.loads((encoders / "clip" / "config.json").read_text())
+    (encoders / "clip" / "config.json").write_text(json.dumps(config | {"logit_scale_init_value": 2.5}))
+    before = modified(copy)
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK]) == 0
+    after = modified(copy)
+    assert after["checkpoints/codebook.safetensors"] != before["checkpoints/codebook.safetensors"]
+    assert after["gaussians.ply"] == before["gaussians.ply"]
+    assert cli.main(["query", str(copy), "red ball", "--json"]) == 0
 
 
 def without_texts(times):

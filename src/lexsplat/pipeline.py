@@ -28,6 +28,7 @@ from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
 from lexsplat.errors import CaptureError, FileFormatError, ModelError
 from lexsplat.features import FeatureMaps, extract_features
+from lexsplat.features.hub import content_hash, model_folder
 from lexsplat.formats.reading import read_splats
 from lexsplat.gaussians import Gaussians
 from lexsplat.joint import JointTrainer
@@ -280,8 +281,10 @@ class _Builder:
         return [self.folder.codebook_path, *(self.folder.code_map_path(n) for n in self.scene.train_names)]
 
     def _model_identity(self, kind: str) -> list[str]:
-        """The name of a model; for a folder also the size and time of its files."""
+        """The name of a model; for a folder also the size and time of its files, for ours the content."""
         name = str(getattr(self.config, kind))
+        if name == "embedded":  # another version of lexsplat may come with others, with any time of writing
+            return [name, content_hash(model_folder(name, kind))]
         folder = Path(name)
         if not folder.is_dir():
             return [name]
