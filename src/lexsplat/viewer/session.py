@@ -152,7 +152,9 @@ class Session:
         if is_plain(question.text):
             if question.automatic is None:
                 question.automatic = float(self.scene.thresholds([question.text])[0])
-            selection = self.scene.select(question.text, question.automatic if manual is None else manual)
+            limit = question.automatic if manual is None else manual
+            selection = self.scene.select(question.text, limit)
+            selection = selection.convincing() if manual is None else selection
         else:
             selection = self.scene.find(question.text, viewpoint, threshold=manual)
             if manual is None:
