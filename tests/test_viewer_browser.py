@@ -1,6 +1,7 @@
 """The viewer in a real browser: headless Chromium with software WebGL, on balls whose places are known."""
 
 import io
+import itertools
 import shutil
 import time
 
@@ -273,4 +274,4 @@ def test_an_orbit_video_is_downloaded_and_shows_every_frame(page, viewer, tmp_pa
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in video.decode(video=0)]
     assert len(frames) == 8
     assert {frame.shape[0] for frame in frames} == {120}
-    assert all(np.abs(a - b).max() > 30 for a, b in zip(frames, frames[1:])), "the camera moves"
+    assert all(np.abs(a - b).max() > 30 for a, b in itertools.pairwise(frames)), "the camera moves"

@@ -51,6 +51,17 @@ def test_a_question_colours_its_ball_at_once_and_selects_it_when_refined(session
     assert session.selection is question.selection
 
 
+def test_what_is_judged_absent_is_drawn_at_half_from_the_first_moment(balls, monkeypatch):
+    fresh = Session(balls[0], Memory(vocabulary=WORDS))
+    fresh.warm_up()
+    monkeypatch.setattr(type(fresh._judge), "judge", lambda self, scores: "no")
+    question = fresh.ask("ball 3")
+    assert question.layer.threshold == 0.5
+    fresh.refine(question)
+    assert question.layer.threshold == 0.5
+    assert question.selection.present == "no"
+
+
 def test_several_questions_are_shown_and_can_be_hidden_and_removed(session, balls):
     _, truth = balls
     before = session.colors()
