@@ -524,7 +524,7 @@ def reconstruction_checkpoints() -> Reader:
 def journal() -> Reader:
     import torch
 
-    from lexsplat.editing import Editor
+    from lexsplat.editing import Editor, Motion
     from lexsplat.search import open_scene
     from lexsplat.selection import Selection
 
@@ -541,10 +541,10 @@ def journal() -> Reader:
             return Selection(gaussians, editor.scene.cameras, mask, mask.float(), phrase="дом")
 
         editor.recolour(choose(0, 1), (0.2, 0.4, 0.6), 0.5)
-        editor.duplicate(choose(2), translation=(0.1, 0, 0), scale=1.5)
+        editor.duplicate(choose(2), Motion(translation=(0.1, 0, 0), scale=1.5))
         editor.delete(choose(0))
         editor.undo()
-        editor.move(choose(1), rotation=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
+        editor.move(choose(1), Motion(rotation=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])))
 
     def read(folder: Path) -> Any:
         return Editor(kept["scene"], folder / "edits.jsonl").scene

@@ -314,3 +314,22 @@ def test_wrong_usage_is_status_2_and_words(arguments, capsys):
 def test_version_is_printed(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("lexsplat 0.")
+
+
+def test_moves_of_the_command_line_are_those_of_the_journal(built, tmp_path, capsys):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    thing = ("--select", "blue ball", "--threshold", "0.13", "--largest")
+    motion = ("--by", "0.5", "0", "0.25", "--turn", "90", "--scale", "1.5")
+    assert cli.main(["edit", str(copy), "move", *thing, *motion]) == 0
+    assert cli.main(["edit", str(copy), "duplicate", *thing, "--by", "0", "0", "1"]) == 0
+    _, moved, copied = map(json.loads, (copy / "edits.jsonl").read_text().splitlines())
+    assert moved["step"] == "move"
+    assert moved["translation"] == [0.5, 0.0, 0.25]
+    assert moved["scale"] == 1.5
+    turn = np.array(moved["rotation"])
+    assert np.trace(turn) == pytest.approx(1)  # 1 + 2 cos 90 degrees
+    assert copied["step"] == "duplicate"
+    assert copied["translation"] == [0.0, 0.0, 1.0]
+    assert np.array(copied["rotation"]) == pytest.approx(np.eye(3))
+    assert "2. duplicate blue ball" in capsys.readouterr().out

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from language_scene import make_scene
 from scipy.spatial.transform import Rotation
 
-from lexsplat.editing import Editor, Step, recoloured
+from lexsplat.editing import Editor, Motion, Step, recoloured
 from lexsplat.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.formats.language import write_field
 from lexsplat.language_field import LiftedField
@@ -62,7 +62,7 @@ def test_move_moves_only_what_was_chosen(base):
     editor = Editor(scene)
     turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     chosen = choose(editor, 2)
-    editor.move(chosen, translation=(1.0, 0, 0), rotation=turn, scale=2.0)
+    editor.move(chosen, Motion(translation=(1.0, 0, 0), rotation=turn, scale=2.0))
     after, before = editor.scene.gaussians, scene.gaussians
     offset = before.means[labels == 2].numpy() - chosen.center
     expected = chosen.center + [1.0, 0, 0] + 2 * np.stack([-offset[:, 1], offset[:, 0], offset[:, 2]], 1)
@@ -78,7 +78,7 @@ def test_move_moves_only_what_was_chosen(base):
 def test_a_duplicate_says_what_the_original_says(base):
     scene, labels = base
     editor = Editor(scene)
-    editor.duplicate(choose(editor, 4), translation=(0, 0, 1.5))
+    editor.duplicate(choose(editor, 4), Motion(translation=(0, 0, 1.5)))
     gaussians, field = editor.scene.gaussians, editor.scene.field
     assert len(gaussians) == 180
     assert torch.equal(gaussians.means[:150], scene.gaussians.means)
@@ -119,8 +119,8 @@ def test_a_journal_read_again_gives_the_same_scene(base, tmp_path_factory, actio
             continue
         options = {
             "recolour": {"color": (0.1 * (number % 5), 0.5, 0.9), "strength": 0.7},
-            "move": {"translation": (0.1, 0.2, number), "scale": 1.1},
-            "duplicate": {"translation": (0.0, 0.3, 0.1)},
+            "move": {"motion": Motion(translation=(0.1, 0.2, number), scale=1.1)},
+            "duplicate": {"motion": Motion(translation=(0.0, 0.3, 0.1))},
         }.get(action, {})
         getattr(editor, action)(chosen, **options)
     again = Editor(scene, journal)
@@ -134,7 +134,7 @@ def test_undo_and_redo_lead_back_and_forth_exactly(base):
     editor = Editor(scene)
     states = [editor.scene]
     for ball in (0, 1, 2):
-        editor.move(choose(editor, ball), translation=(0.1, 0, 0.2))
+        editor.move(choose(editor, ball), Motion(translation=(0.1, 0, 0.2)))
         states.append(editor.scene)
     for state in reversed(states[:-1]):
         assert editor.undo()
@@ -205,7 +205,7 @@ def test_what_cannot_be_done_leaves_no_trace(base, tmp_path):
     with pytest.raises(ValueError, match="colour"):
         editor.recolour(old, (2.0, 0, 0))
     with pytest.raises(ValueError, match="proper rotation"):
-        editor.move(old, rotation=np.diag([1.0, 1, -1]))
+        editor.move(old, Motion(rotation=np.diag([1.0, 1, -1])))
     assert not (tmp_path / "edits.jsonl").exists()
     editor.delete(choose(editor, 0))
     with pytest.raises(ValueError, match="select again"):

@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ import torch
 from conftest import QUICK_BUILD as QUICK
 
 from lexsplat import cli, open_scene
-from lexsplat.exporting import best_labels
+from lexsplat.exporting import best_labels, export_gaussians
 from lexsplat.formats.ply import read_ply
+from lexsplat.formats.reading import read_splats
 from lexsplat.formats.splat import write_splat
+from lexsplat.gaussians import Gaussians
 from lexsplat.selection import Selection
 
 pytestmark = pytest.mark.xdist_group("built")
@@ -89,19 +92,35 @@ def test_what_cannot_be_written_is_told_in_one_line(built, tmp_path, arguments, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_splats_of_another_program_get_language_and_keep_their_geometry(built, tiny_capture, tmp_path):
-    foreign = read_ply(built / "gaussians.ply")
-    write_splat(foreign, tmp_path / "foreign.splat")
-    scene = tmp_path / "scene"
+def written_by_others(ending: str, gaussians: Gaussians, path: Path) -> None:
+    """Splats as gsplat (PLY, .splat) and GaussForge (SPZ) write them."""
+    if ending == ".spz":
+        pytest.importorskip("gaussforge")
+        export_gaussians(gaussians, path)
+        return
+    exporter = pytest.importorskip("gsplat.exporter")
+    g = gaussians
+    if ending == ".ply":
+        exporter.export_splats(
+            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh0, g.shN, format="ply", save_to=str(path)
+        )
+    else:
+        path.write_bytes(
+            exporter.splat2splat_bytes(g.means, g.log_scales, g.quats, g.opacity_logits, g.sh0[:, 0])
+        )
+
+
+@pytest.mark.parametrize("ending", [".ply", ".splat", ".spz"])
+def test_splats_of_another_program_get_language_and_keep_their_geometry(
+    built, tiny_capture, tmp_path, ending
+):
+    original = read_ply(built / "gaussians.ply")
+    file, scene = tmp_path / f"foreign{ending}", tmp_path / "scene"
+    written_by_others(ending, original, file)
+    foreign = read_splats(file)
+    assert len(foreign) == len(original)
     shutil.copytree(built / "checkpoints", scene / "checkpoints")
-    arguments = [
-        "embed",
-        str(tiny_capture),
-        "--output",
-        str(scene),
-        "--splats",
-        str(tmp_path / "foreign.splat"),
-    ]
+    arguments = ["embed", str(tiny_capture), "--output", str(scene), "--splats", str(file)]
     assert cli.main([*arguments, *QUICK, "--method", "lifted"]) == 0
     made = open_scene(scene)
     assert torch.equal(made.gaussians.means, foreign.means)

@@ -43,6 +43,18 @@ def test_specks_are_no_instances_and_can_be_left_out(scene):
     assert len(chosen.clusters()) > 1
 
 
+def test_only_instances_that_answer_about_as_well_as_the_best_convince(scene):
+    labels = torch.from_numpy(scene.labels)
+    scores = torch.tensor([0.9, 0.6, 0.85, 0.1, 0.1])[labels]  # two apples, a duck's back, the rest
+    chosen = Selection(scene.gaussians, scene.cameras, scores >= 0.4, scores, threshold=0.4)
+    assert len(chosen.instances) == 3
+    kept = chosen.convincing()
+    assert torch.equal(kept.mask, (labels == 0) | (labels == 2))
+    assert kept.convincing().count == kept.count
+    alone = Selection(scene.gaussians, scene.cameras, labels == 1, scores, threshold=0.4)
+    assert alone.convincing().count == 200, "the best one is never left out"
+
+
 def test_operators_are_those_of_sets(scene):
     rng = np.random.default_rng(0)
     a, b = (rng.random(len(scene.labels)) < 0.4 for _ in range(2))

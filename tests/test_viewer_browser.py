@@ -1,6 +1,7 @@
 """The viewer in a real browser: headless Chromium with software WebGL, on balls whose places are known."""
 
 import io
+import itertools
 import shutil
 import time
 
@@ -12,6 +13,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from viewer_scene import WORDS, ball_scene
 
 from lexsplat.rendering import render
+from lexsplat.viewer import panels
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -229,3 +231,47 @@ def test_a_screenshot_is_downloaded_and_shows_the_scene(page, viewer, tmp_path):
     shown = sum(where_is(viewer, ball, picture.shape) for ball in range(5))
     assert np.ptp(picture[shown < 0.01].reshape(-1, 3), axis=0).max() < 10  # the ground, without cameras
     assert np.abs(picture[shown > 0.95] - picture[shown < 0.01][0]).max(-1).min() > 25
+
+
+def test_a_click_on_a_camera_in_the_scene_goes_there(page, viewer):
+    from lexsplat.cameras import Camera
+
+    clear(page, viewer)
+    view = viewer.session.scene.views["view1"].camera
+    viewmat = view.viewmat.copy()
+    viewmat[2, 3] += 0.8  # a step back: the camera then stands in the middle of the picture
+    behind = Camera(view.width, view.height, view.K, viewmat)
+    viewer.display.jump(client(viewer), behind)
+    until(lambda: np.allclose(client(viewer).camera.position, behind.position, atol=1e-3))
+    page.get_by_role("tab", name="Cameras").click()
+    page.get_by_label("Show cameras").check()
+    until(lambda: viewer.display._frustums[0].visible)
+    asked = viewer.session.clicked
+    box = canvas(page)
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    settled(page, viewer)
+    page.mouse.move(middle[0] - 3, middle[1])
+    page.mouse.move(*middle)
+    page.wait_for_timeout(300)
+    page.mouse.click(*middle, delay=80)
+    until(lambda: np.allclose(client(viewer).camera.position, view.position, atol=1e-3), seconds=30)
+    assert viewer.session.clicked is asked, "what stands behind the camera was not asked about"
+    page.get_by_label("Show cameras").uncheck()
+    until(lambda: not viewer.display._frustums[0].visible)
+
+
+def test_an_orbit_video_is_downloaded_and_shows_every_frame(page, viewer, tmp_path, monkeypatch):
+    av = pytest.importorskip("av")
+    monkeypatch.setitem(panels._ORBIT, "frames", 8)
+    monkeypatch.setitem(panels._ORBIT, "height", 120)
+    clear(page, viewer)
+    page.get_by_role("tab", name="Save").click()
+    with page.expect_download(timeout=120_000) as started:
+        page.get_by_role("button", name="Orbit video").click()
+    started.value.save_as(tmp_path / "orbit.mp4")
+    assert started.value.suggested_filename == "orbit.mp4"
+    with av.open(str(tmp_path / "orbit.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in video.decode(video=0)]
+    assert len(frames) == 8
+    assert {frame.shape[0] for frame in frames} == {120}
+    assert all(np.abs(a - b).max() > 30 for a, b in itertools.pairwise(frames)), "the camera moves"

@@ -15,7 +15,9 @@ pytest.importorskip("viser")
 
 @pytest.fixture(scope="module")
 def viewer():
-    running = ViewerServer(ball_scene(per_ball=60)[0], ViewerConfig(port=0))
+    scene, truth = ball_scene(per_ball=60)
+    running = ViewerServer(scene, ViewerConfig(port=0))
+    running.truth = truth
     yield running
     running.stop()
 
@@ -105,6 +107,24 @@ def test_asking_reaches_session_and_panels(viewer):
     assert viewer.panels.seconds["ask"] > 0
     viewer.panels._remove("Remove all")
     assert viewer.session.all_questions() == []
+
+
+def test_words_that_a_user_writes_are_what_a_click_is_answered_with(viewer):
+    before = viewer.session.memory.vocabulary
+    viewer.panels._vocabulary.value = "ball 3,  a spoon\nball 3, ball 1"
+    viewer.panels._change_vocabulary()
+    assert viewer.session.memory.vocabulary == ["ball 3", "a spoon", "ball 1"]
+    assert viewer.panels._vocabulary.value == "ball 3, a spoon, ball 1"
+    view = viewer.session.scene.views["view0"].camera
+    labels = viewer.truth.labels
+    place = view.K @ (view.viewmat[:3, :3] @ viewer.truth.gaussians.means[labels == 3].numpy().mean(0)
+                      + view.viewmat[:3, 3])  # fmt: skip
+    viewer.panels._what_is(view, *(place[:2] / place[2]))
+    found = viewer.panels._answer.content
+    assert "ball 3" in found or "ball 1" in found  # a ball may stand before it
+    assert "ball 0" not in found, "what is not in the list is not an answer"
+    viewer.session.memory.set_vocabulary(before)
+    viewer.panels._remove("Remove all")
 
 
 def test_what_goes_wrong_is_told_on_the_page(viewer):

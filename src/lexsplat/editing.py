@@ -156,6 +156,44 @@ def recoloured(gaussians: Gaussians, color: Sequence[float], strength: float) ->
     return replace(gaussians, sh0=sh0, shN=gaussians.shN * (1 - strength))
 
 
+@dataclass(frozen=True)
+class Motion:
+    """How a selection moves: x -> scale R (x - center) + center + translation.
+
+    Args:
+        translation: Shift ``[3]``, world units.
+        rotation: R ``[3, 3]``, a proper rotation; none does not turn.
+        scale: Factor on sizes, positive.
+        center: Fixed point of turning and scaling ``[3]``; none takes the middle of the selection's box.
+    """
+
+    translation: Sequence[float] = (0.0, 0.0, 0.0)
+    rotation: NDArray[np.float64] | None = None
+    scale: float = 1.0
+    center: Sequence[float] | None = None
+
+    def values(self, chosen: Selection) -> dict[str, Any]:
+        """The numbers of a `Step` that moves ``chosen``; they are tried out first.
+
+        Raises:
+            ValueError: If the rotation is none or the scale is not positive.
+        """
+        middle = np.zeros(3)
+        if self.center is not None:
+            middle = np.asarray(self.center, float)
+        elif chosen:
+            middle = chosen.center
+        turn = np.eye(3) if self.rotation is None else np.asarray(self.rotation, float)
+        shift = np.asarray(self.translation, float)
+        moved(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
+        return {
+            "rotation": turn.tolist(),
+            "scale": float(self.scale),
+            "translation": shift.tolist(),
+            "center": middle.tolist(),
+        }
+
+
 class Editor:
     """A scene under edit.
 
@@ -204,29 +242,21 @@ class Editor:
         recoloured(chosen.selected, color, strength)  # raises before the journal knows
         self._do("recolour", chosen, color=[float(c) for c in color], strength=float(strength))
 
-    def move(
-        self,
-        chosen: Selection,
-        *,
-        translation: Sequence[float] = (0.0, 0.0, 0.0),
-        rotation: NDArray[np.float64] | None = None,
-        scale: float = 1.0,
-        center: Sequence[float] | None = None,
-    ) -> None:
-        """Shift, turn and scale a selection about its middle (or ``center``); see `lexsplat.moving.moved`."""
-        self._do("move", chosen, **_motion(chosen, translation, rotation, scale, center))
+    def move(self, chosen: Selection, motion: Motion) -> None:
+        """Shift, turn and scale a selection.
 
-    def duplicate(
-        self,
-        chosen: Selection,
-        *,
-        translation: Sequence[float] = (0.0, 0.0, 0.0),
-        rotation: NDArray[np.float64] | None = None,
-        scale: float = 1.0,
-        center: Sequence[float] | None = None,
-    ) -> None:
-        """Add a copy of a selection, moved as `move` does."""
-        self._do("duplicate", chosen, **_motion(chosen, translation, rotation, scale, center))
+        Raises:
+            ValueError: If the motion is none (see `lexsplat.moving.moved`).
+        """
+        self._do("move", chosen, **motion.values(chosen))
+
+    def duplicate(self, chosen: Selection, motion: Motion) -> None:
+        """Add a copy of a selection, moved as `move` does.
+
+        Raises:
+            ValueError: If the motion is none (see `lexsplat.moving.moved`).
+        """
+        self._do("duplicate", chosen, **motion.values(chosen))
 
     def undo(self) -> bool:
         """Take the last step back; False if there is none."""
@@ -362,23 +392,3 @@ class Editor:
                 found="edits of another one",
                 remedy="the scene was built again: discard the edits",
             )
-
-
-def _motion(
-    chosen: Selection,
-    translation: Sequence[float],
-    rotation: NDArray[np.float64] | None,
-    scale: float,
-    center: Sequence[float] | None,
-) -> dict[str, Any]:
-    middle = np.asarray(chosen.center if center is None and chosen else center or (0, 0, 0), float)
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    moved(
-        chosen.selected, rotation=turn, scale=scale, translation=np.asarray(translation, float), center=middle
-    )
-    return {
-        "rotation": turn.tolist(),
-        "scale": float(scale),
-        "translation": [float(v) for v in translation],
-        "center": middle.tolist(),
-    }

@@ -7,14 +7,14 @@ apple and banana             both; also "or"
 fruit but not the banana     without; also "without", "except", "minus"
 largest book                 of several; also "biggest", "smallest"
 mug nearest to the lamp      also "closest to"
-how many apples              as "apples"; the answer has the count
+how many apples              as "apple"; the answer has the count
 "something on wheels"        in quotation marks: one thing, whatever words it has
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Union
 
 from lexsplat.errors import QueryError
@@ -46,6 +46,15 @@ _COUNT = re.compile(r"^(?:how many|count|number of)\s+")
 _EXCEPT = re.compile(r"\s(?:but not|without|except for|except|minus)\s")
 _BOTH = re.compile(r"\s(?:and|or)\s|\s*,\s*")
 _PICK = re.compile(r"^(largest|biggest|smallest)\s+")
+
+_PLURALS = tuple(
+    (re.compile(ending), instead)
+    for ending, instead in (
+        (r"(\w{2})ies$", r"\1y"),  # berries
+        (r"(\w(?:ss|x|z|ch|sh))es$", r"\1"),  # boxes, glasses, brushes
+        (r"(\w{2}[^su\Wi])s$", r"\1"),  # apples; not glass, bus, tennis
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -119,8 +128,34 @@ def parse(text: str) -> Phrase:
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text)
     words = " ".join(hidden.split()).rstrip("?.!").strip()
-    words = _COUNT.sub("", words[:1].lower() + words[1:])
-    return _parse(words, quoted, text)
+    words = words[:1].lower() + words[1:]
+    if (counted := _COUNT.sub("", words)) == words:
+        return _parse(words, quoted, text)
+    return _each(_parse(counted, quoted, text), keep=bool(quoted))
+
+
+def _each(phrase: Phrase, keep: bool) -> Phrase:
+    """A counted phrase in the singular: an encoder is asked for one of what is counted. Quoted words stay."""
+    if keep:
+        return phrase
+    if isinstance(phrase, Thing):
+        head, of, rest = phrase.text.partition(" of ")
+        return Thing(_singular(head) + of + rest)
+    if isinstance(phrase, Related):
+        return replace(phrase, target=_each(phrase.target, keep))
+    if isinstance(phrase, Both):
+        return Both(_each(phrase.first, keep), _each(phrase.second, keep))
+    if isinstance(phrase, Except):
+        return replace(phrase, first=_each(phrase.first, keep))
+    return phrase
+
+
+def _singular(words: str) -> str:
+    """The last word without its plural's ending, by the rules of English spelling; irregular ones stay."""
+    for ending, instead in _PLURALS:
+        if (shorter := ending.sub(instead, words)) != words:
+            return shorter
+    return words
 
 
 def _parse(words: str, quoted: list[str], whole: str) -> Phrase:

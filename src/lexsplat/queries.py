@@ -360,14 +360,14 @@ def automatic_threshold(
     *,
     tempering: float = 0.5,
     min_contrast: float = 0.05,
-    pull: float = 0.5,
+    pull: float = 1.0,
 ) -> Tensor:
     """A threshold for each prompt from relevancies all over the scene; it never sees the truth.
 
     Otsu's method on a histogram whose counts are raised to ``tempering``. Otsu wants classes of like size and
     splits the background when an object covers a percent of the scene; the square root lets the object count
     (1 is plain Otsu). Where a gap separates the classes, the middle of the gap is taken. If the means of the two
-    classes lie on either side of 0.5, where relevancy itself puts the border, the cut is moved halfway there.
+    classes lie on either side of 0.5, where relevancy itself puts the border, the cut is moved there.
 
     Where something is over 0.5, the class above the cut has to be so on average, too: otherwise the cut has parted
     what is a little like the prompt from what is not like it at all (half of a bear, asked for its nose), and what

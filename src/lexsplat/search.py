@@ -163,7 +163,8 @@ class SearchableScene:
 
         Args:
             phrase: What to look for.
-            threshold: Score from which a Gaussian belongs to it; none chooses one from the scene.
+            threshold: Score from which a Gaussian belongs to it; none chooses one from the scene, and leaves out
+                instances that answer far worse than the best one (`Selection.convincing`).
 
         Raises:
             QueryError: If the phrase is empty.
@@ -175,7 +176,8 @@ class SearchableScene:
         chosen = Selection(
             self.gaussians, self.cameras, scores >= limit, scores, limit, present, phrase, self.world
         )
-        return chosen.without_specks()
+        chosen = chosen.without_specks()
+        return chosen.convincing() if threshold is None else chosen
 
     @property
     def presence_judge(self) -> PresenceJudge:

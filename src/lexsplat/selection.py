@@ -33,6 +33,11 @@ _LINK = 2.5
 """Gaussians of one instance are at most this many times the usual distance to the sixth neighbour apart."""
 _SMALLEST_SHARE = 0.1
 """A cluster with less than this share of the largest one's opacity is not an instance."""
+_CONVINCING = 0.65
+"""An instance counts from this share of the best one's height above the threshold. Chosen on the second demo scene:
+of 14 wrong instances of 34 prompts the best has 0.60; of the right ones one ("something made of metal") has 0.43, all
+others 1."""
+_PEAK_COUNT = 20
 _FAINT = 0.1
 """Gaussians fainter than this join clusters but do not hold them together."""
 
@@ -204,6 +209,25 @@ class Selection:
         mask = torch.zeros_like(self.mask)
         for instance in self.instances:
             mask |= instance.mask
+        return replace(self, mask=mask)
+
+    def convincing(self) -> Selection:
+        """Only instances that answer about as well as the best one does.
+
+        Asked for an apple, a threshold that the apple's rim calls for is passed by a duck's back as well; but the
+        duck peaks far below the apple. Two apples peak alike.
+        """
+        if len(self.instances) < 2:
+            return self
+        peaks = [
+            float(one.scores[one.mask].topk(min(_PEAK_COUNT, one.count)).values.mean())
+            for one in self.instances
+        ]
+        limit = self.threshold + _CONVINCING * (max(peaks) - self.threshold)
+        mask = torch.zeros_like(self.mask)
+        for peak, instance in zip(peaks, self.instances):
+            if peak >= limit:
+                mask |= instance.mask
         return replace(self, mask=mask)
 
     def within(self, mask: Tensor) -> Selection:

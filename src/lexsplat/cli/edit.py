@@ -89,6 +89,7 @@ class Edit:
 
     def _change(self, editor: Editor) -> None:
         from lexsplat.boxes import rotation_about
+        from lexsplat.editing import Motion
 
         chosen = editor.scene.find(self.select or "", threshold=self.threshold)
         chosen = chosen.largest() if self.largest else chosen
@@ -98,6 +99,6 @@ class Edit:
             editor.recolour(chosen, self.color, self.strength)
         elif self.action in ("move", "duplicate"):
             turn = rotation_about(chosen.up.direction, self.turn)
-            getattr(editor, self.action)(chosen, translation=self.by, rotation=turn, scale=self.scale)
+            getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
         else:
             getattr(editor, self.action)(chosen)

@@ -53,24 +53,8 @@ def write_glb(
     if not all(bool(torch.isfinite(tensor).all()) for tensor in g.tensors().values()):
         raise ValueError("a Gaussian has a value that is not finite")
     buffer = _Buffer()
-    color = torch.cat([g.sh0[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], 1).clamp(0, 1)
-    quats = torch.nn.functional.normalize(g.quats, dim=1)[:, [1, 2, 3, 0]]
-    attributes = {
-        "POSITION": buffer.add(g.means, bounds=True),
-        "COLOR_0": buffer.add((color * 255).round().to(torch.uint8), normalized=True),
-        f"{EXTENSION}:ROTATION": buffer.add(quats),
-        f"{EXTENSION}:SCALE": buffer.add(g.scales),
-        f"{EXTENSION}:OPACITY": buffer.add(g.opacities[:, None]),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": buffer.add(g.sh0[:, 0]),
-    }
-    start = 0
-    for degree in range(1, min(g.sh_degree, 3) + 1):
-        for number in range(2 * degree + 1):
-            name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"
-            attributes[name] = buffer.add(g.shN[:, start + number])
-        start += 2 * degree + 1
     primitive: dict[str, Any] = {
-        "attributes": attributes,
+        "attributes": _splat_attributes(g, buffer),
         "mode": 0,
         "extensions": {
             EXTENSION: {
@@ -81,35 +65,69 @@ def write_glb(
             }
         },
     }
+    own: dict[str, Any] = {}
     if language is not None:
-        attributes["_LANGUAGE_CODES"] = buffer.add(language.codes)
-        attributes["_LANGUAGE_WEIGHTS"] = buffer.add(language.weights)
-        attributes["_LANGUAGE_UNCERTAINTY"] = buffer.add(language.uncertainties[:, None])
-        primitive["extras"] = {
-            "lexsplat": {
-                "codebook": buffer.add(language.codewords.reshape(-1, 1), vertices=False),
-                "codebookShape": list(language.codewords.shape),
-                "encoder": dict(language.encoder),
-            }
-        }
+        attributes, own = _language_attributes(language, buffer)
+        primitive["attributes"] |= attributes
     if g.antialiased:
-        primitive.setdefault("extras", {}).setdefault("lexsplat", {})["antialiased"] = True
-    up = np.array([0.0, 0.0, 1.0]) if world is None else world.up.direction
-    node: dict[str, Any] = {"mesh": 0, "rotation": _upright(up)}
-    if world is not None and world.metres_per_unit is not None:
-        node["scale"] = [world.metres_per_unit] * 3
+        own["antialiased"] = True
+    if own:
+        primitive["extras"] = {"lexsplat": own}
     document = {
         "asset": {"version": "2.0", "generator": "lexsplat"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
+        "nodes": [_node(world)],
         "meshes": [{"primitives": [primitive]}],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": buffer.length}],
     }
     path.write_bytes(_container(document, buffer.chunks))
+
+
+def _splat_attributes(g: Gaussians, buffer: _Buffer) -> dict[str, int]:
+    """The attributes of ``KHR_gaussian_splatting``: accessors by name, their values put into the buffer."""
+    color = torch.cat([g.sh0[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], 1).clamp(0, 1)
+    attributes = {
+        "POSITION": buffer.add(g.means, bounds=True),
+        "COLOR_0": buffer.add((color * 255).round().to(torch.uint8), normalized=True),
+        f"{EXTENSION}:ROTATION": buffer.add(torch.nn.functional.normalize(g.quats, dim=1)[:, [1, 2, 3, 0]]),
+        f"{EXTENSION}:SCALE": buffer.add(g.scales),
+        f"{EXTENSION}:OPACITY": buffer.add(g.opacities[:, None]),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": buffer.add(g.sh0[:, 0]),
+    }
+    start = 0
+    for degree in range(1, min(g.sh_degree, 3) + 1):
+        for number in range(2 * degree + 1):
+            name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"
+            attributes[name] = buffer.add(g.shN[:, start + number])
+        start += 2 * degree + 1
+    return attributes
+
+
+def _language_attributes(language: StoredLanguage, buffer: _Buffer) -> tuple[dict[str, int], dict[str, Any]]:
+    """The application attributes of the language, and what ``extras.lexsplat`` says of them."""
+    attributes = {
+        "_LANGUAGE_CODES": buffer.add(language.codes),
+        "_LANGUAGE_WEIGHTS": buffer.add(language.weights),
+        "_LANGUAGE_UNCERTAINTY": buffer.add(language.uncertainties[:, None]),
+    }
+    return attributes, {
+        "codebook": buffer.add(language.codewords.reshape(-1, 1), vertices=False),
+        "codebookShape": list(language.codewords.shape),
+        "encoder": dict(language.encoder),
+    }
+
+
+def _node(world: World | None) -> dict[str, Any]:
+    """The node that turns the scene upright, and scales it to metres where they are known."""
+    up = np.array([0.0, 0.0, 1.0]) if world is None else world.up.direction
+    node: dict[str, Any] = {"mesh": 0, "rotation": _upright(up)}
+    if world is not None and world.metres_per_unit is not None:
+        node["scale"] = [world.metres_per_unit] * 3
+    return node
 
 
 class _Buffer:

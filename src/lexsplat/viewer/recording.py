@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -90,18 +89,18 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = 20) -> tuple[str, bytes]:
-    """Frames ``[H, W, 3]`` as an MP4 where there is an ffmpeg, else as a GIF: suffix and content.
+    """Frames ``[H, W, 3]`` as a file: its suffix and content.
+
+    It is an MP4 where PyAV is installed (``lexsplat[video]``), else a GIF. An MP4 has even sizes: a last odd row or
+    column is left out.
 
     Raises:
         ValueError: If there is no frame.
     """
     if not frames:
         raise ValueError("a video needs at least one frame")
-    program = ffmpeg()
-    if program is not None:
-        content = _mp4(program, frames, fps)
-        if content is not None:
-            return ".mp4", content
+    if importlib.util.find_spec("av") is not None:
+        return ".mp4", _mp4(frames, fps)
     pictures = [Image.fromarray(frame[..., :3]).quantize(128) for frame in frames]
     stream = io.BytesIO()
     pictures[0].save(
@@ -110,24 +109,19 @@ def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = 20) -> tuple[st
     return ".gif", stream.getvalue()
 
 
-def ffmpeg() -> str | None:
-    """The ffmpeg program: the one of the package imageio-ffmpeg, or one on the path."""
-    try:
-        import imageio_ffmpeg
+def _mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
+    """H.264, or MPEG-4 where FFmpeg was built without it; the index comes first, so that browsers play it at once."""
+    import av
 
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError):
-        return shutil.which("ffmpeg")
-
-
-def _mp4(program: str, frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes | None:
-    height, width = (size // 2 * 2 for size in frames[0].shape[:2])  # H.264 wants even sizes
-    raw = b"".join(np.ascontiguousarray(frame[:height, :width, :3]).tobytes() for frame in frames)
+    h264 = "libx264" in av.codecs_available
+    height, width = (size // 2 * 2 for size in frames[0].shape[:2])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "orbit.mp4"
-        command = [
-            program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-            "-r", str(fps), "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path),
-        ]  # fmt: skip
-        done = subprocess.run(command, input=raw, capture_output=True, timeout=600, check=False)
-        return path.read_bytes() if done.returncode == 0 and path.is_file() else None
+        with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+            stream = container.add_stream("libx264", fps) if h264 else container.add_stream("mpeg4", fps)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            for frame in frames:
+                picture = np.ascontiguousarray(frame[:height, :width, :3])
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode(None))
+        return path.read_bytes()

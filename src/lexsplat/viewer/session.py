@@ -22,7 +22,8 @@ from lexsplat.exporting import export_gaussians
 from lexsplat.heatmaps import overlay_mask
 from lexsplat.phrases import Thing, parse
 from lexsplat.picking import select_hit, surface_at
-from lexsplat.queries import check_prompts, probability_relevancy
+from lexsplat.presence import REFERENCE_PHRASES, PresenceJudge
+from lexsplat.queries import BORDER, check_prompts, probability_relevancy
 from lexsplat.rendering import render
 from lexsplat.search import SearchableScene
 from lexsplat.selection import Selection
@@ -92,6 +93,7 @@ class Session:
         self.clicked: Question | None = None
         self.current: Question | None = None
         self._encoding = threading.Lock()
+        self._judge: PresenceJudge | None = None
         self._opacities = scene.gaussians.opacities.detach().cpu().numpy()
 
     def warm_up(self) -> None:
@@ -105,6 +107,10 @@ class Session:
         for phrase in [*self.scene.query.negatives, *self.memory.vocabulary]:
             with self._encoding:  # phrase by phrase: a question that comes meanwhile need not wait for all
                 self.scene.embed([phrase])
+        for phrase in REFERENCE_PHRASES:
+            with self._encoding:
+                self.scene.embed([phrase])
+        self._judge = self.scene.presence_judge
 
     # -- questions
 
@@ -123,7 +129,7 @@ class Session:
             with self._encoding:
                 self.scene.embed([text])
             scores = self.scene.scores([text])[0].cpu().numpy()
-            layer = Layer(text, scores, quick_threshold(scores, self._opacities), self._free_color())
+            layer = Layer(text, scores, self._quick_threshold(scores), self._free_color())
             question = Question(layer)
             self.questions = [*self.questions[-(MAX_QUESTIONS - 1) :], question]
         self.current, self.mode = question, "relevancy"
@@ -152,7 +158,9 @@ class Session:
         if is_plain(question.text):
             if question.automatic is None:
                 question.automatic = float(self.scene.thresholds([question.text])[0])
-            selection = self.scene.select(question.text, question.automatic if manual is None else manual)
+            limit = question.automatic if manual is None else manual
+            selection = self.scene.select(question.text, limit)
+            selection = selection.convincing() if manual is None else selection
         else:
             selection = self.scene.find(question.text, viewpoint, threshold=manual)
             if manual is None:
@@ -178,7 +186,7 @@ class Session:
         elif question.automatic is not None:
             question.layer.threshold = question.automatic
         else:
-            question.layer.threshold = quick_threshold(question.layer.scores, self._opacities)
+            question.layer.threshold = self._quick_threshold(question.layer.scores)
 
     def remove(self, question: Question) -> None:
         """Show a prompt no longer."""
@@ -188,6 +196,13 @@ class Session:
         if question is self.current:
             shown = self.all_questions()
             self.current = shown[-1] if shown else None
+
+    def _quick_threshold(self, scores: NDArray[np.float32]) -> float:
+        """A provisional threshold in milliseconds: 0.5 for what is not there, as the scene's own will be."""
+        judge = self._judge  # none until `warm_up` has read its reference phrases
+        if judge is not None and judge.judge(torch.from_numpy(scores)) == "no":
+            return BORDER
+        return quick_threshold(scores, self._opacities)
 
     def _free_color(self) -> tuple[int, int, int]:
         used = {question.layer.color for question in self.questions[-(MAX_QUESTIONS - 1) :]}
@@ -292,8 +307,11 @@ class Session:
 
 
 def is_plain(phrase: str) -> bool:
-    """Whether a phrase has no parts for `lexsplat.phrases`; "something to sit on" has none, whatever it ends in."""
+    """Whether a phrase is a thing by itself; "something to sit on" is one, whatever it ends in.
+
+    Phrases with parts, articles or counts ("how many mugs") are for `lexsplat.phrases`.
+    """
     try:
-        return isinstance(parse(phrase), Thing)
+        return parse(phrase) == Thing(phrase)
     except QueryError:
         return True
