@@ -95,7 +95,7 @@ class Calibration:
         return "yes" if probability >= self.yes else "no" if probability <= self.no else "unsure"
 
 
-CALIBRATION = Calibration(bias=-0.816, height=0.0, rank=0.24, yes=0.504, no=0.504, peak=2.731)
+CALIBRATION = Calibration(bias=-1.581, height=0.0, rank=0.123, yes=0.512, no=0.512, peak=3.874)
 
 
 class PresenceJudge:

@@ -52,7 +52,10 @@ def train(options: argparse.Namespace) -> None:
         if model == "clip":
             for phase in options.phases:
                 start = None if phase == "first" else folder
-                run_workers(train_clip, options.threads, *frames.values(), folder, PHASES[phase], log, start)
+                settings = PHASES[phase]
+                run_workers(
+                    train_clip, options.threads, *frames.values(), folder, settings, log, phase, start
+                )
         else:
             dense = DinoTraining(steps=options.dino_steps)
             run_workers(train_dino, options.threads, frames["train"], frames["seen"], folder, dense, log)

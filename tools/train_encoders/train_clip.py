@@ -539,6 +539,7 @@ def train_clip(
     folder: Path,
     config: ClipTraining,
     log: Path,
+    phase: str,
     start: Path | None = None,
 ) -> None:
     """The work of one process; the first also saves the averaged model, and its scores as lines of JSON.
@@ -551,6 +552,7 @@ def train_clip(
         folder: Where the model goes.
         config: Settings.
         log: File that gets a line of scores now and then.
+        phase: Its name in the log.
         start: Folder of a model to go on from; none: from nothing, tokenizer and all.
     """
     if rank == 0 and start is None:
@@ -572,6 +574,7 @@ def train_clip(
         if step % every == 0 or step == config.steps:
             save(trainer, folder)
             scores = {
+                "phase": phase,
                 "step": step,
                 "seconds": round(time.perf_counter() - began),
                 **examination.scores(trainer),
