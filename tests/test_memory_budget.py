@@ -127,7 +127,7 @@ LIBRARIES = 320 * MEGABYTE
 """Address space that linear algebra libraries and stacks of threads reserve, most of it never touched."""
 
 SLACK = 32 * MEGABYTE
-"""What may be resident beyond the numbers of `lexsplat.budget`: heaps that are not given back, code that is loaded."""
+"""What may be resident beyond the numbers of `lexsplat.budget`: heaps not given back, code that is loaded."""
 
 
 @pytest.fixture(scope="module")
