@@ -296,8 +296,11 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
             remedy="run the build again to finish it",
         )
     place = choose_device(device)
-    gaussians = folder.read_gaussians()
+    cameras, gaussians = folder.read_cameras(), folder.read_gaussians()
     tensors, metadata = read_tensors(folder.language_path)
+    # A build takes a stage out of the record before it touches its files: what was read is of one build if the record
+    # is still the same.
+    changed = SceneFolder.open(Path(path)).record["stages"] != folder.record["stages"]
     try:
         field = field_from_tensors({name: tensor.to(place) for name, tensor in tensors.items()}, metadata)
     except ValueError as error:
@@ -308,15 +311,15 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
             remedy="run the build again",
         ) from error
     made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
-    if metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
+    if changed or metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
         raise SceneFolderError(
             path,
             expected="language made for these Gaussians",
-            found="language of an earlier reconstruction",
+            found="files that change" if changed else "language of an earlier reconstruction",
             remedy="the scene is being rebuilt or was left half way: run the build again",
         )
     config = folder.record.get("config", {})
     return SearchableScene(
-        gaussians.to(place), field, folder.read_cameras(), clip or config.get("clip", "embedded"),
+        gaussians.to(place), field, cameras, clip or config.get("clip", "embedded"),
         folder=folder,
     )  # fmt: skip

@@ -24,6 +24,9 @@ from lexsplat.threads import one_thread
 if TYPE_CHECKING:
     from lexsplat.features import FeatureMap
 
+_SMALL_BLOCK = 1024
+"""Features at a time where several copies of them are made."""
+
 
 @one_thread()
 def fit_codebook(
@@ -89,8 +92,8 @@ def fit_codebook(
 def mean_cosine(codebook: Codebook, clip: Tensor, dino: Tensor | None) -> float:
     """Mean CLIP cosine between features ``[M, Dc]`` and the codes they are assigned to."""
     kept = 0.0
-    for start in range(0, len(clip), BLOCK_ROWS):
-        rows = slice(start, start + BLOCK_ROWS)
+    for start in range(0, len(clip), _SMALL_BLOCK):
+        rows = slice(start, start + _SMALL_BLOCK)
         chosen = codebook.similarity(clip[rows], None if dino is None else dino[rows]).argmax(-1)
         kept += float(functional.cosine_similarity(clip[rows], codebook.clip[chosen], dim=-1).sum())
     return kept / len(clip)
@@ -233,7 +236,7 @@ def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> 
     """k-means++: the next seed is drawn in proportion to the squared distance from the seeds so far."""
     count = len(joint)
     seeds = [int(torch.randint(count, (1,), generator=generator))]
-    blocks = (joint[i : i + BLOCK_ROWS] for i in range(0, count, BLOCK_ROWS))
+    blocks = (joint[i : i + _SMALL_BLOCK] for i in range(0, count, _SMALL_BLOCK))
     norms = torch.cat([block.square().sum(-1) for block in blocks])
     nearest = torch.full((count,), torch.inf, device=joint.device)
     for _ in range(1, num_codes):
