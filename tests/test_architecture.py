@@ -15,7 +15,7 @@ ORDER = """
     scenes gaussians rendering moving image_losses training_images optimizers exposures densification
     reconstruction features codebook language_field losses embedding joint lifting masking queries
     selection presence truth picking phrases relations heatmaps baselines evaluation report formats
-    scene_folder config captures search scaling editing exporting pipeline experiments ablation
+    scene_folder previous_scene config captures search scaling editing exporting pipeline experiments ablation
     comparison answers viewer demo progress_bars cli __init__
 """.split()  # noqa: SIM905  (thirty quoted names would not read as a list)
 

@@ -18,6 +18,7 @@ from lexsplat.evaluation import PROTOCOLS, EvaluationConfig, evaluate
 from lexsplat.heatmaps import overlay_heatmap
 from lexsplat.phrases import parse
 from lexsplat.pipeline import machine_facts
+from lexsplat.previous_scene import require_current
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import check_prompts
 from lexsplat.report import Gallery, table_rows, write_report, write_rows
@@ -218,6 +219,7 @@ def evaluate_scene(
     if scene.folder is None:
         raise ValueError("only a scene opened from a folder can be evaluated")
     folder, record = scene.folder, scene.folder.record
+    require_current(folder)
     if folder.is_shipped:
         raise SceneFolderError(
             "demo",

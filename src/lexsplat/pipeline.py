@@ -35,6 +35,7 @@ from lexsplat.joint import JointTrainer
 from lexsplat.language_field import LanguageField
 from lexsplat.lifting import lift, tune
 from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
+from lexsplat.previous_scene import drop_previous, keep_previous
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
@@ -149,6 +150,10 @@ class _Builder:
         for name in order[: order.index(until) + 1]:
             inputs, work, outputs = stages[name]
             self._run_stage(name, inputs, work, outputs)
+        if until == "embed":
+            self.folder.record.pop("building", None)
+            self.folder.save()
+            drop_previous(self.folder)
         return self.folder
 
     def _run_stage(
@@ -303,6 +308,8 @@ class _Builder:
         masks = {
             n: _file_hash(v.ignore_path) for n, v in self.scene.views.items() if v.ignore_path is not None
         }
+        keep_previous(self.folder)
+        self.folder.save()
         self.folder.write_cameras(views)
         self._write_world({name: camera for name, (camera, _) in views.items()})
         if "images" not in self.folder.record:

@@ -170,13 +170,15 @@ class SceneFolder:
 
     Args:
         root: The folder.
+        content: Where record, cameras, Gaussians and language lie, if not there (`lexsplat.previous_scene`).
 
     Raises:
         SceneFolderError: If there is a ``scene.json`` of another format version.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, content: Path | None = None) -> None:
         self.root = Path(root)
+        self.content = self.root if content is None else content
         self.record: dict[str, Any] = {"format_version": FORMAT_VERSION, "stages": {}}
         if self._record_path.exists():
             self.record = _checked_record(read_json(self._record_path), self._record_path)
@@ -207,17 +209,17 @@ class SceneFolder:
 
     @property
     def _record_path(self) -> Path:
-        return self.root / "scene.json"
+        return self.content / "scene.json"
 
     @property
     def gaussians_path(self) -> Path:
         """``gaussians.ply``."""
-        return self.root / "gaussians.ply"
+        return self.content / "gaussians.ply"
 
     @property
     def language_path(self) -> Path:
         """``language.safetensors``."""
-        return self.root / "language.safetensors"
+        return self.content / "language.safetensors"
 
     @property
     def codebook_path(self) -> Path:
@@ -315,7 +317,7 @@ class SceneFolder:
         Raises:
             FileFormatError: If ``cameras.json`` is missing or malformed.
         """
-        path = self.root / "cameras.json"
+        path = self.content / "cameras.json"
         content = read_json(path)
         try:
             views = [_stored_view(entry, path) for entry in content["views"]]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -23,6 +23,7 @@ from lexsplat.language_field import LanguageField, field_from_tensors
 from lexsplat.phrases import parse
 from lexsplat.picking import select_hit, surface_at
 from lexsplat.presence import REFERENCE_PHRASES, PresenceJudge, found_thresholds
+from lexsplat.previous_scene import previous_of
 from lexsplat.queries import (
     CANONICAL_PHRASES,
     QueryConfig,
@@ -286,23 +287,63 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     """
     from lexsplat.config import choose_device
 
-    folder = SceneFolder.open(Path(path))
+    place = choose_device(device)
+    folder, cameras, gaussians, field = _read_whole(Path(path), place)
+    clip = clip or folder.record.get("config", {}).get("clip", "embedded")
+    return SearchableScene(gaussians, field, cameras, clip, folder=folder)
+
+
+_Content = tuple[SceneFolder, dict[str, StoredView], Gaussians, LanguageField]
+_ATTEMPTS = 5
+"""A build may end, and the next begin, while a scene is read; more often than this it is no coincidence."""
+
+
+def _read_whole(path: Path, device: str) -> _Content:
+    """The scene in a folder, or while that is built again, the scene before.
+
+    Raises:
+        SceneFolderError: If there is neither.
+        FileFormatError: If a file is damaged.
+    """
+    attempts = 0
+    while True:
+        folder = SceneFolder.open(path)
+        attempts += 1
+        try:
+            kept = previous_of(folder) if folder.record.get("building") else None
+            return _read_content(kept or folder, device)
+        except (SceneFolderError, FileFormatError):
+            if attempts == _ATTEMPTS or _state(SceneFolder.open(path)) == _state(folder):
+                raise
+
+
+def _state(folder: SceneFolder) -> tuple[Any, Any]:
+    """What a build changes in the record before it touches a file."""
+    return folder.record["stages"], folder.record.get("building")
+
+
+def _read_content(folder: SceneFolder, device: str) -> _Content:
+    """One version of a scene.
+
+    Raises:
+        SceneFolderError: If it is not whole.
+        FileFormatError: If a file is damaged.
+    """
     if "embed" not in folder.record["stages"] or not folder.language_path.exists():
         finished = ", ".join(folder.record["stages"]) or "none"
         raise SceneFolderError(
-            path,
+            folder.root,
             expected="a scene with language",
             found=f"finished stages: {finished}",
             remedy="run the build again to finish it",
         )
-    place = choose_device(device)
     cameras, gaussians = folder.read_cameras(), folder.read_gaussians()
     tensors, metadata = read_tensors(folder.language_path)
     # A build takes a stage out of the record before it touches its files: what was read is of one build if the record
     # is still the same.
-    changed = SceneFolder.open(Path(path)).record["stages"] != folder.record["stages"]
+    changed = _state(SceneFolder(folder.root, folder.content)) != _state(folder)
     try:
-        field = field_from_tensors({name: tensor.to(place) for name, tensor in tensors.items()}, metadata)
+        field = field_from_tensors({name: tensor.to(device) for name, tensor in tensors.items()}, metadata)
     except ValueError as error:
         raise FileFormatError(
             folder.language_path,
@@ -313,13 +354,9 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
     if changed or metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
         raise SceneFolderError(
-            path,
+            folder.root,
             expected="language made for these Gaussians",
             found="files that change" if changed else "language of an earlier reconstruction",
             remedy="the scene is being rebuilt or was left half way: run the build again",
         )
-    config = folder.record.get("config", {})
-    return SearchableScene(
-        gaussians.to(place), field, cameras, clip or config.get("clip", "embedded"),
-        folder=folder,
-    )  # fmt: skip
+    return folder, cameras, gaussians.to(device), field

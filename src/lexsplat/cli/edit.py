@@ -71,8 +71,11 @@ class Edit:
     def run(self) -> None:
         """Do one thing and say what the scene is now."""
         from lexsplat.editing import Editor
+        from lexsplat.previous_scene import require_current
 
         scene = open_scene(self.scene, self.device, self.clip)
+        if scene.folder is not None:
+            require_current(scene.folder)
         journal = (scene.folder.root if scene.folder else Path(self.scene)) / "edits.jsonl"
         if self.action == "discard":
             journal.unlink(missing_ok=True)
