@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "src" / "lexsplat"
 ORDER = """
     errors budget atomic tensor_files threads progress checkpoints divergence metrics cameras boxes world
     scenes gaussians rendering moving image_losses training_images optimizers exposures densification
-    reconstruction features codebook language_field losses embedding joint lifting masking queries
+    reconstruction features codebook language_field losses embedding joint lifting masking queries thresholds
     selection presence truth picking phrases relations heatmaps baselines evaluation report formats
     scene_folder previous_scene config captures search scaling editing exporting pipeline experiments ablation
     comparison answers viewer demo progress_bars cli __init__

@@ -14,9 +14,9 @@ from lexsplat.cameras import Camera
 from lexsplat.errors import QueryError
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
-from lexsplat.queries import automatic_threshold
 from lexsplat.rendering import accumulate_weights
 from lexsplat.selection import Selection
+from lexsplat.thresholds import automatic_threshold
 from lexsplat.world import World
 
 _SAME_SURFACE = 0.05

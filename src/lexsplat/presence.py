@@ -25,8 +25,9 @@ from torch import Tensor
 from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
-from lexsplat.queries import BORDER, QueryConfig, code_relevancy, gaussian_relevancy, scene_threshold
+from lexsplat.queries import QueryConfig, code_relevancy, gaussian_relevancy
 from lexsplat.selection import Presence
+from lexsplat.thresholds import BORDER, scene_threshold
 
 REFERENCE_PHRASES = (
     "chair", "bed", "window", "door", "computer", "telephone", "television", "clock", "shoe", "hat", "umbrella",
@@ -164,7 +165,7 @@ def found_thresholds(
     negatives: Tensor,
     config: QueryConfig | None = None,
 ) -> Tensor:
-    """The automatic threshold ``[P]`` of each prompt: `queries.scene_threshold`, and 0.5 for what is not there.
+    """The automatic threshold ``[P]`` of each prompt: `thresholds.scene_threshold`, and 0.5 for what is not there.
 
     What is not in the scene has no two classes that could be told apart: an automatic cut would mark whatever is a
     little less unlike the prompt than the rest, such as the whole table for a mug's handle that the encoder does
@@ -176,7 +177,7 @@ def found_thresholds(
     Args:
         judge: Says what is in the scene; it holds the scene's language.
         gaussians: The scene.
-        cameras: See `queries.scene_threshold`: views that are not evaluated.
+        cameras: See `thresholds.scene_threshold`: views that are not evaluated.
         positives: Text embeddings of the prompts ``[P, D]``.
         negatives: Text embeddings of the canonical phrases ``[M, D]``.
         config: Form, temperature, coverage.

@@ -14,7 +14,8 @@ from torch import Tensor
 from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
 from lexsplat.presence import PresenceJudge, found_thresholds
-from lexsplat.queries import QueryConfig, automatic_threshold, gaussian_relevancy, render_relevancy
+from lexsplat.queries import QueryConfig, gaussian_relevancy, render_relevancy
+from lexsplat.thresholds import automatic_threshold
 
 if TYPE_CHECKING:
     from lexsplat.language_field import LanguageField

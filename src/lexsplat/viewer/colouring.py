@@ -17,7 +17,7 @@ from lexsplat.gaussians import SH_C0, Gaussians
 from lexsplat.heatmaps import PEAK_FLOOR, colorize
 from lexsplat.language_field import LanguageField, LiftedField
 from lexsplat.picking import field_scores
-from lexsplat.queries import automatic_threshold
+from lexsplat.thresholds import automatic_threshold
 
 Mode = Literal["photo", "relevancy", "language", "codes", "uncertainty", "depth"]
 MODES: tuple[Mode, ...] = get_args(Mode)

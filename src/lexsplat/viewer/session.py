@@ -23,10 +23,11 @@ from lexsplat.heatmaps import overlay_mask
 from lexsplat.phrases import Thing, parse
 from lexsplat.picking import select_hit, surface_at
 from lexsplat.presence import REFERENCE_PHRASES, PresenceJudge
-from lexsplat.queries import BORDER, check_prompts, probability_relevancy
+from lexsplat.queries import check_prompts, probability_relevancy
 from lexsplat.rendering import render
 from lexsplat.search import SearchableScene
 from lexsplat.selection import Selection
+from lexsplat.thresholds import BORDER
 from lexsplat.viewer.colouring import PROMPT_COLORS, Colouring, Layer, Mode, quick_threshold
 from lexsplat.viewer.memory import Memory
 from lexsplat.viewer.vocabulary import MAX_LENGTH
