@@ -1,0 +1,92 @@
+"""The smoothing MLP (Eq. 13): language as a smooth function of the place."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor, nn
+
+SEMANTIC_CHANNELS = 8
+"""S, the paper's d_s."""
+
+SMOOTHING_WIDTHS = (128, 128, 128)
+"""Hidden layers of the smoothing MLP (supplement, table of PE and MLP)."""
+
+
+class SmoothingMLP(nn.Module):
+    """Eq. 13: s_MLP = MLP(PE(p)), three hidden layers of 128 with ReLU, then a linear layer to 8.
+
+    A coordinate MLP learns low frequencies first, which is what smooths. Positions are mapped to -1..1 over
+    the scene's box, which the paper leaves open (its code feeds raw coordinates); what lies outside is
+    clamped to -2..2.
+
+    Args:
+        center: Middle of the box ``[3]``, world units.
+        extent: Half of its longest side, world units.
+        num_frequencies: L of NeRF's encoding (x, sin(2^l pi x), cos(2^l pi x) for l < L). The paper's table
+            has 0: x alone.
+        generator: Of the initial weights.
+    """
+
+    center: Tensor
+    extent: Tensor
+
+    def __init__(
+        self,
+        center: Tensor,
+        extent: Tensor,
+        num_frequencies: int = 0,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if num_frequencies < 0:
+            raise ValueError(f"num_frequencies must not be negative, got {num_frequencies}")
+        self.num_frequencies = num_frequencies
+        self.register_buffer("center", center.detach().clone())
+        self.register_buffer("extent", extent.detach().clone())
+        self.layers = mlp((3 + 6 * num_frequencies, *SMOOTHING_WIDTHS, SEMANTIC_CHANNELS), generator)
+
+    def forward(self, means: Tensor) -> Tensor:
+        """s_MLP ``[N, 8]`` at positions ``[N, 3]``; the positions get no gradient."""
+        unit = ((means.detach() - self.center) / self.extent).clamp(-2, 2)
+        return self.layers(positional_encoding(unit, self.num_frequencies))
+
+
+def positional_encoding(positions: Tensor, num_frequencies: int) -> Tensor:
+    """NeRF's encoding with the identity: ``[N, 3]`` to ``[N, 3 + 6 L]``, all sines before the cosines."""
+    if num_frequencies == 0:
+        return positions
+    octaves = 2.0 ** torch.arange(num_frequencies, device=positions.device) * math.pi
+    angles = (positions[:, None, :] * octaves[:, None]).flatten(1)
+    return torch.cat([positions, angles.sin(), angles.cos()], dim=-1)
+
+
+def scene_box(means: Tensor) -> tuple[Tensor, Tensor]:
+    """Middle ``[3]`` and half the longest side ``[]`` of the box that holds all but the outermost 2 % on
+    every axis.
+
+    A few far floaters would otherwise squeeze the scene into a corner of the encoding.
+    """
+    points = means.detach().float()
+    if len(points) > 1_000_000:  # torch.quantile has an upper limit, and a sample says as much
+        points = points[:: len(points) // 1_000_000 + 1]
+    ends = torch.quantile(points, torch.tensor([0.02, 0.98], device=points.device), dim=0)
+    extent = ((ends[1] - ends[0]).max() / 2).clamp_min(1e-6)
+    return ends.mean(0), extent
+
+
+def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Sequential:
+    """Linear layers with ReLU between them, initialised like nn.Linear but from the given generator only."""
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    layers: list[nn.Module] = []
+    for inputs, outputs in itertools.pairwise(widths):
+        linear = nn.utils.skip_init(nn.Linear, inputs, outputs)
+        bound = 1 / math.sqrt(inputs)
+        with torch.no_grad():
+            linear.weight.uniform_(-bound, bound, generator=generator)
+            linear.bias.uniform_(-bound, bound, generator=generator)
+        layers += [linear, nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
