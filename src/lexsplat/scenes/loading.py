@@ -55,20 +55,7 @@ def load_scene(
     if not 0 < downscale < 1e6:
         raise ValueError(f"downscale must be positive, got {downscale:g}")
     capture = _read_capture(Path(path), None if images is None else Path(images))
-    warnings = list(capture.warnings)
-    if capture.missing:
-        total = len(capture.photos) + len(capture.missing)
-        warnings.append(
-            f"{capture.origin}: {len(capture.missing)} of {total} images "
-            f"have no file and are skipped: {', '.join(sorted(capture.missing))}"
-        )
-    if not capture.photos:
-        raise CaptureError(
-            capture.origin,
-            expected="images with files",
-            found=f"{len(capture.missing)} images, none of which is there",
-            remedy="put the images where the capture names them, for COLMAP into images/",
-        )
+    warnings = [*capture.warnings, *_told_missing(capture)]
     masked, strays = find_ignore_masks([capture.root / IGNORE_FOLDER], [p.name for p in capture.photos])
     # Masks of photos that found no place are no mistake: `prepare_photos` has told which fit none.
     warnings += strays if beside is None else []
@@ -76,16 +63,7 @@ def load_scene(
         photo.name: _make_view(photo, capture, downscale, masked.get(photo.name))
         for photo in sorted(capture.photos, key=lambda photo: photo.name)
     }
-    if len(views) < len(capture.photos):
-        names = [photo.name for photo in capture.photos]
-        doubled = next(name for name in names if names.count(name) > 1)
-        raise CaptureError(
-            capture.origin,
-            expected="every image once",
-            found=f"{doubled} twice",
-            remedy="remove one of the two from the file",
-        )
-    _check_stems(list(views), capture.origin)
+    _check_names([photo.name for photo in capture.photos], capture.origin)
     root = capture.root if beside is None else Path(beside)
     segmentations = root / SEGMENTATIONS
     has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
@@ -114,15 +92,46 @@ def load_scene(
     )
 
 
-def _check_stems(names: list[str], origin: Path) -> None:
-    """Refuse images whose names differ in their endings only: index maps, masks and heatmaps are named by stems.
+def _told_missing(capture: Capture) -> list[str]:
+    """A warning that lists the images without a file, if there are any.
+
+    Raises:
+        CaptureError: If none is there.
+    """
+    if not capture.photos:
+        raise CaptureError(
+            capture.origin,
+            expected="images with files",
+            found=f"{len(capture.missing)} images, none of which is there",
+            remedy="put the images where the capture names them, for COLMAP into images/",
+        )
+    if not capture.missing:
+        return []
+    total = len(capture.photos) + len(capture.missing)
+    names = ", ".join(sorted(capture.missing))
+    return [
+        f"{capture.origin}: {len(capture.missing)} of {total} images have no file and are skipped: {names}"
+    ]
+
+
+def _check_names(names: list[str], origin: Path) -> None:
+    """Refuse an image that comes twice, and images whose names differ in their endings only: index maps, masks and
+    heatmaps are named by stems.
 
     Raises:
         CaptureError: If there are two.
     """
     stems: dict[str, str] = {}
     for name in names:
+        twice = stem_of(name) in stems
         other = stems.setdefault(stem_of(name), name)
+        if twice and other == name:
+            raise CaptureError(
+                origin,
+                expected="every image once",
+                found=f"{name} twice",
+                remedy="remove one of the two from the file",
+            )
         if other != name:
             raise CaptureError(
                 origin,
