@@ -226,7 +226,7 @@ def test_truth_from_elsewhere_is_asked_in_the_words_of_either_list_and_runs_are_
             capture, tmp_path / "out", CONFIG, seeds=(0,), methods=("lifted",), variants=("full",), **wishes
         )
         record = json.loads((tmp_path / "out" / "ablation.json").read_text())
-        return list(record["per_prompt"]["full"][0]), len(made) - before, rows[0]["mIoU"][0], record["truth"]
+        return list(record["per_prompt"]["full"][0]), len(made) - before, rows[0]["mAP"][0], record["truth"]
 
     released = measure(masks=truth, prompt_list="released")
     assert released[:2] == (["stale bread"], 1), "the blue ball is in no list"
