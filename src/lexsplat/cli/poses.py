@@ -48,19 +48,13 @@ class Poses:
         from lexsplat.scenes import poses_from_photos
         from lexsplat.scenes.video import is_video, sample_video
 
-        photos = self.photos
+        photos, memory = self.photos, parse_bytes(self.memory)
         with ProgressBars() as bars:
             if is_video(photos):
                 photos = self.output / "images"
-                memory = parse_bytes(self.memory)
                 sample_video(self.photos, photos, self.frames, memory=memory, listener=bars)
             result = poses_from_photos(
-                photos,
-                self.output,
-                self.settings,
-                seed=self.seed,
-                memory=parse_bytes(self.memory),
-                listener=bars,
+                photos, self.output, self.settings, seed=self.seed, memory=memory, listener=bars
             )
         for note in result.notes:
             print(note)
