@@ -98,6 +98,12 @@ def test_without_the_scene_before_it_a_mix_is_refused_in_one_line(scene):
         open_scene(scene, device="cpu")
 
 
+def test_what_is_kept_is_as_open_to_others_as_the_scene_itself(scene):
+    scene.chmod(0o755)
+    keep_previous(SceneFolder.open(scene))
+    assert (scene / "previous").stat().st_mode & 0o777 == 0o755
+
+
 def test_a_build_that_stopped_half_way_leaves_the_last_whole_scene(scene):
     builder = Builder(scene)
     builder.begin(1)

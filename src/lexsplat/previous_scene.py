@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 from pathlib import Path
 
@@ -32,6 +33,8 @@ def keep_previous(folder: SceneFolder) -> None:
     if whole and not folder.record.get("building"):
         drop_previous(folder)
         made = Path(tempfile.mkdtemp(prefix=".previous.", dir=folder.root))
+        # Whoever may read the scene may read what is kept of it; a temporary folder is its owner's alone.
+        made.chmod(stat.S_IMODE(folder.root.stat().st_mode))
         for name in _FILES:
             _link(folder.root / name, made / name)
         os.replace(made, folder.root / FOLDER)
