@@ -26,6 +26,7 @@ from lexsplat.errors import BackendError, CaptureError
 from lexsplat.progress import Event, Listener, silent
 from lexsplat.scenes.feature_budget import check_mapping, extraction_threads, matching_plan
 from lexsplat.scenes.images import image_size
+from lexsplat.scenes.pose_agreement import misplaced, place_again
 from lexsplat.scenes.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
 from lexsplat.scenes.triangulation import quiet_pycolmap
 
@@ -168,6 +169,7 @@ def poses_from_photos(
                 found=f"{len(names)} photos of which none could be placed",
                 remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
             )
+        best = _without_misplaced(best, database, photos, work / "again", seed)
         left_out = _not_placed(names, best)
         _write_model(best, output)
     _discard(work, output)
@@ -355,11 +357,30 @@ def _map(
         database,
         photos.images,
         models,
-        pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3),
+        _mapper_options(seed),
         initial_image_pair_callback=another,
         next_image_callback=another,
     )
     return [found[key] for key in sorted(found)]
+
+
+def _mapper_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    from lexsplat.scenes.pycolmap_import import pycolmap
+
+    return pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3)
+
+
+def _without_misplaced(
+    model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, folder: Path, seed: int
+) -> pycolmap.Reconstruction:
+    """The model with photos placed again, or left out, whose matches contradict their place."""
+    from lexsplat.scenes.pycolmap_import import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        wrong = misplaced(model, opened)
+    if not wrong:
+        return model
+    return place_again(model, wrong, database, photos.images, folder, _mapper_options(seed))
 
 
 def _write_model(model: pycolmap.Reconstruction, output: Path) -> None:
