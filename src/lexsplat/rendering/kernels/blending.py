@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
 from lexsplat.rendering.kernels.binning import (
     CENTRE_X,
     CENTRE_Y,
@@ -24,10 +24,6 @@ from lexsplat.rendering.kernels.binning import (
 )
 from lexsplat.rendering.kernels.jit import kernel
 from lexsplat.rendering.kernels.lanes import LANES, any_positive, load, select_greater, store
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 if TILE != LANES:
     raise RuntimeError(f"a row of a tile must be one vector: TILE {TILE}, LANES {LANES}")

@@ -7,8 +7,8 @@ large as Gaussians x codes except the result, and no two threads write the same 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
 from lexsplat.rendering.kernels.binning import TILE
 from lexsplat.rendering.kernels.blending import (
     CHECK_EVERY,
@@ -23,10 +23,6 @@ from lexsplat.rendering.kernels.blending import (
 )
 from lexsplat.rendering.kernels.jit import kernel
 from lexsplat.rendering.kernels.lanes import any_positive, store
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 
 @kernel

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
 from lexsplat.rendering.kernels.binning import CONIC_B, HALF_A, HALF_C, OPACITY, TILE
 from lexsplat.rendering.kernels.blending import (
     ALPHA_MAX,
@@ -37,10 +37,6 @@ from lexsplat.rendering.kernels.lanes import (
     store_totals,
     total,
 )
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 GEOMETRY_FIELDS = 6
 """Columns of a row before the channels: gradient by the exponent times 1, dx, dy, dx^2, dx dy, dy^2."""
