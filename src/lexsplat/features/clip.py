@@ -20,6 +20,7 @@ from lexsplat.features.pretrained import (
 )
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+"""The CLIP of the paper's released code."""
 
 _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 _HALF = (0.5, 0.5, 0.5)

@@ -21,6 +21,7 @@ from lexsplat.features.pretrained import (
 )
 
 DEFAULT_DINO = "facebook/dino-vits8"
+"""The DINO of the paper's released code."""
 
 Facet = Literal["key", "token"]
 
