@@ -11,12 +11,12 @@ PACKAGE = Path(__file__).parent.parent / "src" / "lexsplat"
 
 # The order in which data flow. A module may import only what stands before it (or its own folder).
 ORDER = """
-    errors budget atomic tensor_files threads progress checkpoints divergence metrics cameras boxes world
+    errors budget machine atomic tensor_files threads progress checkpoints divergence metrics cameras boxes world
     scenes gaussians rendering moving image_losses training_images optimizers exposures densification
     reconstruction features codebook language_field losses embedding joint lifting masking queries thresholds
     selection presence truth picking phrases relations heatmaps baselines evaluation report formats
-    scene_folder previous_scene config captures search scaling editing exporting pipeline experiments ablation
-    comparison answers viewer demo progress_bars cli __init__
+    scene_folder previous_scene config captures search scaling editing exporting provenance pipeline experiments
+    ablation comparison answers viewer demo progress_bars cli __init__
 """.split()  # noqa: SIM905  (thirty quoted names would not read as a list)
 
 # Kernels and helpers that belong to a neighbour share its place in the order.

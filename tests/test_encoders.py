@@ -16,12 +16,11 @@ from PIL import Image
 
 from lexsplat.errors import ModelError
 from lexsplat.features import hub
+from lexsplat.features.clip import _plain_attention
+from lexsplat.features.dino import _ramp, _window_starts
 from lexsplat.features.encoders import (
     ClipEncoder,
     DinoEncoder,
-    _plain_attention,
-    _ramp,
-    _window_starts,
     load_clip,
     load_dino,
     resize_images,
@@ -44,7 +43,7 @@ def one_thread():
 def full_precision(request, monkeypatch):
     """Bfloat16 is tested by itself; everything else is compared to the last digits."""
     if "bfloat16" not in request.node.name:
-        monkeypatch.setattr("lexsplat.features.encoders._computes_in_bfloat16", lambda: False)
+        monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda: False)
 
 
 def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatch):
@@ -52,7 +51,7 @@ def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatc
     crops = torch.rand(12, 3, 24, 24, generator=torch.Generator().manual_seed(0))
     found = []
     for on in (False, True):
-        monkeypatch.setattr("lexsplat.features.encoders._computes_in_bfloat16", lambda on=on: on)
+        monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda on=on: on)
         found.append((clip.encode_images(crops), clip.encode_text(PROMPTS)))
     cosines = (found[0][0] * found[1][0]).sum(-1)
     assert cosines.min() > 0.999

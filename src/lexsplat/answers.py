@@ -16,8 +16,8 @@ from lexsplat.captures import reload_capture
 from lexsplat.errors import CaptureError, SceneFolderError
 from lexsplat.evaluation import PROTOCOLS, EvaluationConfig, evaluate
 from lexsplat.heatmaps import overlay_heatmap
+from lexsplat.machine import machine_facts
 from lexsplat.phrases import parse
-from lexsplat.pipeline import machine_facts
 from lexsplat.previous_scene import require_current
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import check_prompts

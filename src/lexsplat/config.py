@@ -11,16 +11,12 @@ from lexsplat.codebook import CodebookConfig
 from lexsplat.embedding import EmbeddingConfig
 from lexsplat.errors import BackendError
 from lexsplat.features import FeatureConfig
+from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.lifting import LiftingConfig, TuningConfig
 from lexsplat.reconstruction import ReconstructionConfig
 from lexsplat.scenes.photos import PoseConfig
 from lexsplat.scenes.video import DEFAULT_FRAMES
 from lexsplat.world import World, parse_vector
-
-DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
-"""The CLIP of the paper's released code."""
-DEFAULT_DINO = "facebook/dino-vits8"
-"""The DINO of the paper's released code."""
 
 CPU_PIXELS = 80_000
 """Working image size on a CPU when no downscale is given: about 320x240."""

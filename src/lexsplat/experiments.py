@@ -36,8 +36,9 @@ from lexsplat.evaluation.results import plain
 from lexsplat.features import FeatureMaps, TextCache, load_level_maps
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
+from lexsplat.machine import machine_facts
 from lexsplat.masking import MaskedCodeMaps
-from lexsplat.pipeline import build, feature_maps, machine_facts
+from lexsplat.pipeline import build, feature_maps
 from lexsplat.progress import Listener, silent
 from lexsplat.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
 from lexsplat.scene_folder import SceneFolder, fingerprint, read_json, to_json, write_json

@@ -6,10 +6,6 @@ fingerprint of the photos, the cameras, the settings and the stages before it.
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import os
-import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -19,33 +15,30 @@ from typing import Any
 import numpy as np
 import torch
 
-from lexsplat import __version__, budget
+from lexsplat import budget
 from lexsplat.cameras import Camera
 from lexsplat.captures import load_capture
 from lexsplat.checkpoints import Checkpoint
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
-from lexsplat.errors import CaptureError, FileFormatError, ModelError
+from lexsplat.errors import CaptureError, FileFormatError
 from lexsplat.features import FeatureMaps, extract_features
-from lexsplat.features.hub import content_hash, model_folder
 from lexsplat.formats.reading import read_splats
 from lexsplat.gaussians import Gaussians
 from lexsplat.joint import JointTrainer
 from lexsplat.language_field import LanguageField
 from lexsplat.lifting import lift, tune
 from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
-from lexsplat.previous_scene import drop_previous, keep_previous
+from lexsplat.previous_scene import drop_previous
 from lexsplat.progress import Event, Listener, silent
+from lexsplat.provenance import file_hash, model_identity, write_provenance
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
-from lexsplat.scene_folder import SceneFolder, fingerprint, to_json
+from lexsplat.scene_folder import SceneFolder, fingerprint
 from lexsplat.scenes import Scene, load_annotations
 from lexsplat.scenes.triangulation import initial_points
 from lexsplat.tensor_files import read_tensors, write_tensors
-from lexsplat.world import parse_vector, stored_world, world_of
-
-log = logging.getLogger("lexsplat")
 
 STAGES = ("reconstruct", "features", "codebook", "embed")
 """Names of the stages in the order in which they run."""
@@ -112,9 +105,9 @@ class _Builder:
         self.checkpoint: Checkpoint | None = None
 
     def run(self, until: str) -> SceneFolder:
-        capture_hash = self._write_provenance()
+        capture_hash = write_provenance(self.folder, self.scene, self.config)
         config, folder = self.config, self.folder
-        models = [self._model_identity("clip"), self._model_identity("dino")]
+        models = [model_identity(config.clip, "clip"), model_identity(config.dino, "dino")]
         language = [config.method, config.embedding, config.lifting, config.tuning]
         # What each stage is made from (a stage's name stands for all of its inputs), what it does, what it writes.
         stages: dict[str, tuple[list[Any], Callable[[], dict[str, Any]], list[Path]]] = {
@@ -136,7 +129,7 @@ class _Builder:
             ),
         }
         if self.splats is not None:
-            content = _file_hash(existing_splats(self.splats))
+            content = file_hash(existing_splats(self.splats))
             stages["reconstruct"] = ([capture_hash, content], self._take_splats, [folder.gaussians_path])
         order: tuple[str, ...] = STAGES
         if config.joint:  # language needs its codes before geometry is trained
@@ -200,9 +193,7 @@ class _Builder:
         reconstructor = Reconstructor(
             scene, config.reconstruction, points, device=self.device, seed=config.seed
         )
-        cameras = {name: scene.views[name].camera for name in scene.train_names}
-        code_maps = MaskedCodeMaps({name: self.folder.read_code_map(name) for name in cameras}, scene.views)
-        codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
+        cameras, code_maps, codebook = self._lessons()
         trainer = JointTrainer(
             reconstructor, cameras, code_maps, codebook, config.embedding, seed=config.seed
         )
@@ -262,11 +253,7 @@ class _Builder:
 
     def _embed(self) -> dict[str, Any]:
         gaussians = self.folder.read_gaussians().to(self.device)
-        cameras = {name: self.scene.views[name].camera for name in self.scene.train_names}
-        code_maps = MaskedCodeMaps(
-            {name: self.folder.read_code_map(name) for name in cameras}, self.scene.views
-        )
-        codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
+        cameras, code_maps, codebook = self._lessons()
         field = make_field(
             gaussians, cameras, code_maps, codebook, self.bounded, self.listener, self.checkpoint
         )
@@ -282,60 +269,16 @@ class _Builder:
         )
         return maps
 
+    def _lessons(self) -> tuple[dict[str, Camera], MaskedCodeMaps, Codebook]:
+        """What language is learned from: cameras and index maps of the training views, and the codebook."""
+        views = self.scene.views
+        cameras = {name: views[name].camera for name in self.scene.train_names}
+        code_maps = MaskedCodeMaps({name: self.folder.read_code_map(name) for name in cameras}, views)
+        codebook = Codebook.from_tensors(read_tensors(self.folder.codebook_path)[0]).to(self.device)
+        return cameras, code_maps, codebook
+
     def _code_paths(self) -> list[Path]:
         return [self.folder.codebook_path, *(self.folder.code_map_path(n) for n in self.scene.train_names)]
-
-    def _model_identity(self, kind: str) -> list[str]:
-        """The name of a model; for a folder also the size and time of its files, for ours the content."""
-        name = str(getattr(self.config, kind))
-        if name == "embedded":  # another version of lexsplat may come with others, with any time of writing
-            return [name, content_hash(model_folder(name, kind))]
-        folder = Path(name)
-        if not folder.is_dir():
-            return [name]
-        files = sorted(file for file in folder.iterdir() if file.is_file())
-        if not files:
-            raise ModelError(name, expected="a model folder", found="an empty folder")
-        return [name, *(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)]
-
-    def _write_provenance(self) -> str:
-        """Record where the scene comes from; returns a fingerprint of photos, cameras and split."""
-        views = {
-            name: (view.camera, "test" if name in self.scene.test_names else "train")
-            for name, view in self.scene.views.items()
-        }
-        sources = {name: _file_hash(view.image_path) for name, view in self.scene.views.items()}
-        masks = {
-            n: _file_hash(v.ignore_path) for n, v in self.scene.views.items() if v.ignore_path is not None
-        }
-        keep_previous(self.folder)
-        self.folder.save()
-        self.folder.write_cameras(views)
-        self._write_world({name: camera for name, (camera, _) in views.items()})
-        if "images" not in self.folder.record:
-            self.folder.record["capture"] = str(Path(self.scene.root).resolve())
-        self.folder.record["config"] = to_json(self.config)
-        self.folder.record["provenance"] = {
-            "lexsplat": __version__,
-            "versions": _versions(),
-            "seed": self.config.seed,
-            "sources": sources,
-        }
-        self.folder.record["warnings"] = list(self.scene.warnings)
-        self.folder.save()
-        cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
-        return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
-
-    def _write_world(self, cameras: dict[str, Camera]) -> None:
-        """Up from the cameras or the user; what was said of other cameras no longer holds."""
-        record = self.folder.record
-        world = world_of(record, cameras)
-        if self.config.up is not None:
-            world = world.with_up(parse_vector(self.config.up))
-        before = record.get("world")
-        if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
-            log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
-        record["world"] = stored_world(world, cameras)
 
 
 def _check_photos(scene: Scene, memory: int) -> None:
@@ -412,47 +355,3 @@ def make_field(
         lifted, gaussians, cameras, code_maps, config.tuning, config.embedding,
         seed=config.seed, checkpoint=checkpoint, listener=listener,
     )  # fmt: skip
-
-
-def _file_hash(path: Path) -> str:
-    digest = hashlib.blake2b(digest_size=12)
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {"python": platform.python_version()}
-    for package in ("torch", "numpy", "numba", "gsplat", "pycolmap", "transformers"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
-def machine_facts() -> dict[str, Any]:
-    """The machine, in words a reader of numbers needs."""
-    import torch
-
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {
-        "platform": platform.platform(),
-        "cpu": _cpu_name(),
-        "cores": os.cpu_count(),
-        "gpu": gpu,
-        "versions": {"lexsplat": __version__, **_versions()},
-    }
-
-
-def _cpu_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

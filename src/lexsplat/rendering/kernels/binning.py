@@ -14,11 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
 from lexsplat.rendering.kernels.jit import kernel
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 TILE = 16
 """Width and height of a tile in pixels."""

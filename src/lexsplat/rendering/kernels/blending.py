@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
 from lexsplat.rendering.kernels.binning import (
     CENTRE_X,
     CENTRE_Y,
@@ -24,10 +24,6 @@ from lexsplat.rendering.kernels.binning import (
 )
 from lexsplat.rendering.kernels.jit import kernel
 from lexsplat.rendering.kernels.lanes import LANES, any_positive, load, select_greater, store
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 if TILE != LANES:
     raise RuntimeError(f"a row of a tile must be one vector: TILE {TILE}, LANES {LANES}")
@@ -101,12 +97,42 @@ def finish_pixels(before: Any, after: Any) -> Any:
 
 
 @kernel
+def pass_row(live: F32, j: int, row_alpha: Any) -> Any:
+    """Let row ``j`` of the pixels pass a Gaussian: writes ``live``, returns what the Gaussian weighs in each."""
+    before = load(live, j * TILE)
+    after = before * (ONE - row_alpha)
+    store(live, j * TILE, finish_pixels(before, after))
+    return select_greater(after, TRANSMITTANCE_MIN, row_alpha * before, ZERO)
+
+
+@kernel
 def column_numbers() -> Any:
     """0 to 15."""
     ramp = np.empty(TILE, np.float32)
     for i in range(TILE):
         ramp[i] = i
     return load(ramp, 0)
+
+
+@kernel
+def seen_from_tile(ellipses: F32, k: int, left: int, top: int, columns: Any) -> Any:
+    """Ellipse ``k`` in the tile whose corner is pixel (left, top), ready for `alpha_of`.
+
+    Returns:
+        dx of the columns, vectors ``across`` and ``slope`` and a number ``down``, with which -1/8 of the exponent
+        is ``across + slope dy + down dy^2``; dy of row 0; opacity.
+    """
+    dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
+    dy = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
+    across = dx * dx * (EIGHTH * ellipses[k, HALF_A])
+    slope = dx * (EIGHTH * ellipses[k, CONIC_B])
+    return dx, across, slope, EIGHTH * ellipses[k, HALF_C], dy, ellipses[k, OPACITY]
+
+
+@kernel
+def rows_in_tile(boxes: I32, k: int, top: int) -> tuple[int, int]:
+    """First and one past the last row of the tile that box ``k`` covers."""
+    return max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)
 
 
 @kernel
@@ -140,22 +166,12 @@ def blend(
         countdown = CHECK_EVERY
         for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
             k = members[slot]
-            a, b, c = (
-                EIGHTH * ellipses[k, HALF_A],
-                EIGHTH * ellipses[k, CONIC_B],
-                EIGHTH * ellipses[k, HALF_C],
-            )
-            opacity = ellipses[k, OPACITY]
-            dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
-            y = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
-            across, slope = dx * dx * a, dx * b
-            for j in range(max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)):
-                dy = np.float32(j) + y
-                row_alpha = alpha_of(across + c * dy * dy, slope, dy, opacity)
-                before = load(live, j * TILE)
-                after = before * (ONE - row_alpha)
-                weight = select_greater(after, TRANSMITTANCE_MIN, row_alpha * before, ZERO)
-                store(live, j * TILE, finish_pixels(before, after))
+            _, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
+            first, last = rows_in_tile(boxes, k, top)
+            for j in range(first, last):
+                dy = np.float32(j) + dy0
+                row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
+                weight = pass_row(live, j, row_alpha)
                 if any_positive(weight):
                     place = j * channels * TILE
                     for channel in range(channels):

@@ -7,39 +7,22 @@ large as Gaussians x codes except the result, and no two threads write the same 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lexsplat.rendering.kernels.binning import (
-    CENTRE_X,
-    CENTRE_Y,
-    CONIC_B,
-    HALF_A,
-    HALF_C,
-    OPACITY,
-    ROW_FIRST,
-    ROW_LAST,
-    TILE,
-)
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
+from lexsplat.rendering.kernels.binning import TILE
 from lexsplat.rendering.kernels.blending import (
     CHECK_EVERY,
-    EIGHTH,
-    HALF,
-    ONE,
     PIXELS,
-    TRANSMITTANCE_MIN,
-    ZERO,
     alpha_of,
     column_numbers,
-    finish_pixels,
+    pass_row,
+    rows_in_tile,
+    seen_from_tile,
     start_tile,
     tile_finished,
 )
 from lexsplat.rendering.kernels.jit import kernel
-from lexsplat.rendering.kernels.lanes import any_positive, load, select_greater, store
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
+from lexsplat.rendering.kernels.lanes import any_positive, store
 
 
 @kernel
@@ -116,22 +99,12 @@ def weigh_codes(
         entry = entry_offsets[batch_tile]
         for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
             k = members[slot]
-            a, b, c = (
-                EIGHTH * ellipses[k, HALF_A],
-                EIGHTH * ellipses[k, CONIC_B],
-                EIGHTH * ellipses[k, HALF_C],
-            )
-            opacity = ellipses[k, OPACITY]
-            dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
-            y = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
-            across, slope = dx * dx * a, dx * b
-            for j in range(max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)):
-                dy = np.float32(j) + y
-                alpha = alpha_of(across + c * dy * dy, slope, dy, opacity)
-                before = load(live, j * TILE)
-                after = before * (ONE - alpha)
-                weight = select_greater(after, TRANSMITTANCE_MIN, alpha * before, ZERO)
-                store(live, j * TILE, finish_pixels(before, after))
+            _, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
+            first, last = rows_in_tile(boxes, k, top)
+            for j in range(first, last):
+                dy = np.float32(j) + dy0
+                alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
+                weight = pass_row(live, j, alpha)
                 if any_positive(weight):
                     store(weights, 0, weight)
                     for i in range(TILE):

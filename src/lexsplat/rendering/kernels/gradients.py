@@ -6,32 +6,24 @@ known from the image, less what has been passed; so nothing per pixel needs to b
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-from lexsplat.rendering.kernels.binning import (
-    CENTRE_X,
-    CENTRE_Y,
-    CONIC_B,
-    HALF_A,
-    HALF_C,
-    OPACITY,
-    ROW_FIRST,
-    ROW_LAST,
-    TILE,
-)
+import numpy as np
+
+from lexsplat.rendering.kernels.arrays import F32, I32, I64
+from lexsplat.rendering.kernels.binning import CONIC_B, HALF_A, HALF_C, OPACITY, TILE
 from lexsplat.rendering.kernels.blending import (
     ALPHA_MAX,
     CHECK_EVERY,
-    EIGHTH,
     HALF,
     ONE,
     PIXELS,
-    TRANSMITTANCE_MIN,
     ZERO,
     alpha_of,
     column_numbers,
-    finish_pixels,
+    pass_row,
+    rows_in_tile,
+    seen_from_tile,
     start_tile,
     tile_finished,
 )
@@ -45,10 +37,6 @@ from lexsplat.rendering.kernels.lanes import (
     store_totals,
     total,
 )
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 GEOMETRY_FIELDS = 6
 """Columns of a row before the channels: gradient by the exponent times 1, dx, dy, dx^2, dx dy, dy^2."""
@@ -87,6 +75,21 @@ def _load_tile(
                 if channel < colors:
                     loss += gradient * image[top + j, left + i, channel]
             behind[j * TILE + i] = loss
+
+
+@kernel
+def _exponent_gradient(behind: F32, j: int, weight: Any, row_alpha: Any, dots: Any) -> Any:
+    """Gradient by the exponent along row ``j``; takes what the Gaussian contributes out of ``behind``.
+
+    ``dots`` is the Gaussian's colour times the upstream gradient of each pixel.
+    """
+    # d loss / d alpha = T dots - rest / (1 - alpha), and d alpha / d exponent = -alpha.
+    share = weight * dots
+    rest = load(behind, j * TILE) - share
+    store(behind, j * TILE, rest)
+    gradient = rest * row_alpha / (ONE - row_alpha) - share
+    gradient = select_greater(weight, ZERO, gradient, ZERO)
+    return select_greater(ALPHA_MAX, row_alpha, gradient, ZERO)
 
 
 @kernel
@@ -146,12 +149,8 @@ def blend_backward(
         geometry: Whether the geometry wants gradients at all.
     """
     height, width, channels = image.shape
-    live, behind, weights = (
-        np.empty(PIXELS, np.float32),
-        np.empty(PIXELS, np.float32),
-        np.empty(PIXELS, np.float32),
-    )
-    upstream = np.empty(PIXELS * channels, np.float32)
+    live, weights = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+    behind, upstream = np.empty(PIXELS, np.float32), np.empty(PIXELS * channels, np.float32)
     fields = row_width(channels)
     columns = column_numbers()
     zeros = splat(ZERO)
@@ -170,28 +169,17 @@ def blend_backward(
             if finished:
                 continue
             k = members[slot]
-            a, b, c = (
-                EIGHTH * ellipses[k, HALF_A],
-                EIGHTH * ellipses[k, CONIC_B],
-                EIGHTH * ellipses[k, HALF_C],
-            )
-            opacity = ellipses[k, OPACITY]
-            dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
-            y = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
-            across, slope = dx * dx * a, dx * b
+            dx, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
             red, green, blue = ZERO, ZERO, ZERO
             if colors == 3:
                 red, green, blue = values[k, 0], values[k, 1], values[k, 2]
             g0, g1, g2, r0, r1, r2 = zeros, zeros, zeros, zeros, zeros, zeros
-            first, last = max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)
+            first, last = rows_in_tile(boxes, k, top)
             touched = False
             for j in range(first, last):
-                dy = np.float32(j) + y
-                row_alpha = alpha_of(across + c * dy * dy, slope, dy, opacity)
-                before = load(live, j * TILE)
-                after = before * (ONE - row_alpha)
-                weight = select_greater(after, TRANSMITTANCE_MIN, row_alpha * before, ZERO)
-                store(live, j * TILE, finish_pixels(before, after))
+                dy = np.float32(j) + dy0
+                row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
+                weight = pass_row(live, j, row_alpha)
                 store(weights, j * TILE, weight)
                 if not any_positive(weight):
                     continue
@@ -199,24 +187,15 @@ def blend_backward(
                 dots = zeros
                 if colors == 3:
                     place = j * channels * TILE
-                    u0, u1, u2 = (
-                        load(upstream, place),
-                        load(upstream, place + TILE),
-                        load(upstream, place + 2 * TILE),
-                    )
+                    u0, u1 = load(upstream, place), load(upstream, place + TILE)
+                    u2 = load(upstream, place + 2 * TILE)
                     r0 += weight * u0
                     r1 += weight * u1
                     r2 += weight * u2
                     dots = u0 * red + u1 * green + u2 * blue
                 if not geometry:
                     continue
-                # d loss / d alpha = T dots - rest / (1 - alpha); alpha d alpha / d exponent = -alpha.
-                share = weight * dots
-                rest = load(behind, j * TILE) - share
-                store(behind, j * TILE, rest)
-                gradient = rest * row_alpha / (ONE - row_alpha) - share
-                gradient = select_greater(weight, ZERO, gradient, ZERO)
-                gradient = select_greater(ALPHA_MAX, row_alpha, gradient, ZERO)
+                gradient = _exponent_gradient(behind, j, weight, row_alpha, dots)
                 g0 += gradient
                 g1 += gradient * dy
                 g2 += gradient * (dy * dy)

@@ -7,11 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.rendering.kernels.arrays import F32, F64, I32
 from lexsplat.rendering.kernels.jit import kernel
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 
 @kernel

@@ -1,16 +1,10 @@
-"""Training the language field (section 3.4): Eq. 8 to 15, one random training view a step, geometry frozen.
-
-A code map may be coarser than the image: cell j of w covers the pixels whose centres lie in [j W / w, (j + 1)
-W / w).
-"""
+"""The language training as single steps, with all that is needed to go on after a stop."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lexsplat.cameras import Camera
-from lexsplat.codebook import MAX_CODES, Codebook
-from lexsplat.divergence import KEEP_EVERY, Guard
+from lexsplat.codebook import Codebook
+from lexsplat.embedding.code_maps import MASKED_CODE, codes_at_pixels
+from lexsplat.embedding.settings import EmbeddingConfig
 from lexsplat.errors import TrainingError
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import TrainedField
 from lexsplat.losses import (
-    SmoothingWeight,
-    UncertaintyForm,
     cross_entropy_loss,
     semantic_loss,
     smoothing_loss,
@@ -33,122 +26,7 @@ from lexsplat.losses import (
     uncertainty_loss,
 )
 from lexsplat.optimizers import check_moments
-from lexsplat.progress import Event, Listener, silent
-from lexsplat.rendering import PreparedView, prepare
-
-if TYPE_CHECKING:
-    from lexsplat.checkpoints import Checkpoint
-
-MASKED_CODE = MAX_CODES
-"""Index of a pixel that takes no part in any loss: above those of every codebook."""
-
-REPORT_EVERY = 25
-"""Steps between two events, which is also how often the loss is checked."""
-
-
-@dataclass(frozen=True)
-class EmbeddingConfig:
-    """Settings of the language training. Defaults suit a CPU; `as_in_paper` and `as_released` give the
-    others.
-
-    Args:
-        iterations: Steps, one view each (paper: 30,000).
-        pixel_sample: Pixels of a step that enter the cross-entropy, drawn at random; 0 takes the full map
-            (paper).
-        render_downscale: Views are rendered this many times smaller than their cameras.
-        semantics_lr: Learning rate of s_G (paper: 0.001).
-        uncertainty_lr: Of the logits of u (paper: 0.001; authors' code: 0.05).
-        decoder_lr: Of D_MLP (paper: 0.001).
-        smoothing_lr: Of the smoothing MLP (paper: 0.001).
-        decoder_weight_decay: Of D_MLP (paper: 0; authors' code: 1e-5).
-        final_lr_factor: Learning rates fall exponentially to this share of themselves (paper: 1, constant).
-        lambda_ce: Of Eq. 12.
-        lambda_u: Of Eq. 12.
-        lambda_s: Of Eq. 15.
-        lambda_smo: Of Eq. 15.
-        min_smoothing_weight: w_s of Eq. 14.
-        use_uncertainty: Off is the paper's ablation "w/o u_G": Eq. 9 in place of Eq. 10 to 12.
-        use_smoothing: Off is the paper's ablation "w/o MLP".
-        uncertainty_form: "linear" is Eq. 11, "log" the authors' code.
-        smoothing_weight: "max" is Eq. 14, "linear" the authors' code.
-        smoothing_squared: Squared norms in Eq. 14, as in the authors' code.
-        smoothing_every: Steps from one smoothing to the next (paper: 1; authors' code: 10).
-        smoothing_sample: Gaussians of a step that enter Eq. 14, drawn at random; 0 takes all (paper).
-        num_frequencies: Of the positional encoding in Eq. 13 (paper's table: 0).
-        normalise_rendering: Scale the rendered s to unit length before decoding (authors' code).
-        clip_decoder_grad: Largest norm of the decoder's gradient, which keeps a bad batch from ruining it;
-            None is off (paper).
-        memory_bytes: Bound for projections of views kept between steps; further views are projected anew each
-            time.
-    """
-
-    iterations: int = 1000
-    pixel_sample: int = 2048
-    render_downscale: float = 1.0
-    semantics_lr: float = 0.05
-    uncertainty_lr: float = 0.02
-    decoder_lr: float = 2e-3
-    smoothing_lr: float = 1e-3
-    decoder_weight_decay: float = 0.0
-    final_lr_factor: float = 0.1
-    lambda_ce: float = 1.0
-    lambda_u: float = 1.0
-    lambda_s: float = 1.0
-    lambda_smo: float = 1.0
-    min_smoothing_weight: float = 0.1
-    use_uncertainty: bool = True
-    use_smoothing: bool = True
-    uncertainty_form: UncertaintyForm = "linear"
-    smoothing_weight: SmoothingWeight = "max"
-    smoothing_squared: bool = False
-    smoothing_every: int = 1
-    smoothing_sample: int = 2048
-    num_frequencies: int = 0
-    normalise_rendering: bool = False
-    clip_decoder_grad: float | None = 1.0
-    memory_bytes: int = 1 << 30
-
-    def __post_init__(self) -> None:
-        if (
-            self.iterations < 0
-            or self.pixel_sample < 0
-            or self.smoothing_sample < 0
-            or self.smoothing_every < 1
-        ):
-            raise ValueError("iterations and samples must not be negative, smoothing_every must be positive")
-        if not self.render_downscale > 0 or not self.final_lr_factor > 0:
-            raise ValueError("render_downscale and final_lr_factor must be positive")
-
-    def as_in_paper(self) -> EmbeddingConfig:
-        """30,000 iterations over full maps with a constant learning rate of 0.001."""
-        return replace(
-            self,
-            iterations=30_000,
-            pixel_sample=0,
-            render_downscale=1.0,
-            semantics_lr=1e-3,
-            uncertainty_lr=1e-3,
-            decoder_lr=1e-3,
-            smoothing_lr=1e-3,
-            decoder_weight_decay=0.0,
-            final_lr_factor=1.0,
-            smoothing_every=1,
-            smoothing_sample=0,
-            clip_decoder_grad=None,
-        )
-
-    def as_released(self) -> EmbeddingConfig:
-        """What the authors' released code does where it differs from the paper."""
-        return replace(
-            self.as_in_paper(),
-            uncertainty_lr=0.05,
-            decoder_weight_decay=1e-5,
-            uncertainty_form="log",
-            smoothing_weight="linear",
-            smoothing_squared=True,
-            smoothing_every=10,
-            normalise_rendering=True,
-        )
+from lexsplat.rendering import PreparedView
 
 
 class EmbeddingTrainer:
@@ -382,100 +260,3 @@ class EmbeddingTrainer:
                     key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
                     for key, value in moments.items()
                 }
-
-
-def train_field(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    code_maps: Mapping[str, NDArray[np.uint8]],
-    codebook: Codebook,
-    config: EmbeddingConfig,
-    *,
-    seed: int = 0,
-    listener: Listener = silent,
-    trainer: EmbeddingTrainer | None = None,
-    checkpoint: Checkpoint | None = None,
-) -> TrainedField:
-    """Train the paper's language field on frozen Gaussians.
-
-    Args:
-        gaussians: The geometry; it comes out bit for bit as it went in.
-        cameras: The training views by name, and only these.
-        code_maps: Index maps by view name; further views are not looked at.
-        codebook: The discrete feature space S.
-        config: Settings.
-        seed: Of the initial field, the order of views and the samples.
-        listener: Hears of stage "embed" with the losses.
-        trainer: One that was begun, to go on with.
-        checkpoint: Where the training is saved on the way, and goes on from.
-
-    Raises:
-        ValueError: If there is no view, or a view has no index map.
-        TrainingError: If the training diverges again and again.
-    """
-    names = sorted(cameras)
-    check_views(names, code_maps)
-    trainer = trainer or EmbeddingTrainer(gaussians, codebook, config, seed=seed)
-    if checkpoint is not None:
-        checkpoint.resume(trainer)
-    views = _prepare_views(trainer.gaussians, cameras, config)
-    guard = Guard(trainer, "language field", every=KEEP_EVERY[gaussians.device.type])
-    with nullcontext() if checkpoint is None else checkpoint.guarding():
-        while trainer.iteration < config.iterations:
-            with guard:
-                name = trainer.view_of_step(names)
-                camera, prepared = views[name]
-                losses = trainer.step(camera, code_maps[name], prepared=prepared)
-                done = trainer.iteration
-                if done % REPORT_EVERY == 0 or done == config.iterations:
-                    metrics = {key: float(value) for key, value in losses.items()}
-                    trainer.check_loss(metrics["loss"])
-                    listener(Event("embed", done, config.iterations, metrics))
-                guard.after_step(done == config.iterations)
-                if checkpoint is not None:
-                    checkpoint.after_step(trainer)
-    return trainer.field
-
-
-def _prepare_views(
-    gaussians: Gaussians, cameras: Mapping[str, Camera], config: EmbeddingConfig
-) -> dict[str, tuple[Camera, PreparedView | None]]:
-    """Cameras at the size to render, with their projections as far as memory allows (geometry is fixed)."""
-    left = config.memory_bytes
-    views: dict[str, tuple[Camera, PreparedView | None]] = {}
-    for name, camera in cameras.items():
-        resized = camera.downscaled(config.render_downscale)
-        prepared = prepare(gaussians, resized) if left > 0 else None
-        left -= prepared.nbytes if prepared is not None else 0
-        views[name] = (resized, prepared)
-    return views
-
-
-def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -> Tensor:
-    """Codes of the cells in which the centres of pixels lie.
-
-    Args:
-        code_map: Index map ``[h, w]``.
-        height: Of the image the pixels belong to.
-        width: Of that image.
-        pixels: Flat indices into it, row by row ``[M]``.
-
-    Returns:
-        Codes ``[M]`` int64.
-    """
-    rows, columns = code_map.shape
-    # (p + 1/2) h / H in integers, so that no rounding moves a pixel to the neighbouring cell.
-    row = (2 * (pixels // width) + 1) * rows // (2 * height)
-    column = (2 * (pixels % width) + 1) * columns // (2 * width)
-    return code_map[row, column].long()
-
-
-def check_views(names: list[str], code_maps: Mapping[str, object]) -> None:
-    """Raises ValueError if there is no view or one has no index map."""
-    if not names:
-        raise ValueError("no training view")
-    missing = [name for name in names if name not in code_maps]
-    if missing:
-        raise ValueError(
-            f"no index map for {', '.join(missing[:5])}{' and more' if len(missing) > 5 else ''}"
-        )

@@ -1,0 +1,142 @@
+"""CLIP and its relatives: images and words to one space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lexsplat.errors import ModelError
+from lexsplat.features.pretrained import (
+    PretrainedModel,
+    check_images,
+    normalisation,
+    precision,
+    resize_images,
+)
+
+DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+"""The CLIP of the paper's released code."""
+
+_CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+_HALF = (0.5, 0.5, 0.5)
+_TEXT_BATCH = 64
+_FEW_PATCHES = 64
+
+
+class ClipEncoder(PretrainedModel):
+    """A CLIP-like model of transformers: CLIP, SigLIP, SigLIP 2 and other models with both
+    ``get_*_features``.
+    """
+
+    def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
+        from transformers import AutoTokenizer
+
+        super().__init__(folder, name, device)
+        config = self._model.config
+        if not (hasattr(self._model, "get_image_features") and hasattr(config, "vision_config")):
+            raise self._refusal(
+                "a CLIP-like model with an image and a text tower", f"try {DEFAULT_CLIP} or `--clip embedded`"
+            )
+        self._siglip = config.model_type.startswith("siglip")
+        self.image_size = _image_size(config.vision_config)
+        if self.device.type == "cpu":
+            _plain_attention(self._model, config.vision_config, self.image_size)
+        self._text_length = int(config.text_config.max_position_embeddings)
+        default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
+        self._mean, self._std = normalisation(folder, default, self.device)
+        try:
+            self._tokenizer = AutoTokenizer.from_pretrained(
+                folder, local_files_only=True, trust_remote_code=False
+            )
+        except Exception as error:  # tokenizers raise a different type for each file they miss
+            raise ModelError(
+                f"model {name}",
+                expected="a tokenizer beside the weights",
+                found=str(error)[:120],
+                remedy="fetch it again",
+            ) from error
+        self.dim = int(self.encode_text(["object"]).shape[-1])
+
+    @torch.inference_mode()
+    def encode_images(self, images: Tensor) -> Tensor:
+        """``[B, 3, h, w]`` in 0..1, of any size, to ``[B, D]``, float32 on the CPU, unit length."""
+        check_images(images)
+        images = resize_images(images.to(self.device, torch.float32), self.image_size, self.image_size)
+        pixels = (images - self._mean) / self._std
+        with precision(self.device, crops=True):
+            features = _pooled(self._model.get_image_features(**self._vision_inputs(pixels)))
+        return F.normalize(features.float(), dim=-1).cpu()
+
+    @torch.inference_mode()
+    def encode_text(self, prompts: Sequence[str]) -> Tensor:
+        """Prompts to ``[B, D]``, float32 on the CPU, unit length; words beyond the model's text length are
+        cut.
+
+        Raises:
+            ValueError: If there is no prompt or one is empty.
+        """
+        if not prompts or any(not prompt.strip() for prompt in prompts):
+            raise ValueError("prompts must be one or more texts that are not empty")
+        batches = [
+            list(prompts[start : start + _TEXT_BATCH]) for start in range(0, len(prompts), _TEXT_BATCH)
+        ]
+        features = [_pooled(self._model.get_text_features(**self._text_inputs(batch))) for batch in batches]
+        return F.normalize(torch.cat(features).float(), dim=-1).cpu()
+
+    def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
+        if self._siglip:  # trained on lower case, padded to full length, and without an attention mask
+            prompts = [prompt.lower() for prompt in prompts]
+        tokens = self._tokenizer(
+            prompts,
+            padding="max_length" if self._siglip else True,
+            truncation=True,
+            max_length=self._text_length,
+            return_tensors="pt",
+        )
+        keys = ("input_ids",) if self._siglip else ("input_ids", "attention_mask")
+        return {key: tokens[key].to(self.device) for key in keys}
+
+    def _vision_inputs(self, pixels: Tensor) -> dict[str, Tensor]:
+        """What the image tower wants: pixels, or for SigLIP 2 of free size ("NaFlex") a list of patches."""
+        if self._model.config.model_type != "siglip2":
+            return {"pixel_values": pixels}
+        patch = int(self._model.config.vision_config.patch_size)
+        side = pixels.shape[-1] // patch
+        cells = pixels.reshape(len(pixels), 3, side, patch, side, patch)
+        patches = cells.permute(0, 2, 4, 3, 5, 1).reshape(len(pixels), side * side, patch * patch * 3)
+        return {
+            "pixel_values": patches,
+            "pixel_attention_mask": torch.ones(patches.shape[:2], dtype=torch.int32, device=pixels.device),
+            "spatial_shapes": torch.full((len(pixels), 2), side, dtype=torch.long, device=pixels.device),
+        }
+
+
+def _pooled(output: Any) -> Tensor:
+    """The embedding: newer transformers return an object that holds it, older ones the tensor."""
+    return output if isinstance(output, Tensor) else output.pooler_output
+
+
+def _plain_attention(model: Any, vision_config: Any, image_size: int) -> None:
+    """For a handful of patches on a CPU, attention written out takes less time than the fused kernel.
+
+    Only the image tower changes; a model whose tower or patches are not where CLIP's are stays as it is.
+    """
+    tower, patch = getattr(model, "vision_model", None), getattr(vision_config, "patch_size", None)
+    if tower is None or not isinstance(patch, int) or (image_size // patch) ** 2 > _FEW_PATCHES:
+        return
+    for module in tower.modules():
+        if hasattr(module, "config"):
+            module.config._attn_implementation = "eager"
+
+
+def _image_size(vision_config: Any) -> int:
+    """Side in pixels of the square images that the model was trained on."""
+    size = getattr(vision_config, "image_size", None)
+    if size is None:  # SigLIP 2 of free size states the number of patches
+        return round(int(vision_config.num_patches) ** 0.5) * int(vision_config.patch_size)
+    return int(min(size)) if isinstance(size, Sequence) else int(size)

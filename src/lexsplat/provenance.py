@@ -1,0 +1,81 @@
+"""Where a scene comes from: what is recorded of it, and the fingerprints that tell when it has changed."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from pathlib import Path
+
+from lexsplat import __version__
+from lexsplat.cameras import Camera
+from lexsplat.config import BuildConfig
+from lexsplat.errors import ModelError
+from lexsplat.features.hub import content_hash, model_folder
+from lexsplat.machine import versions
+from lexsplat.previous_scene import keep_previous
+from lexsplat.scene_folder import SceneFolder, fingerprint, to_json
+from lexsplat.scenes import Scene
+from lexsplat.world import parse_vector, stored_world, world_of
+
+log = logging.getLogger("lexsplat")
+
+
+def write_provenance(folder: SceneFolder, scene: Scene, config: BuildConfig) -> str:
+    """Record where the scene comes from; returns a fingerprint of photos, cameras and split."""
+    views = {
+        name: (view.camera, "test" if name in scene.test_names else "train")
+        for name, view in scene.views.items()
+    }
+    sources = {name: file_hash(view.image_path) for name, view in scene.views.items()}
+    masks = {n: file_hash(v.ignore_path) for n, v in scene.views.items() if v.ignore_path is not None}
+    keep_previous(folder)
+    folder.save()
+    folder.write_cameras(views)
+    _write_world(folder, config.up, {name: camera for name, (camera, _) in views.items()})
+    if "images" not in folder.record:
+        folder.record["capture"] = str(Path(scene.root).resolve())
+    folder.record["config"] = to_json(config)
+    folder.record["provenance"] = {
+        "lexsplat": __version__,
+        "versions": versions(),
+        "seed": config.seed,
+        "sources": sources,
+    }
+    folder.record["warnings"] = list(scene.warnings)
+    folder.save()
+    cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
+    return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+
+
+def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
+    """Up from the cameras or the user; what was said of other cameras no longer holds."""
+    record = folder.record
+    world = world_of(record, cameras)
+    if up is not None:
+        world = world.with_up(parse_vector(up))
+    before = record.get("world")
+    if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
+        log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
+    record["world"] = stored_world(world, cameras)
+
+
+def model_identity(name: str, kind: str) -> list[str]:
+    """The name of a model; for a folder also the size and time of its files, for ours the content."""
+    if name == "embedded":  # another version of lexsplat may come with others, with any time of writing
+        return [name, content_hash(model_folder(name, kind))]
+    folder = Path(name)
+    if not folder.is_dir():
+        return [name]
+    files = sorted(file for file in folder.iterdir() if file.is_file())
+    if not files:
+        raise ModelError(name, expected="a model folder", found="an empty folder")
+    return [name, *(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)]
+
+
+def file_hash(path: Path) -> str:
+    """Of the content."""
+    digest = hashlib.blake2b(digest_size=12)
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
