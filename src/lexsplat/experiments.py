@@ -348,12 +348,7 @@ class Results:
         }
 
     def _truth(self) -> dict[str, Any]:
-        truth = self.bench.truth
-        return {
-            "folder": str(truth.origin),
-            "layout": truth.layout,
-            "prompt_list": self.bench.prompt_list,
-        }
+        return self.bench.truth.origin_facts(self.bench.prompt_list)
 
     def _measured(self, name: str) -> MeasuredMethod:
         runs = self.runs[name]

@@ -47,6 +47,8 @@ table{border-collapse:collapse;font-variant-numeric:tabular-nums;min-width:50%}
 th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th{color:var(--soft);font-weight:500;font-size:13px}
 th:first-child,td:first-child{text-align:left}
+.facts td{text-align:left;white-space:normal;overflow-wrap:anywhere;vertical-align:top}
+.facts td:first-child{overflow-wrap:normal;color:var(--soft)}
 .meter{display:inline-block;width:72px;height:6px;border-radius:3px;background:var(--line);
   margin-right:10px;vertical-align:middle;overflow:hidden}
 .meter i{display:block;height:100%;background:var(--accent)}
@@ -85,6 +87,8 @@ th:first-child,td:first-child{text-align:left}
 .case p{grid-column:1/-1;margin:0;color:var(--ink);max-width:none}
 .case p span{float:right;color:var(--soft);font-variant-numeric:tabular-nums}
 .case.head{color:var(--soft);font-size:13px;margin-bottom:4px}
+@media(max-width:700px){.cases{overflow-x:auto}.case{width:680px}
+  .case p span{float:none;margin-left:12px}}
 details{margin:8px 0;background:var(--panel);border:1px solid var(--line);border-radius:10px;
   padding:10px 16px}
 summary{cursor:pointer}

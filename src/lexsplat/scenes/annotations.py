@@ -63,6 +63,10 @@ class Annotations:
         """All prompts that have truth somewhere, sorted."""
         return tuple(sorted({prompt for prompts in self.masks.values() for prompt in prompts}))
 
+    def origin_facts(self, prompt_list: PromptList | None) -> dict[str, str | None]:
+        """Where the truth lay and which list was asked, as results record it."""
+        return {"folder": str(self.origin), "layout": self.layout, "prompt_list": prompt_list}
+
     def renamed(self, names: Mapping[str, str]) -> Annotations:
         """The same truth under other words; prompts that ``names`` does not list are left out."""
 
