@@ -109,6 +109,7 @@ def fit_lerf(
     level_maps: LevelMaps,
     config: LerfConfig | None = None,
     *,
+    memory_bytes: int = 1 << 30,
     listener: Listener = silent,
 ) -> ScaledFeatures:
     """Average CLIP at each scale over the training views, then over neighbours that look alike.
@@ -119,6 +120,7 @@ def fit_lerf(
         maps: Dense features by view name; their DINO part regularises.
         level_maps: Features of each crop size.
         config: Settings.
+        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
         listener: Hears of stage "lerf".
     """
     config = config or LerfConfig()
@@ -127,7 +129,7 @@ def fit_lerf(
         rows, cols = maps[name].clip.shape[:2]
         return cols, rows
 
-    views = TrainingViews(gaussians, cameras, cells)
+    views = TrainingViews(gaussians, cameras, cells, memory_bytes=memory_bytes)
     scales = physical_scales(views, level_maps, config.scales)
     total = (config.scales + 1) * len(views.names)
     found = []

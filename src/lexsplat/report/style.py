@@ -78,7 +78,7 @@ th:first-child,td:first-child{text-align:left}
   .s5{--c:#22d3ee}.s6{--c:#f472b6}.s7{--c:#a3e635}.s8{--c:#94a3b8}.s9{--c:#fda4af}}
 .versus{border-top:1px solid var(--line);padding:14px 0 22px}
 .versus p{margin:0 0 8px;color:var(--ink);max-width:none}
-.row{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(130px,1fr);gap:8px;overflow-x:auto}
+.row{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(130px,270px);gap:8px;overflow-x:auto}
 .row.shared{max-width:560px;margin-bottom:12px}
 .answer p{font-size:13px;margin:0 0 6px}
 .answer p span{display:block;color:var(--soft);font-variant-numeric:tabular-nums}
