@@ -142,6 +142,7 @@ def fit_lerf(
         )
         found.append(features)
     stacked = torch.stack(found)
+    del found, features
     with_dino = maps[views.names[0]].dino is not None
     if config.neighbours and with_dino and len(gaussians) > 1:
         dino, _ = average_features(
@@ -240,6 +241,7 @@ def smooth_alike(means: Tensor, dino: Tensor, features: Tensor, config: LerfConf
         alike = torch.exp(config.sharpness * ((unit * unit[other]).sum(-1) - 1))
         # Nothing is known of what was never seen, so its neighbours count alike.
         weight = torch.where(seen > 0, alike, torch.ones_like(alike)) * seen[other]
-        total += weight[:, None] * features[:, other]
+        for scale, values in enumerate(features):  # one scale at a time: what is gathered is a copy
+            total[scale] += weight[:, None] * values[other]
         weights += weight
     return total / weights.clamp_min(1e-12)[:, None]
