@@ -13,10 +13,11 @@ from test_report import Page
 
 from lexsplat import ablation, cli
 from lexsplat.codebook import CodebookConfig
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, parse_bytes
 from lexsplat.embedding import EmbeddingConfig
 from lexsplat.errors import CaptureError
 from lexsplat.features import FeatureConfig
+from lexsplat.tensor_files import read_tensors, write_tensors
 
 CONFIG = BuildConfig(
     clip="colour",
@@ -161,6 +162,35 @@ def test_the_report_has_mean_and_spread_and_the_pictures_of_the_first_seed(ablat
 def test_codebooks_are_shared_where_the_quantization_is_the_same(ablated):
     # Full, w/o DINO and w/o L_lb need their own; the others take that of the full method. Two seeds.
     assert len(list((ablated / "codebooks").glob("*.safetensors"))) == 6
+
+
+def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_capture, tmp_path):
+    shutil.copytree(ablated / "scene", tmp_path / "scene")
+    shutil.copytree(ablated / "codebooks", tmp_path / "codebooks")
+    for path in (tmp_path / "codebooks").iterdir():
+        tensors, facts = read_tensors(path)
+        peaks = json.loads(facts["peaks"])
+        assert peaks["peak_rss_bytes"] is None or peaks["peak_rss_bytes"] > 1e7
+        write_tensors(path, tensors, {**facts, "peaks": json.dumps({"peak_rss_bytes": 10**15})})
+    rows = ablation.ablate(tiny_capture, tmp_path, CONFIG, seeds=(0,), variants=("full",))
+    assert rows[0]["host_bytes"][0] in (None, 10**15)
+
+
+def test_memory_granted_bounds_codebook_and_language(ablated, tiny_capture, tmp_path, monkeypatch):
+    from lexsplat import experiments
+
+    shutil.copytree(ablated / "scene", tmp_path / "scene")
+    granted = []
+    fit, field = experiments.fit_codebook, ablation.make_field
+    monkeypatch.setattr(
+        experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
+    )
+    monkeypatch.setattr(
+        ablation, "make_field", lambda *a: granted.append(a[4].embedding.memory_bytes) or field(*a)
+    )
+    config = replace(CONFIG, memory="800MB")
+    ablation.ablate(tiny_capture, tmp_path, config, seeds=(0,), variants=("full",))
+    assert granted == [parse_bytes("800MB"), parse_bytes("200MB")]
 
 
 def test_seeds_differ_and_the_gaussians_are_shared(ablated):

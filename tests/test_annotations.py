@@ -72,6 +72,30 @@ def test_prompts_that_a_list_does_not_name_are_left_out(authors):
     assert "DSCF4680.JPG" not in found.masks
 
 
+def test_masks_called_in_the_words_of_the_paper_answer_to_either_list(authors):
+    folder = authors / "segmentations" / "DSCF4690"
+    (folder / "green Yucca plant.png").rename(folder / "yucca plant.png")
+    scene = load_scene(authors)
+    assert load_annotations(scene, prompt_list="released").prompts() == (
+        "green Yucca plant", "silver gray curtain", "windows",
+    )  # fmt: skip
+    assert load_annotations(scene, prompt_list="paper").prompts() == ("curtain", "windows", "yucca plant")
+
+
+def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors, caplog):
+    save_mask(authors / "segmentations" / "DSCF4690" / "teapot.png", disk(20, 20, 8))
+    scene = load_scene(authors)
+    assert "teapot" not in load_annotations(scene, prompt_list="paper").prompts()
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert "teapot" in message
+    assert "windows" not in message
+    for folder in ("DSCF4670", "DSCF4690"):
+        for path in (authors / "segmentations" / folder).iterdir():
+            path.rename(path.with_name(f"tea {path.name}"))
+    with pytest.raises(CaptureError, match="words of the list 'paper'"):
+        load_annotations(scene, prompt_list="paper")
+
+
 def test_the_papers_list_is_the_table_of_its_supplement():
     """Counted by hand in the supplement's table, and compared with it where the paper is at hand."""
     assert {scene: len(prompts_of(scene, "paper")) for scene in SCENES} == {

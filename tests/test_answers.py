@@ -75,3 +75,8 @@ def test_prompt_lists_are_for_the_scenes_of_the_paper(built, tiny_capture, tmp_p
     assert cli.main(arguments) == 0
     result = json.loads((copy / "metrics.json").read_text())
     assert list(result["language"]["per_prompt"]) == ["black stool"], "the blue ball is in no list"
+    assert result["config"]["truth"] == {
+        "folder": str(bonsai / "segmentations"), "layout": "segmentations", "prompt_list": "paper",
+    }  # fmt: skip
+    report = (copy / "report.html").read_text()
+    assert f"<td>truth</td><td>{bonsai / 'segmentations'}, words of the list paper</td>" in report

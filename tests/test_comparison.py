@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import time
+from dataclasses import replace
 
 import pytest
 from colour_encoder import ColourClip, ColourDino
@@ -12,7 +13,9 @@ from test_ablation import CONFIG
 from test_report import Page
 
 from lexsplat import baselines, comparison
+from lexsplat.baselines import feature_rendering
 from lexsplat.cli.captures import capture_and_settings
+from lexsplat.config import parse_bytes
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +141,24 @@ def test_protocols_are_those_asked_for_and_measured_anew(compared, tiny_capture,
     with pytest.raises(ValueError, match="lerf-4d"):
         comparison.compare(tiny_capture, tmp_path / "a", CONFIG, protocols=("lerf-4d",))
     assert not (tmp_path / "a").exists()
+
+
+def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_capture, tmp_path, monkeypatch):
+    shutil.copytree(compared[0] / "scene", tmp_path / "scene")
+    monkeypatch.setattr("lexsplat.features.encoders.load_clip", lambda *a: ColourClip())
+    monkeypatch.setattr("lexsplat.features.encoders.load_dino", lambda *a: ColourDino())
+    monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=0))
+    monkeypatch.setattr(comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=0))
+    granted, original = [], feature_rendering.TrainingViews.__init__
+
+    def keep(*args, **wishes):
+        granted.append(wishes["memory_bytes"])
+        original(*args, **wishes)
+
+    monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)
+    config = replace(CONFIG, memory="800MB")
+    comparison.compare(tiny_capture, tmp_path, config, methods=("dff", "lerf", "3dovs"), lpips=False)
+    assert granted == [parse_bytes("200MB")] * 3
 
 
 def test_the_scenes_that_ship_have_names_and_the_demos_settings(tmp_path, monkeypatch):

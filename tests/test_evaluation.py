@@ -1,7 +1,10 @@
 import functools
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -300,6 +303,21 @@ def test_numbers_that_are_not_finite_become_null():
 
 def test_peak_memory_is_in_bytes():
     assert peak_memory() is None or peak_memory() > 50e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are counted anew on Linux only")
+def test_what_was_freed_before_does_not_count_as_needed_after():
+    script = """
+from lexsplat.evaluation import forget_peak_memory, peak_memory
+blocks = [bytearray(64 << 10) for _ in range(4000)]
+top = bytearray(64 << 10)  # lies above them all: the allocator gives nothing back by itself
+full = peak_memory()
+del blocks
+assert forget_peak_memory()
+print(full - peak_memory())
+"""
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert int(found.stdout) > 200e6
 
 
 def test_the_lerf_protocols_average_all_pairs_alike():

@@ -190,7 +190,8 @@ def make_language(
     if wrong_labels:
         code_maps = with_wrong_labels(code_maps, wrong_labels, codebook.num_codes, config.seed)
     start = time.perf_counter()
-    field = make_field(bench.gaussians, cameras, code_maps, codebook, config, bench.listener)
+    bounded = config.within_memory()
+    field = make_field(bench.gaussians, cameras, code_maps, codebook, bounded, bench.listener)
     return field, {"codebook": fit_seconds, "embed": time.perf_counter() - start}
 
 

@@ -245,7 +245,10 @@ def evaluate_scene(
             "language_bytes": folder.bytes_on_disk(folder.language_path),
             "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         },
-        settings=record.get("config", {}),
+        settings={
+            **record.get("config", {}),
+            "truth": truth.origin_facts(prompt_list) if truth.masks else None,
+        },
         machine=machine_facts(),
         prompt_kinds=_prompt_kinds(photos.root),
     )

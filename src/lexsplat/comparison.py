@@ -102,21 +102,23 @@ def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[],
 def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
     scene, maps = bench.scene, bench.maps
     training: Mapping[str, Any] = {view: scene.views[view].camera for view in scene.train_names}
+    memory = bench.config.within_memory().embedding.memory_bytes
     start = time.perf_counter()
     found: Method
     if name == "dff":
         found = baselines.distill(
-            bench.gaussians, training, maps, settings, seed=seed, listener=bench.listener
+            bench.gaussians, training, maps, settings, seed=seed, memory_bytes=memory, listener=bench.listener
         )
     elif name == "lerf":
         found = baselines.fit_lerf(
-            bench.gaussians, training, maps, bench.level_maps, settings, listener=bench.listener
-        )
+            bench.gaussians, training, maps, bench.level_maps, settings,
+            memory_bytes=memory, listener=bench.listener,
+        )  # fmt: skip
     elif name == "3dovs":
         classes = embed_prompts(bench.truth.prompts(), bench.encode_text, bench.evaluation.query.templates)
         found = baselines.fit_3dovs(
             bench.gaussians, training, maps, bench.level_maps, classes, settings, seed=seed,
-            listener=bench.listener,
+            memory_bytes=memory, listener=bench.listener,
         )  # fmt: skip
     else:
         found = baselines.ViewFeatures({view: v.camera for view, v in scene.views.items()}, maps)

@@ -6,8 +6,8 @@ once for each setting and seed, and every measured run is kept, so that a stoppe
 
 from __future__ import annotations
 
-import gc
 import hashlib
+import json
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -29,6 +29,7 @@ from lexsplat.evaluation import (
     ViewPictures,
     evaluate,
     forget_peak_memory,
+    peak_gpu_memory,
     peak_memory,
 )
 from lexsplat.evaluation.methods import Method
@@ -52,8 +53,11 @@ PICTURE_WIDTH = 240
 """Pixels across of the pictures that are kept of a run."""
 
 
-Made = tuple[LanguageField | Method, dict[str, float], "int | None"]
-"""A language, the seconds of its stages, and the peak of memory in bytes."""
+Peaks = dict[str, int | None]
+"""Peaks of host and GPU memory in bytes, by their names in ``metrics.json``."""
+
+Made = tuple[LanguageField | Method, dict[str, float], Peaks]
+"""A language, the seconds of its stages, and the peaks of memory while it was made."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,7 @@ class Bench:
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._clip: Any = None
         self._last: tuple[str, Made] | None = None
+        self._codebook_peaks: Peaks = {}
 
     def _load_scene(self, config: BuildConfig) -> tuple[Scene, BuildConfig]:
         scene = reload_capture(self.folder)
@@ -181,17 +186,23 @@ class Bench:
                 tensors, facts = read_tensors(path)
                 maps = {name: tensors.pop(f"codes/{name}").numpy() for name in names}
                 maps = dict(MaskedCodeMaps(maps, self.scene.views))
+                self._codebook_peaks = json.loads(facts.get("peaks", "{}"))
                 return Codebook.from_tensors(tensors).to(self.device), maps, float(facts["seconds"])
             except (FileFormatError, KeyError, ValueError) as error:
                 log.warning("%s is damaged and made anew (%s)", path, error)
         start = time.perf_counter()
-        codebook = fit_codebook(self.maps, names, settings, seed=seed, listener=self.listener)
+        memory = parse_bytes(self.config.memory)
+        codebook = fit_codebook(
+            self.maps, names, settings, seed=seed, device=self.device, memory=memory, listener=self.listener
+        )
         assigned = assign_code_maps(self.maps, codebook, names, listener=self.listener)
         seconds = time.perf_counter() - start
         import torch
 
         stored = {f"codes/{name}": torch.from_numpy(codes) for name, codes in assigned.items()}
-        write_tensors(path, {**codebook.tensors(), **stored}, {"seconds": f"{seconds:.3f}"})
+        self._codebook_peaks = self._peaks()
+        facts = {"seconds": f"{seconds:.3f}", "peaks": json.dumps(self._codebook_peaks)}
+        write_tensors(path, {**codebook.tensors(), **stored}, facts)
         return codebook.to(self.device), dict(MaskedCodeMaps(assigned, self.scene.views)), seconds
 
     def _stage(self, name: str) -> str:
@@ -229,11 +240,11 @@ class Bench:
                     return Run(name, seed, stored["metrics"], True, stored.get("detail", {}), shown)
             except (FileFormatError, KeyError, TypeError) as error:
                 log.warning("%s is damaged and measured anew (%s)", path, error)
-        language, seconds, peak = self._made(fingerprint(stages, list(settings), seed), make)
+        language, seconds, peaks = self._made(fingerprint(stages, list(settings), seed), make)
         gallery = Gallery(width=PICTURE_WIDTH)
         metrics = self._measure(name, language, seconds, gallery.add if pictures else None)
         result = metrics.to_json()
-        result["size"]["peak_rss_bytes"] = peak
+        result["size"] |= peaks
         result["config"]["seed"] = seed
         if pictures:
             write_tensors(drawn, gallery.tensors(), {"fingerprint": made_from})
@@ -246,13 +257,18 @@ class Bench:
         """What ``make`` makes; a language that is measured in two forms is made once."""
         if self._last is not None and self._last[0] == key:
             return self._last[1]
-        self._last = None  # what was made before is let go first
-        gc.collect()
+        self._last, self._codebook_peaks = None, {}  # what was made before is let go first
+        if self._maps is not None:
+            self._maps.forget()
         forget_peak_memory()
         language, seconds = make()
-        made = (language, seconds, peak_memory())
+        peaks = {name: _larger(peak, self._codebook_peaks.get(name)) for name, peak in self._peaks().items()}
+        made = (language, seconds, peaks)
         self._last = (key, made)
         return made
+
+    def _peaks(self) -> Peaks:
+        return {"peak_rss_bytes": peak_memory(), "peak_gpu_bytes": peak_gpu_memory(self.device)}
 
     def _measure(
         self,
@@ -349,12 +365,7 @@ class Results:
         }
 
     def _truth(self) -> dict[str, Any]:
-        truth = self.bench.truth
-        return {
-            "folder": str(truth.origin),
-            "layout": truth.layout,
-            "prompt_list": self.bench.prompt_list,
-        }
+        return self.bench.truth.origin_facts(self.bench.prompt_list)
 
     def _measured(self, name: str) -> MeasuredMethod:
         runs = self.runs[name]
@@ -386,6 +397,10 @@ def detail_of(metrics: Metrics) -> dict[str, Any]:
             for view, prompts in metrics.pairs.items()
         },
     }
+
+
+def _larger(peak: int | None, other: int | None) -> int | None:
+    return max(peak, other) if peak is not None and other is not None else peak
 
 
 def _digest(mask: Path | np.ndarray) -> str:

@@ -39,7 +39,7 @@ def without_masked_cells(maps: FeatureMaps, scene: Scene) -> FeatureMaps:
         counts = torch.from_numpy(share > 0)[..., None].to(found.clip.device)
         return FeatureMap(found.clip * counts, None if found.dino is None else found.dino * counts)
 
-    return FeatureMaps(list(maps), load, 0)
+    return FeatureMaps(list(maps), load, 0, source=maps)
 
 
 class MaskedCodeMaps(Mapping[str, Any]):

@@ -93,6 +93,7 @@ def distill(
     config: DffConfig | None = None,
     *,
     seed: int = 0,
+    memory_bytes: int = 1 << 30,
     listener: Listener = silent,
 ) -> DistilledFeatures:
     """Fit CLIP features to the Gaussians.
@@ -103,6 +104,7 @@ def distill(
         maps: Dense features by view name.
         config: Settings.
         seed: Of the order of the views.
+        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
         listener: Hears of stage "dff".
     """
     config = config or DffConfig()
@@ -111,7 +113,7 @@ def distill(
         rows, cols = maps[name].clip.shape[:2]
         return cols, rows
 
-    views = TrainingViews(gaussians, cameras, cells, scale=config.scale)
+    views = TrainingViews(gaussians, cameras, cells, scale=config.scale, memory_bytes=memory_bytes)
     dimensions = maps[views.names[0]].clip.shape[-1]
     ranges = chunks(dimensions)
     total = len(views.names) + config.steps * len(ranges)

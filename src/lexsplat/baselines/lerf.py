@@ -109,6 +109,7 @@ def fit_lerf(
     level_maps: LevelMaps,
     config: LerfConfig | None = None,
     *,
+    memory_bytes: int = 1 << 30,
     listener: Listener = silent,
 ) -> ScaledFeatures:
     """Average CLIP at each scale over the training views, then over neighbours that look alike.
@@ -119,6 +120,7 @@ def fit_lerf(
         maps: Dense features by view name; their DINO part regularises.
         level_maps: Features of each crop size.
         config: Settings.
+        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
         listener: Hears of stage "lerf".
     """
     config = config or LerfConfig()
@@ -127,7 +129,7 @@ def fit_lerf(
         rows, cols = maps[name].clip.shape[:2]
         return cols, rows
 
-    views = TrainingViews(gaussians, cameras, cells)
+    views = TrainingViews(gaussians, cameras, cells, memory_bytes=memory_bytes)
     scales = physical_scales(views, level_maps, config.scales)
     total = (config.scales + 1) * len(views.names)
     found = []
@@ -140,6 +142,7 @@ def fit_lerf(
         )
         found.append(features)
     stacked = torch.stack(found)
+    del found, features
     with_dino = maps[views.names[0]].dino is not None
     if config.neighbours and with_dino and len(gaussians) > 1:
         dino, _ = average_features(
@@ -238,6 +241,7 @@ def smooth_alike(means: Tensor, dino: Tensor, features: Tensor, config: LerfConf
         alike = torch.exp(config.sharpness * ((unit * unit[other]).sum(-1) - 1))
         # Nothing is known of what was never seen, so its neighbours count alike.
         weight = torch.where(seen > 0, alike, torch.ones_like(alike)) * seen[other]
-        total += weight[:, None] * features[:, other]
+        for scale, values in enumerate(features):  # one scale at a time: what is gathered is a copy
+            total[scale] += weight[:, None] * values[other]
         weights += weight
     return total / weights.clamp_min(1e-12)[:, None]

@@ -156,6 +156,7 @@ def fit_3dovs(
     config: Ovs3dConfig | None = None,
     *,
     seed: int = 0,
+    memory_bytes: int = 1 << 30,
     listener: Listener = silent,
 ) -> ClassFeatures:
     """Fit features to the Gaussians with the classes known.
@@ -168,6 +169,7 @@ def fit_3dovs(
         classes: Text embeddings ``[K, D]`` of all classes.
         config: Settings.
         seed: Of views and pixels.
+        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
         listener: Hears of stage "3dovs".
 
     Raises:
@@ -182,7 +184,7 @@ def fit_3dovs(
         rows, cols = maps[name].clip.shape[:2]
         return cols, rows
 
-    views = TrainingViews(gaussians, cameras, cells)
+    views = TrainingViews(gaussians, cameras, cells, memory_bytes=memory_bytes)
     total = len(views.names) + config.steps
     start, weights = average_features(
         views,

@@ -1,7 +1,7 @@
 """How good a scene is on its held-out views: pictures, words, speed and size, as in the paper's Table 1."""
 
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
-from lexsplat.evaluation.memory import forget_peak_memory, peak_memory
+from lexsplat.evaluation.memory import forget_peak_memory, peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import FieldMethod, Method
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.results import THRESHOLD_KINDS, Masks, Metrics, PairResult, ViewPictures
@@ -19,6 +19,7 @@ __all__ = [
     "ViewPictures",
     "evaluate",
     "forget_peak_memory",
+    "peak_gpu_memory",
     "peak_memory",
     "precision_curves",
     "summarize_kinds",

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.cameras import Camera
-from lexsplat.evaluation.memory import peak_memory
+from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import FieldMethod, Method, method_thresholds
 from lexsplat.evaluation.protocols import PROTOCOLS, lerf_2d_scores, official_scores, silhouette_iou
 from lexsplat.evaluation.results import Boxes, Masks, Metrics, PairResult, ViewPictures
@@ -337,11 +337,10 @@ def _sizes(gaussians: Gaussians, method: Method | None, stored: Mapping[str, int
     def size(tensors: Mapping[str, Tensor]) -> int:
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
 
-    on_gpu = gaussians.device.type == "cuda"
     return {
         "gaussians": len(gaussians),
         "language_bytes": stored.get("language_bytes", size(method.tensors()) if method else 0),
         "gaussian_bytes": stored.get("gaussian_bytes", size(gaussians.tensors())),
         "peak_rss_bytes": peak_memory(),
-        "peak_gpu_bytes": torch.cuda.max_memory_allocated(gaussians.device) if on_gpu else None,
+        "peak_gpu_bytes": peak_gpu_memory(gaussians.device),
     }

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -30,8 +33,20 @@ def peak_memory() -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def peak_gpu_memory(device: torch.device | str) -> int | None:
+    """Most bytes that tensors took on a GPU, counted as `peak_memory`; None for other devices."""
+    device = torch.device(device)
+    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
+
+
 def forget_peak_memory() -> bool:
-    """Count the peaks of host and GPU memory from now on; False where the system cannot (not Linux)."""
+    """Count the peaks of host and GPU memory from now on; False where the system cannot (not Linux).
+
+    What was freed goes back to the system first: the allocator would keep it, and what comes next would seem to need
+    what went before.
+    """
+    gc.collect()
+    _give_back_freed()
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     try:
@@ -39,3 +54,9 @@ def forget_peak_memory() -> bool:
     except OSError:
         return False
     return True
+
+
+def _give_back_freed() -> None:
+    """glibc's ``malloc_trim``; nothing where there is none (macOS, Windows, musl)."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -40,7 +40,7 @@ _EPSILON = np.float32(1e-6)
 
 @dataclass(frozen=True)
 class OfficialScores:
-    """Numbers of one image and prompt under the official protocol, float32 as in the authors' code."""
+    """Numbers of one image and prompt under the official protocol: float32 as in the code, the AP float64."""
 
     iou: float
     accuracy: float
@@ -67,8 +67,8 @@ def official_scores(relevancy: ArrayLike, mask: ArrayLike, threshold: float = 0.
     - Average precision: thresholds 0, 0.01, ..., 1 with >, recall TP / (TP + FN + 1e-6), the best precision at each
       of 101 recalls or beyond, divided by **100**: 1.01 at most.
 
-    Where the sums depend on the version of numpy (comparing float32 recalls with float64 levels), numpy 1's rule
-    is taken, which the authors' code was written for.
+    Where the result depends on the version of numpy (float32 recalls meet float64 levels, float32 precisions a
+    Python sum), it is that of 1.24, which the authors pin: compared in float32, added up in float64.
 
     Args:
         relevancy: ``[H, W]`` in 0..1, at the size of the rendered image.
@@ -106,8 +106,9 @@ def _official_average_precision(
     precisions, recalls = hits / (hits + alarms + _EPSILON), hits / (hits + misses + _EPSILON)
     best = np.append(np.float32(0), np.maximum.accumulate(precisions))
     reached = len(recalls) - np.searchsorted(recalls[::-1], levels, side="left")
-    # A running sum, one after the other, as the authors' loop adds them.
-    return float(np.cumsum(best[reached], dtype=np.float32)[-1] / np.float32(100))
+    # A running sum, one after the other, as the authors' loop adds them: in float64, since in numpy 1 a Python
+    # number plus a float32 is one.
+    return float(np.cumsum(best[reached], dtype=np.float64)[-1] / 100)
 
 
 # LERF-OVS in 2D

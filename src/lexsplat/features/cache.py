@@ -61,14 +61,19 @@ class FeatureMaps(Mapping[str, FeatureMap]):
         names: Names of the views.
         load: Makes the map of a view.
         cache_bytes: Most bytes of maps to keep.
+        source: What ``load`` takes maps from, if it keeps some too.
     """
 
     def __init__(
-        self, names: Sequence[str], load: Callable[[str], FeatureMap], cache_bytes: int = 1 << 30
+        self,
+        names: Sequence[str],
+        load: Callable[[str], FeatureMap],
+        cache_bytes: int = 1 << 30,
+        source: FeatureMaps | None = None,
     ) -> None:
         self._names, self._load, self._limit = dict.fromkeys(names), load, cache_bytes
         self._kept: OrderedDict[str, FeatureMap] = OrderedDict()
-        self._lock = Lock()
+        self._lock, self._source = Lock(), source
 
     def __getitem__(self, name: str) -> FeatureMap:
         if name not in self._names:
@@ -83,6 +88,13 @@ class FeatureMaps(Mapping[str, FeatureMap]):
             while self._kept and self.cached_bytes > self._limit:
                 self._kept.popitem(last=False)
         return found
+
+    def forget(self) -> None:
+        """Let go of what is kept; maps are made again when they are asked for."""
+        with self._lock:
+            self._kept.clear()
+        if self._source is not None:
+            self._source.forget()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

@@ -36,6 +36,12 @@ def table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
+def facts_table(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values, both HTML; long values are broken, so that a narrow window shows them too."""
+    body = "".join(f"<tr><td>{name}</td><td>{value}</td></tr>" for name, value in rows)
+    return f'<table class="facts"><tbody>{body}</tbody></table>'
+
+
 def cards(facts: Sequence[tuple[str, str, str]]) -> str:
     """Large numbers: name, value and a note for each."""
     inner = "".join(
@@ -99,14 +105,21 @@ _PROVENANCE = (
 
 
 def provenance(config: Mapping[str, Any], machine: Mapping[str, Any]) -> str:
-    """What somebody needs who wants to repeat the numbers: seed, models, machine, versions; all settings folded."""
+    """What somebody needs to repeat the numbers: seed, models, machine, truth, versions; all settings folded."""
     known = {**config, **machine}
-    rows = [[name, escape(_words(known[name]))] for name in _PROVENANCE if known.get(name) is not None]
+    rows = [(name, escape(_words(known[name]))) for name in _PROVENANCE if known.get(name) is not None]
+    if known.get("truth"):
+        rows.append(("truth", escape(_truth_words(known["truth"]))))
     versions = machine.get("versions") or {}
     if versions:
-        rows.append(["versions", escape(", ".join(f"{name} {value}" for name, value in versions.items()))])
-    shown = table(["", ""], rows) if rows else ""
+        rows.append(("versions", escape(", ".join(f"{name} {value}" for name, value in versions.items()))))
+    shown = facts_table(rows) if rows else ""
     return shown + folded_json("machine", machine) + folded_json("config", config)
+
+
+def _truth_words(truth: Mapping[str, Any]) -> str:
+    asked = truth.get("prompt_list")
+    return f"{truth.get('folder')}, " + (f"words of the list {asked}" if asked else "words of the masks")
 
 
 def _words(value: Any) -> str:

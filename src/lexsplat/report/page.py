@@ -24,6 +24,7 @@ from lexsplat.report.markup import (
     cards,
     curve_points,
     data_uri,
+    facts_table,
     header,
     image,
     meter,
@@ -208,7 +209,7 @@ def _cases(cases: Sequence[_Case], gallery: Gallery, limit: int) -> str:
     if not cases:
         return ""
     heads = "".join(f"<span>{name}</span>" for name in ("photo", "rendering", "relevancy", "mask", "truth"))
-    rows = [f'<div class="case head">{heads}</div>']
+    rows = [f'<div class="cases"><div class="case head">{heads}</div>']
     index = {view: place for place, view in enumerate(gallery.views)}
     for case in cases[:limit]:
         pictures = gallery.cases[case.view, case.prompt]
@@ -221,6 +222,7 @@ def _cases(cases: Sequence[_Case], gallery: Gallery, limit: int) -> str:
         words = f"<b>{escape(case.prompt)}</b> in {escape(case.view)}"
         numbers = f"IoU {number(case.iou)} · AP {number(case.average_precision)}"
         rows.append(f'<div class="case"><p>{words}<span>{numbers}</span></p>{"".join(tiles)}</div>')
+    rows.append("</div>")
     left_out = len(cases) - limit
     if left_out > 0:
         rows.append(f"<p>{left_out} better cases are left out.</p>")
@@ -242,19 +244,19 @@ def _quality_table(data: Mapping[str, Any]) -> str:
 def _resources(data: Mapping[str, Any]) -> str:
     speed, size = data["speed"], data["size"]
     rows = [
-        ["frames a second, colour and one prompt", number(speed["render_fps"], 1)],
-        ["frames a second, colour", number(speed["rgb_fps"], 1)],
-        ["milliseconds for a prompt in a view", number(speed["query_ms"], 1)],
-        ["Gaussians", f"{size['gaussians']:,}"],
-        ["geometry and colour", size_text(size["gaussian_bytes"])],
-        ["language", size_text(size["language_bytes"])],
-        ["peak memory", size_text(size["peak_rss_bytes"])],
-        ["peak memory of the GPU", size_text(size["peak_gpu_bytes"])],
+        ("frames a second, colour and one prompt", number(speed["render_fps"], 1)),
+        ("frames a second, colour", number(speed["rgb_fps"], 1)),
+        ("milliseconds for a prompt in a view", number(speed["query_ms"], 1)),
+        ("Gaussians", f"{size['gaussians']:,}"),
+        ("geometry and colour", size_text(size["gaussian_bytes"])),
+        ("language", size_text(size["language_bytes"])),
+        ("peak memory", size_text(size["peak_rss_bytes"])),
+        ("peak memory of the GPU", size_text(size["peak_gpu_bytes"])),
     ]
     rows += [
-        [f"seconds of {escape(name)}", number(value, 1)] for name, value in speed["stage_seconds"].items()
+        (f"seconds of {escape(name)}", number(value, 1)) for name, value in speed["stage_seconds"].items()
     ]
-    return table(["", ""], rows)
+    return facts_table(rows)
 
 
 def view_styles(gallery: Gallery, used: set[str]) -> str:

@@ -47,6 +47,8 @@ table{border-collapse:collapse;font-variant-numeric:tabular-nums;min-width:50%}
 th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th{color:var(--soft);font-weight:500;font-size:13px}
 th:first-child,td:first-child{text-align:left}
+.facts td{text-align:left;white-space:normal;overflow-wrap:anywhere;vertical-align:top}
+.facts td:first-child{overflow-wrap:normal;color:var(--soft)}
 .meter{display:inline-block;width:72px;height:6px;border-radius:3px;background:var(--line);
   margin-right:10px;vertical-align:middle;overflow:hidden}
 .meter i{display:block;height:100%;background:var(--accent)}
@@ -76,7 +78,7 @@ th:first-child,td:first-child{text-align:left}
   .s5{--c:#22d3ee}.s6{--c:#f472b6}.s7{--c:#a3e635}.s8{--c:#94a3b8}.s9{--c:#fda4af}}
 .versus{border-top:1px solid var(--line);padding:14px 0 22px}
 .versus p{margin:0 0 8px;color:var(--ink);max-width:none}
-.row{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(130px,1fr);gap:8px;overflow-x:auto}
+.row{display:grid;grid-auto-flow:column;grid-auto-columns:minmax(130px,270px);gap:8px;overflow-x:auto}
 .row.shared{max-width:560px;margin-bottom:12px}
 .answer p{font-size:13px;margin:0 0 6px}
 .answer p span{display:block;color:var(--soft);font-variant-numeric:tabular-nums}
@@ -85,6 +87,8 @@ th:first-child,td:first-child{text-align:left}
 .case p{grid-column:1/-1;margin:0;color:var(--ink);max-width:none}
 .case p span{float:right;color:var(--soft);font-variant-numeric:tabular-nums}
 .case.head{color:var(--soft);font-size:13px;margin-bottom:4px}
+@media(max-width:700px){.cases{overflow-x:auto}.case{width:680px}
+  .case p span{float:none;margin-left:12px}}
 details{margin:8px 0;background:var(--panel);border:1px solid var(--line);border-radius:10px;
   padding:10px 16px}
 summary{cursor:pointer}

@@ -10,6 +10,7 @@ A test holds each reader to small fixtures in its layout. Views with truth are t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +29,8 @@ from lexsplat.scenes.scene import Scene, View, stem_of
 from lexsplat.scenes.splits import mask_folders, match_stem
 from lexsplat.scenes.transforms_json import read_json
 from lexsplat.scenes.undistortion import MAX_SIDE
+
+log = logging.getLogger("lexsplat")
 
 LAYOUTS = ("segmentations", "3d-ovs", "lerf-ovs")
 """Names of the layouts."""
@@ -59,6 +62,10 @@ class Annotations:
     def prompts(self) -> tuple[str, ...]:
         """All prompts that have truth somewhere, sorted."""
         return tuple(sorted({prompt for prompts in self.masks.values() for prompt in prompts}))
+
+    def origin_facts(self, prompt_list: PromptList | None) -> dict[str, str | None]:
+        """Where the truth lay and which list was asked, as results record it."""
+        return {"folder": str(self.origin), "layout": self.layout, "prompt_list": prompt_list}
 
     def renamed(self, names: Mapping[str, str]) -> Annotations:
         """The same truth under other words; prompts that ``names`` does not list are left out."""
@@ -132,19 +139,37 @@ def load_annotations(
         scene: The capture.
         folder: Where the truth is; None looks in and beside the capture (`find_annotations`).
         prompt_list: Ask the words of the paper or of the released code, for captures called like its scenes;
-            None asks what the masks are called.
+            None asks what the masks are called. Masks may be called in the words of either; others are left out.
 
     Returns:
         Masks and boxes; empty where the capture has none.
 
     Raises:
         CaptureError: If a file belongs to no view or several, does not fit its photo, a class is missing, the
-            folder is none, or the capture has no prompt lists.
+            folder is none, the capture has no prompt lists, or no mask is called like one of their prompts.
         FileFormatError: If a label file is not what LangSplat's reader expects.
     """
     check_truth_wishes(scene.root, folder, prompt_list)
     truth = _read_truth(scene, folder)
-    return truth.renamed(capture_prompt_names(scene.root, prompt_list)) if prompt_list else truth
+    return _in_words_of(truth, scene.root, prompt_list) if prompt_list else truth
+
+
+def _in_words_of(truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
+    """The truth that a list asks for, in its words; what is left out is told."""
+    names = capture_prompt_names(root, prompt_list)
+    left_out = [prompt for prompt in truth.prompts() if prompt not in names]
+    found = truth.renamed(names)
+    if left_out and not found.masks:
+        raise CaptureError(
+            truth.origin,
+            expected="masks called like prompts of the paper",
+            found=f"none in the words of the list {prompt_list!r}, but {', '.join(left_out[:3])}",
+            remedy="leave the prompt list out: prompts are then what the masks are called",
+        )
+    if left_out:
+        some = ", ".join(left_out[:5]) + (" and more" if len(left_out) > 5 else "")
+        log.warning("%s: not in the prompt list %r and not asked: %s", truth.origin, prompt_list, some)
+    return found
 
 
 def _read_truth(scene: Scene, folder: Path | None) -> Annotations:

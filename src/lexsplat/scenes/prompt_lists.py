@@ -1,7 +1,7 @@
 """The prompts and test views of the paper's evaluation on Mip-NeRF 360: the supplement's and the released code's.
 
-The two differ in 19 of 48 prompts: capitals, and words ("curtain" became "silver gray curtain"). Masks are named by
-the released code, so its words are what a file name says; `prompt_names` maps them to either list.
+The two differ in 19 of 48 prompts: capitals, and words ("curtain" became "silver gray curtain"). The authors' masks
+are named by the released code; `prompt_names` maps what a file is called, in the words of either, to one of them.
 """
 
 from __future__ import annotations
@@ -119,11 +119,11 @@ def prompts_of(scene: str, prompt_list: PromptList = "released") -> tuple[str, .
     Raises:
         ValueError: If the scene or the list is unknown.
     """
-    return tuple(prompt_names(scene, prompt_list).values())
+    return tuple(dict.fromkeys(prompt_names(scene, prompt_list).values()))
 
 
 def prompt_names(scene: str, prompt_list: PromptList) -> dict[str, str]:
-    """The words of the mask files of a scene to the words of a list, for `Annotations.renamed`.
+    """What the mask files of a scene are called, in either list, to the words of one, for `Annotations.renamed`.
 
     Raises:
         ValueError: If the scene or the list is unknown.
@@ -132,11 +132,11 @@ def prompt_names(scene: str, prompt_list: PromptList) -> dict[str, str]:
         raise ValueError(
             f"prompt lists are paper and released, of {', '.join(SCENES)}; got {prompt_list!r} of {scene!r}"
         )
-    table = _PROMPTS[scene]
-    return {
-        released or paper: paper if prompt_list == "paper" else released or paper
-        for paper, released in table.items()
-    }
+    names: dict[str, str] = {}
+    for paper, other in _PROMPTS[scene].items():
+        released = other or paper
+        names |= dict.fromkeys((paper, released), paper if prompt_list == "paper" else released)
+    return names
 
 
 def capture_prompt_names(root: Path, prompt_list: PromptList) -> dict[str, str]:

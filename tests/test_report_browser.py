@@ -1,0 +1,53 @@
+"""The report in a real browser, wide and narrow: what it says can be read there."""
+
+import shutil
+
+import pytest
+from test_report import evaluated
+
+from lexsplat.report import write_report
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(12)}
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")
+
+
+@pytest.fixture(scope="module", params=[1280, 400])
+def opened(request, tmp_path_factory):
+    """The report in a window of a width; what it asked for or complained about is in ``refused``."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    metrics, gallery = evaluated()
+    metrics.machine["versions"] = VERSIONS
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(path, metrics, gallery)
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": request.param, "height": 800})
+        page.refused = []
+        page.on("console", lambda message: page.refused.append(message.text))
+        page.on("requestfailed", lambda request: page.refused.append(request.url))
+        page.goto(path.as_uri())
+        yield page
+        browser.close()
+
+
+def test_the_page_is_no_wider_than_its_window_and_asks_for_nothing(opened):
+    assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert opened.refused == []
+
+
+def test_settings_and_costs_can_be_read_without_moving_sideways(opened):
+    edges = opened.evaluate(
+        "[...document.querySelectorAll('.facts td')].map(cell => cell.getBoundingClientRect().right)"
+    )
+    assert len(edges) > 20
+    assert max(edges) <= opened.viewport_size["width"]
+
+
+def test_pictures_of_a_case_are_large_enough_to_see_something(opened):
+    widths = opened.evaluate(
+        "[...document.querySelectorAll('.case img, .case .pic')].map(p => p.getBoundingClientRect().width)"
+    )
+    assert widths
+    assert min(widths) >= 120
