@@ -35,7 +35,6 @@ VALIDATION_EVERY = 6
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "mcmc": {"strategy": "mcmc"},
-    "mcmc-often": {"strategy": "mcmc", "densify_min_every": 1},
     "plain-rates": {"rate_scale": 1.0},
     "no-warm-up": {"warm_up": 0.0},
     "classic": {"antialiased": False},

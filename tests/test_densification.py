@@ -265,6 +265,13 @@ def test_the_schedule_of_the_full_length_is_that_of_3dgs():
     assert density_schedule("mcmc", 30_000).stop == 25_000
 
 
+def test_a_short_training_has_as_many_rounds_of_mcmc_as_a_long_one():
+    """Each adds a twentieth: with a tenth of the rounds it would grow by 3 where a long one grows by 150,000."""
+    short, full = density_schedule("mcmc", 3_000, minimum_every=100), density_schedule("mcmc", 30_000)
+    rounds = [(schedule.stop - schedule.start) // schedule.every for schedule in (short, full)]
+    assert rounds == [245, 245]
+
+
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 100_000), st.integers(1, 200))
 def test_every_schedule_is_in_order(iterations, minimum):

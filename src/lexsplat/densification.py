@@ -56,13 +56,15 @@ def density_schedule(
         strategy: Whose schedule.
         iterations: Length of the training.
         every: Steps between two rounds in a training of 30,000.
-        minimum_every: Rounds are never closer than this, so that enough views vote.
+        minimum_every: Rounds of "default" are never closer than this, so that enough views vote. Nothing votes in
+            "mcmc": it adds by chance, a twentieth a round, and with few rounds would never come to its cap.
     """
     scale = iterations / REFERENCE_ITERATIONS
+    closest = minimum_every if strategy == "default" else 1
     return DensitySchedule(
         start=round(500 * scale),
         stop=round((15_000 if strategy == "default" else 25_000) * scale),
-        every=max(1, minimum_every, round(every * scale)),
+        every=max(1, closest, round(every * scale)),
         reset_every=max(1, round(3_000 * scale)),
     )
 

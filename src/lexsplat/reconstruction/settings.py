@@ -26,7 +26,7 @@ class ReconstructionConfig:
         strategy: Density control: "default" (3DGS) or "mcmc".
         max_gaussians: Never more than this many; None is 3,000,000 on CUDA and 40,000 on a CPU.
         densify_every: Steps between two rounds of density control.
-        densify_min_every: Rounds are never closer than this many actual steps.
+        densify_min_every: Rounds of "default" are never closer than this many actual steps.
         grow_gradient: Mean gradient of projected centres above which "default" adds Gaussians.
         min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
         reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None does so in trainings of at
