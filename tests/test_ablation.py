@@ -11,7 +11,7 @@ from colour_encoder import ColourClip, ColourDino
 from PIL import Image
 from test_report import Page
 
-from lexsplat import ablation, cli
+from lexsplat import ablation, cli, experiments
 from lexsplat.codebook import CodebookConfig
 from lexsplat.config import BuildConfig, parse_bytes
 from lexsplat.embedding import EmbeddingConfig
@@ -216,6 +216,16 @@ def test_a_stopped_ablation_goes_on_with_what_is_missing(ablated, tiny_capture, 
     for name in ("mIoU", "mAP", "official_mAP"):
         values = [[float(row[name]) for row in rows] for rows in (rows_of(ablated), before)]
         assert values[0] == values[1], name
+
+
+def test_another_program_measures_anew_what_the_one_before_kept(ablated, tiny_capture, tmp_path, monkeypatch):
+    """A method that was mended must not show the numbers of the broken one under today's versions."""
+    output = shutil.copytree(ablated, tmp_path / "ablated")
+    monkeypatch.setattr(experiments, "code_identity", lambda: "another")
+    made, original = [], ablation.make_field
+    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(a[4].seed) or original(*a))
+    ablation.ablate(tiny_capture, output, CONFIG, variants=("full",), seeds=(0,))
+    assert made == [0]
 
 
 def test_wrong_wishes_are_told_before_anything_is_made(tiny_capture, tmp_path):

@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -333,3 +335,8 @@ def test_moves_of_the_command_line_are_those_of_the_journal(built, tmp_path, cap
     assert copied["translation"] == [0.0, 0.0, 1.0]
     assert np.array(copied["rotation"]) == pytest.approx(np.eye(3))
     assert "2. duplicate blue ball" in capsys.readouterr().out
+
+
+def test_the_package_runs_as_a_module_too():
+    answer = subprocess.run([sys.executable, "-m", "lexsplat", "--version"], capture_output=True, text=True)
+    assert (answer.returncode, answer.stdout.split()[0]) == (0, "lexsplat")

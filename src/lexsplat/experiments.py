@@ -37,7 +37,7 @@ from lexsplat.evaluation.results import plain
 from lexsplat.features import FeatureMaps, TextCache, load_level_maps
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField
-from lexsplat.machine import machine_facts
+from lexsplat.machine import code_identity, machine_facts
 from lexsplat.masking import MaskedCodeMaps
 from lexsplat.pipeline import build, feature_maps
 from lexsplat.progress import Listener, silent
@@ -178,7 +178,7 @@ class Bench:
         Returns:
             The codebook, index maps by view, and the seconds it took when it was made.
         """
-        key = fingerprint(self._stage("features"), settings, seed)
+        key = fingerprint(self._stage("features"), settings, seed, code_identity())
         path = self.output / "codebooks" / f"{key}.safetensors"
         names = self.scene.train_names
         if path.is_file():
@@ -219,7 +219,7 @@ class Bench:
         *,
         pictures: bool = False,
     ) -> Run:
-        """Make a language and measure it, unless that was done before with the same settings.
+        """Make a language and measure it, unless that was done before with the same settings and the same code.
 
         Args:
             name: Of the variant or method.
@@ -229,7 +229,8 @@ class Bench:
             pictures: Whether to keep pictures of every prompt in every view.
         """
         stages = [self._stage("reconstruct"), self._stage("features")]
-        made_from = fingerprint(stages, list(settings), seed, asdict(self.evaluation), self._truth_identity)
+        measured = (asdict(self.evaluation), self._truth_identity, code_identity())
+        made_from = fingerprint(stages, list(settings), seed, *measured)
         path = self.output / "runs" / _folder_name(name) / f"seed-{seed}.json"
         drawn = path.with_name(f"seed-{seed}.pictures.safetensors")
         if path.is_file():
