@@ -16,6 +16,7 @@ from tiny_capture import write_capture
 
 from lexsplat import cli, open_scene
 from lexsplat.features import hub
+from lexsplat.scene_folder import SHIPPED_SCENE
 
 pytestmark = pytest.mark.xdist_group("built")
 
@@ -335,6 +336,48 @@ def test_moves_of_the_command_line_are_those_of_the_journal(built, tmp_path, cap
     assert copied["translation"] == [0.0, 0.0, 1.0]
     assert np.array(copied["rotation"]) == pytest.approx(np.eye(3))
     assert "2. duplicate blue ball" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["move", "--select", "red apple"], "move needs --by, --turn or --scale"),
+        (["duplicate", "--select", "red apple"], "duplicate needs --by, --turn or --scale"),
+        (["move", "--select", "red apple", "--scale", "-1"], "scale must be positive"),
+        (["move", "--select", "red apple", "--by", "nan", "0", "0"], "finite"),
+        (["recolour", "--select", "red apple", "--color", "2", "0", "0"], "in 0..1"),
+        (["recolour", "--select", "red apple", "--color", "1", "0", "0", "--strength", "3"], "in 0..1"),
+        (["delete", "--select", "red apple", "--threshold", "3"], "in 0..1"),
+        (["delete", "--select", "red apple", "--grow", "-1"], "not be negative"),
+    ],
+)
+def test_edits_that_mean_nothing_are_wrong_usage(built, arguments, words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["edit", str(built), *arguments])
+    assert ended.value.code == 2
+    assert words in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert not (built / "edits.jsonl").exists()
+
+
+def test_an_edit_of_nothing_says_what_could_be_done(built, capsys):
+    assert cli.main(["edit", str(built), "delete", "--select", "red apple", "--threshold", "1"]) == 1
+    assert "found nothing; try other words or a lower threshold" in capsys.readouterr().err
+
+
+def test_the_scene_that_ships_is_edited_in_a_journal_beside_the_user(tmp_path, monkeypatch, capsys):
+    before = {path: path.stat().st_mtime_ns for path in SHIPPED_SCENE.rglob("*")}
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["edit", "demo", "delete", "--select", "red apple"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["demo_edits.jsonl"]
+    less = capsys.readouterr().out.splitlines()[-1]
+    assert cli.main(["edit", "demo", "list"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == less
+    assert cli.main(["edit", "demo", "save", "--output", "mine"]) == 0
+    assert "demo_edits.jsonl" in capsys.readouterr().out, "it says that the steps are still there"
+    assert len(open_scene("mine").gaussians) < len(open_scene("demo").gaussians)
+    assert cli.main(["edit", "demo", "discard"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert {path: path.stat().st_mtime_ns for path in SHIPPED_SCENE.rglob("*")} == before
 
 
 def test_the_package_runs_as_a_module_too():

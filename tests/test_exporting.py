@@ -2,7 +2,9 @@
 
 import csv
 import json
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +49,28 @@ def test_a_selection_alone_holds_the_gaussians_that_were_found(built, tmp_path):
     assert (tmp_path / "apple.codebook.safetensors").exists()
 
 
+def test_selections_are_those_of_find_and_are_told(built, tmp_path, monkeypatch, capsys):
+    """Relations, a viewer, what was found of each phrase: as find and edit have it, not the bare words."""
+    asked = []
+    limit = float(open_scene(built).scores(["red apple"]).quantile(0.8))
+
+    def find(scene, phrase, view=None, *, threshold=None):
+        asked.append((phrase, view))
+        found = scene.select("red apple", 2.0 if "giraffe" in phrase else limit)
+        return replace(found, phrase="as understood", present="no" if "giraffe" in phrase else "yes")
+
+    monkeypatch.setattr("lexsplat.search.SearchableScene.find", find)
+    view = next(iter(open_scene(built).views))
+    phrases = ["apple left of the ball", "giraffe"]
+    assert export(built, tmp_path / "l.json", "--select", *phrases, "--view", view) == 0
+    assert asked == [(phrase, view) for phrase in phrases]
+    labels = json.loads((tmp_path / "l.json").read_text())["labels"]
+    assert [entry["phrase"] for entry in labels] == phrases
+    first, second, _ = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"apple left of the ball: [\d,]+ Gaussians", first)
+    assert second == "giraffe: 0 Gaussians; probably not in this scene"
+
+
 def test_labels_say_which_phrase_claims_which_gaussian(built, tmp_path):
     phrases = ["red apple", "blue ball"]
     for name in ("l.csv", "l.json"):
@@ -84,6 +108,9 @@ def test_of_two_phrases_the_one_further_above_its_threshold_labels(built):
         (["x.obj"], "ends in"),
         (["x.csv"], "phrases to label by"),
         (["x.splat", "--language"], "without room for language"),
+        (["x.csv", "--select", "apple", "--language"], "without room for language"),
+        (["x.ply", "--select", "red apple", "blue ball", "--threshold", "1"],
+         "red apple, blue ball: expected something to write, found nothing"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_written_is_told_in_one_line(built, tmp_path, arguments, words, capsys):

@@ -44,6 +44,23 @@ MUG, CLOTH, DUCK = Thing("mug"), Thing("cloth"), Thing("duck")
         ("something to drink from", Thing("something to drink from")),
         ("something to sit on", Thing("something to sit on")),
         ("a vase to put flowers in", Thing("vase to put flowers in")),
+        ("how many apples are there?", Thing("apple")),
+        ("how many apples are on the cloth", Related("on", Thing("apple"), CLOTH)),
+        ("How many red apples are there on the cloth?", Related("on", Thing("red apple"), CLOTH)),
+        ("is there a mug?", MUG),
+        ("is there a mug on the cloth?", Related("on", MUG, CLOTH)),
+        ("are there any mugs", Thing("mugs")),
+        ("where is the mug?", MUG),
+        ("Where are the mug and the duck", Both(MUG, DUCK)),
+        ("Mug On The Cloth", Related("on", Thing("mug"), Thing("Cloth"))),
+        ("how many MUGS", Thing("MUG")),
+        ("mug not on the cloth", Except(MUG, Related("on", MUG, CLOTH))),
+        ("mug that is not on the cloth", Except(MUG, Related("on", MUG, CLOTH))),
+        (
+            "how many apples are not on the cloth",
+            Except(Thing("apple"), Related("on", Thing("apple"), CLOTH)),
+        ),
+        ("theremin", Thing("theremin")),
         ("wooden table", Thing("wooden table")),
         ("onion", Thing("onion")),
         ("something made of metal", Thing("something made of metal")),
@@ -64,3 +81,8 @@ def test_what_was_understood_can_be_read():
         str(parse("largest mug on the cloth but not the duck"))
         == '((largest ("mug" on "cloth")) minus "duck")'
     )
+
+
+def test_an_empty_part_is_told_with_a_phrase_that_would_do():
+    with pytest.raises(QueryError, match=r"left of the mug.*such as"):
+        parse("left of the mug")

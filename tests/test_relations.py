@@ -1,5 +1,7 @@
 """Relations between balls and plates at known places."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +24,10 @@ THINGS = {  # a table top, things on it, a lamp over it, a pea in a bowl, a ball
     "bowl": ("ball", (0.0, -0.9, 0.35), 0.35),
     "pea": ("ball", (0.0, -0.9, 0.3), 0.08),
     "floor ball": ("ball", (3.0, 0.0, -1.0), 0.25),
+    "beside": ("ball", (1.8, 0.0, 0.25), 0.25),  # a hand's breadth from the table's edge, at its height
+    "cup": ("ball", (0.6, 1.0, 0.29), 0.15),  # on the table, its foot lost in the shadow
+    "pole": ("pole", (-1.0, -1.2, 1.0), 1.0),
+    "other pole": ("pole", (0.2, -1.2, 1.0), 1.0),
 }
 FRONT = look_at([0.0, -5.0, 1.5], [0.0, 0.0, 0.0], UP, 64, 48, 0.8)
 BACK = look_at([0.0, 5.0, 1.5], [0.0, 0.0, 0.0], UP, 64, 48, 0.8)
@@ -35,6 +41,8 @@ def things():
         count = 1500 if kind == "plate" else 200
         if kind == "plate":
             cloud = np.c_[rng.uniform(-size, size, (count, 2)), rng.normal(0, 0.01, count)]
+        elif kind == "pole":
+            cloud = np.c_[rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(-size, size, count)]
         else:
             cloud = rng.normal(size=(count, 3))
             cloud *= size / np.linalg.norm(cloud, axis=1, keepdims=True)
@@ -58,13 +66,14 @@ TRUE = [
     ("bowl", "in front of", "far ball"), ("left ball", "on", "table"), ("bowl", "on", "table"),
     ("table", "under", "left ball"), ("lamp", "above", "table"), ("table", "below", "lamp"),
     ("pea", "inside", "bowl"),
-    ("left ball", "next to", "bowl"), ("floor ball", "right of", "table"),
+    ("left ball", "next to", "bowl"), ("floor ball", "right of", "table"), ("cup", "on", "table"),
 ]  # fmt: skip
 FALSE = [
     ("right ball", "left of", "left ball"), ("lamp", "on", "table"), ("floor ball", "on", "table"),
     ("table", "on", "left ball"), ("bowl", "inside", "pea"), ("left ball", "inside", "bowl"),
     ("left ball", "next to", "floor ball"), ("left ball", "above", "right ball"), ("bowl", "behind", "far ball"),
     ("far ball", "left of", "bowl"), ("lamp", "next to", "table"),
+    ("beside", "on", "table"), ("table", "under", "beside"), ("pole", "next to", "other pole"),
 ]  # fmt: skip
 
 
@@ -135,3 +144,22 @@ def test_a_phrase_is_answered_with_what_it_asks_for(things):
     assert ask("lamp on the table").present == "no"
     assert ask("largest ball").count == 200
     assert ask("ball on the table").phrase == '("ball" on "table")'
+
+
+def test_what_fits_is_as_sure_as_the_least_sure_of_the_words(things):
+    sure = {"ball": "yes", "table": "unsure", "bowl": "no", "lamp": "yes", "bear": "yes"}
+    words = {"ball": ("left ball", "right ball"), "table": ("table",), "bowl": ("bowl",), "lamp": ("lamp",)}
+
+    def ask(text: str) -> Selection:
+        return answer(
+            parse(text),
+            lambda word: replace(things(*words[word]), present=sure[word]),
+            lambda _: FRONT,
+        )
+
+    assert ask("ball on the table").present == "unsure"
+    assert ask("ball next to the bowl").count == 400
+    assert ask("ball next to the bowl").present == "no", "what it stands next to is not in the scene"
+    assert ask("ball nearest to the bowl").present == "no"
+    assert (ask("ball but not the lamp").present, ask("ball but not the bowl").present) == ("yes", "yes")
+    assert (ask("ball but not the ball").count, ask("ball but not the ball").present) == (0, "no")

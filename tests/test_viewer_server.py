@@ -6,11 +6,16 @@ import socket
 import pytest
 from viewer_scene import WORDS, ball_scene
 
+from lexsplat.cameras import look_at
 from lexsplat.errors import BackendError
 from lexsplat.viewer.guard import Guard
+from lexsplat.viewer.memory import Memory
 from lexsplat.viewer.server import ViewerConfig, ViewerServer, is_loopback
 
 pytest.importorskip("viser")
+
+FRONT = look_at([0.0, -5.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 64, 48, 0.8)
+BACK = look_at([0.0, 5.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 64, 48, 0.8)
 
 
 @pytest.fixture(scope="module")
@@ -165,3 +170,29 @@ def test_the_command_line_serves_until_it_is_interrupted(built, monkeypatch, cap
     monkeypatch.setattr("lexsplat.cli.view.wait_for_interrupt", visit)
     assert cli.main(["view", str(built), "--port", "0"]) == 0
     assert served == [200]
+
+
+def test_what_was_asked_before_can_be_asked_again_from_the_first_moment(monkeypatch):
+    monkeypatch.setattr(Memory, "load", lambda *_: Memory(history=["red mug", "apple"]))
+    running = ViewerServer(ball_scene(per_ball=20)[0], ViewerConfig(port=0))
+    try:
+        assert running.panels._history.options[1:] == ("red mug", "apple")
+    finally:
+        running.stop()
+
+
+def test_left_and_right_are_those_of_the_page_that_asks(viewer, monkeypatch):
+    """Another page that moved last does not turn them round."""
+    asked = []
+    pages = {"mine": FRONT, "another": BACK}
+    monkeypatch.setattr("lexsplat.viewer.panels.page_camera", pages.__getitem__)
+    monkeypatch.setattr(viewer.session, "refine", lambda question, viewpoint: asked.append(viewpoint))
+    monkeypatch.setattr(viewer.panels, "_viewpoint", BACK)
+    viewer.panels.ask("ball 1 left of ball 2", "mine")
+    viewer.panels.wait()
+    viewer.panels._change_threshold("mine")
+    viewer.panels.wait()
+    viewer.panels.ask("ball 3")
+    viewer.panels.wait()
+    viewer.panels._remove("Remove all")
+    assert [camera is FRONT for camera in asked] == [True, True, False]

@@ -88,13 +88,19 @@ def answer_queries(
     }
 
 
-def find_phrases(scene: SearchableScene, phrases: Sequence[str], view: str | None = None) -> dict[str, Any]:
+def find_phrases(
+    scene: SearchableScene,
+    phrases: Sequence[str],
+    view: str | None = None,
+    threshold: float | None = None,
+) -> dict[str, Any]:
     """What ``lexsplat find`` says: the things that phrases ask for, in 3D.
 
     Args:
         scene: The scene to ask.
         phrases: What to look for, with relations (`lexsplat.phrases`).
         view: Name of the view whose left and right are meant; none takes one for each relation.
+        threshold: Relevancy from which a Gaussian belongs to a thing; none chooses one for each.
 
     Returns:
         ``{"scene", "up", "metres_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
@@ -106,7 +112,7 @@ def find_phrases(scene: SearchableScene, phrases: Sequence[str], view: str | Non
     """
     answers = []
     for phrase in check_prompts(phrases):
-        found = scene.find(phrase, view)
+        found = scene.find(phrase, view, threshold=threshold)
         entry = found.to_json()
         known = {"phrase": phrase, "understood": str(parse(phrase)), "count": len(entry["instances"])}
         answers.append({**entry, **known})

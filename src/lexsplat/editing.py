@@ -317,7 +317,12 @@ class Editor:
         if len(chosen.mask) != len(self.scene.gaussians):
             raise ValueError("the selection is of the scene before an edit: select again")
         if not chosen:
-            raise QueryError(chosen.phrase or "selection", expected="something to edit", found="nothing")
+            raise QueryError(
+                chosen.phrase or "selection",
+                expected="something to edit",
+                found="nothing",
+                remedy="try other words or a lower threshold",
+            )
         step = Step(kind, chosen.mask.clone().cpu(), values, chosen.phrase)
         self._advance(step)
         self.undone.clear()

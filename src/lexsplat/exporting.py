@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -77,10 +78,7 @@ def export_gaussians(
         BackendError: If the format needs a library that is not installed.
     """
     ending = ending_of(path)
-    if language is not None and ending not in (".ply", ".glb"):
-        raise SceneFolderError(
-            path, expected="a name that ends in .ply or .glb", found="a format without room for language"
-        )
+    check_room(path, language is not None)
     if len(gaussians) == 0:
         raise QueryError(path, expected="something to write", found="no Gaussian")
     if ending in LABEL_ENDINGS:
@@ -107,30 +105,44 @@ def export_gaussians(
     return written
 
 
-def export_scene(
+def found_by(
     scene: SearchableScene,
-    path: Path,
-    *,
-    phrases: Sequence[str] = (),
-    language: bool = False,
+    phrases: Sequence[str],
+    view: str | None = None,
     threshold: float | None = None,
+) -> list[Selection]:
+    """What answers to each phrase, relations and all, under the phrase as it was written.
+
+    Args:
+        scene: The scene.
+        phrases: What to look for (`lexsplat.phrases`).
+        view: Whose left and right are meant; none takes one for each relation.
+        threshold: Score from which a Gaussian was found; none chooses one for each phrase.
+
+    Raises:
+        QueryError: If a phrase is empty or the view is unknown.
+    """
+    return [replace(scene.find(phrase, view, threshold=threshold), phrase=phrase) for phrase in phrases]
+
+
+def export_scene(
+    scene: SearchableScene, path: Path, *, found: Sequence[Selection] = (), language: bool = False
 ) -> list[Path]:
-    """Write a scene, or what answers to phrases, or which Gaussian answers to which phrase.
+    """Write a scene, or selections of it, or which Gaussian belongs to which selection.
 
     Args:
         scene: The scene.
         path: A splat format (see `export_gaussians`); ``.csv`` for a line for each Gaussian; ``.json`` for what
             was found, with boxes and indices.
-        phrases: What to look for; splat formats then hold only what was found.
+        found: Selections, from `found_by`; splat formats then hold only them.
         language: Write codes and codebook along.
-        threshold: Score from which a Gaussian was found; none chooses one for each phrase.
 
     Raises:
-        QueryError: If nothing was found.
-        SceneFolderError: See `export_gaussians`; also for labels without phrases.
+        QueryError: If nothing is selected.
+        SceneFolderError: See `export_gaussians`; also for labels without selections.
     """
     ending = ending_of(path)
-    found = [scene.select(phrase, threshold) for phrase in phrases]
+    check_room(path, language)
     if ending in LABEL_ENDINGS and found:
         with atomic_path(path) as temporary:
             if ending == ".csv":
@@ -144,9 +156,28 @@ def export_scene(
     gaussians = scene.gaussians
     if found:
         mask = torch.stack([selection.mask for selection in found]).any(0)
+        if not mask.any():
+            raise QueryError(
+                ", ".join(selection.phrase for selection in found),
+                expected="something to write",
+                found="nothing",
+                remedy="try other words or a lower threshold",
+            )
         gaussians = gaussians.select(mask)
         stored = stored.select(mask.cpu()) if stored else None
     return export_gaussians(gaussians, path, language=stored, world=scene.world)
+
+
+def check_room(path: Path, language: bool) -> None:
+    """Refuse language for a format that cannot hold it.
+
+    Raises:
+        SceneFolderError: If the ending of the name is another than ``.ply`` or ``.glb``.
+    """
+    if language and ending_of(path) not in (".ply", ".glb"):
+        raise SceneFolderError(
+            path, expected="a name that ends in .ply or .glb", found="a format without room for language"
+        )
 
 
 def best_labels(found: Sequence[Selection]) -> tuple[Tensor, Tensor]:

@@ -2,12 +2,14 @@
 
 mug                          a thing; every word goes to the text encoder
 mug on the cloth             things by where they are
+mug not on the cloth         the others
 mug next to the duck on the table    read from the left: mug next to (duck on the table)
 apple and banana             both; also "or"
 fruit but not the banana     without; also "without", "except", "minus"
 largest book                 of several; also "biggest", "smallest"
 mug nearest to the lamp      also "closest to"
-how many apples              as "apple"; the answer has the count
+how many apples              as "apple"; the answer has the count; also "how many apples are there"
+is there a mug               as "mug"; also "where is the mug"
 "something on wheels"        in quotation marks: one thing, whatever words it has
 """
 
@@ -37,18 +39,22 @@ _WORDS: tuple[tuple[str, RelationName], ...] = (
     (r"nearest to|closest to|nearest|closest", "nearest to"),
 )
 _RELATION = re.compile(
-    r"\s(?:that (?:is|are)\s|which (?:is|are)\s)?(?:"
+    r"\s(?:(?:that |which )?(?:is|are)\s(?:there\s)?)?(?P<not>not\s)?(?:"
     + "|".join(f"(?P<r{i}>{words})" for i, (words, _) in enumerate(_WORDS))
-    + r")\s"
+    + r")\s",
+    re.IGNORECASE,
 )
-_ARTICLE = re.compile(r"^(?:the|a|an|some|all|every|any|my|this|that)\s+")
-_COUNT = re.compile(r"^(?:how many|count|number of)\s+")
-_EXCEPT = re.compile(r"\s(?:but not|without|except for|except|minus)\s")
-_BOTH = re.compile(r"\s(?:and|or)\s|\s*,\s*")
-_PICK = re.compile(r"^(largest|biggest|smallest)\s+")
+_ARTICLE = re.compile(r"^(?:the|a|an|some|all|every|any|my|this|that)\s+", re.IGNORECASE)
+_COUNT = re.compile(r"^(?:how many|count|number of)\s+", re.IGNORECASE)
+_QUESTION = re.compile(r"^(?:is there|are there|where is|where are)\s+", re.IGNORECASE)
+_THERE = re.compile(r"\s+(?:is|are)(?:\s+there)?$", re.IGNORECASE)
+_EXCEPT = re.compile(r"\s(?:but not|without|except for|except|minus)\s", re.IGNORECASE)
+_BOTH = re.compile(r"\s(?:and|or)\s|\s*,\s*", re.IGNORECASE)
+_PICK = re.compile(r"^(largest|biggest|smallest)\s+", re.IGNORECASE)
+_NEAREST = re.compile(r"^(?:nearest|closest)\s+(.+?)\s+to\s+(.+)$", re.IGNORECASE)
 
 _PLURALS = tuple(
-    (re.compile(ending), instead)
+    (re.compile(ending, re.IGNORECASE), instead)
     for ending, instead in (
         (r"(\w{2})ies$", r"\1y"),  # berries
         (r"(\w(?:ss|x|z|ch|sh))es$", r"\1"),  # boxes, glasses, brushes
@@ -130,8 +136,8 @@ def parse(text: str) -> Phrase:
     words = " ".join(hidden.split()).rstrip("?.!").strip()
     words = words[:1].lower() + words[1:]
     if (counted := _COUNT.sub("", words)) == words:
-        return _parse(words, quoted, text)
-    return _each(_parse(counted, quoted, text), keep=bool(quoted))
+        return _parse(_QUESTION.sub("", words), quoted, text)
+    return _each(_parse(_THERE.sub("", counted), quoted, text), keep=bool(quoted))
 
 
 def _each(phrase: Phrase, keep: bool) -> Phrase:
@@ -146,7 +152,10 @@ def _each(phrase: Phrase, keep: bool) -> Phrase:
     if isinstance(phrase, Both):
         return Both(_each(phrase.first, keep), _each(phrase.second, keep))
     if isinstance(phrase, Except):
-        return replace(phrase, first=_each(phrase.first, keep))
+        second = phrase.second
+        if isinstance(second, Related) and second.target == phrase.first:  # "not on": of the same things
+            second = replace(second, target=_each(second.target, keep))
+        return Except(_each(phrase.first, keep), second)
     return phrase
 
 
@@ -165,18 +174,25 @@ def _parse(words: str, quoted: list[str], whole: str) -> Phrase:
     if (parts := _BOTH.split(f" {words} ", maxsplit=1)) and len(parts) == 2:
         return Both(*(_parse(part, quoted, whole) for part in parts))
     bare = _ARTICLE.sub("", words)
-    if found := re.match(r"^(?:nearest|closest)\s+(.+?)\s+to\s+(.+)$", bare):
+    if found := _NEAREST.match(bare):
         return Related("nearest to", *(_parse(part, quoted, whole) for part in found.groups()))
     if found := _PICK.match(bare):
-        which: Literal["largest", "smallest"] = "smallest" if found[1] == "smallest" else "largest"
+        which: Literal["largest", "smallest"] = "smallest" if found[1].lower() == "smallest" else "largest"
         return Pick(which, _parse(bare[found.end() :], quoted, whole))
     if found := _RELATION.search(f" {bare} "):
         number = next(i for i in range(len(_WORDS)) if found.group(f"r{i}") is not None)
         target, reference = f" {bare} "[: found.start()], f" {bare} "[found.end() :]
         # "something to sit on" ends in such a word, and relates to nothing.
         if reference.strip() or " to " not in target:
-            return Related(_WORDS[number][1], _parse(target, quoted, whole), _parse(reference, quoted, whole))
+            things = _parse(target, quoted, whole)
+            related = Related(_WORDS[number][1], things, _parse(reference, quoted, whole))
+            return Except(things, related) if found.group("not") else related
     text = re.sub("\x00(\\d+)\x00", lambda match: quoted[int(match[1])], bare).strip()
     if not text:
-        raise QueryError(f"phrase {whole!r}", expected="a thing on either side", found="an empty part")
+        raise QueryError(
+            f"phrase {whole!r}",
+            expected="a thing on either side",
+            found="an empty part",
+            remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
+        )
     return Thing(text)

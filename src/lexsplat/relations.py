@@ -18,14 +18,18 @@ from scipy.spatial import cKDTree
 from lexsplat.boxes import upright_frame
 from lexsplat.cameras import Camera
 from lexsplat.phrases import Both, Except, Phrase, Pick, RelationName, Thing
-from lexsplat.selection import Selection
+from lexsplat.selection import PRESENCES, Presence, Selection
 
 _CONE = 0.5
 """Sideways means: at least this share of the level offset goes that way (within 60 degrees)."""
 _NEAR = 1.0
-"""Next to means: the gap is at most this many times the smaller thing's diagonal."""
-_SUPPORT = 0.35
-"""On means: the gap below is at most this many times the thing's height."""
+"""Next to means: the gap is at most this many times the diagonal of the smaller footprint (tall things are no nearer
+to each other for being tall)."""
+_SUPPORT = 0.5
+"""On means: the gap below is at most this many times the thing's height. Feet of things are often left out of
+selections: they stand in their own shadow."""
+_OVER = 0.3
+"""Over means: at least this share of the smaller of the two is over, or under, the other's footprint."""
 _INSIDE = 0.6
 """Inside means: at least this share of it lies in the other's box."""
 _SAMPLE = 4000
@@ -86,7 +90,7 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
         share = float(reference.box.contains(_points(target)).mean())
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
-        smaller = min(np.linalg.norm(target.size), np.linalg.norm(reference.size))
+        smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
         return bool(distance(target, reference) <= _NEAR * smaller) and not _over(target, reference, frame)
     raise ValueError(f"no such relation between two things: {relation!r}")
 
@@ -140,6 +144,7 @@ def answer(
     """
     if isinstance(phrase, Thing):
         return select(phrase.text)
+    present: Presence | None = None
     if isinstance(phrase, Both):
         found = answer(phrase.first, select, viewer) | answer(phrase.second, select, viewer)
     elif isinstance(phrase, Except):
@@ -158,7 +163,9 @@ def answer(
         else:
             frame = frame_of(viewer(references), references.up.direction)
             found = related(phrase.relation, targets, references, frame)
-    return replace(found, phrase=str(phrase))
+        present = min(found.present, references.present, key=PRESENCES.index)
+    # Nothing that fits is a "no", however sure the parts are.
+    return replace(found, phrase=str(phrase), present=(present or found.present) if found else "no")
 
 
 # One relation each
@@ -179,8 +186,11 @@ def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
     """Whether the support has a surface below the target, about where the target ends.
 
     The ground below a thing was often never seen, so its surroundings are asked: what of the support lies in the
-    target's footprint, widened by half.
+    target's footprint, widened by half. What stands beside a cloth has the cloth's edge in there as well, so the two
+    must lie over each other first.
     """
+    if not _overlap(target, support):
+        return False
     box, height = target.box, float(2 * target.box.half_sizes[2])
     points = _points(support)
     local = (points - box.center) @ box.axes.T
@@ -212,9 +222,14 @@ def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
     rise = float((upper.center - lower.center) @ frame.up)
     if rise < 0.8 * float(upper.box.half_sizes[2] + lower.box.half_sizes[2]):
         return False
-    small, large = sorted((upper, lower), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
+    return _overlap(upper, lower)
+
+
+def _overlap(first: Selection, second: Selection) -> bool:
+    """Whether two things lie over each other, seen from above."""
+    small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
     local = (_points(small) - large.center) @ large.box.axes[:2].T
-    return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= 0.3)
+    return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
 
 
 def _points(selection: Selection) -> NDArray[np.float64]:

@@ -27,6 +27,8 @@ from lexsplat.rendering import render
 from lexsplat.world import World
 
 Presence = Literal["yes", "no", "unsure"]
+PRESENCES: tuple[Presence, ...] = ("no", "unsure", "yes")
+"""The answers, the least sure first."""
 
 _NEIGHBOURS = 8
 _LINK = 2.5
@@ -265,13 +267,12 @@ class Selection:
         if len(self.mask) != len(other.mask):
             raise ValueError("the selections are of different scenes")
         scores = self.scores if word == "minus" else torch.maximum(self.scores, other.scores)
-        order: tuple[Presence, ...] = ("no", "unsure", "yes")
-        ranks = [order.index(self.present), order.index(other.present)]
+        ranks = [PRESENCES.index(self.present), PRESENCES.index(other.present)]
         present = {"or": max(ranks), "and": min(ranks), "minus": ranks[0]}[word]
         phrase = f"{self.phrase} {word} {other.phrase}".strip()
         threshold = min(self.threshold, other.threshold) if word == "or" else self.threshold
         return replace(
-            self, mask=mask, scores=scores, present=order[present], phrase=phrase, threshold=threshold
+            self, mask=mask, scores=scores, present=PRESENCES[present], phrase=phrase, threshold=threshold
         )
 
     def _with(self, indices: NDArray) -> Selection:

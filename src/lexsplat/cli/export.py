@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene
+from lexsplat.cli.options import PRESENCE, Device, check_relevancy, open_scene
 
 
 @dataclasses.dataclass
@@ -19,9 +19,11 @@ class Export:
     labels (see docs/formats.md).
 
     Args:
-        scene: A scene folder.
+        scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
         file: The file to write.
-        select: Write only what answers to these phrases; in .csv and .json, which Gaussian answers to which.
+        select: Write only what answers to these phrases (see `lexsplat find --help`); in .csv and .json, which
+            Gaussian answers to which.
+        view: Whose left and right a phrase means; none takes the view that shows the other thing best.
         language: Write codes and codebook along (.ply and .glb).
         threshold: Relevancy from which a Gaussian answers; none chooses one for each phrase.
         clip: Text encoder, if it is not where the build found it.
@@ -31,23 +33,28 @@ class Export:
     scene: tyro.conf.Positional[str]
     file: tyro.conf.Positional[Path]
     select: tuple[str, ...] = ()
+    view: str | None = None
     language: bool = False
     threshold: float | None = None
     clip: str | None = None
     device: Device = "auto"
 
+    def __post_init__(self) -> None:
+        check_relevancy(self.threshold)
+
     def run(self) -> None:
         """Write the file."""
-        from lexsplat.exporting import ending_of, export_gaussians, export_scene
+        from lexsplat.exporting import ending_of, export_gaussians, export_scene, found_by
         from lexsplat.scene_folder import SceneFolder
         from lexsplat.world import world_of
 
         ending_of(self.file)
         if self.select or self.language:
             scene = open_scene(self.scene, self.device, self.clip)
-            files = export_scene(
-                scene, self.file, phrases=self.select, language=self.language, threshold=self.threshold
-            )
+            found = found_by(scene, self.select, self.view, self.threshold)
+            for selection in found:
+                print(f"{selection.phrase}: {selection.count:,} Gaussians{PRESENCE[selection.present]}")
+            files = export_scene(scene, self.file, found=found, language=self.language)
         else:
             folder = SceneFolder.open(Path(self.scene))
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}

@@ -6,7 +6,7 @@ import dataclasses
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene, print_json
+from lexsplat.cli.options import Device, check_relevancy, open_scene, print_json
 
 
 @dataclasses.dataclass
@@ -19,9 +19,10 @@ class Find:
     units; sizes are in metres once the scale is known (see `lexsplat scale`).
 
     Args:
-        scene: A scene folder.
+        scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
         phrases: What to look for.
         view: Whose left and right are meant; none takes the view that shows the other thing best.
+        threshold: Relevancy from which a Gaussian belongs to a thing; none chooses one for each.
         clip: Text encoder, if it is not where the build found it.
         device: Where to compute.
         json: Print one JSON document on standard output.
@@ -30,21 +31,27 @@ class Find:
     scene: tyro.conf.Positional[str]
     phrases: tyro.conf.Positional[tuple[str, ...]]
     view: str | None = None
+    threshold: float | None = None
     clip: str | None = None
     device: Device = "auto"
     json: bool = False
+
+    def __post_init__(self) -> None:
+        check_relevancy(self.threshold)
 
     def run(self) -> None:
         """Find and print."""
         from lexsplat.answers import find_phrases
 
-        answers = find_phrases(open_scene(self.scene, self.device, self.clip), self.phrases, self.view)
+        scene = open_scene(self.scene, self.device, self.clip)
+        answers = find_phrases(scene, self.phrases, self.view, self.threshold)
         if self.json:
             print_json(answers)
             return
         for answer in answers["phrases"]:
             count = answer["count"]
-            print(f"{answer['phrase']}: present: {answer['present']}, {count} found")
+            weak = " that is a little like it" if answer["present"] == "no" and count else ""
+            print(f"{answer['phrase']}: present: {answer['present']}, {count} found{weak}")
             for number, thing in enumerate(answer["instances"], start=1):
                 center = ", ".join(f"{v:.2f}" for v in thing["center"])
                 metres = thing.get("size_metres")

@@ -19,6 +19,9 @@ PromptListName = Literal["paper", "released"]
 ProtocolName = Literal["strict", "official", "lerf-2d", "lerf-3d"]
 ALL_PROTOCOLS: tuple[ProtocolName, ...] = ("strict", "official", "lerf-2d", "lerf-3d")
 
+PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probably not in this scene"}
+"""What is said behind an answer, for each verdict on whether the thing is in the scene at all."""
+
 
 def open_scene(path: str, device: str, clip: str | None) -> SearchableScene:
     """The scene a command was given, ready to be asked."""
@@ -43,6 +46,16 @@ def print_evaluation(result: dict, folder: Path) -> None:
 def print_json_file(path: Path) -> None:
     """One JSON document that a command has written, on standard output."""
     print_json(json.loads(path.read_text(encoding="utf-8")))
+
+
+def check_relevancy(threshold: float | None) -> None:
+    """Refuse a threshold that no relevancy can be compared with.
+
+    Raises:
+        ValueError: It is given and not in 0..1.
+    """
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise ValueError(f"threshold must be in 0..1, got {threshold:g}")
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:

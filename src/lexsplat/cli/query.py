@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene, print_json
+from lexsplat.cli.options import PRESENCE, Device, check_relevancy, open_scene, print_json
 from lexsplat.queries import QueryConfig
 
 if TYPE_CHECKING:
     from lexsplat.search import SearchableScene
-
-PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probably not in this scene"}
-"""What is said behind an answer, for each verdict on whether the thing is in the scene at all."""
 
 
 @dataclasses.dataclass
@@ -53,8 +50,7 @@ class Query:
     json: bool = False
 
     def __post_init__(self) -> None:
-        if self.threshold is not None and not 0 <= self.threshold <= 1:
-            raise ValueError(f"threshold must be in 0..1, got {self.threshold:g}")
+        check_relevancy(self.threshold)
         self._changed(QueryConfig())
 
     def _changed(self, config: QueryConfig) -> QueryConfig:

@@ -95,12 +95,14 @@ class Panels:
         form = gui.add_form(None)
         with form:
             self._text = gui.add_text("Find", "")
-        self._when(form.on_submit, lambda _: self._submit())
+        self._when(form.on_submit, self._submit)
         self._when(self._text.on_update, lambda _: self._suggest())
         self._suggestions = gui.add_button_group("Try", ("",), visible=False)
-        self._when(self._suggestions.on_click, lambda _: self.ask(self._suggestions.value))
-        self._history = gui.add_dropdown("Recent", (_NO_PROMPT,), hint="What was asked before.")
-        self._when(self._history.on_update, lambda _: self._ask_again())
+        self._when(self._suggestions.on_click, lambda client: self.ask(self._suggestions.value, client))
+        self._history = gui.add_dropdown(
+            "Recent", (_NO_PROMPT, *self.session.memory.history), hint="What was asked before."
+        )
+        self._when(self._history.on_update, self._ask_again)
         self._message = gui.add_html("", visible=False)
         self._mode = gui.add_dropdown("Show", tuple(MODE_LABELS.values()))
         self._when(self._mode.on_update, lambda _: self._change_mode())
@@ -116,9 +118,9 @@ class Panels:
             self._color = gui.add_rgb("Colour", (230, 57, 70), hint="Used when several prompts are shown.")
             self._when(self._color.on_update, lambda _: self._change_prompt())
             self._automatic = gui.add_checkbox("Automatic", True, hint="A threshold found from the scene.")
-            self._when(self._automatic.on_update, lambda _: self._change_threshold())
+            self._when(self._automatic.on_update, self._change_threshold)
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.005, 0.5, disabled=True)
-            self._when(self._threshold.on_update, lambda _: self._change_threshold())
+            self._when(self._threshold.on_update, self._change_threshold)
             buttons = gui.add_button_group("", ("Remove", "Remove all"))
             self._when(buttons.on_click, lambda _: self._remove(buttons.value))
         self._opacity = gui.add_slider("Opacity", 0.0, 1.0, 0.05, self.session.opacity)
@@ -141,7 +143,7 @@ class Panels:
     def _build_what(self, gui: viser.GuiApi) -> None:
         self._answer = gui.add_html(pages.note("Click on something in the scene."))
         self._suggest_answer = gui.add_button_group("Find", ("",), visible=False)
-        self._when(self._suggest_answer.on_click, lambda _: self.ask(self._suggest_answer.value))
+        self._when(self._suggest_answer.on_click, lambda client: self.ask(self._suggest_answer.value, client))
         self._vocabulary = gui.add_text(
             "Words", ", ".join(self.session.memory.vocabulary), multiline=True,
             hint="What the answer is chosen from, separated by commas. Empty brings the first list back.",
@@ -181,19 +183,34 @@ class Panels:
 
     # -- asking
 
-    def ask(self, text: str) -> None:
-        """Ask for something: colours at once, threshold and selection when they are known."""
+    def ask(self, text: str, client: Any = None) -> None:
+        """Ask for something: colours at once, threshold and selection when they are known.
+
+        Args:
+            text: The prompt.
+            client: The page that asks: left and right are those of its camera. None takes the page that moved last.
+        """
         started = time.perf_counter()
         with self._lock:
             question = self.session.ask(text)
             self._redraw()
             self.seconds["ask"] = time.perf_counter() - started
             self._show_prompt()
-        self._later(f"refine {question.text}", lambda: self._refine(question, started))
+        viewpoint = self._camera_of(client)
+        self._later(f"refine {question.text}", lambda: self._refine(question, started, viewpoint))
 
-    def _submit(self) -> None:
+    def _camera_of(self, client: Any) -> Camera | None:
+        """Where a page stands; none, or one that has no size yet, takes the one that moved last."""
+        if client is None:
+            return self._viewpoint
+        try:
+            return page_camera(client)
+        except (ValueError, ZeroDivisionError):
+            return self._viewpoint
+
+    def _submit(self, client: Any) -> None:
         time.sleep(0.06)  # the page sends the last key stroke up to 50 ms late
-        self.ask(self._text.value)
+        self.ask(self._text.value, client)
 
     def _suggest(self) -> None:
         memory = self.session.memory
@@ -203,13 +220,13 @@ class Panels:
                 self._suggestions.options = tuple(options)
             self._suggestions.visible = bool(options)
 
-    def _ask_again(self) -> None:
+    def _ask_again(self, client: Any) -> None:
         if self._history.value != _NO_PROMPT:
-            self.ask(self._history.value)
+            self.ask(self._history.value, client)
             _set(self._history, _NO_PROMPT)
 
-    def _refine(self, question: Question, started: float) -> None:
-        self.session.refine(question, self._viewpoint)
+    def _refine(self, question: Question, started: float, viewpoint: Camera | None) -> None:
+        self.session.refine(question, viewpoint)
         with self._lock:
             if question not in self.session.all_questions():
                 return
@@ -247,7 +264,7 @@ class Panels:
             self._redraw()
             self._tell()
 
-    def _change_threshold(self) -> None:
+    def _change_threshold(self, client: Any) -> None:
         question = self.session.current
         if question is None or question is self.session.clicked:
             return
@@ -259,7 +276,8 @@ class Panels:
             self.session.set_threshold(question, value)
             self._redraw()
             self._tell()
-        self._later(f"refine {question.text}", lambda: self._refine(question, started))
+        viewpoint = self._camera_of(client)
+        self._later(f"refine {question.text}", lambda: self._refine(question, started, viewpoint))
 
     def _change_strength(self) -> None:
         with self._lock:
