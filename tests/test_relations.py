@@ -17,8 +17,8 @@ from lexsplat.selection import Selection
 UP = np.array([0.0, 0.0, 1.0])
 THINGS = {  # a table top, things on it, a lamp over it, a pea in a bowl, a ball on the floor
     "table": ("plate", (0.0, 0.0, 0.0), 1.5),
-    "left ball": ("ball", (-0.8, 0.0, 0.25), 0.25),
-    "right ball": ("ball", (0.8, 0.0, 0.25), 0.25),
+    "left ball": ("ball", (-0.8, -0.5, 0.25), 0.25),
+    "right ball": ("ball", (0.8, -0.5, 0.25), 0.25),
     "far ball": ("ball", (0.0, 1.1, 0.25), 0.25),
     "lamp": ("ball", (0.0, 0.0, 2.0), 0.3),
     "bowl": ("ball", (0.0, -0.9, 0.35), 0.35),
@@ -26,6 +26,7 @@ THINGS = {  # a table top, things on it, a lamp over it, a pea in a bowl, a ball
     "floor ball": ("ball", (3.0, 0.0, -1.0), 0.25),
     "beside": ("ball", (1.8, 0.0, 0.25), 0.25),  # a hand's breadth from the table's edge, at its height
     "cup": ("ball", (0.6, 1.0, 0.29), 0.15),  # on the table, its foot lost in the shadow
+    "coin": ("coin", (0.9, 0.9, 0.03), 0.15),
     "pole": ("pole", (-1.0, -1.2, 1.0), 1.0),
     "other pole": ("pole", (0.2, -1.2, 1.0), 1.0),
 }
@@ -38,8 +39,8 @@ def things():
     rng = np.random.default_rng(0)
     points, labels = [], []
     for number, (kind, place, size) in enumerate(THINGS.values()):
-        count = 1500 if kind == "plate" else 200
-        if kind == "plate":
+        count = {"plate": 1500, "coin": 40}.get(kind, 200)
+        if kind in ("plate", "coin"):
             cloud = np.c_[rng.uniform(-size, size, (count, 2)), rng.normal(0, 0.01, count)]
         elif kind == "pole":
             cloud = np.c_[rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(-size, size, count)]
@@ -63,7 +64,7 @@ def things():
 
 TRUE = [
     ("left ball", "left of", "right ball"), ("right ball", "right of", "bowl"), ("far ball", "behind", "bowl"),
-    ("bowl", "in front of", "far ball"), ("left ball", "on", "table"), ("bowl", "on", "table"),
+    ("bowl", "in front of", "far ball"), ("left ball", "on", "table"), ("bowl", "on", "table"), ("coin", "on", "table"),
     ("table", "under", "left ball"), ("lamp", "above", "table"), ("table", "below", "lamp"),
     ("pea", "inside", "bowl"),
     ("left ball", "next to", "bowl"), ("floor ball", "right of", "table"), ("cup", "on", "table"),
@@ -72,7 +73,8 @@ FALSE = [
     ("right ball", "left of", "left ball"), ("lamp", "on", "table"), ("floor ball", "on", "table"),
     ("table", "on", "left ball"), ("bowl", "inside", "pea"), ("left ball", "inside", "bowl"),
     ("left ball", "next to", "floor ball"), ("left ball", "above", "right ball"), ("bowl", "behind", "far ball"),
-    ("far ball", "left of", "bowl"), ("lamp", "next to", "table"),
+    ("far ball", "left of", "bowl"), ("lamp", "next to", "table"), ("left ball", "next to", "right ball"),
+    ("far ball", "next to", "right ball"),
     ("beside", "on", "table"), ("table", "under", "beside"), ("pole", "next to", "other pole"),
 ]  # fmt: skip
 
@@ -126,6 +128,16 @@ def test_of_several_instances_those_that_fit_are_kept(things):
     )
     assert torch.equal(nearest(things("lamp", "floor ball"), things("right ball")).mask, things("lamp").mask)
     assert related("on", things("floor ball"), things("table"), frame).present == "no"
+
+
+def test_a_small_thing_that_a_large_ones_selection_takes_in_still_stands_on_it(things):
+    """A coin lies so close to its table that it answers to "table" as well."""
+    found = related("on", things("coin"), things("table", "coin"), frame_of(None, UP))
+    assert found.count == things("coin").count
+
+
+def test_a_thing_is_not_next_to_itself_under_another_name(things):
+    assert not related("next to", things("cup"), things("cup", "left ball"), frame_of(None, UP))
 
 
 def test_a_phrase_is_answered_with_what_it_asks_for(things):

@@ -22,7 +22,7 @@ from lexsplat.selection import PRESENCES, Presence, Selection
 
 _CONE = 0.5
 """Sideways means: at least this share of the level offset goes that way (within 60 degrees)."""
-_NEAR = 1.0
+_NEAR = 0.5
 """Next to means: the gap is at most this many times the diagonal of the smaller footprint (tall things are no nearer
 to each other for being tall)."""
 _SUPPORT = 0.5
@@ -32,6 +32,8 @@ _OVER = 0.3
 """Over means: at least this share of the smaller of the two is over, or under, the other's footprint."""
 _INSIDE = 0.6
 """Inside means: at least this share of it lies in the other's box."""
+_SAME_SIZE = 0.1
+"""Two names of one thing have boxes whose volumes differ by less than this factor."""
 _SAMPLE = 4000
 
 
@@ -101,7 +103,7 @@ def related(relation: RelationName, targets: Selection, references: Selection, f
         target
         for target in targets.instances
         if any(
-            holds(relation, target, reference, frame)
+            holds(relation, target, reference - target, frame)  # what both words mean supports nothing
             for reference in references.instances
             if not _same(target, reference)
         )
@@ -238,8 +240,10 @@ def _points(selection: Selection) -> NDArray[np.float64]:
 
 
 def _same(first: Selection, second: Selection) -> bool:
+    """Whether two words mean one thing. A coin that its table's selection takes in is not the table."""
+    small, large = sorted((first, second), key=lambda s: s.box.volume)
     shared = int((first.mask & second.mask).sum())
-    return shared > 0.5 * min(first.count, second.count)
+    return shared > 0.5 * min(first.count, second.count) and small.box.volume > _SAME_SIZE * large.box.volume
 
 
 def _union(whole: Selection, parts: list[Selection]) -> Selection:
