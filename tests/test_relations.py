@@ -64,8 +64,8 @@ def things():
 
 TRUE = [
     ("left ball", "left of", "right ball"), ("right ball", "right of", "bowl"), ("far ball", "behind", "bowl"),
-    ("bowl", "in front of", "far ball"), ("left ball", "on", "table"), ("bowl", "on", "table"), ("coin", "on", "table"),
-    ("table", "under", "left ball"), ("lamp", "above", "table"), ("table", "below", "lamp"),
+    ("bowl", "in front of", "far ball"), ("left ball", "on", "table"), ("bowl", "on", "table"),
+    ("coin", "on", "table"), ("table", "under", "left ball"), ("lamp", "above", "table"), ("table", "below", "lamp"),
     ("pea", "inside", "bowl"),
     ("left ball", "next to", "bowl"), ("floor ball", "right of", "table"), ("cup", "on", "table"),
 ]  # fmt: skip
