@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene
+from lexsplat.cli.options import Device, check_threshold, open_scene
+from lexsplat.errors import QueryError
 
 if TYPE_CHECKING:
     from lexsplat.editing import Editor
@@ -67,6 +69,15 @@ class Edit:
             raise ValueError(f'{self.action} needs --select "what"')
         if self.action in needs and getattr(self, needs[self.action]) is None:
             raise ValueError(f"{self.action} needs --{needs[self.action]}")
+        check_threshold(self.threshold)
+        for name in ("grow", "shrink"):
+            distance = getattr(self, name)
+            if distance is not None and not 0 <= distance < math.inf:
+                raise ValueError(f"{name} must be a distance, got {distance:g}")
+        if not all(0 <= value <= 1 for value in (*(self.color or ()), self.strength)):
+            raise ValueError(f"color and strength must be in 0..1, got {self.color} and {self.strength:g}")
+        if not all(map(math.isfinite, (*self.by, self.turn))) or not 0 < self.scale < math.inf:
+            raise ValueError("by, turn and scale must be finite numbers, and scale positive")
 
     def run(self) -> None:
         """Do one thing and say what the scene is now."""
@@ -98,10 +109,15 @@ class Edit:
         chosen = chosen.largest() if self.largest else chosen
         chosen = chosen.grow(self.grow) if self.grow is not None else chosen
         chosen = chosen.shrink(self.shrink) if self.shrink is not None else chosen
-        if self.action == "recolour" and self.color:
-            editor.recolour(chosen, self.color, self.strength)
-        elif self.action in ("move", "duplicate"):
-            turn = rotation_about(chosen.up.direction, self.turn)
-            getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
-        else:
-            getattr(editor, self.action)(chosen)
+        try:
+            if self.action == "recolour" and self.color:
+                editor.recolour(chosen, self.color, self.strength)
+            elif self.action in ("move", "duplicate"):
+                turn = rotation_about(chosen.up.direction, self.turn)
+                getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
+            else:
+                getattr(editor, self.action)(chosen)
+        except ValueError as error:  # numbers that only together, or only for these Gaussians, lead too far
+            raise QueryError(
+                self.action, expected="Gaussians that can be drawn afterwards", found=str(error)
+            ) from error

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene
+from lexsplat.cli.options import Device, check_threshold, open_scene
 
 
 @dataclasses.dataclass
@@ -36,6 +36,9 @@ class Export:
     clip: str | None = None
     device: Device = "auto"
 
+    def __post_init__(self) -> None:
+        check_threshold(self.threshold)
+
     def run(self) -> None:
         """Write the file."""
         from lexsplat.exporting import ending_of, export_gaussians, export_scene
@@ -43,6 +46,7 @@ class Export:
         from lexsplat.world import world_of
 
         ending_of(self.file)
+        SceneFolder.open(Path(self.scene)).refuse_own_file(self.file)
         if self.select or self.language:
             scene = open_scene(self.scene, self.device, self.clip)
             files = export_scene(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, check_seed
 
 if TYPE_CHECKING:
     from lexsplat.search import SearchableScene
@@ -46,10 +46,22 @@ def print_json_file(path: Path) -> None:
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Refuse an empty list of seeds.
+    """Refuse an empty list of seeds, and seeds that are none.
 
     Raises:
-        ValueError: There is none.
+        ValueError: There is none, or it is negative or too large.
     """
     if not seeds:
         raise ValueError("at least one seed is needed")
+    for seed in seeds:
+        check_seed(seed)
+
+
+def check_threshold(threshold: float | None) -> None:
+    """Refuse a threshold that no relevancy can be compared with.
+
+    Raises:
+        ValueError: It is not in 0..1.
+    """
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise ValueError(f"threshold must be in 0..1, got {threshold:g}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, open_scene, print_json
+from lexsplat.cli.options import Device, check_threshold, open_scene, print_json
 from lexsplat.queries import QueryConfig
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ class Query:
     json: bool = False
 
     def __post_init__(self) -> None:
-        if self.threshold is not None and not 0 <= self.threshold <= 1:
-            raise ValueError(f"threshold must be in 0..1, got {self.threshold:g}")
+        check_threshold(self.threshold)
         self._changed(QueryConfig())
 
     def _changed(self, config: QueryConfig) -> QueryConfig:
