@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -376,13 +378,42 @@ def test_names_that_are_no_text_end_in_one_line(tmp_path, capsys):
     fails_in_one_line(capsys, ["build", str(capture), "--output", str(tmp_path / "out"), *QUICK], "UTF-8")
 
 
-def test_ctrl_c_while_the_program_starts_ends_in_a_line(monkeypatch, capsys):
+STOPPED = "stopped; run the same command again to go on\n"
+
+
+def test_the_second_of_two_at_one_output_says_who_holds_it_and_stops(tiny_capture, tmp_path, capsys):
+    from lexsplat.scene_folder import SceneFolder
+
+    with SceneFolder(tmp_path / "out").locked():
+        for arguments in (["poses", str(tiny_capture / "images")], ["build", str(tiny_capture), *QUICK]):
+            arguments += ["--output", str(tmp_path / "out")]
+            fails_in_one_line(capsys, arguments, f"process {os.getpid()} at work", "another --output")
+
+
+def test_ctrl_c_while_arguments_are_read_ends_in_a_line(monkeypatch, capsys):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli.tyro, "cli", interrupted)
     assert cli.main(["info", "demo"]) == 130
-    assert capsys.readouterr().err == "stopped; run the same command again to go on\n"
+    assert capsys.readouterr().err == STOPPED
+
+
+def test_ctrl_c_while_the_libraries_load_ends_in_a_line():
+    interrupting = """
+import os, signal, sys
+from lexsplat.__main__ import main
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", interrupting], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
 def test_version_is_printed(capsys):

@@ -47,11 +47,12 @@ class Poses:
     def run(self) -> None:
         """Write the model and say how many photos were placed, and which were not."""
         from lexsplat.progress_bars import ProgressBars
+        from lexsplat.scene_folder import SceneFolder
         from lexsplat.scenes import poses_from_photos
         from lexsplat.scenes.video import is_video, sample_video
 
         photos, memory = self.photos, parse_bytes(self.memory)
-        with ProgressBars() as bars:
+        with SceneFolder(self.output).locked(), ProgressBars() as bars:
             if is_video(photos):
                 photos = self.output / "images"
                 sample_video(self.photos, photos, self.frames, memory=memory, listener=bars)

@@ -1,0 +1,22 @@
+"""``lexsplat`` and ``python -m lexsplat``: the command line, also quiet when stopped while its libraries load."""
+
+from __future__ import annotations
+
+import sys
+
+STOPPED = "stopped; run the same command again to go on"
+
+
+def main() -> int:
+    """Run one command; returns the exit status."""
+    try:
+        from lexsplat import cli  # takes seconds, in which people change their minds
+
+        return cli.main()
+    except KeyboardInterrupt:
+        print(STOPPED, file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
