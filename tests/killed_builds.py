@@ -16,7 +16,11 @@ from pathlib import Path
 import numpy as np
 
 STAGES = 4
-KILLS_A_SCENE = 13
+KILLS_A_SCENE = 7
+SHORTEST_STAGE = 0.2
+"""Seconds of the codebook on a quick machine: a kill within them, after the stage before, is in it."""
+LONGEST_SECONDS = 1.2
+"""Until any other kill."""
 
 
 def attempt(arguments: list[str], output: Path, seconds: float | None, after_stages: int = 0) -> str:
@@ -55,9 +59,9 @@ def stages_done(output: Path) -> int:
 
 def main() -> None:
     folder, kills, seed, *arguments = sys.argv[1:]
-    import lexsplat.cli
-    import lexsplat.features.encoders
-    import lexsplat.pipeline  # noqa: F401  (torch, numba and the rest, before the first fork)
+    import transformers.models.auto.tokenization_auto
+    import transformers.models.clip.modeling_clip
+    import transformers.models.vit.modeling_vit  # noqa: F401  (seconds of imports, once, before the first fork)
 
     rng = np.random.default_rng(int(seed))
     killed: list[int] = []
@@ -68,7 +72,10 @@ def main() -> None:
         # come, most of them while the process starts or goes on with a training.
         wanted = len(finished) % STAGES
         for number in range(KILLS_A_SCENE):
-            result = attempt(arguments, output, float(rng.uniform(0.0, 2.0)), 0 if number else wanted)
+            if number:
+                result = attempt(arguments, output, float(rng.uniform(0.0, LONGEST_SECONDS)))
+            else:
+                result = attempt(arguments, output, float(rng.uniform(0.0, SHORTEST_STAGE)), wanted)
             if result != "killed":
                 break
             killed.append(stages_done(output))

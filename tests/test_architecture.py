@@ -16,7 +16,7 @@ ORDER = """
     reconstruction features codebook language_field losses embedding joint lifting masking queries thresholds
     selection presence truth picking phrases relations heatmaps baselines evaluation report formats
     scene_folder previous_scene config captures search scaling editing exporting provenance pipeline experiments
-    ablation comparison answers viewer demo progress_bars cli __main__ __init__
+    ablation comparison answers viewer demo progress_bars cli __init__ __main__
 """.split()  # noqa: SIM905  (thirty quoted names would not read as a list)
 
 # Kernels and helpers that belong to a neighbour share its place in the order.

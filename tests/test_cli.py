@@ -304,6 +304,25 @@ def test_bad_captures_end_in_one_line_and_no_half_written_output(tmp_path, capsy
         ["query", "x", "apple", "--threshold", "nan"],
         ["query", "x", "apple", "--template", "no braces"],
         ["query", "x", "apple", "--temperature", "-1"],
+        ["build", "x", "--output", "y", "--seed", "-1"],
+        ["build", "x", "--output", "y", "--seed", str(2**70)],
+        ["build", "x", "--output", "y", "--reconstruction.max-gaussians", "0"],
+        ["embed", "x", "--output", "y", "--splats", "z.ply", "--joint", "--method", "trained"],
+        ["poses", "x", "--output", "y", "--memory", "plenty"],
+        ["poses", "x", "--output", "y", "--seed", "-1"],
+        ["demo", "--iterations", "0"],
+        ["demo", "--seed", "-1"],
+        ["compare", "x", "--output", "y", "--seeds", "-1"],
+        ["edit", "x", "delete", "--select", "a", "--threshold", "nan"],
+        ["edit", "x", "delete", "--select", "a", "--grow", "-1"],
+        ["edit", "x", "delete", "--select", "a", "--shrink", "inf"],
+        ["edit", "x", "move", "--select", "a", "--by", "nan", "0", "0"],
+        ["edit", "x", "move", "--select", "a", "--turn", "inf"],
+        ["edit", "x", "move", "--select", "a", "--scale", "0"],
+        ["edit", "x", "recolour", "--select", "a", "--color", "255", "0", "0"],
+        ["edit", "x", "recolour", "--select", "a", "--color", "1", "0", "0", "--strength", "2"],
+        ["export", "x", "a.ply", "--select", "a", "--threshold", "nan"],
+        ["scale", "x", "--up", "0,0,0"],
     ],
     ids=" ".join,
 )
@@ -312,6 +331,90 @@ def test_wrong_usage_is_status_2_and_words(arguments, capsys):
         cli.main(arguments)
     assert caught.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_an_edit_that_leads_nowhere_ends_in_one_line_and_is_no_step(built, tmp_path, capsys):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    thing = ("--select", "blue ball", "--threshold", "0.13", "--largest")
+    for motion in (["--by", "1e300", "0", "0"], ["--scale", "1e30"]):
+        fails_in_one_line(capsys, ["edit", str(copy), "move", *thing, *motion], "move", "Gaussians")
+    assert cli.main(["edit", str(copy), "list"]) == 0
+    assert not (copy / "edits.jsonl").exists()
+
+
+@pytest.mark.parametrize("name", ["gaussians.ply", "codes/../gaussians.ply", "metrics.json", "scene.json"])
+def test_an_export_never_takes_the_place_of_a_file_of_its_scene(built, tmp_path, capsys, name):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    before = (copy / "gaussians.ply").read_bytes()
+    fails_in_one_line(
+        capsys, ["export", str(copy), str(copy / name), "--select", "blue ball"], "another name"
+    )
+    assert (copy / "gaussians.ply").read_bytes() == before
+    assert cli.main(["export", str(copy), str(copy / "copy.ply")]) == 0
+
+
+@pytest.mark.parametrize("name", ["gaussians.ply", "cameras.json"])
+def test_a_build_never_takes_the_place_of_files_of_another_program(tiny_capture, tmp_path, capsys, name):
+    """The folder of a 3DGS training has a cameras.json, too."""
+    output = tmp_path / "output"
+    output.mkdir()
+    (output / name).write_text("mine")
+    arguments = ["build", str(tiny_capture), "--output", str(output), *QUICK]
+    fails_in_one_line(capsys, arguments, name, "another --output")
+    assert [path.name for path in output.iterdir()] == [name]
+    assert (output / name).read_text() == "mine"
+
+
+def test_a_capture_worked_on_too_small_is_told_before_the_training(tiny_capture, tmp_path, capsys):
+    arguments = ["build", str(tiny_capture), "--output", str(tmp_path / "out"), *QUICK]
+    fails_in_one_line(capsys, [*arguments, "--downscale", "100"], "6 pixels", "--downscale")
+    # Eight pixels are enough, though half of them, as in the warm-up of a training, are not.
+    assert cli.main(["reconstruct", *arguments[1:], "--downscale", "9", "--iterations", "10"]) == 0
+
+
+def test_names_that_are_no_text_end_in_one_line(tmp_path, capsys):
+    capture = write_capture(tmp_path / "capture\udcff", views=4, width=32, height=24)
+    fails_in_one_line(capsys, ["build", str(capture), "--output", str(tmp_path / "out"), *QUICK], "UTF-8")
+
+
+STOPPED = "stopped; run the same command again to go on\n"
+
+
+def test_the_second_of_two_at_one_output_says_who_holds_it_and_stops(tiny_capture, tmp_path, capsys):
+    from lexsplat.scene_folder import SceneFolder
+
+    with SceneFolder(tmp_path / "out").locked():
+        for arguments in (["poses", str(tiny_capture / "images")], ["build", str(tiny_capture), *QUICK]):
+            arguments += ["--output", str(tmp_path / "out")]
+            fails_in_one_line(capsys, arguments, f"process {os.getpid()} at work", "another --output")
+
+
+def test_ctrl_c_while_arguments_are_read_ends_in_a_line(monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.tyro, "cli", interrupted)
+    assert cli.main(["info", "demo"]) == 130
+    assert capsys.readouterr().err == STOPPED
+
+
+def test_ctrl_c_while_the_libraries_load_ends_in_a_line():
+    interrupting = """
+import os, signal, sys
+from lexsplat.__main__ import main
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", interrupting], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
 def test_version_is_printed(capsys):

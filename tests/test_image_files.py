@@ -233,3 +233,19 @@ def test_a_damaged_length_does_not_become_memory(tmp_path):
     tracemalloc.stop()
     np.testing.assert_allclose(found, painted() / 255.0, atol=1e-6)
     assert peak < 10_000_000
+
+
+def test_a_mask_in_dark_colours_is_told_and_not_taken_for_empty(tmp_path):
+    """Label tools write classes as colours of a palette: the first is a dark red."""
+    mask = Image.new("P", (8, 8))
+    mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    mask.paste(1, (0, 0, 4, 8))
+    mask.save(tmp_path / "red apple.png")
+    with pytest.raises(CaptureError, match="black and white"):
+        read_mask(tmp_path / "red apple.png")
+    assert read_mask(tmp_path / "red apple.png", nonzero=True).mean() == 0.5
+    for noise in (0, 1, 9):
+        Image.fromarray(np.full((8, 8), 255 * (noise == 1) + noise * (noise > 1), np.uint8)).save(
+            tmp_path / "m.png"
+        )
+        assert read_mask(tmp_path / "m.png").all() == (noise == 1)

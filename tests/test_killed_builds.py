@@ -8,15 +8,20 @@ import sys
 from pathlib import Path
 
 import pytest
+from tiny_capture import write_capture
 
 SCRIPT = Path(__file__).with_name("killed_builds.py")
 KILLS = 50
 
 
 @pytest.fixture(scope="module")
-def options(tiny_capture) -> list[str]:
+def options(tmp_path_factory) -> list[str]:
+    """A build of which the trainings, which have most to lose, take the larger part: features are few and small."""
+    capture = write_capture(tmp_path_factory.mktemp("killed") / "capture", views=6, width=64, height=48)
     return [
-        "build", str(tiny_capture), "--clip", "embedded", "--dino", "embedded", "--device", "cpu",
+        "build", str(capture), "--clip", "embedded", "--dino", "embedded", "--device", "cpu",
+        "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5", "--features.map-cells", "16",
+        "--features.max-short-side", "36", "--features.dino-short-side", "48",
         "--iterations", "120", "--codebook.num-codes", "16", "--embedding.iterations", "60",
         "--method", "trained", "--checkpoint-seconds", "0.05",
     ]  # fmt: skip

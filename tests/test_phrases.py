@@ -76,6 +76,15 @@ def test_phrases_with_an_empty_part_are_refused(text):
         parse(text)
 
 
+@pytest.mark.parametrize("joint", [" on ", " and ", " but not ", ", "])
+def test_phrases_of_very_many_parts_are_refused(joint):
+    assert str(parse(joint.join(["cup"] * 30)))
+    with pytest.raises(QueryError, match="parts"):
+        parse(joint.join(["cup"] * 3000))
+    with pytest.raises(QueryError, match="parts"):
+        parse("largest " * 3000 + "cup")
+
+
 def test_what_was_understood_can_be_read():
     assert (
         str(parse("largest mug on the cloth but not the duck"))

@@ -206,6 +206,36 @@ def test_a_text_model_may_leave_out_observations_and_the_last_empty_line(tmp_pat
     np.testing.assert_allclose(scene.views["b.png"].camera.position, [-1, 0, 0])
 
 
+@pytest.mark.parametrize("observations", ["", "1.5 2.5 -1 3 4 7"])
+def test_images_whose_observation_lines_are_gone_are_told_not_every_second_one_taken(tmp_path, observations):
+    folder = text_model(tmp_path)
+    poses = [f"{number} 1 0 0 0 {number} 0 3 1 {number}.png" for number in range(1, 5)]
+    write_images(tmp_path / "images", [f"{number}.png" for number in range(1, 5)])
+    (folder / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    (folder / "images.txt").write_text("".join(f"{line}\n{observations}\n" for line in poses))
+    assert len(load_scene(tmp_path).views) == 4
+    (folder / "images.txt").write_text("".join(f"{line}\n" for line in poses))
+    fails(tmp_path, "images.txt", "observations", "2.png", kind=FileFormatError)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_camera_that_is_there_twice_is_told(tmp_path, binary):
+    """Nobody can say which of the two an image means."""
+    if binary:
+        model = write_colmap(tmp_path, ["a.png", "b.png"])
+        content = (model / "cameras.bin").read_bytes()
+        (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + content[8:] * 2)
+    else:
+        model = text_model(tmp_path)
+        (model / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n1 PINHOLE 64 48 99 99 32 24\n")
+    fails(tmp_path, "cameras.", "camera 1 twice", kind=FileFormatError)
+
+
+def test_a_principal_point_far_outside_the_picture_is_told(tmp_path):
+    write_colmap(tmp_path, ["a.png"], params=(60.0, 60.0, 1e6, 24.0))
+    fails(tmp_path, "cameras.bin", "principal point")
+
+
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 def test_mutated_models_end_in_a_scene_or_a_typed_error(tmp_path, suffix):
     rng = np.random.default_rng(0)

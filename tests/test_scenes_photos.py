@@ -1,3 +1,7 @@
+import os
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
@@ -287,6 +291,43 @@ def test_a_mask_of_another_shape_is_told_before_anything_is_done(tmp_path):
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "photos")
     assert_tells(caught.value, "--output")
+
+
+def three_photos(folder, suffix: str = ".jpg") -> None:
+    for index in range(3):
+        save(folder / f"{index}{suffix}", np.random.default_rng(index).random((96, 128, 3)))
+
+
+def test_a_photo_that_is_cut_off_is_told_before_anything_is_done(tmp_path):
+    """pycolmap would take the grey half for a part of the place, and the training would stumble over it later."""
+    three_photos(tmp_path / "photos")
+    path = tmp_path / "photos" / "1.jpg"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(CaptureError) as caught:
+        prepare_photos(tmp_path / "photos", tmp_path / "output")
+    assert_tells(caught.value, "1.jpg", "damaged", "truncated")
+    assert not (tmp_path / "output").exists()
+
+
+@pytest.mark.parametrize("name", [b"a\nb.jpg", b"a\\b.jpg", b"\xff\xfe.jpg", b"sub\x7f/a.jpg"])
+def test_photos_with_names_that_no_camera_file_can_hold_are_told_before_anything_is_done(tmp_path, name):
+    three_photos(tmp_path / "photos")
+    path = Path(os.fsdecode(os.fsencode(tmp_path / "photos") + b"/" + name))
+    path.parent.mkdir(exist_ok=True)
+    shutil.copy(tmp_path / "photos" / "0.jpg", path)
+    with pytest.raises(CaptureError) as caught:
+        prepare_photos(tmp_path / "photos", tmp_path / "output")
+    assert_tells(caught.value, "photos", "rename")
+    str(caught.value).encode("utf-8")
+
+
+@pytest.mark.parametrize(
+    "name", ["100%.jpg", "%s.jpg", "\U0001f600.jpg", "[red]{x}.jpg", "2.JPG", "a'b \"c.jpg"]
+)
+def test_photos_may_have_odd_names(tmp_path, name):
+    three_photos(tmp_path / "photos")
+    shutil.copy(tmp_path / "photos" / "0.jpg", tmp_path / "photos" / name)
+    assert name in prepare_photos(tmp_path / "photos", tmp_path / "output").names
 
 
 def test_settings_that_make_no_sense_are_refused():

@@ -42,6 +42,27 @@ time.sleep(20)
         assert "***" not in done.stderr, "no stack trace"
 
 
+def test_ctrl_c_during_the_import_is_ctrl_c_and_the_import_is_whole():
+    script = """
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "pycolmap._core":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+try:
+    from lexsplat.scenes.pycolmap_import import pycolmap
+except KeyboardInterrupt:
+    print("stopped")
+from lexsplat.scenes.pycolmap_import import pycolmap
+print(len(pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2]).params))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert done.stdout == "stopped\n4\n"
+
+
 def test_sigterm_ends_a_build_at_once_with_what_is_saved(tiny_capture, tmp_path):
     from lexsplat.tensor_files import read_tensors
 

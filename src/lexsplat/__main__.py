@@ -1,7 +1,22 @@
-"""``python -m lexsplat``: the command line, where the folder of scripts is not on the path."""
+"""``lexsplat`` and ``python -m lexsplat``: the command line, also quiet when stopped while its libraries load."""
+
+from __future__ import annotations
 
 import sys
 
-from lexsplat.cli import main
+STOPPED = "stopped; run the same command again to go on"
 
-sys.exit(main())
+
+def main() -> int:
+    """Run one command; returns the exit status."""
+    try:
+        from lexsplat import cli  # takes seconds, in which people change their minds
+
+        return cli.main()
+    except KeyboardInterrupt:
+        print(STOPPED, file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -147,4 +147,6 @@ def check_photo(photo: tuple[int, int], memory: int, made: tuple[int, int] = (0,
 def size_text(count: int, *, up: bool = False) -> str:
     """Bytes as ``--memory`` takes them: whole megabytes of 2^20, rounded up to the next where wanted."""
     megabyte = 1 << 20
-    return f"{-(-count // megabyte) if up or count < megabyte else count // megabyte}MB"
+    if up:
+        return f"{-(-count // megabyte)}MB"
+    return f"{count // megabyte}MB" if count >= megabyte else f"{count}B"

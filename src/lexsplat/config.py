@@ -92,6 +92,7 @@ class BuildConfig:
 
     def __post_init__(self) -> None:
         parse_bytes(self.memory)
+        check_seed(self.seed)
         if self.downscale is not None and not 0 < self.downscale < 1e6:
             raise ValueError(f"downscale must be positive, got {self.downscale:g}")
         if self.joint and self.method != "trained":
@@ -166,6 +167,16 @@ def choose_device(wanted: str) -> str:
         found = "none" if torch.version.cuda else "a PyTorch built for the CPU only"
         raise BackendError("--device cuda", expected="a CUDA GPU", found=found, remedy="use --device cpu")
     return "cuda" if available else "cpu"
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that one of the libraries does not take.
+
+    Raises:
+        ValueError: If it is negative or has more than 31 bits.
+    """
+    if not 0 <= seed < 2**31:
+        raise ValueError(f"seed must be in 0..{2**31 - 1}, got {seed}")
 
 
 def parse_bytes(text: str) -> int:

@@ -118,6 +118,9 @@ class Pick:
         return f"({self.which} {self.target})"
 
 
+MAX_PARTS = 100
+"""More parts than anybody asks for; each is answered within the one before."""
+
 Phrase = Union[Thing, Related, Both, Except, Pick]  # noqa: UP007  (forward references)
 
 
@@ -125,7 +128,7 @@ def parse(text: str) -> Phrase:
     """What a phrase asks for.
 
     Raises:
-        QueryError: If it is empty, a part of it is, or a quotation mark is missing.
+        QueryError: If it is empty, a part of it is, a quotation mark is missing, or it has too many parts.
     """
     if text.count('"') % 2:
         raise QueryError(f"phrase {text!r}", expected="quotation marks in pairs", found="one too many")
@@ -167,25 +170,30 @@ def _singular(words: str) -> str:
     return words
 
 
-def _parse(words: str, quoted: list[str], whole: str) -> Phrase:
-    words = words.strip()
+def _parse(words: str, quoted: list[str], whole: str, depth: int = 0) -> Phrase:
+    if depth >= MAX_PARTS:
+        subject = f"phrase {whole[:40]!r}..."
+        raise QueryError(
+            subject, expected=f"at most {MAX_PARTS} parts", found="more", remedy="ask for less at once"
+        )
+    words, depth = words.strip(), depth + 1
     if (parts := _EXCEPT.split(f" {words} ", maxsplit=1)) and len(parts) == 2:
-        return Except(*(_parse(part, quoted, whole) for part in parts))
+        return Except(*(_parse(part, quoted, whole, depth) for part in parts))
     if (parts := _BOTH.split(f" {words} ", maxsplit=1)) and len(parts) == 2:
-        return Both(*(_parse(part, quoted, whole) for part in parts))
+        return Both(*(_parse(part, quoted, whole, depth) for part in parts))
     bare = _ARTICLE.sub("", words)
     if found := _NEAREST.match(bare):
-        return Related("nearest to", *(_parse(part, quoted, whole) for part in found.groups()))
+        return Related("nearest to", *(_parse(part, quoted, whole, depth) for part in found.groups()))
     if found := _PICK.match(bare):
         which: Literal["largest", "smallest"] = "smallest" if found[1].lower() == "smallest" else "largest"
-        return Pick(which, _parse(bare[found.end() :], quoted, whole))
+        return Pick(which, _parse(bare[found.end() :], quoted, whole, depth))
     if found := _RELATION.search(f" {bare} "):
         number = next(i for i in range(len(_WORDS)) if found.group(f"r{i}") is not None)
         target, reference = f" {bare} "[: found.start()], f" {bare} "[found.end() :]
         # "something to sit on" ends in such a word, and relates to nothing.
         if reference.strip() or " to " not in target:
-            things = _parse(target, quoted, whole)
-            related = Related(_WORDS[number][1], things, _parse(reference, quoted, whole))
+            things = _parse(target, quoted, whole, depth)
+            related = Related(_WORDS[number][1], things, _parse(reference, quoted, whole, depth))
             return Except(things, related) if found.group("not") else related
     text = re.sub("\x00(\\d+)\x00", lambda match: quoted[int(match[1])], bare).strip()
     if not text:

@@ -74,6 +74,7 @@ def build(
     device = choose_device(config.device)
     parse_bytes(config.memory)
     folder = SceneFolder(output)
+    folder.refuse_foreign_files()
     with folder.locked():
         scene = load_capture(capture, folder, config, test_names, listener)
         load_annotations(scene)  # a mask that belongs to no view is told now, not after the training
@@ -282,9 +283,18 @@ class _Builder:
 
 
 def _check_photos(scene: Scene, memory: int) -> None:
-    """Refuse photos that do not fit into the budget one by one, before anything is done."""
+    """Refuse photos that are too small, or do not fit into the budget one by one, before anything is done."""
+    from lexsplat.image_losses import SMALLEST_SIDE
+
     for view in scene.views.values():
         made = (view.camera.width, view.camera.height)
+        if min(made) < SMALLEST_SIDE:
+            raise CaptureError(
+                view.image_path,
+                expected=f"at least {SMALLEST_SIDE} pixels a side to work on",
+                found=f"{made[0]}x{made[1]}",
+                remedy="give a smaller --downscale, or larger photos",
+            )
         budget.check_photo((view.lens.width, view.lens.height), memory, made)
 
 

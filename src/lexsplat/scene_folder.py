@@ -42,6 +42,9 @@ FORMAT_VERSION = 1
 
 _MAX_JSON_BYTES = 256 << 20
 
+_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
+"""What a scene is made of."""
+
 
 def to_json(value: Any) -> Any:
     """Plain JSON data from dataclasses, paths, tuples and numpy numbers.
@@ -234,6 +237,36 @@ class SceneFolder:
     def code_map_path(self, name: str) -> Path:
         """``codes/NAME.png`` for the view ``name``: its folders stay, its suffix becomes .png."""
         return self.root / "codes" / Path(name).with_suffix(".png")
+
+    def refuse_own_file(self, path: Path) -> None:
+        """Refuse to write what would take the place of a file that the scene is made of, or of its measurements.
+
+        Raises:
+            SceneFolderError: If ``path`` is one.
+        """
+        own = {self.root / name for name in (*_FILES, "metrics.json", "metrics.csv", "viewer.json")}
+        if path.resolve() in {file.resolve() for file in own}:
+            raise SceneFolderError(
+                path,
+                expected="a file beside the scene's own",
+                found="one of them",
+                remedy="give another name",
+            )
+
+    def refuse_foreign_files(self) -> None:
+        """Refuse a folder in which a build would take the place of files that no build has made.
+
+        Raises:
+            SceneFolderError: If there are some: ``scene.json`` is the first file of a build.
+        """
+        there = [name for name in _FILES if (self.root / name).exists()]
+        if there and "scene.json" not in there:
+            raise SceneFolderError(
+                self.root / there[0],
+                expected="a new folder or one of an earlier build",
+                found="a file of another program",
+                remedy="give another --output",
+            )
 
     # -- stages
 

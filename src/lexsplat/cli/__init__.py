@@ -62,6 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             description="Search a place with words: photos in, 3D Gaussians that carry language out.",
             args=arguments,
         )
+    except KeyboardInterrupt:
+        return _stopped()
     except ValueError as error:  # settings check themselves when they are made
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -71,8 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("stopped; run the same command again to go on", file=sys.stderr)
-        return 130
+        return _stopped()
     except BrokenPipeError:  # whoever read our output has seen enough, as in `lexsplat info SCENE | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (MemoryError, RuntimeError) as error:
@@ -85,8 +86,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
         print(f"error: memory: expected more of it, found the end of it; {remedy}", file=sys.stderr)
         return 1
+    except UnicodeEncodeError as error:
+        # The system has names of any bytes; camera files, JSON and reports have letters.
+        subject = ascii(str(error.object))[1:100]
+        remedy = "rename the file or folder"
+        print(f"error: {subject}: expected names in UTF-8, found other bytes; {remedy}", file=sys.stderr)
+        return 1
     except OSError as error:
         # A full disk or a folder without permission: the system's words and the file are the whole story.
         print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _stopped() -> int:
+    """What Ctrl-C ends in: a line, and the status that shells give it."""
+    print("stopped; run the same command again to go on", file=sys.stderr)
+    return 130

@@ -73,3 +73,7 @@ class Embed(Build):
     """
 
     splats: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.splats is not None and self.settings.joint:
+            raise ValueError("joint training makes its own Gaussians: leave --splats or --joint out")

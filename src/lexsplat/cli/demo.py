@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from lexsplat.cli.options import Device, print_evaluation
-from lexsplat.config import LanguageMethod
+from lexsplat.config import BuildConfig, LanguageMethod
 
 
 @dataclasses.dataclass
@@ -33,6 +33,9 @@ class Demo:
     device: Device = "auto"
     seed: int = 0
     iterations: int | None = None
+
+    def __post_init__(self) -> None:
+        BuildConfig(seed=self.seed, iterations=self.iterations)
 
     def run(self) -> None:
         """Build, evaluate, print the table."""

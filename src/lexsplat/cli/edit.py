@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from lexsplat.cli.options import Device, check_relevancy, open_scene
+from lexsplat.errors import QueryError
 
 if TYPE_CHECKING:
     from lexsplat.editing import Editor
@@ -85,8 +86,8 @@ class Edit:
         if not all(0 <= value <= 1 for value in (*(self.color or ()), self.strength)):
             raise ValueError("--color is three numbers in 0..1, and --strength one in 0..1")
         for name, value in (("grow", self.grow), ("shrink", self.shrink)):
-            if value is not None and not value >= 0:
-                raise ValueError(f"--{name} must not be negative, got {value:g}")
+            if value is not None and not 0 <= value < math.inf:
+                raise ValueError(f"--{name} must not be negative or endless, got {value:g}")
 
     def run(self) -> None:
         """Do one thing and say what the scene is now."""
@@ -126,13 +127,18 @@ class Edit:
         chosen = chosen.largest() if self.largest else chosen
         chosen = chosen.grow(self.grow) if self.grow is not None else chosen
         chosen = chosen.shrink(self.shrink) if self.shrink is not None else chosen
-        if self.action == "recolour" and self.color:
-            editor.recolour(chosen, self.color, self.strength)
-        elif self.action in ("move", "duplicate"):
-            turn = rotation_about(chosen.up.direction, self.turn)
-            getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
-        else:
-            getattr(editor, self.action)(chosen)
+        try:
+            if self.action == "recolour" and self.color:
+                editor.recolour(chosen, self.color, self.strength)
+            elif self.action in ("move", "duplicate"):
+                turn = rotation_about(chosen.up.direction, self.turn)
+                getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
+            else:
+                getattr(editor, self.action)(chosen)
+        except ValueError as error:  # numbers that only together, or only for these Gaussians, lead too far
+            raise QueryError(
+                self.action, expected="Gaussians that can be drawn afterwards", found=str(error)
+            ) from error
 
 
 def _journal_of(scene: SearchableScene) -> Path:

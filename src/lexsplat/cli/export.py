@@ -49,6 +49,7 @@ class Export:
         from lexsplat.world import world_of
 
         ending_of(self.file)
+        SceneFolder.open(Path(self.scene)).refuse_own_file(self.file)
         if self.select or self.language:
             scene = open_scene(self.scene, self.device, self.clip)
             found = found_by(scene, self.select, self.view, self.threshold)

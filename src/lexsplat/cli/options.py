@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.config import BuildConfig
+from lexsplat.config import BuildConfig, check_seed
 
 if TYPE_CHECKING:
     from lexsplat.search import SearchableScene
@@ -59,10 +59,12 @@ def check_relevancy(threshold: float | None) -> None:
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Refuse an empty list of seeds.
+    """Refuse an empty list of seeds, and seeds that are none.
 
     Raises:
-        ValueError: There is none.
+        ValueError: There is none, or it is negative or too large.
     """
     if not seeds:
         raise ValueError("at least one seed is needed")
+    for seed in seeds:
+        check_seed(seed)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from lexsplat.config import check_seed, parse_bytes
 from lexsplat.scenes.photos import PoseConfig
 from lexsplat.scenes.video import DEFAULT_FRAMES
 
@@ -40,16 +41,18 @@ class Poses:
     def __post_init__(self) -> None:
         if self.frames < 3:
             raise ValueError(f"frames must be at least 3, got {self.frames}")
+        check_seed(self.seed)
+        parse_bytes(self.memory)
 
     def run(self) -> None:
         """Write the model and say how many photos were placed, and which were not."""
-        from lexsplat.config import parse_bytes
         from lexsplat.progress_bars import ProgressBars
+        from lexsplat.scene_folder import SceneFolder
         from lexsplat.scenes import poses_from_photos
         from lexsplat.scenes.video import is_video, sample_video
 
         photos, memory = self.photos, parse_bytes(self.memory)
-        with ProgressBars() as bars:
+        with SceneFolder(self.output).locked(), ProgressBars() as bars:
             if is_video(photos):
                 photos = self.output / "images"
                 sample_video(self.photos, photos, self.frames, memory=memory, listener=bars)

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from lexsplat.cli.options import Device, open_scene, print_json
-from lexsplat.world import parse_vector, world_of
+from lexsplat.world import World, parse_vector, world_of
 
 
 @dataclasses.dataclass
@@ -55,8 +55,10 @@ class Scale:
             )
         if self.distance is not None and not 0 < self.distance < float("inf"):
             raise ValueError(f"distance must be positive, got {self.distance:g}")
-        for text in (*(self.points or ()), *([self.up] if self.up else [])):
+        for text in self.points or ():
             parse_vector(text)
+        if self.up is not None:
+            World.of_cameras([]).with_up(parse_vector(self.up))
 
     def run(self) -> None:
         """Measure, store, print."""

@@ -85,6 +85,8 @@ class ReconstructionConfig:
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise ValueError(f"iterations must be positive, got {self.iterations}")
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise ValueError(f"max_gaussians must be positive, got {self.max_gaussians}")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must be in 0..1, got {self.ssim_weight:g}")
         if not 0 <= self.sh_degree <= 4:

@@ -68,11 +68,15 @@ class Reconstructor:
         device: torch.device | str = "cpu",
         seed: int = 0,
     ) -> None:
+        from lexsplat.image_losses import SMALLEST_SIDE
+
         self.config = config
         self.device = torch.device(device)
         self.steps_done = 0
         self._views = {view.name: view for view in scene.train_views}
         self._names = sorted(self._views)
+        halves = [view.camera.downscaled(2.0) for view in self._views.values()]
+        self._can_shrink = all(min(half.width, half.height) >= SMALLEST_SIDE for half in halves)
         if not self._names:
             raise TrainingError(
                 scene.root, expected="at least one training view", found="none", remedy="hold out fewer views"
@@ -342,7 +346,7 @@ class Reconstructor:
         """The photos at the present resolution; those of the warm-up are dropped after it."""
         from lexsplat.training_images import TrainingImages
 
-        shrink = 2.0 if self.steps_done < self.config.warm_up_iterations else 1.0
+        shrink = 2.0 if self.steps_done < self.config.warm_up_iterations and self._can_shrink else 1.0
         if shrink != self._images_shrink:
             self._images = TrainingImages(
                 self._views.values(), memory=self.config.image_memory, shrink=shrink, device=self.device

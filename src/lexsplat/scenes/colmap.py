@@ -53,7 +53,7 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> Capture:
         CaptureError: If a camera or pose cannot be used, or no image has a file.
     """
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
-    lenses = dict(_read_cameras(model / f"cameras{suffix}"))
+    lenses = _lenses_by_id(model / f"cameras{suffix}")
     images_file = model / f"images{suffix}"
     if not images_file.is_file():
         raise FileFormatError(
@@ -99,6 +99,15 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> Capture:
         missing=missing,
         warnings=warnings,
     )
+
+
+def _lenses_by_id(file: Path) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    for camera_id, lens in _read_cameras(file):
+        if camera_id in lenses:
+            raise _damaged(file, "every camera once", f"camera {camera_id} twice")
+        lenses[camera_id] = lens
+    return lenses
 
 
 def _image_folder(root: Path, names: list[str]) -> Path:
@@ -271,11 +280,23 @@ def _read_images_text(file: Path) -> Iterator[ImageEntry]:
         except (ValueError, IndexError) as error:
             raise _damaged(file, "ID QW QX QY QZ TX TY TZ CAMERA NAME", repr(line[:60])) from error
         # Every image has a second line with its observations, which may be empty but not absent.
-        if next(lines, None) is None:
-            raise _damaged(file, f"a line of observations after image {name}", "the end of the file")
+        observations = next(lines, None)
+        if observations is None or not _are_observations(observations):
+            instead = "the end of the file" if observations is None else repr(observations[:60])
+            raise _damaged(file, f"a line of observations after image {name}", instead)
         found += 1
         yield name, camera_id, pose[:4], pose[4:]
     _check_promise(file, promised, found, "images")
+
+
+def _are_observations(line: str) -> bool:
+    """Whether a line is of ``X Y POINT`` triples, by their number and the last one; the next image's is not."""
+    words = line.split()
+    try:
+        float(words[-2]), int(words[-1])
+    except (IndexError, ValueError):
+        return not words
+    return len(words) % 3 == 0
 
 
 def _read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:

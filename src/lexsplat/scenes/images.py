@@ -223,7 +223,8 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
         nonzero: True is every pixel that is not black, however dark: what COLMAP takes masks for.
 
     Raises:
-        CaptureError: As :func:`open_image`.
+        CaptureError: As :func:`open_image`, and for a mask that is dark and not black: of its labels nobody knows
+            which is meant.
     """
     with open_image(path) as image:
         image.load()
@@ -235,7 +236,16 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     highest = float(values.max(initial=0))
     if highest <= 1:
         return values > 0.5
-    return values > (127 if highest <= 255 else 32767)
+    half = 127 if highest <= 255 else 32767
+    # A little over black is the noise of a JPEG. More of it is a mask in colours, such as labels in a palette.
+    if half / 4 < highest <= half:
+        raise CaptureError(
+            path,
+            expected="a mask in black and white",
+            found=f"nothing brighter than half, and yet not all black (up to {highest:g})",
+            remedy="save it in black and white",
+        )
+    return values > half
 
 
 def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:

@@ -60,6 +60,10 @@ class Lens:
         for focal in (camera.focal_length_x, camera.focal_length_y):
             if not 1e-2 * side <= focal <= 1e3 * side:
                 raise ValueError(f"focal length {focal:g} for images of {self.width}x{self.height}")
+        # A picture cut out of a larger one has it outside, but not by a hundred pictures.
+        for center in (camera.principal_point_x, camera.principal_point_y):
+            if abs(center) > 1e2 * side:
+                raise ValueError(f"principal point at {center:g} for images of {self.width}x{self.height}")
 
     def to_pycolmap(self) -> pycolmap.Camera:
         """The same camera as pycolmap's object."""
