@@ -249,3 +249,15 @@ def test_a_mask_in_dark_colours_is_told_and_not_taken_for_empty(tmp_path):
             tmp_path / "m.png"
         )
         assert read_mask(tmp_path / "m.png").all() == (noise == 1)
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "PA"])
+def test_what_is_transparent_is_outside_a_mask(tmp_path, mode):
+    """Programs that cut things out save white pictures whose shape is in the alpha channel."""
+    pixels = np.full((4, 6, 4), 255, np.uint8)
+    pixels[:, 2:, 3] = 0
+    Image.fromarray(pixels).convert(mode).save(
+        tmp_path / "mask.png" if mode != "PA" else tmp_path / "mask.tif"
+    )
+    mask = read_mask(tmp_path / ("mask.png" if mode != "PA" else "mask.tif"))
+    np.testing.assert_array_equal(mask, pixels[..., 3] > 0)

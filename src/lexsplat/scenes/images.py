@@ -216,7 +216,7 @@ def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> ND
 def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     """A mask as ``[H, W]`` bool: true where the picture is brighter than half.
 
-    A picture with values 0 and 1 only counts 1 as true.
+    A picture with values 0 and 1 only counts 1 as true. What is transparent is outside.
 
     Args:
         path: The picture.
@@ -229,6 +229,9 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     with open_image(path) as image:
         image.load()
         values = np.asarray(image if image.mode.startswith(("I", "F", "1")) else image.convert("L"))
+        if image.has_transparency_data:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+            values = np.where(alpha > 127, values, 0)
     if values.dtype == np.bool_:
         return values
     if nonzero:
