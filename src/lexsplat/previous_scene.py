@@ -14,11 +14,10 @@ import tempfile
 from pathlib import Path
 
 from lexsplat.errors import SceneFolderError
-from lexsplat.scene_folder import SceneFolder
+from lexsplat.scene_folder import SCENE_FILES, SceneFolder
 
 FOLDER = "previous"
 """Name of the folder within the scene folder."""
-_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
 
 
 def keep_previous(folder: SceneFolder) -> None:
@@ -28,14 +27,14 @@ def keep_previous(folder: SceneFolder) -> None:
     """
     stages = folder.record["stages"]
     whole = {"reconstruct", "embed"} <= stages.keys() and all(
-        (folder.root / name).is_file() for name in _FILES
+        (folder.root / name).is_file() for name in SCENE_FILES
     )
     if whole and not folder.record.get("building"):
         drop_previous(folder)
         made = Path(tempfile.mkdtemp(prefix=".previous.", dir=folder.root))
         # Whoever may read the scene may read what is kept of it; a temporary folder is its owner's alone.
         made.chmod(stat.S_IMODE(folder.root.stat().st_mode))
-        for name in _FILES:
+        for name in SCENE_FILES:
             _link(folder.root / name, made / name)
         os.replace(made, folder.root / FOLDER)
     folder.record["building"] = True

@@ -42,7 +42,7 @@ FORMAT_VERSION = 1
 
 _MAX_JSON_BYTES = 256 << 20
 
-_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
+SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
 """What a scene is made of."""
 
 
@@ -244,7 +244,7 @@ class SceneFolder:
         Raises:
             SceneFolderError: If ``path`` is one.
         """
-        own = {self.root / name for name in (*_FILES, "metrics.json", "metrics.csv", "viewer.json")}
+        own = {self.root / name for name in (*SCENE_FILES, "metrics.json", "metrics.csv", "viewer.json")}
         if path.resolve() in {file.resolve() for file in own}:
             raise SceneFolderError(
                 path,
@@ -259,7 +259,7 @@ class SceneFolder:
         Raises:
             SceneFolderError: If there are some: ``scene.json`` is the first file of a build.
         """
-        there = [name for name in _FILES if (self.root / name).exists()]
+        there = [name for name in SCENE_FILES if (self.root / name).exists()]
         if there and "scene.json" not in there:
             raise SceneFolderError(
                 self.root / there[0],
