@@ -403,6 +403,7 @@ def test_ctrl_c_while_arguments_are_read_ends_in_a_line(monkeypatch, capsys):
 def test_ctrl_c_while_the_libraries_load_ends_in_a_line():
     interrupting = """
 import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background is started with it ignored
 from lexsplat.__main__ import main
 class Interrupting:
     def find_spec(self, name, path=None, target=None):

@@ -45,6 +45,7 @@ time.sleep(20)
 def test_ctrl_c_during_the_import_is_ctrl_c_and_the_import_is_whole():
     script = """
 import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background is started with it ignored
 class Interrupting:
     def find_spec(self, name, path=None, target=None):
         if name == "pycolmap._core":
