@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-STOPPED = "stopped; run the same command again to go on"
+from lexsplat.errors import STOPPED
 
 
 def main() -> int:

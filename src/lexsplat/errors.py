@@ -6,6 +6,9 @@ Bad arguments of Python functions raise ``ValueError`` as usual.
 
 from __future__ import annotations
 
+STOPPED = "stopped; run the same command again to go on"
+"""What Ctrl-C ends in, at any moment."""
+
 
 class LexsplatError(Exception):
     """Base of every error that has a remedy.

@@ -78,7 +78,7 @@ def export_gaussians(
         BackendError: If the format needs a library that is not installed.
     """
     ending = ending_of(path)
-    check_room(path, language is not None)
+    _check_language_fits(path, language is not None)
     if len(gaussians) == 0:
         raise QueryError(path, expected="something to write", found="no Gaussian")
     if ending in LABEL_ENDINGS:
@@ -142,7 +142,7 @@ def export_scene(
         SceneFolderError: See `export_gaussians`; also for labels without selections.
     """
     ending = ending_of(path)
-    check_room(path, language)
+    _check_language_fits(path, language)
     if ending in LABEL_ENDINGS and found:
         with atomic_path(path) as temporary:
             if ending == ".csv":
@@ -168,7 +168,7 @@ def export_scene(
     return export_gaussians(gaussians, path, language=stored, world=scene.world)
 
 
-def check_room(path: Path, language: bool) -> None:
+def _check_language_fits(path: Path, language: bool) -> None:
     """Refuse language for a format that cannot hold it.
 
     Raises:

@@ -27,7 +27,7 @@ from lexsplat.cli.poses import Poses
 from lexsplat.cli.query import Query
 from lexsplat.cli.scale import Scale
 from lexsplat.cli.view import View
-from lexsplat.errors import LexsplatError
+from lexsplat.errors import STOPPED, LexsplatError
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -100,6 +100,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _stopped() -> int:
-    """What Ctrl-C ends in: a line, and the status that shells give it."""
-    print("stopped; run the same command again to go on", file=sys.stderr)
+    """Say so, with the status that shells give to Ctrl-C."""
+    print(STOPPED, file=sys.stderr)
     return 130

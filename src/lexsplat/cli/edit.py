@@ -92,7 +92,6 @@ class Edit:
     def run(self) -> None:
         """Do one thing and say what the scene is now."""
         from lexsplat.editing import Editor
-        from lexsplat.errors import QueryError
         from lexsplat.previous_scene import require_current
 
         scene = open_scene(self.scene, self.device, self.clip)
@@ -109,12 +108,7 @@ class Edit:
                 f"{editor.save(self.output).root}: written; the steps stay in {journal} until you discard them"
             )
         elif self.action in ("delete", "keep", "recolour", "move", "duplicate"):
-            try:
-                self._change(editor)
-            except ValueError as error:  # numbers that only this scene does not take
-                raise QueryError(
-                    self.select or "", expected="an edit that can be done", found=str(error)
-                ) from error
+            self._change(editor)
         for number, step in enumerate(editor.steps, start=1):
             print(f"{number}. {step}")
         print(f"{len(editor.scene.gaussians):,} Gaussians, {len(editor.undone)} steps undone")

@@ -58,7 +58,7 @@ class Scale:
         for text in self.points or ():
             parse_vector(text)
         if self.up is not None:
-            World.of_cameras([]).with_up(parse_vector(self.up))
+            World.of_cameras([]).with_up(parse_vector(self.up))  # refuses a direction that is none
 
     def run(self) -> None:
         """Measure, store, print."""
