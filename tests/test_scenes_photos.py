@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 from captures import save
 from PIL import Image, ImageOps
+from test_pose_agreement import move
 from test_scenes import assert_tells, fails
 from test_scenes_triangulation import texture
 
@@ -96,6 +97,28 @@ def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
     assert poses.images == folder, "photos that need nothing are not copied"
     assert not (poses.root / "images").exists()
     assert not (poses.root / ".poses").exists(), "what was worked with is gone"
+
+
+def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_path, monkeypatch):
+    folder, _, _ = room
+    mapping, moved = pycolmap.incremental_mapping, []
+
+    def misled_once(*arguments, **options):
+        found = mapping(*arguments, **options)
+        if not moved:
+            moved.extend(
+                number for number in found[0].reg_image_ids() if found[0].image(number).name == "4.png"
+            )
+            move(found[0], moved[0])
+        return found
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", misled_once)
+    poses = poses_from_photos(folder, tmp_path / "poses")
+    assert moved, "there was something to put right"
+    scene = load_scene(poses.root, images=folder, test_every=0)
+    assert_same_up_to_a_similarity(
+        [scene.views[f"{index}.png"].camera for index in range(COUNT)], room_cameras()
+    )
 
 
 def test_folders_that_are_no_capture_are_told(tmp_path):
