@@ -464,6 +464,34 @@ def test_a_prompt_is_embedded_once_and_kept_on_disk(tmp_path):
     torch.testing.assert_close(TextCache(tmp_path).encode("colour", prompts, never), found)
 
 
+def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkeypatch):
+    """In a batch the last bits of an embedding depend on what else is in it."""
+    batches, written = [], []
+
+    class Watched(ColourEncoder):
+        def encode_text(self, prompts):
+            batches.append(list(prompts))
+            return super().encode_text(prompts)
+
+    from lexsplat.features import text
+
+    def write(path, tensors, metadata):
+        written.append(len(tensors))
+
+    monkeypatch.setattr(text, "write_tensors", write)
+    TextCache(tmp_path).encode("colour", ["apple", "pear", "apple"], Watched)
+    assert batches == [["apple"], ["pear"]]
+    assert written == [2]
+
+
+def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path, caplog):
+    in_the_way = tmp_path / "texts"
+    in_the_way.write_text("no folder")
+    found = TextCache(in_the_way).encode("colour", ["apple"], ColourEncoder)
+    assert found.shape == (1, 4)
+    assert "not kept" in caplog.text
+
+
 def test_text_of_another_model_is_never_used(tmp_path):
     TextCache(tmp_path).encode("colour", ["apple"], ColourEncoder)
     other = ColourEncoder("other")

@@ -108,6 +108,27 @@ def test_uncertainty_is_the_normalised_entropy_believed_by_visibility(small, ref
         assert float(histogram.uncertainties(EXACT)[n]) == pytest.approx(expected, abs=2e-3)
 
 
+def test_what_was_hardly_seen_carries_no_language(small, reference) -> None:
+    totals = reference.sum(1)
+    gate = float(np.median(totals[totals > 0]))
+    field = lift_scene(small, replace(EXACT, min_visibility=gate))
+    seen = torch.from_numpy(totals >= gate)
+    assert 0 < seen.sum() < len(seen)
+    sums = field.code_probabilities().sum(1)
+    np.testing.assert_allclose(sums[seen], 1, atol=1e-5)
+    assert not sums[~seen & torch.from_numpy(np.abs(totals - gate) > 1e-3)].any()
+
+
+def test_the_visibility_at_which_a_histogram_is_half_believed_is_the_setting(small) -> None:
+    histogram = accumulate_histogram(small.gaussians, small.cameras, small.code_maps, 5, EXACT)
+    sure = replace(histogram, entropies=torch.zeros_like(histogram.entropies))
+    seen = histogram.totals > 0.5
+    for prior in (0.5, 7.0):
+        expected = prior / (histogram.totals + prior)
+        found = sure.uncertainties(replace(EXACT, prior_visibility=prior))
+        np.testing.assert_allclose(found[seen], expected[seen], atol=1e-6)
+
+
 @pytest.mark.parametrize("memory_codes", [1, 2, 4])
 def test_a_memory_bound_changes_nothing_but_the_number_of_passes(small, memory_codes: int) -> None:
     whole = accumulate_histogram(small.gaussians, small.cameras, small.code_maps, 5, replace(EXACT, top=3))
@@ -117,6 +138,8 @@ def test_a_memory_bound_changes_nothing_but_the_number_of_passes(small, memory_c
         small.gaussians, small.cameras, small.code_maps, 5, bound, listener=events.append
     )
     assert len(events) == 3 * math.ceil(5 / memory_codes)
+    assert events[-1].done == events[-1].total == len(events)
+    assert events[-1].metrics == {"dropped": parts.dropped}, "the user hears what sparsity costs"
     np.testing.assert_allclose(dense(parts), dense(whole), atol=1e-6)
     np.testing.assert_allclose(parts.entropies, whole.entropies, atol=1e-5)
     np.testing.assert_allclose(parts.totals, whole.totals, rtol=1e-6)
@@ -130,6 +153,10 @@ def test_the_error_of_sparsity_is_reported(small, reference) -> None:
         )
         assert histogram.codes.shape == (len(small.gaussians), top)
         assert histogram.dropped == pytest.approx(1 - kept / reference.sum(), abs=1e-5)
+        field = lift_scene(small, replace(EXACT, top=top))
+        assert type(field).from_tensors(field.tensors(), field.metadata()).dropped == pytest.approx(
+            histogram.dropped, abs=1e-6
+        )
 
 
 def test_lifting_recovers_known_labels(scene) -> None:

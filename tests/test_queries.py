@@ -171,6 +171,28 @@ def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("coverage", ["composite", "divide"])
+def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, coverage, monkeypatch):
+    """``[N, K]`` of millions of Gaussians would be gigabytes."""
+    field, _, _ = lifted
+    positives, negatives = texts(3, 16, 5), texts(4, 16, 6)
+    config = QueryConfig(form=form, coverage=coverage)
+    whole = queries.gaussian_relevancy(field, positives, negatives, config)
+    most = []
+
+    def probabilities(self):
+        most.append(len(self.codes))
+        return original(self)
+
+    original = type(field).code_probabilities
+    monkeypatch.setattr(type(field), "code_probabilities", probabilities)
+    monkeypatch.setattr(queries, "_GAUSSIANS", 7)
+    found = queries.gaussian_relevancy(field, positives, negatives, config)
+    torch.testing.assert_close(found, whole, rtol=0, atol=1e-6)
+    assert max(most, default=0) <= 7
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_several_prompts_at_once_are_each_alone(lifted, form):
     field, gaussians, camera = lifted
     positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form=form)

@@ -181,6 +181,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "codes": stages.get("codebook", {}).get("codes"),
         "codes_used": stages.get("codebook", {}).get("codes_used"),
         "method": stages.get("embed", {}).get("method"),
+        "weight_dropped": stages.get("embed", {}).get("dropped"),
         "clip": config.get("clip"),
         "dino": config.get("dino"),
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),

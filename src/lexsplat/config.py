@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 from lexsplat.codebook import CodebookConfig
@@ -42,6 +43,8 @@ class BuildConfig:
         dino: Dense encoder, in the same way, or "none" (the paper's ablation without DINO).
         device: "auto" takes CUDA where there is a GPU.
         seed: Seed of all randomness.
+        features_from: Folder with features made by another program, one array a view, in place of our own
+            (docs/captures.md); of the encoders only the words of `clip` are used then.
         memory: Host memory that photos, features and projections kept by any stage may take, such as "4GB"; beside
             it comes what the libraries, the encoders and the Gaussians themselves need (docs/conventions.md).
         checkpoint_seconds: Seconds between two savings of a training that is under way.
@@ -73,6 +76,7 @@ class BuildConfig:
     dino: str = DEFAULT_DINO
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
+    features_from: Path | None = None
     memory: str = "4GB"
     checkpoint_seconds: float = 20.0
     downscale: float | None = None

@@ -157,6 +157,13 @@ class Bench:
 
     def level_maps(self, name: str) -> tuple[Tensor, list[float]]:
         """The CLIP map of each crop size of a view, and the sides of the crops (`features.load_level_maps`)."""
+        if self.config.features_from is not None:
+            raise CaptureError(
+                self.config.features_from,
+                expected="features of several crop sizes, which this method needs",
+                found="one feature a pixel",
+                remedy="leave --features-from out, or the method (lerf) with --methods",
+            )
         if self._clip is None:
             from lexsplat.features.encoders import load_clip
 

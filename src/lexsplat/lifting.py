@@ -126,7 +126,7 @@ def accumulate_histogram(
             ignored.
         num_codes: K.
         config: Settings.
-        listener: Hears of stage "lift".
+        listener: Hears of stage "lift", and at its end of ``dropped``, what keeping few codes leaves out.
 
     Raises:
         ValueError: If there is no view, or a view has no index map.
@@ -135,6 +135,7 @@ def accumulate_histogram(
     check_views(names, code_maps)
     gaussians, count = gaussians.detach(), len(gaussians)
     ranges = list(_code_ranges(num_codes, count, config.memory_bytes))
+    steps = len(ranges) * len(names)
     found: list[tuple[Tensor, Tensor]] = []
     totals = torch.zeros(count, device=gaussians.device)
     sum_wlogw = torch.zeros(count, device=gaussians.device, dtype=torch.float64)
@@ -145,7 +146,8 @@ def accumulate_histogram(
             code_map = _full_size(code_maps[name], camera) - codes.start
             code_map[(code_map < 0) | (code_map >= len(codes))] = -1
             accumulate_codes(gaussians, camera, code_map, len(codes), out=dense)
-            listener(Event("lift", part * len(names) + done, len(ranges) * len(names)))
+            if part * len(names) + done < steps:
+                listener(Event("lift", part * len(names) + done, steps))
         totals += dense.sum(1)
         for rows in _row_ranges(count):
             sum_wlogw[rows] += torch.special.xlogy(dense[rows], dense[rows]).double().sum(1)
@@ -154,7 +156,9 @@ def accumulate_histogram(
     kept_codes, kept_weights = found[0]
     entropies = (totals.clamp_min(1e-30).log() - sum_wlogw / totals.clamp_min(1e-30)).clamp_min(0).float()
     entropies = torch.where(totals > 0, entropies, torch.zeros_like(entropies))
-    return CodeHistogram(kept_codes.to(torch.uint8), kept_weights, totals, entropies, num_codes)
+    histogram = CodeHistogram(kept_codes.to(torch.uint8), kept_weights, totals, entropies, num_codes)
+    listener(Event("lift", steps, steps, {"dropped": histogram.dropped}))
+    return histogram
 
 
 def lift(
@@ -186,7 +190,7 @@ def field_from_histogram(
         codes, weights = smooth_codes(
             gaussians.means, codes, weights, uncertainties, visible, histogram.num_codes, config
         )
-    return LiftedField(codebook, codes, weights, uncertainties)
+    return LiftedField(codebook, codes, weights, uncertainties, dropped=histogram.dropped)
 
 
 def smooth_codes(
@@ -330,7 +334,9 @@ def principal_semantics(lifted: LiftedField) -> Tensor:
     features = codebook.clip
     if codebook.dino is not None:
         features = torch.cat([features, codebook.lambda_dino**0.5 * codebook.dino], dim=1)
-    usage = lifted.scores(torch.eye(codebook.num_codes, device=features.device)).sum(0)
+    usage = features.new_zeros(codebook.num_codes)
+    for rows in torch.arange(len(lifted.codes), device=lifted.codes.device).split(ROWS):
+        usage += lifted.select(rows).code_probabilities().sum(0)
     share = usage / usage.sum().clamp_min(1e-12)
     centred = (features - share @ features) * share.sqrt()[:, None]
     axes = torch.linalg.svd(centred.double(), full_matrices=False).Vh[:SEMANTIC_CHANNELS].float()

@@ -6,6 +6,7 @@ fingerprint of the photos, the cameras, the settings and the stages before it.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -19,15 +20,15 @@ from lexsplat import budget
 from lexsplat.cameras import Camera
 from lexsplat.captures import load_capture
 from lexsplat.checkpoints import Checkpoint
-from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
+from lexsplat.codebook import MAX_CODES, Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
 from lexsplat.errors import CaptureError, FileFormatError
-from lexsplat.features import FeatureMaps, extract_features
+from lexsplat.features import FeatureMaps, external_identity, extract_features, load_external_features
 from lexsplat.formats.reading import read_splats
 from lexsplat.gaussians import Gaussians
 from lexsplat.joint import JointTrainer
-from lexsplat.language_field import LanguageField
+from lexsplat.language_field import LanguageField, LiftedField
 from lexsplat.lifting import lift, tune
 from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
 from lexsplat.previous_scene import drop_previous
@@ -39,6 +40,8 @@ from lexsplat.scene_folder import SceneFolder, fingerprint
 from lexsplat.scenes import Scene, load_annotations
 from lexsplat.scenes.triangulation import initial_points
 from lexsplat.tensor_files import read_tensors, write_tensors
+
+log = logging.getLogger("lexsplat")
 
 STAGES = ("reconstruct", "features", "codebook", "embed")
 """Names of the stages in the order in which they run."""
@@ -82,6 +85,8 @@ def build(
         config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
         scene = scene.downscaled(config.downscale or 1.0)
         _check_photos(scene, parse_bytes(config.memory))
+        if config.features_from is not None:
+            load_external_features(config.features_from, scene)  # that one is missing is told now, too
         return _Builder(scene, folder, config, device, listener, splats).run(until)
 
 
@@ -109,6 +114,9 @@ class _Builder:
         capture_hash = write_provenance(self.folder, self.scene, self.config)
         config, folder = self.config, self.folder
         models = [model_identity(config.clip, "clip"), model_identity(config.dino, "dino")]
+        features: list[Any] = [capture_hash, config.features, models]
+        if config.features_from is not None:
+            features = [capture_hash, external_identity(config.features_from, self.scene), models[0]]
         language = [config.method, config.embedding, config.lifting, config.tuning]
         # What each stage is made from (a stage's name stands for all of its inputs), what it does, what it writes.
         stages: dict[str, tuple[list[Any], Callable[[], dict[str, Any]], list[Path]]] = {
@@ -118,9 +126,9 @@ class _Builder:
                 [folder.gaussians_path],
             ),
             "features": (
-                [capture_hash, config.features, models],
+                features,
                 self._extract_features,
-                [folder.features_path],
+                [] if config.features_from is not None else [folder.features_path],
             ),
             "codebook": (["features", config.codebook, config.seed], self._fit_codebook, self._code_paths()),
             "embed": (
@@ -227,6 +235,10 @@ class _Builder:
 
     def _extract_features(self) -> dict[str, Any]:
         maps = self._feature_maps()
+        if self.config.features_from is not None:
+            for done, name in enumerate(maps, start=1):  # all are checked before anything is made of them
+                _ = maps[name]
+                self.listener(Event("features", done, len(maps)))
         return {"views": len(maps), "clip_hash": self.clip_hash}
 
     def _fit_codebook(self) -> dict[str, Any]:
@@ -260,7 +272,8 @@ class _Builder:
         )
         metadata = {**field.metadata(), "reconstruction": self.made_from["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)
-        return {"method": field.method}
+        dropped = {"dropped": round(field.dropped, 6)} if isinstance(field, LiftedField) else {}
+        return {"method": field.method, **dropped}
 
     # -- what stages share
 
@@ -333,10 +346,24 @@ def check_in_view(gaussians: Gaussians, cameras: list[Camera], subject: Path) ->
 def feature_maps(
     scene: Scene, config: BuildConfig, cache_dir: Path, device: str, listener: Listener = silent
 ) -> tuple[FeatureMaps, str]:
-    """Features of every view, extracted where they are not in the cache, and the hash of the CLIP that made them."""
+    """Features of every view, extracted where they are not in the cache, and the hash of the CLIP that made them.
+
+    Those of another program are taken as they are; the hash is then that of the CLIP that embeds the words.
+    """
     from lexsplat.features.encoders import load_clip, load_dino
 
     clip = load_clip(config.clip, device)
+    if config.features_from is not None:
+        if any(view.lens.distorts for view in scene.views.values()):
+            log.warning("features are taken to be of undistorted photos, and these photos are distorted")
+        maps = load_external_features(
+            config.features_from,
+            scene,
+            memory=parse_bytes(config.memory),
+            dimension=clip.dim,
+            allow_holes=config.codebook.num_codes < MAX_CODES,
+        )
+        return without_masked_cells(maps, scene), clip.content_hash
     dino = None if config.dino == "none" else load_dino(config.dino, device)
     settings = replace(config.features, memory=parse_bytes(config.memory))
     maps = extract_features(scene, clip, dino, settings, cache_dir=cache_dir, listener=listener)

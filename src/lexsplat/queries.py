@@ -49,6 +49,7 @@ PHOTO_TEMPLATES = (
 
 
 _CHUNK = 1 << 13  # pixels at a time; small enough that a block stays in the cache
+_GAUSSIANS = 1 << 16  # whose distributions are held at a time
 _MIN_COVERAGE = 0.05
 
 QueryForm = Literal["feature", "code"]
@@ -98,6 +99,13 @@ class QueryableField(Protocol):
     """What a query needs of a language field (``language_field.LanguageField`` has it)."""
 
     codebook: Codebook
+
+    @property
+    def uncertainties(self) -> Tensor:
+        """``[N]`` in 0..1."""
+
+    def select(self, index: Tensor) -> QueryableField:
+        """The rows of some Gaussians."""
 
     def code_probabilities(self) -> Tensor:
         """Distribution over codes of every Gaussian ``[N, K]``; a row of zeros was never seen."""
@@ -331,9 +339,13 @@ def gaussian_relevancy(
     if config.form == "code" and config.coverage == "composite" and hasattr(field, "scores"):
         table = code_relevancy(field.codebook.clip, positives, negatives, config.temperature)
         return field.scores(table).T.clamp(0.0, 1.0).contiguous()  # sparse: [N, K] is never held
-    probabilities = field.code_probabilities()
-    codewords = field.codebook.clip.to(probabilities.device)
-    return probability_relevancy(probabilities, codewords, positives, negatives, config).T.contiguous()
+    codewords = field.codebook.clip.to(field.uncertainties.device)
+    index = torch.arange(len(field.uncertainties), device=codewords.device)
+    blocks = [
+        probability_relevancy(rows.code_probabilities(), codewords, positives, negatives, config).T
+        for rows in map(field.select, index.split(_GAUSSIANS))  # [N, K] is never held
+    ]
+    return torch.cat(blocks, dim=1).contiguous()
 
 
 def ranking(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:

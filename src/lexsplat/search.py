@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lexsplat.cameras import Camera
 from lexsplat.errors import FileFormatError, ModelError, QueryError, SceneFolderError
-from lexsplat.features.text import TextCache
+from lexsplat.features.text import TextCache, encode_each
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LanguageField, field_from_tensors
 from lexsplat.phrases import parse
@@ -89,11 +89,11 @@ class SearchableScene:
         """
         import torch
 
-        for prompt in prompts:
-            if prompt not in self._texts:
-                self._texts[prompt] = embed_prompts([prompt], self.encode_text, self.query.templates)[0]
         if not prompts:
             raise QueryError("query", expected="at least one prompt", found="none")
+        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._texts]
+        if new:  # by one call: the cache on disk is written once
+            self._texts.update(zip(new, embed_prompts(new, self.encode_text, self.query.templates)))
         return torch.stack([self._texts[prompt] for prompt in prompts])
 
     def encode_text(self, texts: list[str]) -> Tensor:
@@ -107,7 +107,7 @@ class SearchableScene:
         known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
         writable = self.folder and not self.folder.is_shipped and os.access(self.folder.root, os.W_OK)
         if self.folder is None or known is None or not writable:
-            return self._load_encoder(known).encode_text(texts)
+            return encode_each(self._load_encoder(known), texts)
         if self._cache is None:
             self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))

@@ -110,14 +110,17 @@ class Codebook:
     def assign(self, feature_map: FeatureMap) -> NDArray[np.uint8]:
         """Index map M of one view: the most similar code of every cell (Eq. 4), ``[h, w]`` uint8.
 
-        Ties go to the lower index. Works in blocks of cells.
+        Ties go to the lower index. A cell whose CLIP feature is zero, about which nothing is known, holds 255 where
+        that is no code. Works in blocks of cells.
         """
         height, width = feature_map.clip.shape[:2]
         with one_thread():  # the last bit of a similarity may decide between two codes
-            indices = [
-                self.similarity(clip, dino).argmax(-1)
-                for clip, dino in _blocks(feature_map, self.clip.device, self.dino is not None)
-            ]
+            indices = []
+            for clip, dino in _blocks(feature_map, self.clip.device, self.dino is not None):
+                found = self.similarity(clip, dino).argmax(-1)
+                if self.num_codes < MAX_CODES:
+                    found[~clip.any(-1)] = MAX_CODES - 1
+                indices.append(found)
         return torch.cat(indices).reshape(height, width).to(torch.uint8).cpu().numpy()
 
     def to(self, device: torch.device | str) -> Codebook:

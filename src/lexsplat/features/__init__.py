@@ -5,7 +5,7 @@ The maps never lie in memory all at once: `extract_features` writes small files 
 """
 
 from lexsplat.features.cache import FeatureMap, FeatureMaps
-from lexsplat.features.external import load_external_features
+from lexsplat.features.external import external_identity, load_external_features
 from lexsplat.features.extraction import FeatureConfig, extract_features, load_level_maps
 from lexsplat.features.pca import pca_image
 from lexsplat.features.text import TextCache
@@ -15,6 +15,7 @@ __all__ = [
     "FeatureMap",
     "FeatureMaps",
     "TextCache",
+    "external_identity",
     "extract_features",
     "load_external_features",
     "load_level_maps",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from lexsplat.features.pretrained import (
     precision,
     resize_images,
 )
+
+log = logging.getLogger("lexsplat")
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 """The CLIP of the paper's released code."""
@@ -91,6 +94,8 @@ class ClipEncoder(PretrainedModel):
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case, padded to full length, and without an attention mask
             prompts = [prompt.lower() for prompt in prompts]
+        for prompt in prompts:
+            self._tell_if_cut(prompt)
         tokens = self._tokenizer(
             prompts,
             padding="max_length" if self._siglip else True,
@@ -100,6 +105,19 @@ class ClipEncoder(PretrainedModel):
         )
         keys = ("input_ids",) if self._siglip else ("input_ids", "attention_mask")
         return {key: tokens[key].to(self.device) for key in keys}
+
+    def _tell_if_cut(self, prompt: str) -> None:
+        """Warn where the end of a prompt is not heard; a token has at least one character, but for its two ends."""
+        if len(prompt) + 2 <= self._text_length:
+            return
+        count = len(self._tokenizer(prompt, verbose=False)["input_ids"])
+        if count > self._text_length:
+            log.warning(
+                "%r is too long: the model hears %d of its %d tokens, not its end",
+                prompt[:30] + "...",
+                self._text_length,
+                count,
+            )
 
     def _vision_inputs(self, pixels: Tensor) -> dict[str, Tensor]:
         """What the image tower wants: pixels, or for SigLIP 2 of free size ("NaFlex") a list of patches."""

@@ -5,22 +5,31 @@ from __future__ import annotations
 import tokenize
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 
+from lexsplat import budget
 from lexsplat.errors import FileFormatError
 from lexsplat.features.cache import FeatureMap, FeatureMaps
 from lexsplat.tensor_files import PICKLES, refuse_pickle
 
 if TYPE_CHECKING:
-    from lexsplat.scenes import Scene
+    from lexsplat.scenes import Scene, View
+
+_FLOATS = ("F64", "F32", "F16", "BF16")
 
 
-def load_external_features(folder: Path, scene: Scene, *, cache_bytes: int = 1 << 30) -> FeatureMaps:
+def load_external_features(
+    folder: Path,
+    scene: Scene,
+    *,
+    memory: int = budget.DEFAULT_MEMORY,
+    dimension: int | None = None,
+    allow_holes: bool = True,
+) -> FeatureMaps:
     """Per-view features from a folder of arrays, named by the views' stems.
 
     Three forms are read, for a view ``a/b.jpg``:
@@ -29,12 +38,17 @@ def load_external_features(folder: Path, scene: Scene, *, cache_bytes: int = 1 <
     - ``a/b.safetensors``: a tensor "clip" (or one tensor of any name) ``[h, w, D]``, and if wanted "dino";
     - ``a/b_f.npy`` ``[n, D]`` with ``a/b_s.npy`` ``[h, w]`` or ``[L, h, w]``: one feature a segment, and the
       segment of every pixel (-1 for none) for L levels of segments, as LangSplat-style preprocessing writes
-      them; levels are averaged.
+      them; levels are averaged, and pixels in no segment have the feature zero.
+
+    An array has the photo's shape at any size. What is finer than the pictures that language is learned from is
+    read at their pixels' centres only.
 
     Args:
         folder: Where the arrays are.
         scene: Every view must have its array.
-        cache_bytes: Most bytes of maps to keep in memory.
+        memory: Bytes that reading a map may take; a quarter of it is for maps that are kept.
+        dimension: Depth that the features must have to be compared with words; None takes any.
+        allow_holes: Whether pixels may have no feature.
 
     Returns:
         Maps by view name; each array is read, and its numbers checked, when its view is asked for.
@@ -42,23 +56,62 @@ def load_external_features(folder: Path, scene: Scene, *, cache_bytes: int = 1 <
     Raises:
         FileFormatError: If a view has no array or, when it is read, the array has a wrong shape or type, is
             not finite, or has another depth than those before.
+        MemoryBudgetError: When it is read, if a map does not fit.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileFormatError(folder, expected="a folder with one array a view", found="no folder")
-    sources = {name: _source(folder, view.stem) for name, view in scene.views.items()}
+    sources = external_sources(folder, scene)
     depth: dict[str, int] = {}
 
     def load(name: str) -> FeatureMap:
-        path = sources[name]
-        found = _read_segments(path) if path.name.endswith("_f.npy") else _read_arrays(path)
+        path, reading = sources[name], _Reading(scene.views[name], memory)
+        found = reading.segments(path) if path.name.endswith("_f.npy") else reading.arrays(path)
         dims = {"clip": found.clip.shape[-1]} | ({} if found.dino is None else {"dino": found.dino.shape[-1]})
+        if dimension is not None and dims["clip"] != dimension:
+            raise FileFormatError(
+                path,
+                expected=f"features of depth {dimension}, as the encoder of the words has them",
+                found=str(dims["clip"]),
+                remedy="name with --clip the encoder that the features were made with",
+            )
         if depth and dims != depth:
             raise FileFormatError(path, expected=f"features of depth {depth}", found=f"{dims}")
         depth.update(dims)
+        if not allow_holes and not bool(found.clip.any(-1).all()):
+            raise FileFormatError(
+                path,
+                expected="a feature for every pixel where there are 256 codes",
+                found="pixels without one",
+                remedy="give --codebook.num-codes 255 or less",
+            )
         return found
 
-    return FeatureMaps(list(sources), load, cache_bytes)
+    return FeatureMaps(list(sources), load, memory // 4)
+
+
+def external_sources(folder: Path, scene: Scene) -> dict[str, Path]:
+    """The file of each view by its name; of a pair, the features.
+
+    Raises:
+        FileFormatError: If a view has none.
+    """
+    return {name: _source(folder, view.stem) for name, view in scene.views.items()}
+
+
+def external_identity(folder: Path, scene: Scene) -> list[str]:
+    """Name, size and time of every file that is read: what tells that features have changed."""
+    files = []
+    for path in external_sources(folder, scene).values():
+        files.append(path)
+        if path.name.endswith("_f.npy"):
+            files.append(_segments_of(path))
+    facts = [(file, file.stat()) for file in files if file.is_file()]
+    return [f"{file.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}" for file, stat in facts]
+
+
+def _segments_of(path: Path) -> Path:
+    return path.with_name(path.name.removesuffix("_f.npy") + "_s.npy")
 
 
 def _source(folder: Path, stem: str) -> Path:
@@ -77,65 +130,127 @@ def _source(folder: Path, stem: str) -> Path:
     )
 
 
-def _read_arrays(path: Path) -> FeatureMap:
-    if path.suffix == ".npy":
-        return FeatureMap(_unit(_read_npy(path), path))
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
+class _Reading:
+    """Reads the arrays of one view at no more cells than its picture has pixels.
 
-    try:
-        tensors = load_file(path)
-    except (OSError, SafetensorError, ValueError, RuntimeError) as error:
-        raise FileFormatError(path, expected="safetensors", found=str(error)[:200]) from error
-    for name, tensor in tensors.items():
-        if not tensor.is_floating_point():
-            raise FileFormatError(path, expected=f"{name} as floating-point numbers", found=str(tensor.dtype))
-    dino = tensors.pop("dino", None)
-    if len(tensors) != 1 and "clip" not in tensors:
-        raise FileFormatError(path, expected='a tensor "clip"', found=", ".join(sorted(tensors)) or "none")
-    clip = _unit(tensors.get("clip", next(iter(tensors.values()))).float().numpy(), path)
-    if dino is None:
-        return FeatureMap(clip)
-    if dino.shape[:2] != clip.shape[:2]:
-        raise FileFormatError(
-            path, expected=f"dino of size {list(clip.shape[:2])}", found=f"{list(dino.shape[:2])}"
-        )
-    return FeatureMap(clip, _unit(dino.float().numpy(), path))
+    Args:
+        view: The view.
+        memory: Bytes that this may take.
+    """
+
+    def __init__(self, view: View, memory: int) -> None:
+        self.view, self.memory = view, memory
+
+    def arrays(self, path: Path) -> FeatureMap:
+        """``[h, w, D]`` from .npy or safetensors."""
+        if path.suffix == ".npy":
+            array = _open_npy(path)
+            itemsize = 0 if array.dtype == np.float32 else array.itemsize
+            rows, columns = self._cells(array.shape, itemsize, path)
+            return FeatureMap(_unit(array[rows[:, None], columns], path))
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="pt") as file:
+                parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+                for name, part in parts.items():
+                    if part.get_dtype() not in _FLOATS:
+                        found = str(part.get_dtype())
+                        raise FileFormatError(path, expected=f"{name} as floating-point numbers", found=found)
+                dino = parts.pop("dino", None)
+                if len(parts) != 1 and "clip" not in parts:
+                    found = ", ".join(sorted(parts)) or "none"
+                    raise FileFormatError(path, expected='a tensor "clip"', found=found)
+                clip = parts.get("clip", next(iter(parts.values())))
+                if dino is not None and dino.get_shape()[:2] != clip.get_shape()[:2]:
+                    size = clip.get_shape()[:2]
+                    raise FileFormatError(
+                        path, expected=f"dino of size {size}", found=f"{dino.get_shape()[:2]}"
+                    )
+                made = [None if part is None else self._sliced(part, path) for part in (clip, dino)]
+        except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
+            raise FileFormatError(path, expected="safetensors", found=str(error)[:200]) from error
+        return FeatureMap(*made)  # type: ignore[arg-type]
+
+    def _sliced(self, part: Any, path: Path) -> torch.Tensor:
+        """Unit vectors of a slice of a safetensors file, row by row: a row is all that is held twice."""
+        rows, columns = self._cells(tuple(part.get_shape()), 0, path)
+        read = [part[row : row + 1][:, columns].float().numpy() for row in rows.tolist()]
+        return _unit(np.concatenate(read), path)
+
+    def segments(self, path: Path) -> FeatureMap:
+        """One feature a segment and the segment of every pixel, painted."""
+        features, pixels = _open_npy(path), _segments_of(path)
+        if features.ndim != 2:
+            raise FileFormatError(path, expected="[n, D]", found=str(list(features.shape)))
+        numbers = _open_npy(pixels)
+        if numbers.ndim not in (2, 3):
+            found = str(list(numbers.shape))
+            raise FileFormatError(pixels, expected="[h, w] or [L, h, w]", found=found)
+        if 0 in numbers.shape:
+            raise FileFormatError(pixels, expected="segment numbers", found="none")
+        rows, columns = self._cells((*numbers.shape[-2:], features.shape[1]), 0, pixels)
+        index = _segment_numbers(numbers[..., rows[:, None], columns], len(features), pixels)
+        unit = _unit(np.array(features)[None], path)[0].numpy()
+        padded = np.concatenate(
+            [unit, np.zeros((1, unit.shape[1]), np.float32)]
+        )  # -1 picks the zero at the end
+        total = np.empty((*index.shape[1:], unit.shape[1]), np.float32)
+        for row in range(len(total)):
+            total[row] = padded[index[:, row]].sum(0)
+        return FeatureMap(_unit(total, path))
+
+    def _cells(
+        self, shape: tuple[int, ...], itemsize: int, path: Path
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns to read of an array ``[h, w, D]``.
+
+        Raises:
+            FileFormatError: If it is no such array, or not of the photo's shape.
+            MemoryBudgetError: If the map does not fit.
+        """
+        if len(shape) != 3 or 0 in shape:
+            raise FileFormatError(path, expected="features [h, w, D]", found=str(list(shape)))
+        height, width, depth = shape
+        photo_width, photo_height = self.view.capture_size
+        # Cells are whole: either side may be off by one.
+        if abs(height * photo_width - width * photo_height) >= photo_width + photo_height:
+            raise FileFormatError(
+                path,
+                expected=f"[h, w, D] of the photo's shape, {photo_width}x{photo_height}",
+                found=f"{width}x{height}",
+                remedy="give features of the whole photo",
+            )
+        rows, columns = min(height, self.view.camera.height), min(width, self.view.camera.width)
+        # The map, and beside it what it is read from or norms and a row.
+        need = rows * columns * (depth * (4 + itemsize) + 16) + (16 << 20)
+        what = f"features of {columns}x{rows}x{depth} of a view"
+        budget.require("features", need, self.memory, what, "a larger --downscale")
+        return _centres(rows, height), _centres(columns, width)
 
 
-def _read_segments(path: Path) -> FeatureMap:
-    features = _read_npy(path)
-    pixels = path.with_name(path.name.removesuffix("_f.npy") + "_s.npy")
-    segments = _read_npy(pixels)
-    if features.ndim != 2:
-        raise FileFormatError(path, expected="[n, D]", found=str(list(features.shape)))
-    if segments.ndim not in (2, 3):
-        raise FileFormatError(pixels, expected="[h, w] or [L, h, w]", found=str(list(segments.shape)))
-    if (
-        0 in segments.shape
-        or not np.isfinite(segments).all()
-        or np.abs(segments.astype(np.float64)).max() > 2**31
-    ):
-        raise FileFormatError(pixels, expected="segment numbers", found="none, or numbers that are none")
+def _centres(count: int, length: int) -> NDArray[np.intp]:
+    """The cells out of ``length`` in which the centres of ``count`` cells lie."""
+    return ((2 * np.arange(count) + 1) * length) // (2 * count)
+
+
+def _segment_numbers(segments: NDArray, count: int, path: Path) -> NDArray[np.int64]:
+    """Segments ``[L, h, w]`` of pixels ``[h, w]`` or ``[L, h, w]``: whole numbers from -1 to ``count`` - 1."""
+    if not np.isfinite(segments).all() or np.abs(segments.astype(np.float64)).max() > 2**31:
+        raise FileFormatError(path, expected="segment numbers", found="numbers that are none")
     index = segments.astype(np.int64)
-    if index.min() < -1 or index.max() >= len(features) or (index != segments).any():
+    if index.min() < -1 or index.max() >= count or (index != segments).any():
         raise FileFormatError(
-            pixels,
-            expected=f"whole numbers from -1 to {len(features) - 1}",
+            path,
+            expected=f"whole numbers from -1 to {count - 1}",
             found=f"{segments.min():g} to {segments.max():g}",
         )
-    index = index.reshape(-1, *index.shape[-2:])
-    unit = _unit(features[None], path)[0].numpy()
-    padded = np.concatenate([unit, np.zeros((1, unit.shape[1]), np.float32)])  # -1 picks the zero at the end
-    total = np.zeros((*index.shape[1:], unit.shape[1]), np.float32)
-    for level in index:
-        total += padded[level]
-    return FeatureMap(_unit(total, path))
+    return index.reshape(-1, *index.shape[-2:])
 
 
-def _read_npy(path: Path) -> NDArray:
+def _open_npy(path: Path) -> NDArray:
+    """An array of numbers, mapped: a header that promises more than the file holds must not become memory."""
     try:
-        # Mapped first: a header that promises more than the file holds must not become memory.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError) as error:
         raise _no_array(path, error) from error
@@ -145,7 +260,7 @@ def _read_npy(path: Path) -> NDArray:
         raise FileFormatError(
             path, expected="an array of numbers", found=str(getattr(array, "dtype", type(array)))
         )
-    return np.array(array)
+    return array
 
 
 def _no_array(path: Path, error: Exception) -> FileFormatError:
@@ -153,11 +268,12 @@ def _no_array(path: Path, error: Exception) -> FileFormatError:
 
 
 def _unit(array: NDArray, path: Path) -> torch.Tensor:
-    if array.ndim != 3 or 0 in array.shape:
+    """Unit vectors ``[h, w, D]`` in float32, made in place where the array is that already."""
+    if 0 in array.shape:
         raise FileFormatError(path, expected="features [h, w, D]", found=str(list(array.shape)))
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, which is refused below
-        array = array.astype(np.float32)
-    values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
-    if not bool(torch.isfinite(values).all()):
-        raise FileFormatError(path, expected="finite numbers", found="NaN or infinity")
-    return F.normalize(values, dim=-1)
+        values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+    lengths = torch.linalg.vector_norm(values, dim=-1, keepdim=True)
+    if not bool(torch.isfinite(lengths).all()):
+        raise FileFormatError(path, expected="finite numbers", found="NaN, infinity, or numbers beyond 1e19")
+    return values.div_(lengths.clamp_min(1e-12))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +13,13 @@ from torch import Tensor
 from lexsplat.errors import FileFormatError
 from lexsplat.features.encoders import ImageTextEncoder
 from lexsplat.tensor_files import read_tensors, write_tensors
+
+log = logging.getLogger("lexsplat")
+
+
+def encode_each(encoder: ImageTextEncoder, texts: Sequence[str]) -> Tensor:
+    """Embeddings ``[T, D]`` of texts one by one: in a batch the last bits depend on what else is in it."""
+    return torch.cat([encoder.encode_text([text]) for text in texts])
 
 
 class TextCache:
@@ -48,8 +56,11 @@ class TextCache:
             model = encoder()
             if model.content_hash != content_hash:
                 raise ValueError(f"{model.name} is not the model that was asked for ({content_hash})")
-            known.update(zip(new, model.encode_text(new)))
-            self._write(content_hash, known)
+            known.update(zip(new, encode_each(model, new)))
+            try:
+                self._write(content_hash, known)
+            except OSError as error:  # the answer does not depend on it
+                log.warning("%s: embeddings of words are not kept (%s)", self._folder, error.strerror)
         return torch.stack([known[prompt] for prompt in prompts])
 
     def _path(self, content_hash: str) -> Path:

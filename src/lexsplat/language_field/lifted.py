@@ -31,6 +31,8 @@ class LiftedField:
             known.
         uncertainties: u_G ``[N]`` in 0..1.
         method: Name under which results are reported.
+        dropped: Share of the weight of all codes that lay outside the T codes kept, 0 to 1: what their sparsity
+            costs.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class LiftedField:
         uncertainties: Tensor,
         *,
         method: str = "lifted",
+        dropped: float = 0.0,
     ) -> None:
         if codes.ndim != 2 or codes.dtype != torch.uint8 or weights.shape != codes.shape:
             raise ValueError(
@@ -60,6 +63,7 @@ class LiftedField:
         self.weights = weights.float()
         self._uncertainties = uncertainties.float()
         self.method = method
+        self.dropped = dropped
 
     @property
     def uncertainties(self) -> Tensor:
@@ -110,6 +114,7 @@ class LiftedField:
             self.weights[index],
             self._uncertainties[index],
             method=self.method,
+            dropped=self.dropped,
         )
 
     def tensors(self) -> dict[str, Tensor]:
@@ -119,7 +124,7 @@ class LiftedField:
 
     def metadata(self) -> dict[str, str]:
         """What is not a tensor."""
-        return {"kind": "lifted", "method": self.method}
+        return {"kind": "lifted", "method": self.method, "dropped": f"{self.dropped:.6g}"}
 
     @classmethod
     def from_tensors(
@@ -131,10 +136,12 @@ class LiftedField:
             ValueError: If a tensor is missing or of the wrong shape.
         """
         require(tensors, ("codes", "weights", "uncertainties"))
+        metadata = metadata or {}
         return cls(
             stored_codebook(tensors),
             tensors["codes"],
             tensors["weights"],
             tensors["uncertainties"],
-            method=(metadata or {}).get("method", "lifted"),
+            method=metadata.get("method", "lifted"),
+            dropped=float(metadata.get("dropped", "0")),
         )
