@@ -144,7 +144,8 @@ def segments(tmp_path_factory) -> Path:
 def embed(capture: Path, output: Path, built: Path, features: Path, *options: str) -> int:
     return cli.main([
         "embed", str(capture), "--output", str(output), "--splats", str(built / "gaussians.ply"),
-        "--clip", "embedded", "--device", "cpu", "--codebook.num-codes", "16", "--features-from", str(features), *options,
+        "--clip", "embedded", "--device", "cpu", "--codebook.num-codes", "16",
+        "--features-from", str(features), *options,
     ])  # fmt: skip
 
 

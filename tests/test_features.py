@@ -492,6 +492,16 @@ def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path
     assert "not kept" in caplog.text
 
 
+def test_a_prompt_whose_end_is_not_heard_is_told(caplog):
+    from lexsplat.features.encoders import load_clip
+
+    clip = load_clip("embedded")
+    clip.encode_text(["something that one could drink from"])
+    assert not caplog.records
+    clip.encode_text(["a very " * 200 + "red apple"])
+    assert "too long: the model hears 24 of its 804 tokens" in caplog.text
+
+
 def test_text_of_another_model_is_never_used(tmp_path):
     TextCache(tmp_path).encode("colour", ["apple"], ColourEncoder)
     other = ColourEncoder("other")

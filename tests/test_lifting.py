@@ -284,6 +284,7 @@ def test_the_fit_without_rendering_reproduces_the_distributions(scene) -> None:
 
 def test_tuning_ends_in_the_papers_field_and_recovers_known_labels(scene) -> None:
     before = {name: tensor.clone() for name, tensor in scene.gaussians.tensors().items()}
+    events = []
     field = tune(
         lift_scene(scene, LiftingConfig()),
         scene.gaussians,
@@ -291,6 +292,11 @@ def test_tuning_ends_in_the_papers_field_and_recovers_known_labels(scene) -> Non
         scene.code_maps,
         TuningConfig(fit_steps=60, batch_size=256, fit_lr=0.02, iterations=10),
         EMBEDDING,
+        listener=events.append,
+    )
+    last = {event.stage: (event.done, event.total) for event in events}
+    assert last == {"fit": (60, 60), "embed": (10, 10)}, (
+        "so many steps without rendering, then so many with it"
     )
     assert isinstance(field, TrainedField)
     assert field.method == "lifted+tuned"
