@@ -170,6 +170,28 @@ def test_maps_are_unit_length_and_without_dino_have_none(scene, tmp_path):
         torch.testing.assert_close(found.clip.norm(dim=-1), torch.ones(8, 12))
 
 
+@pytest.mark.parametrize("size", [(4000, 8), (8, 4000)])
+def test_the_maps_of_a_long_strip_have_no_more_cells_than_those_of_a_picture_of_16_by_1(size, tmp_path):
+    scene = make_scene(tmp_path, count=1)
+    (view,) = scene.views.values()
+    Image.new("RGB", size, (90, 20, 60)).save(view.image_path)
+    seen = []
+
+    class Asked(GridEncoder):
+        def encode_dense(self, image, *, short_side=224, **rest):
+            seen.append(short_side)
+            return super().encode_dense(image, short_side=short_side, **rest)
+
+    config = dataclasses.replace(
+        CONFIG, crop_sizes=(0.5,), crop_strides=(1.0,), map_cells=20, dino_short_side=100
+    )
+    maps = extract_features(scene, ColourEncoder(), Asked(), config, cache_dir=tmp_path / "cache")
+    rows, cols = maps[view.name].clip.shape[:2]
+    assert rows * cols == pytest.approx(16 * 20**2, rel=0.2)
+    assert max(rows, cols) / min(rows, cols) == pytest.approx(500, rel=0.2), "cells stay square"
+    assert seen == [round(100 * (16 / 500) ** 0.5)]
+
+
 def test_a_second_run_costs_nothing_and_gives_the_same(scene, tmp_path):
     first = extract_features(scene, ColourEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
     before = {name: first[name].clip for name in first}

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from lexsplat.scenes import Scene, View
 
 _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15 % slower at 256
+_LONGEST = 16  # in short sides: longer strips get coarser maps, or the memory of a map would know no bound
 _MAX_WORKERS = 4  # beyond this, threads inside an operation pay better than more images in flight
 
 
@@ -61,7 +62,7 @@ class FeatureConfig:
         random_levels: Random: number of sizes.
         random_sizes: Random: smallest and largest side as fractions of the image's short side.
         seed: Random: seed of the positions; every view draws its own.
-        map_cells: Cells of the feature maps along the short side.
+        map_cells: Cells of the feature maps along the short side (fewer on strips longer than 16 short sides).
         max_short_side: Larger images are reduced to this many pixels on the short side before cropping.
         dino_short_side: Pixels on the short side of the image that DINO sees.
         dino_stride: Pixels of that image between features; below the patch size, shifted copies are
@@ -223,7 +224,7 @@ class _Entry:
         width, height = view.capture_size
         factor = min(1.0, config.max_short_side / min(width, height))
         image_size = max(1, round(width * factor)), max(1, round(height * factor))
-        cells = config.map_cells / min(width, height)
+        cells = config.map_cells / min(width, height) * _strip_factor(width, height)
         map_size = max(1, round(width * cells)), max(1, round(height * cells))
         # The pixels follow from the file, the lens they are undistorted by, the background, the size and the mask.
         lens = dataclasses.asdict(view.lens)
@@ -244,6 +245,11 @@ class _Entry:
 
     def is_complete(self) -> bool:
         return is_stored(self.clip) and (self.dino is None or is_stored(self.dino))
+
+
+def _strip_factor(width: int, height: int) -> float:
+    """1, or for strips what makes the area of their maps that of a picture of 16 by 1."""
+    return min(1.0, (_LONGEST * min(width, height) / max(width, height)) ** 0.5)
 
 
 class _Extraction:
@@ -331,7 +337,7 @@ class _Extraction:
         config = self.config
         return dino.encode_dense(
             image,
-            short_side=config.dino_short_side,
+            short_side=max(1, round(config.dino_short_side * _strip_factor(*image.shape[-2:]))),
             stride=config.dino_stride,
             facet=config.dino_facet,
             layer=config.dino_layer,
