@@ -98,7 +98,7 @@ class _Builder:
         splats: Path | None = None,
     ) -> None:
         self.scene, self.folder, self.config = scene, folder, config
-        # How much is kept in memory decides nothing about a result: stages use it, fingerprints leave it out.
+        # How much is kept in memory decides nothing about a result: stages use it, fingerprints (`decisive`) do not.
         self.bounded = config.within_memory()
         self.device, self.listener, self.splats = device, listener, splats
         self.made_from: dict[str, str] = {}
@@ -107,7 +107,7 @@ class _Builder:
 
     def run(self, until: str) -> SceneFolder:
         capture_hash = write_provenance(self.folder, self.scene, self.config)
-        config, folder = self.config, self.folder
+        config, folder = self.config.decisive(), self.folder
         models = [model_identity(config.clip, "clip"), model_identity(config.dino, "dino")]
         language = [config.method, config.embedding, config.lifting, config.tuning]
         # What each stage is made from (a stage's name stands for all of its inputs), what it does, what it writes.
@@ -164,7 +164,8 @@ class _Builder:
         every = self.config.checkpoint_seconds
         self.checkpoint = Checkpoint(path, made_from, every=every)
         facts = work()
-        self.folder.finish(name, made_from, time.perf_counter() - start, **facts)
+        seconds = self.checkpoint.seconds_before + time.perf_counter() - start
+        self.folder.finish(name, made_from, seconds, **facts)
         self.checkpoint.remove()
 
     # -- what a stage does
