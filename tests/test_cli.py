@@ -243,6 +243,9 @@ def test_an_unknown_model_says_the_three_ways_to_get_one(tiny_capture, tmp_path,
         capsys, [*arguments, "--clip", "nobody/nothing"], "nobody/nothing", "embedded", "folder"
     )
     assert not (output / "language.safetensors").exists()
+    arguments = ["build", *arguments[1:], "--clip", "embedded", "--dino", "nobody/nothing"]
+    fails_in_one_line(capsys, arguments, "nobody/nothing", "--dino embedded")
+    assert not (output / "gaussians.ply").exists(), "it is told before the long part"
 
 
 def broken(tmp_path: Path, damage) -> Path:

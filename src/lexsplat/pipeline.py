@@ -24,6 +24,7 @@ from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
 from lexsplat.errors import CaptureError, FileFormatError
 from lexsplat.features import FeatureMaps, extract_features
+from lexsplat.features.hub import model_folder
 from lexsplat.formats.reading import read_splats
 from lexsplat.gaussians import Gaussians
 from lexsplat.joint import JointTrainer
@@ -141,7 +142,12 @@ class _Builder:
             stages["reconstruct"] = (inputs, self._train_jointly, [*outputs, self._joint_path])
             stages["embed"] = (["reconstruct", language], self._take_joint_language, [folder.language_path])
             order = ("features", "codebook", "reconstruct", "embed")
-        for name in order[: order.index(until) + 1]:
+        wanted = order[: order.index(until) + 1]
+        if "features" in wanted and not folder.is_finished("features", fingerprint(stages["features"][0])):
+            model_folder(config.clip, "clip")  # a missing model is told now, not after the reconstruction
+            if config.dino != "none":
+                model_folder(config.dino, "dino")
+        for name in wanted:
             inputs, work, outputs = stages[name]
             self._run_stage(name, inputs, work, outputs)
         if until == "embed":
