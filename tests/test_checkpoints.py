@@ -45,6 +45,20 @@ def test_a_saved_state_comes_back_exactly(tmp_path):
     assert torch.equal(first.value, second.value)
 
 
+def test_the_time_of_a_stopped_training_counts(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("lexsplat.checkpoints.time.perf_counter", lambda: now[0])
+    path = tmp_path / "state"
+    for begun, expected in ((100.0, 0.0), (500.0, 7.0), (900.0, 14.0)):
+        now[0] = begun
+        checkpoint = Checkpoint(path, "inputs")
+        checkpoint.resume(Counter())
+        assert checkpoint.seconds_before == expected
+        now[0] += 7
+        checkpoint.save(Counter())
+    assert Checkpoint(path, "other inputs").seconds_before == 0
+
+
 def test_the_state_of_other_inputs_is_not_taken_up(tmp_path):
     Checkpoint(tmp_path / "state", "inputs").save(Counter())
     assert not Checkpoint(tmp_path / "state", "other inputs").resume(Counter())

@@ -50,7 +50,13 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
     copy = tmp_path / "copy"
     shutil.copytree(built, copy)
     before = modified(copy)
-    arguments = [*QUICK, "--embedding.no-use-smoothing"]
+    # The scene is lifted: nothing of a training, nor how much is kept in memory, has a part in it.
+    idle = ["--embedding.no-use-smoothing", "--tuning.iterations", "9", "--lifting.memory-bytes", "999999"]
+    idle += ["--features.random-crops", "7", "--reconstruction.image-memory", "999999", "--memory", "3GB"]
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, *idle]) == 0
+    after = modified(copy)
+    assert {name for name in before if after[name] != before[name]} <= {"scene.json", "cameras.json", ".lock"}
+    arguments = [*QUICK, "--lifting.top", "3"]
     assert cli.main(["build", str(tiny_capture), "--output", str(copy), *arguments]) == 0
     after = modified(copy)
     assert after["language.safetensors"] != before["language.safetensors"]
@@ -237,6 +243,9 @@ def test_an_unknown_model_says_the_three_ways_to_get_one(tiny_capture, tmp_path,
         capsys, [*arguments, "--clip", "nobody/nothing"], "nobody/nothing", "embedded", "folder"
     )
     assert not (output / "language.safetensors").exists()
+    arguments = ["build", *arguments[1:], "--clip", "embedded", "--dino", "nobody/nothing"]
+    fails_in_one_line(capsys, arguments, "nobody/nothing", "--dino embedded")
+    assert not (output / "gaussians.ply").exists(), "it is told before the long part"
 
 
 def broken(tmp_path: Path, damage) -> Path:
@@ -299,6 +308,8 @@ def test_bad_captures_end_in_one_line_and_no_half_written_output(tmp_path, capsy
         ["build", "x", "--output", "y", "--memory", "plenty"],
         ["build", "x", "--output", "y", "--downscale", "-1"],
         ["build", "x", "--output", "y", "--iterations", "0"],
+        ["build", "x", "--output", "y", "--reconstruction.iterations", "5"],
+        ["build", "x", "--output", "y", "--features.memory", "5"],
         ["build", "x", "--output", "y", "--test-every", "1"],
         ["build", "x", "--output", "y", "--codebook.num-codes", "300"],
         ["query", "x", "apple", "--threshold", "nan"],

@@ -177,14 +177,16 @@ def test_load_balancing_loss_is_at_most_one_and_lowest_when_balanced(seed: int, 
 @pytest.mark.parametrize("use_dino", [True, False])
 def test_quantization_loss_is_equation_7_with_its_gradient(load_balancing: bool, use_dino: bool) -> None:
     clip, dino, code_clip, code_dino = random_problem(4, rows=9)
-    config = CodebookConfig(num_codes=5, lambda_cos=0.7, lambda_lb=0.3, load_balancing=load_balancing)
+    config = CodebookConfig(
+        num_codes=5, lambda_dino=0.8, lambda_cos=0.7, lambda_lb=0.3, load_balancing=load_balancing
+    )
     dino, code_dino = (dino, code_dino) if use_dino else (None, None)
 
     def reference(flat: np.ndarray) -> float:
         codes = torch.from_numpy(flat.reshape(5, 6))
-        scores = reference_similarity(clip, dino, codes, code_dino, 0.5)
+        scores = reference_similarity(clip, dino, codes, code_dino, 0.8)
         chosen = scores.argmax(1)
-        ceiling = 1.5 if use_dino else 1.0
+        ceiling = 1.8 if use_dino else 1.0
         loss = 0.7 * np.mean([ceiling - scores[i, m] for i, m in enumerate(chosen)])
         return loss + (0.3 * reference_load_balancing(scores, 1.0) if load_balancing else 0)
 

@@ -8,8 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lexsplat.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig, choose_device, parse_bytes
+from lexsplat.embedding import EmbeddingConfig
 from lexsplat.errors import BackendError
 from lexsplat.features import FeatureConfig
+from lexsplat.lifting import LiftingConfig, TuningConfig
+from lexsplat.reconstruction import ReconstructionConfig
 
 
 @pytest.mark.parametrize(
@@ -51,6 +54,58 @@ def test_features_suit_the_encoder_and_the_device():
     assert embedded.features == FeatureConfig.embedded()
     assert BuildConfig().resolved("cpu", (10, 10)).features == FeatureConfig.sparse()
     assert BuildConfig().resolved("cuda", (10, 10)).features == FeatureConfig()
+
+
+@pytest.mark.parametrize(("clip", "suited"), [("embedded", "embedded"), ("some/clip", "sparse")])
+def test_one_setting_of_the_features_leaves_the_others_as_they_suit(clip, suited):
+    suited = getattr(FeatureConfig, suited)()
+    for change in ({"dino_facet": "token"}, {"mode": "random"}, {"map_cells": 9}, {"seed": 3}):
+        config = BuildConfig(clip=clip, features=FeatureConfig(**change)).resolved("cpu", (10, 10))
+        assert config.features == replace(suited, **change)
+        assert config.resolved("cpu", (10, 10)) == config
+    sizes = (0.1,) * len(FeatureConfig().crop_sizes)  # their strides are the usual ones, and stay
+    config = BuildConfig(clip=clip, features=FeatureConfig(crop_sizes=sizes)).resolved("cpu", (10, 10))
+    strides = FeatureConfig().crop_strides
+    assert config.features == replace(suited, crop_sizes=sizes, crop_strides=strides)
+
+
+def test_steps_set_in_the_part_they_belong_to_are_taken():
+    given = BuildConfig(reconstruction=ReconstructionConfig(iterations=50))
+    assert given.resolved("cpu", (10, 10)).reconstruction.iterations == 50
+    both = replace(given, iterations=60)
+    assert both.resolved("cpu", (10, 10)).reconstruction.iterations == 60
+
+
+def test_fingerprints_hold_what_decides_a_result_and_nothing_else():
+    config = BuildConfig()
+    idle = [
+        replace(config, reconstruction=ReconstructionConfig(image_memory=9)),
+        replace(config, features=FeatureConfig(memory=9)),
+        replace(config, features=FeatureConfig(random_crops=9)),
+        replace(config, embedding=EmbeddingConfig(iterations=9)),
+        replace(config, tuning=TuningConfig(iterations=9)),
+        replace(config, lifting=LiftingConfig(memory_bytes=9)),
+    ]
+    assert all(other.decisive() == config.decisive() for other in idle)
+    touched = [
+        replace(config, features=FeatureConfig(map_cells=9)),
+        replace(config, features=FeatureConfig(dino_stride=9)),
+        replace(config, features=FeatureConfig(mode="random")),
+        replace(config, lifting=LiftingConfig(top=3)),
+        replace(config, method="lifted+tuned"),
+    ]
+    assert all(other.decisive() != config.decisive() for other in touched)
+    random = replace(config, features=FeatureConfig(mode="random", random_crops=9))
+    assert random.decisive() != replace(random, features=FeatureConfig(mode="random")).decisive()
+    trained = replace(config, method="trained")
+    assert replace(trained, lifting=LiftingConfig(top=3)).decisive() == trained.decisive()
+    longer = replace(trained, embedding=EmbeddingConfig(iterations=9))
+    assert longer.decisive() != trained.decisive()
+    both = replace(config, method="lifted+tuned")
+    for part in ({"lifting": LiftingConfig(top=3)}, {"tuning": TuningConfig(iterations=9)}):
+        assert replace(both, **part).decisive() != both.decisive()
+    plain = replace(config, dino="none")
+    assert replace(plain, features=FeatureConfig(dino_stride=9)).decisive() == plain.decisive()
 
 
 def test_resolving_twice_changes_nothing():

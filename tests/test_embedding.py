@@ -185,6 +185,59 @@ def test_an_ablation_leaves_its_parameters_alone(scene, switch: str, untouched: 
     assert not torch.equal(on[untouched], start[untouched])
 
 
+def test_without_uncertainty_the_cross_entropy_keeps_its_weight(scene) -> None:
+    losses = {}
+    for weight in (1.0, 0.5):
+        config = replace(QUICK, use_uncertainty=False, use_smoothing=False, lambda_ce=weight)
+        trainer = EmbeddingTrainer(scene.gaussians, scene.codebook, config, seed=1)
+        losses[weight] = trainer.step(scene.cameras["view0"], scene.code_maps["view0"])["loss"]
+    assert float(losses[0.5]) == pytest.approx(0.5 * float(losses[1.0]))
+
+
+def test_without_uncertainty_the_smoothing_has_its_least_weight(scene) -> None:
+    config = replace(QUICK, use_uncertainty=False, smoothing_sample=0, min_smoothing_weight=0.25)
+    trainer = EmbeddingTrainer(scene.gaussians, scene.codebook, config, seed=1)
+    with torch.no_grad():
+        trainer.field.uncertainty_logits.fill_(5.0)  # a field that was tuned with uncertainties before
+        distance = trainer.field.smoother(scene.gaussians.means) - trainer.field.semantics
+        expected = 1.25 * float(distance.norm(dim=1).mean())
+    losses = trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+    assert float(losses["smoothing"]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_training_starts_as_the_paper_and_the_settings_say(scene) -> None:
+    trainer = EmbeddingTrainer(scene.gaussians, scene.codebook, replace(QUICK, num_frequencies=2))
+    assert trainer.field.smoother.num_frequencies == 2
+    assert not trainer.field.normalise_rendering
+    assert trainer.field.uncertainties.tolist() == pytest.approx([0.01] * len(scene.gaussians))
+    assert trainer.field.semantics.std().item() == pytest.approx(1, abs=0.1)  # N(0, 1)
+    assert all(group["betas"] == (0.9, 0.999) for group in trainer.optimizer.param_groups)
+
+
+def test_every_part_has_its_learning_rate_and_its_decay(scene) -> None:
+    config = replace(
+        QUICK, iterations=8, semantics_lr=0.1, uncertainty_lr=0.2, decoder_lr=0.3, smoothing_lr=0.4
+    )
+    config = replace(config, decoder_weight_decay=0.01, final_lr_factor=0.25)
+    trainer = EmbeddingTrainer(scene.gaussians, scene.codebook, config)
+    field = trainer.field
+    firsts = [field.semantics, field.uncertainty_logits, field.decoder[0].weight]
+    firsts.append(field.smoother.layers[0].weight)
+
+    def of_parts(key: str) -> list[float]:
+        groups = [
+            next(g for g in trainer.optimizer.param_groups if any(p is first for p in g["params"]))
+            for first in firsts
+        ]
+        return [group[key] for group in groups]
+
+    assert of_parts("weight_decay") == [0, 0, 0.01, 0]
+    for iteration, factor in ((0, 1.0), (4, 0.5), (8, 0.25)):  # exponential: half way it is the root
+        trainer.iteration = iteration
+        trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+        assert of_parts("lr") == pytest.approx([factor * rate for rate in (0.1, 0.2, 0.3, 0.4)])
+
+
 def test_smoothing_runs_every_so_many_steps(scene) -> None:
     trainer = EmbeddingTrainer(scene.gaussians, scene.codebook, replace(QUICK, smoothing_every=3))
     steps = [trainer.step(scene.cameras["view0"], scene.code_maps["view0"]) for _ in range(6)]

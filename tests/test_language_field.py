@@ -180,6 +180,14 @@ def test_language_gradients_never_reach_geometry(scene) -> None:
     assert field.uncertainty_logits.grad.abs().sum() > 0
 
 
+def test_smoothing_gradients_never_reach_the_places(scene) -> None:
+    means = scene.gaussians.means.clone().requires_grad_()
+    smoother = make_trained(scene).smoother
+    smoother(means).square().sum().backward()
+    assert means.grad is None
+    assert smoother.layers[0].weight.grad.abs().sum() > 0
+
+
 def test_lifted_field_renders_its_distributions(scene) -> None:
     field = make_lifted(scene)
     dense = np.zeros((len(scene.gaussians), 70))

@@ -132,6 +132,20 @@ class TestTransforms:
         np.testing.assert_allclose(image[15, 5], [0.8, 0.8, 1.0], atol=1e-6)
         np.testing.assert_allclose(image[15, 15], [1, 1, 1])
 
+    def test_only_nerf_synthetic_has_white_behind_alpha(self, tmp_path):
+        document = write_transforms(tmp_path, NAMES[:2])
+        rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+        for name in NAMES[:2]:
+            Image.fromarray(rgba).save(tmp_path / "images" / name)
+        assert load_scene(tmp_path).background == (0.0, 0.0, 0.0)
+        intrinsics = {key: document.pop(key) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+        for frame in document["frames"]:
+            frame |= intrinsics
+        write_json(tmp_path, document)
+        scene = load_scene(tmp_path)
+        assert scene.background == (0.0, 0.0, 0.0), "intrinsics of each frame are no reason for white"
+        assert scene.views[NAMES[0]].load_image().max() == 0
+
     def test_fox_is_loaded_without_its_17_missing_frames(self):
         scene = load_scene(shared_data("fox"), downscale=8)
         assert len(scene.views) == 50

@@ -49,9 +49,11 @@ class Checkpoint:
 
     def __init__(self, path: Path, made_from: str, *, every: float = 20.0) -> None:
         self.path, self.made_from, self.every = Path(path), made_from, every
-        self._saved_at = time.perf_counter()
+        self._saved_at = self._begun_at = time.perf_counter()
         self._pause = every
         self._stop_asked = False
+        self.seconds_before = 0.0
+        """What the training took before it was stopped, up to the state that it goes on from."""
 
     def resume(self, trainer: Trainer) -> bool:
         """Bring ``trainer`` to the saved state; returns whether there was one that fits."""
@@ -65,11 +67,15 @@ class Checkpoint:
             broken = not_finite(state)
             if broken:
                 raise ValueError(f"NaN or infinity in {broken}")
+            seconds = float(metadata.get("seconds", 0.0))
+            if not 0 <= seconds < 1e9:
+                raise ValueError(f"{seconds} seconds of training")
             trainer.load_state_dict(state)
         except (FileFormatError, ValueError, RuntimeError, KeyError, TypeError, IndexError) as error:
             log.warning("%s cannot be used, the training starts again: %s", self.path, error)
             trainer.load_state_dict(start)  # some of the damaged state may have been taken up already
             return False
+        self.seconds_before = seconds
         return True
 
     def after_step(self, trainer: Trainer) -> None:
@@ -100,7 +106,8 @@ class Checkpoint:
                 found=f"NaN or infinity in {broken}",
                 remedy=f"lower the learning rates; the last good state is in {self.path}",
             )
-        write_tensors(self.path, state, {"made_from": self.made_from})
+        seconds = self.seconds_before + start - self._begun_at
+        write_tensors(self.path, state, {"made_from": self.made_from, "seconds": repr(seconds)})
         self._saved_at = time.perf_counter()
         self._pause = max(self.every, 20 * (self._saved_at - start))
 

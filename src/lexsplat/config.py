@@ -62,7 +62,8 @@ class BuildConfig:
             method "trained"; its steps are then those of the reconstruction).
         poses: Structure from motion, for photos without cameras and videos.
         reconstruction: Geometry and appearance.
-        features: Dense CLIP and DINO features.
+        features: Dense CLIP and DINO features. What is left at its default takes the value that suits the encoder and
+            the device; `scene.json` has the values that were taken.
         codebook: Quantization.
         embedding: Training of the language field.
         lifting: Computing the language field directly.
@@ -129,6 +130,23 @@ class BuildConfig:
             lifting=replace(self.lifting, memory_bytes=histogram),
         )
 
+    def decisive(self) -> BuildConfig:
+        """What fingerprints hold: these settings, with those at their defaults that decide nothing about the result.
+
+        How much is kept in memory, the ways to the language that are not taken, the crops of the other mode.
+        """
+        kept = {
+            "reconstruction": {"image_memory": ReconstructionConfig.image_memory},
+            "embedding": {"memory_bytes": EmbeddingConfig.memory_bytes},
+            "lifting": {"memory_bytes": LiftingConfig.memory_bytes},
+        }
+        parts = {name: replace(getattr(self, name), **fields) for name, fields in kept.items()}
+        if self.method == "lifted":
+            parts |= {"embedding": EmbeddingConfig(), "tuning": TuningConfig()}
+        if self.method == "trained":
+            parts |= {"lifting": LiftingConfig(), "tuning": TuningConfig()}
+        return replace(self, features=self.features.decisive(use_dino=self.dino != "none"), **parts)
+
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
         """The same settings with nothing left open.
 
@@ -143,9 +161,14 @@ class BuildConfig:
             # Halves keep the numbers readable; never enlarge.
             downscale = max(1.0, round(factor * 2) / 2)
         features = self.features
-        if features == FeatureConfig() and (self.clip == "embedded" or device == "cpu"):
-            features = FeatureConfig.embedded() if self.clip == "embedded" else FeatureConfig.sparse()
-        iterations = self.iterations or (CPU_ITERATIONS if device == "cpu" else CUDA_ITERATIONS)
+        if self.clip == "embedded" or device == "cpu":
+            suited = FeatureConfig.embedded() if self.clip == "embedded" else FeatureConfig.sparse()
+            features = features.where_open(suited)
+        iterations = self.iterations
+        if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:
+            iterations = self.reconstruction.iterations  # set from Python
+        if iterations is None:
+            iterations = CPU_ITERATIONS if device == "cpu" else CUDA_ITERATIONS
         return replace(
             self,
             device=device,  # type: ignore[arg-type]

@@ -25,6 +25,7 @@ from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
 from lexsplat.errors import CaptureError, FileFormatError
 from lexsplat.features import FeatureMaps, external_identity, extract_features, load_external_features
+from lexsplat.features.hub import model_folder
 from lexsplat.formats.reading import read_splats
 from lexsplat.gaussians import Gaussians
 from lexsplat.joint import JointTrainer
@@ -103,7 +104,7 @@ class _Builder:
         splats: Path | None = None,
     ) -> None:
         self.scene, self.folder, self.config = scene, folder, config
-        # How much is kept in memory decides nothing about a result: stages use it, fingerprints leave it out.
+        # How much is kept in memory decides nothing about a result: stages use it, fingerprints (`decisive`) do not.
         self.bounded = config.within_memory()
         self.device, self.listener, self.splats = device, listener, splats
         self.made_from: dict[str, str] = {}
@@ -112,7 +113,7 @@ class _Builder:
 
     def run(self, until: str) -> SceneFolder:
         capture_hash = write_provenance(self.folder, self.scene, self.config)
-        config, folder = self.config, self.folder
+        config, folder = self.config.decisive(), self.folder
         models = [model_identity(config.clip, "clip"), model_identity(config.dino, "dino")]
         features: list[Any] = [capture_hash, config.features, models]
         if config.features_from is not None:
@@ -149,7 +150,12 @@ class _Builder:
             stages["reconstruct"] = (inputs, self._train_jointly, [*outputs, self._joint_path])
             stages["embed"] = (["reconstruct", language], self._take_joint_language, [folder.language_path])
             order = ("features", "codebook", "reconstruct", "embed")
-        for name in order[: order.index(until) + 1]:
+        wanted = order[: order.index(until) + 1]
+        if "features" in wanted and not folder.is_finished("features", fingerprint(stages["features"][0])):
+            model_folder(config.clip, "clip")  # a missing model is told now, not after the reconstruction
+            if config.dino != "none" and config.features_from is None:
+                model_folder(config.dino, "dino")
+        for name in wanted:
             inputs, work, outputs = stages[name]
             self._run_stage(name, inputs, work, outputs)
         if until == "embed":
@@ -172,7 +178,8 @@ class _Builder:
         every = self.config.checkpoint_seconds
         self.checkpoint = Checkpoint(path, made_from, every=every)
         facts = work()
-        self.folder.finish(name, made_from, time.perf_counter() - start, **facts)
+        seconds = self.checkpoint.seconds_before + time.perf_counter() - start
+        self.folder.finish(name, made_from, seconds, **facts)
         self.checkpoint.remove()
 
     # -- what a stage does

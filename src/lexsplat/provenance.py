@@ -34,7 +34,11 @@ def write_provenance(folder: SceneFolder, scene: Scene, config: BuildConfig) -> 
     _write_world(folder, config.up, {name: camera for name, (camera, _) in views.items()})
     if "images" not in folder.record:
         folder.record["capture"] = str(Path(scene.root).resolve())
-    folder.record["config"] = to_json(config)
+    folder.record["config"] = {
+        **to_json(config),
+        "clip": model_place(config.clip),  # a scene is asked from other folders than it was built in
+        "dino": model_place(config.dino),
+    }
     folder.record["provenance"] = {
         "lexsplat": __version__,
         "versions": versions(),
@@ -59,11 +63,17 @@ def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]
     record["world"] = stored_world(world, cameras)
 
 
+def model_place(name: str) -> str:
+    """The name of a model; of a folder its full path."""
+    folder = Path(name).expanduser()
+    return name if name in ("embedded", "none") or not folder.is_dir() else str(folder.resolve())
+
+
 def model_identity(name: str, kind: str) -> list[str]:
     """The name of a model; for a folder also the size and time of its files, for ours the content."""
     if name == "embedded":  # another version of lexsplat may come with others, with any time of writing
         return [name, content_hash(model_folder(name, kind))]
-    folder = Path(name)
+    folder = Path(name).expanduser()
     if not folder.is_dir():
         return [name]
     files = sorted(file for file in folder.iterdir() if file.is_file())

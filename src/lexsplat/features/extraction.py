@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
+import tyro
 from torch import Tensor
 
 from lexsplat import budget
@@ -47,6 +48,9 @@ _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15
 _LONGEST = 16  # in short sides: longer strips get coarser maps, or the memory of a map would know no bound
 _MAX_WORKERS = 4  # beyond this, threads inside an operation pay better than more images in flight
 
+_GRID = ("crop_sizes", "crop_strides")
+_RANDOM = ("random_crops", "random_levels", "random_sizes", "seed")
+
 
 @dataclass(frozen=True)
 class FeatureConfig:
@@ -71,7 +75,8 @@ class FeatureConfig:
         dino_layer: Layer of the keys, 0-based; None is the last.
         dino_max_tokens: Patches that DINO's attention sees at once; larger images are seen in overlapping
             windows.
-        memory: Bytes that extraction and reading may use, beside the weights of the encoders.
+        memory: Bytes that extraction and reading may use, beside the weights of the encoders; a build sets it to its
+            ``--memory``.
     """
 
     mode: Literal["grid", "random"] = "grid"
@@ -88,7 +93,7 @@ class FeatureConfig:
     dino_facet: Facet = "key"
     dino_layer: int | None = None
     dino_max_tokens: int = 4096
-    memory: int = 4 << 30
+    memory: tyro.conf.Suppress[int] = 4 << 30
 
     def __post_init__(self) -> None:
         if self.mode not in ("grid", "random"):
@@ -124,6 +129,25 @@ class FeatureConfig:
             dino_short_side=320,
             dino_stride=8,
         )
+
+    def where_open(self, suited: FeatureConfig) -> FeatureConfig:
+        """``suited`` with everything in which these settings differ from the defaults.
+
+        Sizes and strides of the grid are one thing: they must have the same length.
+        """
+        usual = FeatureConfig()
+        given = {name for name in dataclasses.asdict(self) if getattr(self, name) != getattr(usual, name)}
+        if given & set(_GRID):
+            given |= set(_GRID)
+        return dataclasses.replace(suited, **{name: getattr(self, name) for name in given})
+
+    def decisive(self, use_dino: bool) -> FeatureConfig:
+        """The same with those at their defaults that decide nothing: memory, the other mode's, an unused DINO's."""
+        usual = FeatureConfig()
+        unused = {"memory", *(_RANDOM if self.mode == "grid" else _GRID)}
+        if not use_dino:
+            unused |= {name for name in dataclasses.asdict(self) if name.startswith("dino_")}
+        return dataclasses.replace(self, **{name: getattr(usual, name) for name in unused})
 
 
 def extract_features(
@@ -231,9 +255,7 @@ class _Entry:
         masked = [] if view.ignore_path is None else [hash_file(view.ignore_path)]
         pixels = hash_of(hash_file(view.image_path), lens, list(view.background), image_size, *masked)
         settings = dataclasses.asdict(config)
-        random_names = ("random_crops", "random_levels", "random_sizes", "seed")
-        crop_names = ("crop_sizes", "crop_strides") if config.mode == "grid" else random_names
-        crops = {name: settings[name] for name in ("mode", *crop_names)}
+        crops = {name: settings[name] for name in ("mode", *(_GRID if config.mode == "grid" else _RANDOM))}
         dense = {name: settings[name] for name in settings if name.startswith("dino_")}
         clip_key = hash_of("clip", clip.content_hash, crops, pixels)
         dino_path = None

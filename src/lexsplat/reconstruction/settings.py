@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import tyro
 
 from lexsplat.densification import REFERENCE_ITERATIONS
 
@@ -19,7 +20,7 @@ class ReconstructionConfig:
     """Settings of the reconstruction; numbers of steps refer to a training of 30,000.
 
     Args:
-        iterations: Optimisation steps, one view each.
+        iterations: Optimisation steps, one view each; on the command line ``--iterations`` sets it.
         ssim_weight: Weight of 1 - SSIM against L1, in 0..1.
         sh_degree: Highest degree of spherical harmonics, 0..3 (4 where the backend can).
         sh_degree_every: Steps after which the next degree joins.
@@ -53,7 +54,7 @@ class ReconstructionConfig:
         image_memory: Bytes for photos kept in memory.
     """
 
-    iterations: int = 30_000
+    iterations: tyro.conf.Suppress[int] = 30_000
     ssim_weight: float = 0.2
     sh_degree: int = 3
     sh_degree_every: int = 1_000

@@ -133,7 +133,8 @@ class _Reader:
                 remedy="export the capture again with nerfstudio or instant-ngp",
             )
         self.document = document
-        self.sizes_come_from_images = not ("w" in document or "fl_x" in document)
+        places = [document, *(frame for frame in document["frames"] if isinstance(frame, Mapping))]
+        self.sizes_come_from_images = not any("w" in place or "fl_x" in place for place in places)
         for key in _UNSUPPORTED_LENSES:
             if document.get(key):
                 raise CaptureError(
