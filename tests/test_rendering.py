@@ -600,6 +600,9 @@ def test_wrong_arguments_are_told():
         accumulate_codes(gaussians, camera, np.zeros((37, 50)), 4)
     with pytest.raises(ValueError, match="codes must be below 4"):
         accumulate_codes(gaussians, camera, np.full((37, 50), 4), 4)
+    with pytest.raises(ValueError, match="codes must be below 4, got 4294967296"):
+        accumulate_codes(gaussians, camera, np.full((37, 50), 2**32), 4)
+    assert not accumulate_codes(gaussians, camera, np.full((37, 50), -(2**32)), 4).any()
     with pytest.raises(ValueError, match="out must be"):
         accumulate_codes(gaussians, camera, np.zeros((37, 50), int), 4, out=torch.zeros(5, 3))
     with pytest.raises(BackendError, match="CUDA"):
