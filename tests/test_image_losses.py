@@ -33,6 +33,32 @@ def test_ssim_equals_torchmetrics(height, width):
     )
 
 
+@pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0, 1.1])
+@pytest.mark.parametrize("noise", [1e-3, 1e-2, 0.1])
+def test_bright_flat_and_gray_surfaces_are_as_exact(level, noise):
+    # Squares near 1 whose difference is a variance of 1e-6: in float32 that is rounding (SSIM once was off by 1e-4).
+    generator = torch.Generator().manual_seed(0)
+    photo = min(level, 1.0) + noise * torch.randn(31, 43, 1, generator=generator).expand(31, 43, 3)
+    image = (level + noise * torch.randn(31, 43, 1, generator=generator).expand(31, 43, 3)).contiguous()
+    image.requires_grad_()
+    reference = image.detach().double().requires_grad_()
+    expected = torchmetrics_ssim(reference, photo)
+    (exact,) = torch.autograd.grad(expected, reference)
+    for found in (ssim(image, ssim_target(photo)), image_losses._ssim_in_torch(image, ssim_target(photo))):
+        (gradient,) = torch.autograd.grad(found, image)
+        assert float(found.detach()) == pytest.approx(float(expected.detach()), abs=1e-6)
+        assert float((gradient - exact).abs().max()) <= 2e-5 * float(exact.abs().max())
+
+
+def test_an_image_that_equals_its_photo_has_no_gradient_at_all():
+    photo = torch.full((20, 30, 3), 0.9)
+    image = photo.clone().requires_grad_()
+    loss = photometric_loss(image, ssim_target(photo))
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx(0.0, abs=1e-7)
+    assert not image.grad.any()
+
+
 def test_the_torch_path_equals_torchmetrics():
     image, photo = two_images(33, 61)
     value = image_losses._ssim_in_torch(image.double(), ssim_target(photo.double()))

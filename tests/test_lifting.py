@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from language_scene import IGNORED, label_accuracy, make_scene
-from rendering_reference import blend, project, to_float64
+from language_scene import IGNORED, label_accuracy, make_codebook, make_scene
+from rendering_reference import blend, front_camera, project, random_gaussians, to_float64
 
 from lexsplat.embedding import EmbeddingConfig
 from lexsplat.language_field import TrainedField
@@ -236,6 +236,22 @@ def test_gaussians_no_view_shows_stay_silent_without_smoothing_and_follow_their_
         assert float(field.code_probabilities()[-1].sum()) == pytest.approx(expected, abs=1e-6)
         if expected:
             assert int(field.codes[-1, 0]) == 0
+
+
+def test_the_number_of_threads_changes_no_bit_of_what_is_lifted() -> None:
+    # Large enough for torch to share its sums out too.
+    gaussians, camera = random_gaussians(40_000, 0, scale=0.02), front_camera(160, 120)
+    codes = np.random.default_rng(0).integers(0, 20, (120, 160)).astype(np.uint8)
+    codebook, config = make_codebook(20), LiftingConfig(min_visibility=0.01)
+    results = []
+    for threads in (1, 2, 4):
+        torch.set_num_threads(threads)  # back to one after each test
+        histogram = accumulate_histogram(gaussians, {"a": camera}, {"a": codes}, 20, config)
+        field = lift(gaussians, {"a": camera}, {"a": codes}, codebook, config)
+        results.append([histogram.totals, histogram.weights, histogram.entropies, field.weights, field.codes])
+    assert int((results[0][0] > 0).sum()) > 5_000
+    for other in results[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(results[0], other))
 
 
 def test_views_without_a_camera_take_no_part(scene) -> None:

@@ -39,6 +39,22 @@ def test_what_never_had_a_gradient_does_not_move():
     torch.testing.assert_close(parameter.detach(), torch.tensor([1.0, 0.9, 1.0, 1.1]))
 
 
+def test_what_is_out_of_sight_for_a_while_moves_on_as_torchs_does():
+    # Of every second row the gradient is zero from the second step on: a Gaussian that the views do not show.
+    ours, reference = torch.nn.Parameter(torch.ones(40, 3)), torch.nn.Parameter(torch.ones(40, 3).double())
+    optimizer, expected = Adam(ours, 1e-2), torch.optim.Adam([reference], lr=1e-2, eps=1e-15)
+    before = torch.ones(20, 3)
+    for i, gradient in enumerate(gradients((40, 3), 4)):
+        if i:
+            gradient[::2] = 0.0
+        ours.grad, reference.grad = gradient.clone(), gradient.double()
+        optimizer.step()
+        expected.step()
+        assert ((ours.detach()[::2] - before).abs() > 1e-4).all()
+        before = ours.detach()[::2].clone()
+        torch.testing.assert_close(ours.detach(), reference.detach().float(), rtol=1e-5, atol=1e-6)
+
+
 def test_no_gradient_means_no_step():
     parameter = torch.nn.Parameter(torch.ones(4))
     optimizer = Adam(parameter, 0.1)

@@ -1,5 +1,6 @@
 """The parts of the CPU rasterizer on their own: projection, harmonics, pairs, vectors, the kernel cache."""
 
+import logging
 import math
 import os
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numba.core.caching import NullCache
 from rendering_reference import front_camera, random_gaussians
 
 from lexsplat.cameras import look_at
@@ -245,6 +247,14 @@ def test_alpha_is_the_exponential_to_three_millionths(exponent, opacity):
     assert found == pytest.approx(exact if exact >= 1 / 255 else 0.0, rel=3e-6)
 
 
+def test_a_tile_is_finished_when_its_last_pixel_is():
+    for place in range(blending.PIXELS):
+        live = np.full(blending.PIXELS, -0.5, np.float32)
+        assert blending.tile_finished(live)
+        live[place] = 2e-4
+        assert not blending.tile_finished(live)
+
+
 # ----------------------------------------------------------------------------------------------- threads and cache
 
 
@@ -275,7 +285,6 @@ import logging, sys
 logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
 from lexsplat.rendering.kernels import binning, jit
 import numpy as np
-jit.announce_compilation()
 binning.offsets_of(np.ones((2, 3), np.int64), np.zeros(4, np.int64))
 print("hits", sum(binning.offsets_of.stats.cache_hits.values()))
 print("at", binning.offsets_of.stats.cache_path)
@@ -301,6 +310,51 @@ def test_compiled_kernels_are_found_again_where_numba_cache_dir_says(tmp_path):
     assert str(tmp_path) in second
 
 
+def test_kernels_of_another_processor_do_no_harm_and_those_of_this_one_are_announced(tmp_path):
+    # A home on a network, a disk that moves to another machine: once they were compiled anew without a word.
+    here = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    run_probe(**here)
+    other = run_probe(**here, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
+    assert "compiling CPU kernels, once" in other
+    assert "hits 0" in other
+    assert "hits 1" in run_probe(**here)
+
+
+def test_what_is_never_compiled_is_not_announced(tmp_path):
+    # Whoever only looks compiles no gradients, and was told "compiling, once" at every start.
+    assert "compiling" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+    assert "compiling" not in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+
+
+def test_every_compilation_of_ours_is_announced_once_and_nobody_elses(monkeypatch, caplog):
+    from lexsplat import optimizer_kernels
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.setattr(jit, "_announced", False)
+    monkeypatch.setattr(jit, "_dispatchers", set(jit._dispatchers))
+    numbers = [np.ones(3, np.float32) for _ in range(4)]
+    with caplog.at_level(logging.INFO, logger="lexsplat"):
+        numba.njit(lambda x: x + 1)(3)
+        assert not caplog.records
+        for _ in range(2):
+            fresh = jit.kernel(optimizer_kernels._adam.py_func)
+            fresh._cache = NullCache()
+            fresh(0, 3, *numbers, *[np.float32(0.5)] * 6)
+    assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
+
+
+def test_two_processes_that_compile_at_once_do_each_other_no_harm(tmp_path):
+    command = [sys.executable, "-c", PROBE]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    both = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        for _ in range(2)
+    ]
+    assert [process.communicate()[1] for process in both] == [b"", b""]
+    assert [process.returncode for process in both] == [0, 0]
+    assert "hits 1" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+
+
 def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tmp_path, monkeypatch):
     from lexsplat.rendering.kernels import jit
 
@@ -320,6 +374,32 @@ def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tm
     finally:
         jit._cache_folder.cache_clear()
     assert folder.startswith(str(tmp_path / "home" / "lexsplat" / "kernels-"))
+
+
+@pytest.mark.parametrize("homeless", [False, True])
+def test_where_nothing_can_be_written_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch, homeless):
+    # Homeless: a container whose user has no entry in /etc/passwd, and no HOME.
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(jit.tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
+
+    def refused(self, *args, **options):
+        raise PermissionError(self)
+
+    def no_home(self):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "mkdir", refused)
+    if homeless:
+        monkeypatch.setattr(Path, "expanduser", no_home)
+    jit._cache_folder.cache_clear()
+    try:
+        folder = jit._cache_folder()
+    finally:
+        jit._cache_folder.cache_clear()
+    assert folder == str(tmp_path / "lexsplat-kernels-")
 
 
 def test_a_far_turned_camera_keeps_depths_positive():

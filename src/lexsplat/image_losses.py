@@ -47,8 +47,11 @@ def ssim_target(image: Tensor) -> SSIMTarget:
             f"image must be [H, W, 3] with sides of at least {SMALLEST_SIDE}, got {list(image.shape)}"
         )
     image = image.detach().contiguous()
-    mean = _blur(image)
-    return SSIMTarget(image, mean, (_blur(image * image) - mean * mean).clamp_min_(0.0))
+    # In float64: the variance of what is bright and flat is lost in the rounding of its squares.
+    exact = image.double()
+    mean = _blur(exact)
+    variance = (_blur(exact * exact) - mean * mean).clamp_min_(0.0)
+    return SSIMTarget(image, mean.to(image.dtype), variance.to(image.dtype))
 
 
 def l1_loss(image: Tensor, target: Tensor) -> Tensor:
@@ -97,13 +100,15 @@ def _check_same_shape(image: Tensor, target: SSIMTarget) -> None:
 
 
 def _ssim_in_torch(image: Tensor, target: SSIMTarget) -> Tensor:
+    """With differences from the photo, as the kernel does it (see `image_loss_kernels`): they keep their digits."""
     c1, c2 = 0.01**2, 0.03**2
-    mean = _blur(image)
-    variance = _blur(image * image) - mean * mean
-    covariance = _blur(image * target.image) - mean * target.mean
-    luminance = (2 * mean * target.mean + c1) / (mean * mean + target.mean * target.mean + c1)
-    structure = (2 * covariance + c2) / (variance + target.variance + c2)
-    return (luminance * structure).mean()
+    difference = image - target.image
+    mean = _blur(difference)
+    spread = (_blur(difference * difference) - mean * mean).clamp_min(0.0)
+    covariance = _blur(difference * (target.image - 0.5)) - mean * (target.mean - 0.5)
+    luminance = 2 * target.mean * (target.mean + mean) + c1
+    structure = 2 * (target.variance + covariance) + c2
+    return (luminance / (luminance + mean * mean) * structure / (structure + spread)).mean()
 
 
 def _blur(image: Tensor) -> Tensor:

@@ -16,6 +16,9 @@ class Adam(torch.optim.Adam):
     On CUDA it is torch's fused Adam. On a CPU it is our kernel: torch's synchronises its OpenMP threads by
     spinning, which takes ten times as long as the arithmetic when another process wants the cores.
 
+    Every number is stepped, also of Gaussians that the view does not show: their moments decay and move them on, so
+    leaving them out would be another optimiser.
+
     Args:
         parameter: The one parameter it changes, float32.
         rate: Learning rate.

@@ -258,11 +258,13 @@ def accumulate_codes(
         raise ValueError(
             f"code_map must be integer [{camera.height}, {camera.width}], got {codes.dtype} {list(codes.shape)}"
         )
-    codes = np.ascontiguousarray(codes, dtype=np.int32)
+    highest = int(codes.max(initial=0, where=codes != IGNORED_CODE if num_codes <= IGNORED_CODE else True))
+    if num_codes < 1 or highest >= num_codes:
+        raise ValueError(f"codes must be below {num_codes}, got {highest}")
+    # Only now: a number of 64 bits would wrap around to a code.
+    codes = np.ascontiguousarray(np.maximum(codes, -1) if codes.dtype.kind == "i" else codes, dtype=np.int32)
     if num_codes <= IGNORED_CODE:
         codes = np.where(codes == IGNORED_CODE, np.int32(-1), codes)
-    if num_codes < 1 or codes.max(initial=-1) >= num_codes:
-        raise ValueError(f"codes must be below {num_codes}, got {codes.max(initial=-1)}")
     if out is None:
         out = torch.zeros(len(gaussians), num_codes, device=gaussians.device)
     elif out.shape != (len(gaussians), num_codes) or out.dtype != torch.float32 or not out.is_contiguous():

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
 from lexsplat.rendering.kernels import blending, code_weights, gradients, projection, spherical_harmonics
-from lexsplat.rendering.kernels.jit import announce_compilation, parallel
+from lexsplat.rendering.kernels.jit import parallel
 from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs
 
 TILE_GRAIN = 8
@@ -184,7 +184,6 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, 
 
     The last entry are the means again, for `shade`.
     """
-    announce_compilation()
     g = gaussians
     tensors = (g.means, g.quats, g.log_scales, g.opacity_logits)
     return _Project.apply(*tensors, camera_vector(camera, near), g.antialiased)

@@ -20,10 +20,11 @@ from typing import Any
 
 import numba
 import torch
+from numba.core import event
 
 logger = logging.getLogger("lexsplat")
 
-_dispatchers: list[Any] = []
+_dispatchers: set[Any] = set()
 _announced = False
 
 
@@ -40,28 +41,30 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     finally:
         numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
-    _dispatchers.append((dispatcher, function))
+    _dispatchers.add(dispatcher)
     return dispatcher
 
 
 @functools.cache
 def _cache_folder() -> str:
-    """Where compiled kernels are kept, for exactly these sources.
+    """Where compiled kernels are kept, for exactly these sources and this compiler.
 
     Numba looks only at the file of the function it compiles, and would keep kernels whose parts, written in
-    another file, have changed. The first folder that can be written is taken: that of the environment variable
-    NUMBA_CACHE_DIR, the package's, the user's, a temporary one.
+    another file, have changed. Two versions of Numba would overwrite each other's; those of several processors and
+    versions of Python it keeps apart. The first folder that can be written is taken: that of the environment
+    variable NUMBA_CACHE_DIR, the package's, the user's, a temporary one.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(numba.__version__.encode())
     here = Path(__file__).parent
     for source in sorted(here.glob("*.py")):
         digest.update(source.read_bytes())
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
-    places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home).expanduser() / "lexsplat"]
+    places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home) / "lexsplat"]
     for place in places:
-        folder = place / f"kernels-{digest.hexdigest()[:12]}"
         try:
+            # A user without a home is a RuntimeError.
+            folder = place.expanduser() / f"kernels-{digest.hexdigest()[:12]}"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return str(folder)
@@ -73,20 +76,24 @@ def _cache_folder() -> str:
     return tempfile.mkdtemp(prefix="lexsplat-kernels-")
 
 
-def announce_compilation() -> None:
-    """Log once per process, before the first kernel runs, if the kernels must be compiled first."""
-    global _announced
-    if _announced:
-        return
-    _announced = True
-    if not all(_is_cached(dispatcher, function) for dispatcher, function in _dispatchers):
-        logger.info("compiling CPU kernels, once (about 15 seconds)")
+class _Announcer(event.Listener):
+    """Says once per process, before the first of our kernels is compiled, what the wait is for.
+
+    Numba tells when it compiles, and does not when it finds a kernel in the cache: no guess at what is cached for
+    this processor and this version, nor at which kernels will be needed.
+    """
+
+    def on_start(self, event: Any) -> None:
+        global _announced
+        if not _announced and event.data["dispatcher"] in _dispatchers:
+            _announced = True
+            logger.info("compiling CPU kernels, once (about 15 seconds)")
+
+    def on_end(self, event: Any) -> None:
+        pass
 
 
-def _is_cached(dispatcher: Any, function: Callable[..., Any]) -> bool:
-    module = Path(function.__code__.co_filename)
-    names = Path(dispatcher.stats.cache_path).glob(f"{module.stem}.{function.__name__}-*.nbi")
-    return any(name.stat().st_mtime >= module.stat().st_mtime for name in names)
+event.register("numba:compile", _Announcer())
 
 
 _pool: ThreadPoolExecutor | None = None
