@@ -4,6 +4,8 @@ This shows that our calls are what gsplat wants, that shapes and orders are unde
 they should; what CUDA itself computes is for `test_rendering_gpu.py`.
 """
 
+import importlib.abc
+import importlib.machinery
 import sys
 import types
 
@@ -137,6 +139,26 @@ def test_an_extension_that_cannot_be_built_ends_in_one_line(monkeypatch, kind):
         BackendError, match=r"expected its CUDA extension, found .*Error building extension.*nvcc"
     ):
         gsplat_backend._require_gsplat()
+
+
+def test_what_gsplat_says_while_it_compiles_is_no_part_of_our_output(monkeypatch, capsys):
+    class Talkative(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+        def find_spec(self, name, path=None, target=None):
+            return importlib.machinery.ModuleSpec(name, self) if name == "gsplat.cuda._backend" else None
+
+        def exec_module(self, module):
+            print("gsplat: CUDA extension has been set up successfully")
+            module._C = object()
+
+    monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Talkative(), *sys.meta_path])
+    try:
+        gsplat_backend._require_gsplat()
+    finally:
+        sys.modules.pop("gsplat.cuda._backend", None)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "set up successfully" in said.err
 
 
 def test_an_installation_without_the_extension_ends_in_one_line(monkeypatch):

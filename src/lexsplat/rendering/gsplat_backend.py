@@ -6,7 +6,9 @@ the pass for colour and the pass for features. The second one sees the geometry 
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,11 +56,12 @@ def _require_gsplat() -> None:
     except ImportError as error:
         raise BackendError("gsplat", found=str(error), remedy="pip install gsplat==1.5.3") from error
     found = "an installation without one"
+    # It may compile the extension when it is imported, and says so where our answers and JSON go.
+    first = "gsplat.cuda._backend" not in sys.modules
     try:
-        from gsplat.cuda._backend import _C
-    except (
-        Exception
-    ) as error:  # it compiles the extension when it is imported: whatever a compiler can end in
+        with contextlib.redirect_stdout(sys.stderr) if first else contextlib.nullcontext():
+            from gsplat.cuda._backend import _C
+    except Exception as error:  # whatever a compiler can end in
         _C, found = None, f"{type(error).__name__} {error}"[:200]
     if _C is None:
         raise BackendError(
