@@ -10,7 +10,7 @@ What this shows: that the program keeps its tensors where they belong on the pat
 waits for the device (`waits`: a read of a number, a copy to the host, or one from ordinary host memory); that
 gsplat's own Python is called as it wants to be. What it cannot show: what CUDA's kernels compute, in which order they
 add, how fast they are and what memory they take, that an operation exists on CUDA at all, what runs while the host
-goes on, what inference mode forbids, and libraries that look at torch's C++ types (torch takes its per-tensor paths
+goes on, where gsplat's extension waits itself (once for each projection), what inference mode forbids, and libraries that look at torch's C++ types (torch takes its per-tensor paths
 for optimisers here, not those over lists).
 """
 

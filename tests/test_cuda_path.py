@@ -98,7 +98,7 @@ def on_host(state):
     return {name: tensor.cpu() for name, tensor in state.items()}
 
 
-def test_a_step_of_the_reconstruction_never_waits_for_the_gpu(pretended_gpu, scene, points):
+def test_a_step_of_the_reconstruction_has_no_wait_of_our_own(pretended_gpu, scene, points):
     config = dataclasses.replace(GEOMETRY, iterations=60, densify_min_every=1000, warm_up=0.0)
     trainer = Reconstructor(scene, config, points, device="cuda")
     for _ in range(len(scene.train_views) + 1):  # every photo is loaded by then
@@ -179,7 +179,7 @@ def test_the_language_field_trains_on_the_gpu(pretended_gpu, balls, options):
     assert all(bool(parameter.isfinite().all()) for parameter in field.parameters())
 
 
-def test_a_step_of_the_language_training_waits_only_for_its_sample(pretended_gpu, balls):
+def test_a_step_of_the_language_training_never_waits_for_the_gpu(pretended_gpu, balls):
     gaussians, codebook = balls.gaussians.to("cuda"), balls.codebook.to("cuda")
     trainer = EmbeddingTrainer(gaussians, codebook, LANGUAGE)
     name, camera = next(iter(balls.cameras.items()))
