@@ -9,9 +9,9 @@ makes torch.cuda say that there is a GPU; `gsplat_kernels` does what gsplat's CU
 What this shows: that the program keeps its tensors where they belong on the paths a GPU's user takes; how often it
 waits for the device (`waits`: a read of a number, a copy to the host, or one from ordinary host memory); that
 gsplat's own Python is called as it wants to be. What it cannot show: what CUDA's kernels compute, in which order they
-add, how fast they are and what memory they take, that an operation exists on CUDA at all, what runs while the host
-goes on, where gsplat's extension waits itself (once for each projection), what inference mode forbids, and libraries that look at torch's C++ types (torch takes its per-tensor paths
-for optimisers here, not those over lists).
+add, how fast they are and what memory they take; that an operation exists on CUDA at all; what runs while the host
+goes on; where gsplat's extension waits by itself (once for each projection); what inference mode forbids; and
+libraries that look at torch's C++ types (torch takes its per-tensor paths for optimisers here, not those over lists).
 """
 
 from __future__ import annotations
