@@ -46,6 +46,17 @@ def built(tiny_capture, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
+def pretended_gpu(monkeypatch):
+    """A GPU that is none, with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts what is waited for."""
+    import gsplat_kernels
+    import pretended_gpu
+
+    gsplat_kernels.install(monkeypatch)
+    with pretended_gpu.pretending(monkeypatch) as waits:
+        yield waits
+
+
+@pytest.fixture
 def real_captures() -> Path:
     """The folder of real photos, where there is one."""
     if not TEST_DATA.is_dir():

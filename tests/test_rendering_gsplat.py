@@ -1,96 +1,32 @@
-"""The gsplat backend without a GPU: gsplat's own torch twins stand in for its CUDA functions.
+"""The gsplat backend without a GPU: gsplat's own Python, over a stand-in for its CUDA extension (`gsplat_kernels`).
 
-This shows that our calls fit gsplat's signatures, that shapes and orders are understood, and that gradients go
-where they should; what CUDA itself computes is for `test_rendering_gpu.py`. gsplat's twin of the last step needs
-CUDA, so that one is written out here.
+This shows that our calls are what gsplat wants, that shapes and orders are understood, and that gradients go where
+they should; what CUDA itself computes is for `test_rendering_gpu.py`.
 """
 
-import inspect
+import importlib.abc
+import importlib.machinery
+import sys
+import types
 
+import gsplat_kernels
 import numpy as np
 import pytest
 import torch
 from rendering_reference import front_camera, random_gaussians
 
 from lexsplat import rendering
-from lexsplat.rendering import accumulate_codes, prepare, render
+from lexsplat.errors import BackendError
+from lexsplat.rendering import accumulate_codes, gsplat_backend, prepare, render
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 COUNT, WIDTH, HEIGHT = 60, 50, 37
 
 
-def rasterize(means2d, conics, colors, opacities, width, height, tile, offsets, members, backgrounds=None):
-    """What `gsplat.rasterize_to_pixels` documents, pixel by pixel over the list of its tile, for one image."""
-    assert means2d.shape == (1, COUNT, 2)
-    assert conics.shape == (1, COUNT, 3)
-    assert opacities.shape == (1, COUNT)
-    assert colors.shape[:2] == (1, COUNT)
-    rows, columns = offsets.shape[1:]
-    starts = [*offsets.flatten().tolist(), len(members)]
-    ys, xs = torch.meshgrid(torch.arange(tile) + 0.5, torch.arange(tile) + 0.5, indexing="ij")
-    strips = []
-    for row in range(rows):
-        tiles = []
-        for column in range(columns):
-            place = row * columns + column
-            x, y = xs + column * tile, ys + row * tile
-            left = torch.ones_like(x)
-            done = torch.zeros_like(x, dtype=torch.bool)
-            image = torch.zeros(tile, tile, colors.shape[-1])
-            for k in members[starts[place] : starts[place + 1]].tolist():
-                dx, dy = means2d[0, k, 0] - x, means2d[0, k, 1] - y
-                a, b, c = conics[0, k]
-                sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-                alpha = (opacities[0, k] * torch.exp(-sigma)).clamp_max(0.999)
-                alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, torch.zeros_like(alpha))
-                after = left * (1 - alpha)
-                done = done | (after <= 1e-4)
-                weight = torch.where(done, torch.zeros_like(alpha), alpha * left)
-                left = torch.where(done, left, after)
-                image = image + weight[..., None] * colors[0, k]
-            if backgrounds is not None:
-                image = image + left[..., None] * backgrounds[0]
-            tiles.append(torch.cat([image, 1 - left[..., None]], -1))
-        strips.append(torch.cat(tiles, 1))
-    whole = torch.cat(strips, 0)[:height, :width]
-    return whole[None, ..., :-1], whole[None, ..., -1:]
-
-
-def project(means, covars, quats, scales, viewmats, Ks, width, height, **options):
-    """gsplat's twin takes covariances, and does not narrow the radii by the opacities."""
-    from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
-
-    assert covars is None
-    options.pop("opacities")
-    covariances, _ = _quat_scale_to_covar_preci(quats, scales, True, False, False)
-    return _fully_fused_projection(means, covariances, viewmats, Ks, width, height, **options)
-
-
 @pytest.fixture
 def on_gsplat(monkeypatch):
-    """Makes rendering take the gsplat backend, with stand-ins that insist on gsplat's signatures."""
-    from gsplat.cuda import _torch_impl, _wrapper
-
-    from lexsplat.rendering import gsplat_backend
-
-    stand_ins = {
-        "fully_fused_projection": project,
-        "isect_tiles": _torch_impl._isect_tiles,
-        "isect_offset_encode": _torch_impl._isect_offset_encode,
-        "spherical_harmonics": lambda degree, dirs, coeffs, masks: _torch_impl._spherical_harmonics(
-            degree, dirs, coeffs
-        ),
-        "rasterize_to_pixels": rasterize,
-    }
-    for name, stand_in in stand_ins.items():
-        signature = inspect.signature(getattr(_wrapper, name))
-
-        def call(*args, _signature=signature, _stand_in=stand_in, **kwargs):
-            _signature.bind(*args, **kwargs)
-            return _stand_in(*args, **kwargs)
-
-        monkeypatch.setattr(_wrapper, name, call)
-    monkeypatch.setattr(gsplat_backend, "_require_gsplat", lambda: None)
+    """Makes rendering take the gsplat backend for tensors on the CPU."""
+    gsplat_kernels.install(monkeypatch)
 
     def switch():
         monkeypatch.setattr(rendering, "_module", lambda *_: gsplat_backend)
@@ -162,3 +98,78 @@ def test_a_view_prepared_by_gsplat_renders_the_same(on_gsplat):
     torch.testing.assert_close(
         render(gaussians, camera, prepared=view).image, render(gaussians, camera).image, atol=0, rtol=0
     )
+
+
+def test_on_the_gsplat_backend_no_gaussian_at_all_is_an_empty_picture(on_gsplat):
+    on_gsplat()
+    nothing = random_gaussians(COUNT, 3).select(torch.zeros(COUNT, dtype=torch.bool))
+    nothing = nothing.map(lambda t: t.detach().clone().requires_grad_())
+    camera, background = front_camera(WIDTH, HEIGHT), torch.tensor([0.1, 0.4, 0.8])
+    found = render(nothing, camera, background=background, depth=True)
+    assert torch.equal(found.image, background.expand(HEIGHT, WIDTH, 3))
+    assert not found.alpha.any()
+    assert not found.depth.any()
+    (found.image.sum() + found.alpha.sum()).backward()
+    assert accumulate_codes(nothing, camera, np.zeros((HEIGHT, WIDTH), int), 3).shape == (0, 3)
+
+
+def test_the_gsplat_backend_renders_more_channels_than_gsplat_has_kernels_or_memory_for(on_gsplat):
+    on_gsplat()
+    gaussians, camera = random_gaussians(COUNT, 3), front_camera(WIDTH, HEIGHT)
+    features = torch.randn(COUNT, 600).requires_grad_()
+    found = render(gaussians, camera, features=features)
+    assert found.features.shape == (HEIGHT, WIDTH, 600)
+    for columns in (slice(0, 3), slice(597, 600)):
+        alone = render(gaussians, camera, features=features[:, columns]).features
+        torch.testing.assert_close(found.features[..., columns], alone)
+    found.features.sum().backward()
+    weights = accumulate_codes(gaussians, camera, np.zeros((HEIGHT, WIDTH), int), 1)
+    torch.testing.assert_close(features.grad, weights.expand(-1, 600))
+
+
+@pytest.mark.parametrize("kind", [ImportError, RuntimeError])
+def test_an_extension_that_cannot_be_built_ends_in_one_line(monkeypatch, kind):
+    class Backend(types.ModuleType):
+        @property
+        def _C(self):
+            raise kind("Error building extension 'gsplat_cuda'")
+
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Backend("gsplat.cuda._backend"))
+    with pytest.raises(
+        BackendError, match=r"expected its CUDA extension, found .*Error building extension.*nvcc"
+    ):
+        gsplat_backend._require_gsplat()
+
+
+def test_what_gsplat_says_while_it_compiles_is_no_part_of_our_output(monkeypatch, capsys):
+    class Talkative(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+        def find_spec(self, name, path=None, target=None):
+            return importlib.machinery.ModuleSpec(name, self) if name == "gsplat.cuda._backend" else None
+
+        def exec_module(self, module):
+            print("gsplat: CUDA extension has been set up successfully")
+            module._C = object()
+
+    monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Talkative(), *sys.meta_path])
+    try:
+        gsplat_backend._require_gsplat()
+    finally:
+        sys.modules.pop("gsplat.cuda._backend", None)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "set up successfully" in said.err
+
+
+def test_an_installation_without_the_extension_ends_in_one_line(monkeypatch):
+    backend = types.ModuleType("gsplat.cuda._backend")
+    backend._C = None
+    monkeypatch.setitem(sys.modules, backend.__name__, backend)
+    with pytest.raises(BackendError, match="expected its CUDA extension, found an installation without one"):
+        gsplat_backend._require_gsplat()
+
+
+def test_a_missing_gsplat_ends_in_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(BackendError, match=r"gsplat: found .*; pip install gsplat==1\.5\.3"):
+        gsplat_backend._require_gsplat()

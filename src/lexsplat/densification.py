@@ -205,7 +205,7 @@ class DensityControl:
             self._state["grad2d"] = torch.zeros(len(radii), device=self._device)
             self._state["count"] = torch.zeros(len(radii), device=self._device)
         visible = radii > 0
-        x, y = (means2d.grad * torch.tensor(image_size, device=self._device).div(2.0)).unbind(1)
+        x, y = (means2d.grad[:, axis] * (image_size[axis] / 2) for axis in (0, 1))
         self._state["grad2d"] += (x * x + y * y).sqrt_() * visible
         self._state["count"] += visible
 

@@ -62,6 +62,7 @@ class JointTrainer:
         self.config = replace(config, iterations=reconstructor.config.iterations)
         self.cameras = {name: camera.downscaled(config.render_downscale) for name, camera in cameras.items()}
         self.language = EmbeddingTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
+        self._losses = {"loss": float("nan")}
 
     @property
     def done(self) -> bool:
@@ -69,7 +70,7 @@ class JointTrainer:
         return self.reconstructor.done
 
     def step(self) -> dict[str, float]:
-        """One iteration of both on one view; returns the losses of the language.
+        """One iteration of both on one view; returns the losses of the language, on a GPU those that were read last.
 
         Raises:
             TrainingError: If a loss is no longer finite.
@@ -81,9 +82,12 @@ class JointTrainer:
         self.language.gaussians = gaussians
         name = self.reconstructor.last_view
         losses = self.language.step(self.cameras[name], self.code_maps[name])
-        values = {key: float(value) for key, value in losses.items()}
-        self.language.check_loss(values["loss"])
-        return values
+        done = self.reconstructor.steps_done
+        # Reading waits for a GPU, so there only as often as the reconstruction reads its own loss.
+        if self.reconstructor.device.type == "cpu" or done % EVENT_EVERY == 0 or self.done:
+            self._losses = {key: float(value) for key, value in losses.items()}
+            self.language.check_loss(self._losses["loss"])
+        return self._losses
 
     @property
     def rate_factor(self) -> float:

@@ -131,7 +131,7 @@ class PresenceJudge:
         """What speaks for a phrase with relevancies ``scores [N]`` (form "code")."""
         if len(self._shown) == 0:
             return Evidence(-5.0, 0.0, 0.0)
-        best = scores[self._shown].topk(self._peak_count())
+        best = scores.to(self._shown.device)[self._shown].topk(self._peak_count())
         region = self._shown[best.indices]
         there = (self.language.select(region).code_probabilities() @ self._table).mean(0)
         peak = float(best.values.mean())

@@ -85,7 +85,7 @@ class ClassFeatures:
         """Maps ``[P, H, W]``: each prompt against the best other class; the negatives have no part."""
         (positives,) = unit_texts(positives)
         cosines, alpha = render_cosines(
-            gaussians, camera, self.features, torch.cat([positives, self.classes])
+            gaussians, camera, self.features, torch.cat([positives, self.classes.to(positives)])
         )
         return (
             (self._against_others(cosines, positives, config) * alpha[..., None])
@@ -97,7 +97,7 @@ class ClassFeatures:
         """Scores ``[P, N]``."""
         (positives,) = unit_texts(positives)
         lengths = self.features.norm(dim=1, keepdim=True)
-        texts = torch.cat([positives, self.classes]).to(self.features.device)
+        texts = torch.cat([positives, self.classes.to(positives)]).to(self.features.device)
         cosines = (self.features / lengths.clamp_min(1e-12)) @ texts.T
         return (self._against_others(cosines, positives, config) * (lengths > 0)).T.contiguous()
 

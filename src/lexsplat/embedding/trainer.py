@@ -151,7 +151,7 @@ class EmbeddingTrainer:
         codes = codes_at_pixels(torch.as_tensor(code_map).cpu(), height, width, pixels)
         known = codes < self.field.codebook.num_codes
         device = self.gaussians.device
-        return pixels[known].to(device), codes[known].to(device)
+        return _sent(pixels[known], device), _sent(codes[known], device)
 
     def _smoothing_term(self) -> Tensor:
         """Eq. 13 and 14 for all Gaussians or a sample of them."""
@@ -161,7 +161,9 @@ class EmbeddingTrainer:
         semantics: Tensor = field.semantics
         logits: Tensor = field.uncertainty_logits
         if config.smoothing_sample and config.smoothing_sample < count:
-            rows = torch.randint(count, (config.smoothing_sample,), generator=self.generator).to(means.device)
+            rows = _sent(
+                torch.randint(count, (config.smoothing_sample,), generator=self.generator), means.device
+            )
             means, semantics, logits = (t.index_select(0, rows) for t in (means, semantics, logits))
         uncertainties = logits.sigmoid() if config.use_uncertainty else torch.zeros_like(logits)
         return smoothing_loss(
@@ -260,3 +262,10 @@ class EmbeddingTrainer:
                     key: value.clone() if key == "step" else value.to(parameter.device, copy=True)
                     for key, value in moments.items()
                 }
+
+
+def _sent(sample: Tensor, device: torch.device) -> Tensor:
+    """A sample on the device; a GPU takes it from pinned memory, so that nobody waits for the step before."""
+    if device.type != "cuda":
+        return sample.to(device)
+    return sample.pin_memory().to(device, non_blocking=True)

@@ -364,8 +364,9 @@ class Reconstructor:
         return total
 
     def _checks_now(self) -> bool:
-        """Reading the loss is free on a CPU; on CUDA it waits for the device, so only now and then."""
-        return self.device.type == "cpu" or self.steps_done % EVENT_EVERY == EVENT_EVERY - 1
+        """Reading the loss is free on a CPU; on CUDA it waits for the device: now and then, and at the end."""
+        done = self.steps_done + 1
+        return self.device.type == "cpu" or done % EVENT_EVERY == 0 or done == self.config.iterations
 
     def _follow(self, image: Tensor, target: Tensor) -> None:
         """Mean squared errors of recent views, and those that a picture of nothing but background would have.

@@ -6,6 +6,9 @@ the pass for colour and the pass for features. The second one sees the geometry 
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +21,11 @@ from lexsplat.errors import BackendError
 from lexsplat.gaussians import Gaussians
 
 TILE = 16
-CODE_CHANNELS = 32
-"""Codes that `accumulate_codes` handles at a time: bounds its memory to [N, 32] and [H, W, 32]."""
+CHANNELS = 32
+"""Channels blended, and codes accumulated, at a time. Bounds memory to [N, 32] and [H, W, 32]; for gradients gsplat
+keeps the colours of 256 Gaussians in a block's shared memory, where 64 channels are too many for small cards."""
+CAMERAS = 4096
+"""Matrices kept on the device, so that rendering a view again waits for no copy."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +52,36 @@ class TileLists:
 
 def _require_gsplat() -> None:
     try:
-        from gsplat.cuda._backend import _C
+        import gsplat  # noqa: F401
     except ImportError as error:
         raise BackendError("gsplat", found=str(error), remedy="pip install gsplat==1.5.3") from error
+    found = "an installation without one"
+    # It may compile the extension when it is imported, and says so where our answers and JSON go.
+    first = "gsplat.cuda._backend" not in sys.modules
+    try:
+        with contextlib.redirect_stdout(sys.stderr) if first else contextlib.nullcontext():
+            from gsplat.cuda._backend import _C
+    except Exception as error:  # whatever a compiler can end in
+        _C, found = None, f"{type(error).__name__} {error}"[:200]
     if _C is None:
         raise BackendError(
             "gsplat",
             expected="its CUDA extension",
-            found="an installation without one",
-            remedy="install a wheel built for this torch and CUDA, or put nvcc on the PATH",
+            found=found,
+            remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH",
         )
 
 
 def _matrix(matrix: NDArray[np.float64], device: torch.device) -> Tensor:
-    return torch.as_tensor(matrix, dtype=torch.float32, device=device)[None]
+    """A camera's matrix ``[1, ...]`` on the device; it must not be changed."""
+    single = np.ascontiguousarray(matrix, dtype=np.float32)[None]
+    return _kept(single.tobytes(), single.shape, device)
+
+
+@functools.lru_cache(CAMERAS)
+def _kept(content: bytes, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # gsplat keeps it for gradients
+        return torch.from_numpy(np.frombuffer(content, np.float32).reshape(shape).copy()).to(device)
 
 
 def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
@@ -69,6 +91,8 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, 
 
     g = gaussians
     opacities = g.opacities
+    if len(g) == 0:  # gsplat divides by their number, which ends the process
+        return g.means[:, :2], g.means, opacities, g.means[:, 2].detach(), g.means.new_zeros(0, 2).int()
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         g.means, None, g.quats, g.scales,
         _matrix(camera.viewmat, g.device), _matrix(camera.K, g.device), camera.width, camera.height,
@@ -95,7 +119,7 @@ def shade(gaussians: Gaussians, camera: Camera, projected: tuple[Tensor, ...], d
     """RGB ``[N, 3]`` of the visible Gaussians seen from the camera: max(0, SH + 0.5)."""
     from gsplat.cuda._wrapper import spherical_harmonics
 
-    eye = torch.as_tensor(camera.position, dtype=torch.float32, device=gaussians.device)
+    eye = _matrix(camera.position, gaussians.device)
     coefficients = torch.cat([gaussians.sh0, gaussians.shN[:, : (degree + 1) ** 2 - 1]], 1)
     colors = spherical_harmonics(
         degree, gaussians.means - eye, coefficients, masks=(projected[4] > 0).all(-1)
@@ -109,12 +133,17 @@ def _rasterize(
     from gsplat.cuda._wrapper import rasterize_to_pixels
 
     means2d, conics, opacities = geometry
-    image, alpha = rasterize_to_pixels(
-        means2d[None], conics[None], values[None], opacities[None],
-        lists.width, lists.height, TILE, lists.offsets, lists.members,
-        backgrounds=None if background is None else background[None],
-    )  # fmt: skip
-    return image[0], alpha[0, ..., 0]
+    images: list[Tensor] = []
+    alphas: list[Tensor] = []
+    for part in values.split(CHANNELS, dim=1):
+        image, found = rasterize_to_pixels(
+            means2d[None], conics[None], part[None], opacities[None],
+            lists.width, lists.height, TILE, lists.offsets, lists.members,
+            backgrounds=None if background is None else background[None],
+        )  # fmt: skip
+        images.append(image[0])
+        alphas.append(found[0, ..., 0])
+    return (images[0] if len(images) == 1 else torch.cat(images, -1)), alphas[0]
 
 
 def blend(
@@ -154,8 +183,8 @@ def accumulate_codes(
     """
     deaf = tuple(t.detach() for t in projected[:3])
     wanted = torch.as_tensor(codes, device=totals.device).long()
-    for first in range(0, num_codes, CODE_CHANNELS):
-        channels = min(CODE_CHANNELS, num_codes - first)
+    for first in range(0, num_codes, CHANNELS):
+        channels = min(CHANNELS, num_codes - first)
         inside = (wanted >= first) & (wanted < first + channels)
         if not bool(inside.any()):
             continue
