@@ -9,8 +9,11 @@ For each size, number of Gaussians and number of channels it prints, in millisec
     blend       blending alone, of that
     naive       the same blending, pixel by pixel over the list of its tile, with libm's exp (`per_pixel`)
 
-and the pairs of Gaussian and tile per second of forward time. `floor` is what blending would take if its exps
-were all there was: rows of 16 pixels that the boxes cover, at the rate measured for a loop of only `alpha_of`.
+and the pairs of Gaussian and tile per second of forward time. Two floors, in milliseconds:
+
+    exps        what blending would take if its exps were all there was: rows of 16 pixels that the boxes
+                cover, at the rate measured for a loop of only `alpha_of`
+    bytes       what forward would take if it only moved what it must (`bytes_moved`), at the rate of a copy
 """
 
 from __future__ import annotations
@@ -116,6 +119,26 @@ def rows_of(pairs: TilePairs) -> int:
     return int(((boxes[:, 3] - boxes[:, 2]) * (boxes[:, 1] - boxes[:, 0])).sum())
 
 
+def bytes_moved(gaussians: Gaussians, channels: int, pairs: TilePairs) -> int:
+    """What a forward pass reads and writes at least, each thing once: parameters, projections, pairs, pictures.
+
+    A visible Gaussian has 12 projected numbers, written and read again, as are the values it is blended with; a
+    pair has a number, written and read.
+    """
+    parameters = sum(tensor.numel() for tensor in gaussians.tensors().values())
+    parameters += len(gaussians) * (channels - 3)
+    projected = 2 * len(pairs.order) * (12 + channels)
+    pixels = pairs.width * pairs.height * (channels + 1)
+    return 4 * (parameters + projected + 2 * len(pairs.members) + pixels)
+
+
+def copy_rate(repeats: int) -> float:
+    """Bytes read and written a millisecond by a copy of 64 MiB on all threads."""
+    source = torch.ones(1 << 24)
+    target = torch.empty_like(source)
+    return 2 * 4 * source.numel() / measure(lambda: target.copy_(source), repeats)[0]
+
+
 def run_case(width: int, height: int, count: int, channels: int, repeats: int) -> dict[str, float]:
     camera, gaussians = camera_of(width, height), three_shells(count)
     generator = torch.Generator().manual_seed(1)
@@ -154,6 +177,7 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
         "forward_ms": forward[0], "forward_median_ms": forward[1],
         "backward_ms": backward_times[0], "backward_median_ms": backward_times[1],
         "blend_ms": blend[0], "naive_ms": naive[0], "ratio": naive[0] / blend[0], "floor_ms": floor[0],
+        "bytes_ms": bytes_moved(gaussians, channels, pairs) / copy_rate(repeats),
         "pairs_per_second": len(pairs.members) / forward[0] * 1e3,
     }  # fmt: skip
 
@@ -170,7 +194,7 @@ def main() -> None:
     )
     print(
         f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14}   {'backward':>14} {'Mpairs/s':>9}"
-        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'floor':>6}"
+        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6}"
     )
     cases = []
     for width, height in SIZES:
@@ -183,7 +207,7 @@ def main() -> None:
                 print(
                     f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14}   {backward:>14}"
                     f" {c['pairs_per_second'] / 1e6:>9.1f} {c['blend_ms']:>7.1f} {c['naive_ms']:>7.1f}"
-                    f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f}",
+                    f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f}",
                     flush=True,
                 )
     if options.json:
