@@ -203,8 +203,8 @@ def test_a_crop_shows_what_lies_around_its_middle():
         assert float(crop.weights[crop.codes == 0].sum()) == pytest.approx(expected)
 
 
-def frames_with_a_handle():
-    """A red mug with a handle of three by five pixels, on a blue table."""
+def frames_with_a_handle(scale=1):
+    """A red mug with a handle of three by five pixels, times ``scale``, on a blue table."""
     from crops import Frame, Frames
     from words import Label
 
@@ -213,8 +213,9 @@ def frames_with_a_handle():
     codes = np.full((60, 80), 2, np.int32)
     codes[20:40, 30:50] = 0
     codes[27:32, 50:53] = 1
+    codes = codes.repeat(scale, 0).repeat(scale, 1)
     things = np.where(codes == 2, 2, 1).astype(np.uint8)
-    frames.frames = [Frame("scene", Image.new("RGB", (80, 60)), codes, things)]
+    frames.frames = [Frame("scene", Image.new("RGB", codes.shape[::-1]), codes, things)]
     return frames
 
 
@@ -264,3 +265,27 @@ def test_a_thin_part_in_the_very_middle_counts_as_shown_if_asked_for():
     assert all(0.1 < weight < 0.25 for weight in weights)
     assert TruthTable(frames.labels).of(handle, crops).tolist() == [[OPEN], [OPEN]]
     assert TruthTable(frames.labels, centre=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]
+
+
+def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
+    from crops import part_crops
+    from words import any_part
+
+    frames = frames_with_a_handle(scale=4)
+    frames.labels = [
+        *frames.labels,
+        *(type(frames.labels[0])("lamp", "red", part=part) for part in ("stand", "shade")),
+    ]
+    frames.frames[0].codes[:40, :40] = 3
+    frames.frames[0].codes[-40:, -40:] = 4
+
+    def share(handles):
+        crops = part_crops(frames, 600, np.random.default_rng(0), handles=handles)
+        shown = [int(crop.grid[12, 12]) for crop in crops[0::2]]
+        return shown.count(1) / len(shown)
+
+    assert share(handles=1) == pytest.approx(1 / 3, abs=0.08)
+    assert share(handles=8) == pytest.approx(8 / 10, abs=0.08)
+    rng = np.random.default_rng(0)
+    asked = [any_part(rng, handles=8).part for _ in range(600)]
+    assert asked.count("handle") / len(asked) == pytest.approx(8 / 21, abs=0.06)

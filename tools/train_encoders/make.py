@@ -76,8 +76,8 @@ def main() -> None:
     parser.add_argument(
         "--phases",
         nargs="+",
-        choices=("first", "refine", "parts"),
-        default=["first", "refine", "parts"],
+        choices=("first", "refine", "parts", "handles"),
+        default=["first", "refine", "parts", "handles"],
         help="of the image-text encoder; all but the first go on from the model in OUTPUT",
     )
     parser.add_argument("--dino-steps", type=int, default=600)
