@@ -1,7 +1,8 @@
 # Everything from nothing: each target makes its own environment in .venv first.
 # Needs Python 3.10 to 3.13, make and a package registry; no GPU, no compiler, no model hub.
 
-PYTHON ?= python3
+# The first of these that is new enough makes the environment; `make PYTHON=...` names another.
+PYTHON ?= python3 python3.13 python3.12 python3.11 python3.10 python
 VENV := .venv
 BIN := $(VENV)/bin
 OUTPUT ?= output/demo
@@ -14,7 +15,7 @@ help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 demo: $(VENV)/.runtime  ## reconstruct, embed, query and evaluate the scene that ships with the package
-	$(BIN)/lexsplat demo --output $(OUTPUT)
+	$(BIN)/lexsplat demo --output "$(OUTPUT)"
 
 test: $(VENV)/.dev  ## run the tests
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadgroup
@@ -26,16 +27,28 @@ lint: $(VENV)/.dev  ## style and types
 
 install: $(VENV)/.runtime  ## only set up the environment
 
-$(VENV)/bin/python:
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
-		{ echo "lexsplat needs Python 3.10 to 3.13, found $$($(PYTHON) --version 2>&1); run: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+# An environment that was cut off before it had pip, or whose Python is gone, is mended first.
+ifneq ($(shell test -x $(BIN)/python && test -x $(BIN)/pip && echo whole),whole)
+.PHONY: $(BIN)/pip
+endif
 
-$(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(BIN)/pip:
+	@if test -x $(BIN)/python; then exec $(BIN)/python -m ensurepip --default-pip; fi; \
+	for python in $(PYTHON); do \
+		version=$$("$$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); \
+		case "$$version" in \
+			3.10|3.11|3.12|3.13) \
+				echo "$$python -m venv --clear $(VENV)"; exec "$$python" -m venv --clear $(VENV) ;; \
+			?*) found="$$found $$python is $$version;" ;; \
+		esac; \
+	done; \
+	echo "lexsplat needs Python 3.10 to 3.13, found:$${found:- none;} run: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)" >&2; exit 1
+
+$(VENV)/.runtime: pyproject.toml constraints.txt $(BIN)/pip
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/.dev: pyproject.toml constraints.txt $(BIN)/pip
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@ $(VENV)/.runtime
 

@@ -86,6 +86,21 @@ def test_no_scene_that_ships_holds_a_pair_kept_from_training():
         assert not HELD_OUT_PAIRS & {(place.kind, place.colour) for place in layout.placements}
 
 
+def test_the_scene_for_choosing_shares_no_thing_place_or_camera_with_the_demo():
+    from layouts import SECOND, TABLETOP
+
+    for what in (
+        lambda scene: {(place.kind, place.colour) for place in scene.placements},
+        lambda scene: {(place.x, place.y) for place in scene.placements},
+        lambda scene: {scene.cloth[0], scene.wall, scene.key_light, scene.seed},
+        lambda scene: {pose.tobytes() for pose in scene.path.poses(scene.views)},
+    ):
+        assert not what(TABLETOP) & what(SECOND)
+    # Words for one thing alone are of that scene alone; those of both mean other things in each.
+    both = TABLETOP.prompts.keys() & SECOND.prompts.keys()
+    assert all(TABLETOP.prompts[words].kind not in ("name", "colour") for words in both)
+
+
 @pytest.mark.parametrize("scene", ["tabletop", "second"])
 def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
     from words import COLOURS, NAMES, PARTS, QUALITIES

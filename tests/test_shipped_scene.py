@@ -65,6 +65,7 @@ def test_the_command_line_answers_beside_the_user_and_leaves_the_package_alone(t
     assert cli.main(["evaluate", "demo"]) == 1
     assert "lexsplat demo" in capsys.readouterr().err
     assert cli.main(["info", "demo"]) == 0
+    assert "None" not in capsys.readouterr().out
     assert snapshot() == before
 
 

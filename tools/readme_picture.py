@@ -1,6 +1,7 @@
 """Make the picture at the top of the README: a rendering and the relevancy of a few queries, side by side.
 
-python tools/readme_picture.py output/demo view_033 docs/images/queries.jpg "red apple" "blue mug" ...
+python tools/readme_picture.py output/demo view_033 docs/images/queries.jpg \\
+    "red apple" "blue mug" "something made of metal" "bear nose" "checkered cloth"
 """
 
 import sys

@@ -33,5 +33,6 @@ class Info:
             return
         width = max(len(name) for name in facts)
         for name, value in facts.items():
+            value = "unknown" if value is None else value
             text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
             print(f"{name.replace('_', ' '):<{width}}  {text}")
