@@ -139,6 +139,7 @@ def test_a_made_up_word_is_none_that_means_something():
     words = {_made_up_word(rng) for _ in range(500)}
     assert len(words) > 300
     assert not words & _KNOWN_WORDS
+    assert {"metal", "paper", "fur", "wooden"} <= _KNOWN_WORDS, "of these some can come of the syllables"
 
 
 def test_turned_hues_take_red_to_green_and_leave_grey():

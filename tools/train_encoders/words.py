@@ -266,11 +266,14 @@ TRUE, FALSE, OPEN = 1, 0, -1
 
 _KNOWN_WORDS = frozenset(
     word
-    for group in (NAMES, SYNONYMS, PARTS, COLOURS, {"": OTHER_WORDS})
+    for group in (
+        NAMES, SYNONYMS, PARTS, COLOURS, {"": OTHER_WORDS},
+        {key: (*quality.phrases, *quality.adjectives) for key, quality in QUALITIES.items()},
+    )
     for phrases in group.values()
     for phrase in phrases
     for word in phrase.split()
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
