@@ -305,3 +305,23 @@ def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
     rng = np.random.default_rng(0)
     asked = [any_part(rng, handles=8).part for _ in range(600)]
     assert asked.count("handle") / len(asked) == pytest.approx(8 / 21, abs=0.06)
+
+
+def test_what_a_part_lies_beside_can_be_said_not_to_show_it():
+    from crops import cut
+    from truth import BESIDE, TruthTable
+    from words import FALSE, OPEN, TRUE, Phrase
+
+    frames = frames_with_a_handle()
+    handle = [Phrase("mug handle", kind="mug", part="handle")]
+    # The handle spans x = 50 to 53: beside the middle, a little nearer, and in the middle with as little weight.
+    crops = [cut(frames.frames[0], left, 20.0, 20.0) for left in (37.0, 39.0, 41.5)]
+    crops.append(cut(frames.frames[0], 34.5, 12.5, 34.0))
+    weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
+    assert 0.04 < weights[0] < weights[1] < BESIDE
+    assert 0.04 < weights[3] < 0.1
+    usual, strict = (TruthTable(frames.labels, centre=True, **more) for more in ({}, {"beside": BESIDE}))
+    assert usual.of(handle, crops).ravel().tolist() == [OPEN, OPEN, TRUE, OPEN]
+    assert strict.of(handle, crops).ravel().tolist() == [FALSE, FALSE, TRUE, OPEN], (
+        "in the middle it stays open"
+    )

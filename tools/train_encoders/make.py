@@ -101,9 +101,10 @@ def main() -> None:
     parser.add_argument(
         "--phases",
         nargs="+",
-        choices=("first", "refine", "parts", "handles"),
-        default=["first", "refine", "parts", "handles"],
-        help="of the image-text encoder; all but the first go on from the model in OUTPUT",
+        choices=("first", "refine", "parts", "handles", "edges"),
+        default=["first", "refine", "parts"],
+        help="of the image-text encoder; all but the first go on from the model in OUTPUT; the last two are an "
+        "experiment (docs/results.md), not in the weights that ship",
     )
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
