@@ -139,6 +139,7 @@ def test_a_made_up_word_is_none_that_means_something():
     words = {_made_up_word(rng) for _ in range(500)}
     assert len(words) > 300
     assert not words & _KNOWN_WORDS
+    assert {"metal", "paper", "fur", "wooden"} <= _KNOWN_WORDS, "of these some can come of the syllables"
 
 
 def test_turned_hues_take_red_to_green_and_leave_grey():
@@ -218,8 +219,8 @@ def test_a_crop_shows_what_lies_around_its_middle():
         assert float(crop.weights[crop.codes == 0].sum()) == pytest.approx(expected)
 
 
-def frames_with_a_handle():
-    """A red mug with a handle of three by five pixels, on a blue table."""
+def frames_with_a_handle(scale=1):
+    """A red mug with a handle of three by five pixels, times ``scale``, on a blue table."""
     from crops import Frame, Frames
     from words import Label
 
@@ -228,8 +229,9 @@ def frames_with_a_handle():
     codes = np.full((60, 80), 2, np.int32)
     codes[20:40, 30:50] = 0
     codes[27:32, 50:53] = 1
+    codes = codes.repeat(scale, 0).repeat(scale, 1)
     things = np.where(codes == 2, 2, 1).astype(np.uint8)
-    frames.frames = [Frame("scene", Image.new("RGB", (80, 60)), codes, things)]
+    frames.frames = [Frame("scene", Image.new("RGB", codes.shape[::-1]), codes, things)]
     return frames
 
 
@@ -279,3 +281,47 @@ def test_a_thin_part_in_the_very_middle_counts_as_shown_if_asked_for():
     assert all(0.1 < weight < 0.25 for weight in weights)
     assert TruthTable(frames.labels).of(handle, crops).tolist() == [[OPEN], [OPEN]]
     assert TruthTable(frames.labels, centre=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]
+
+
+def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
+    from crops import part_crops
+    from words import any_part
+
+    frames = frames_with_a_handle(scale=4)
+    frames.labels = [
+        *frames.labels,
+        *(type(frames.labels[0])("lamp", "red", part=part) for part in ("stand", "shade")),
+    ]
+    frames.frames[0].codes[:40, :40] = 3
+    frames.frames[0].codes[-40:, -40:] = 4
+
+    def share(handles):
+        crops = part_crops(frames, 600, np.random.default_rng(0), handles=handles)
+        shown = [int(crop.grid[12, 12]) for crop in crops[0::2]]
+        return shown.count(1) / len(shown)
+
+    assert share(handles=1) == pytest.approx(1 / 3, abs=0.08)
+    assert share(handles=8) == pytest.approx(8 / 10, abs=0.08)
+    rng = np.random.default_rng(0)
+    asked = [any_part(rng, handles=8).part for _ in range(600)]
+    assert asked.count("handle") / len(asked) == pytest.approx(8 / 21, abs=0.06)
+
+
+def test_what_a_part_lies_beside_can_be_said_not_to_show_it():
+    from crops import cut
+    from truth import BESIDE, TruthTable
+    from words import FALSE, OPEN, TRUE, Phrase
+
+    frames = frames_with_a_handle()
+    handle = [Phrase("mug handle", kind="mug", part="handle")]
+    # The handle spans x = 50 to 53: beside the middle, a little nearer, and in the middle with as little weight.
+    crops = [cut(frames.frames[0], left, 20.0, 20.0) for left in (37.0, 39.0, 41.5)]
+    crops.append(cut(frames.frames[0], 34.5, 12.5, 34.0))
+    weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
+    assert 0.04 < weights[0] < weights[1] < BESIDE
+    assert 0.04 < weights[3] < 0.1
+    usual, strict = (TruthTable(frames.labels, centre=True, **more) for more in ({}, {"beside": BESIDE}))
+    assert usual.of(handle, crops).ravel().tolist() == [OPEN, OPEN, TRUE, OPEN]
+    assert strict.of(handle, crops).ravel().tolist() == [FALSE, FALSE, TRUE, OPEN], (
+        "in the middle it stays open"
+    )

@@ -69,6 +69,21 @@ def zero_shot(
     return scores
 
 
+def by_pair(
+    unseen: Sequence[tuple[Crop, Label]], encode_images: EncodeImages, encode_text: EncodeText
+) -> dict[str, tuple[float, float, int]]:
+    """Of each pair of kind and colour that training lacks: top-1 of the kind, of both, and the number of crops.
+
+    The questions are those of `zero_shot`.
+    """
+    found = {}
+    for kind, colour in sorted({(label.kind, label.colour) for _, label in unseen}):
+        mine = [(crop, label) for crop, label in unseen if (label.kind, label.colour) == (kind, colour)]
+        scores = zero_shot(mine, mine, encode_images, encode_text)
+        found[f"{colour} {kind}"] = (scores["unseen_kind"], scores["unseen_pair"], len(mine))
+    return found
+
+
 def calibration(
     crops: Sequence[Crop],
     phrases: Sequence[Phrase],

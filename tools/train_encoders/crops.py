@@ -197,14 +197,17 @@ def _around(frame: Frame, x: float, y: float, side: float) -> Crop:
     return cut(frame, left, top, side)
 
 
-def part_crops(frames: Frames, count: int, rng: np.random.Generator, *, near: bool = False) -> list[Crop]:
-    """Crops of a part, every part as often as any other, of the rest of the same thing, and of what is ``near``.
+def part_crops(
+    frames: Frames, count: int, rng: np.random.Generator, *, near: bool = False, handles: int = 1
+) -> list[Crop]:
+    """Crops of a part, of the rest of the same thing, and of what is ``near``.
 
     Anywhere in the frames a handle is seen in one crop of two hundred; and only a mug's body and the edge of a
-    table, cut out in the same size, say what a handle is not.
+    table, cut out in the same size, say what a handle is not. Every part is drawn as often as any other, but handles,
+    which look most like what they are not, ``handles`` times as often.
     """
     crops: list[Crop] = []
-    parts = list(frames.of_parts)
+    parts = [part for part in frames.of_parts for _ in range(handles if part == "handle" else 1)]
     while len(crops) < count:
         places = frames.of_parts[parts[int(rng.integers(len(parts)))]]
         frame, code = places[int(rng.integers(len(places)))]

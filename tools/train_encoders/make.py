@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -61,9 +62,33 @@ def train(options: argparse.Namespace) -> None:
             run_workers(train_dino, options.threads, frames["train"], frames["seen"], folder, dense, log)
 
 
+def score(options: argparse.Namespace) -> None:
+    """Prints what the encoders in the output folder score on the frames that training does not see."""
+    from clip_scores import by_pair
+    from crops import Frames
+    from train_clip import ClipTraining, Examination, Trainer
+    from train_dino import dense_scores
+    from transformers import CLIPTokenizer, ViTModel
+
+    seen, unseen = (Frames([options.work / "frames" / name]) for name in ("seen", "unseen"))
+    if "clip" in options.models:
+        folder, questions = options.output / "clip", Examination(seen, unseen)
+        trainer = Trainer(CLIPTokenizer.from_pretrained(folder), ClipTraining(), folder)
+        print(json.dumps(questions.scores(trainer)))
+        for pair, (kind, both, count) in by_pair(
+            questions.unseen, trainer.encode_images, trainer.encode_text
+        ).items():
+            print(f"{pair:16s} kind {kind:.2f}  kind and colour {both:.2f}  of {count} crops")
+    if "dino" in options.models:
+        model = ViTModel.from_pretrained(options.output / "dino", add_pooling_layer=False)
+        print(json.dumps({name: round(value, 4) for name, value in dense_scores(model, seen).items()}))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", nargs="+", choices=("render", "train"), default=["render", "train"])
+    parser.add_argument(
+        "--steps", nargs="+", choices=("render", "train", "score"), default=["render", "train"]
+    )
     parser.add_argument("--models", nargs="+", choices=("clip", "dino"), default=["clip", "dino"])
     parser.add_argument(
         "--work", type=Path, default=REPOSITORY / "output" / "train_encoders", help="work folder"
@@ -76,9 +101,10 @@ def main() -> None:
     parser.add_argument(
         "--phases",
         nargs="+",
-        choices=("first", "refine", "parts"),
+        choices=("first", "refine", "parts", "handles", "edges"),
         default=["first", "refine", "parts"],
-        help="of the image-text encoder; all but the first go on from the model in OUTPUT",
+        help="of the image-text encoder; all but the first go on from the model in OUTPUT; the last two are an "
+        "experiment (docs/results.md), not in the weights that ship",
     )
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
@@ -86,13 +112,17 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     if "render" in options.steps and "train" in options.steps:
         # Blender keeps memory and threads for itself: it gets a process of its own, gone before training.
-        arguments = [argument for argument in sys.argv[1:] if argument not in ("--steps", "render", "train")]
+        arguments = [
+            argument for argument in sys.argv[1:] if argument not in ("--steps", "render", "train", "score")
+        ]
         subprocess.run([sys.executable, __file__, *arguments, "--steps", "render"], check=True)
         train(options)
     elif "render" in options.steps:
         render(options)
-    else:
+    elif "train" in options.steps:
         train(options)
+    if "score" in options.steps:
+        score(options)
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ SHOWS, SHOWS_PART = 0.45, 0.25
 """A phrase is true of a crop if what it names has this share of the weight."""
 LACKS, LACKS_PART = 0.15, 0.04
 """It is false if what it names, or may name, has less than this; between the two it is open."""
-
-
 CENTRE = 0.1
 """With this share of the weight a part is shown if it also lies in the very middle."""
+BESIDE = 0.15
+"""With less than this share of the weight a part that is not in the very middle is only beside what is shown."""
 
 
 class TruthTable:
@@ -26,11 +26,13 @@ class TruthTable:
         labels: All labels that occur.
         centre: Whether a part is also true of a crop whose middle it is, with ``CENTRE`` of the weight. A handle
             is thin: in a crop that also shows what it belongs to, it never has a quarter of the weight.
+        beside: A part with less of the weight, and not in the middle, is false of a crop instead of open. Where
+            it is open, what lies around a part answers like the part itself, and the best place is any of these.
     """
 
-    def __init__(self, labels: Sequence[Label], *, centre: bool = False) -> None:
+    def __init__(self, labels: Sequence[Label], *, centre: bool = False, beside: float = LACKS_PART) -> None:
         self.labels = list(labels)
-        self.centre = centre
+        self.centre, self.beside = centre, beside
         self._known: dict[tuple, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
 
     def _columns(self, phrase: Phrase) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -57,4 +59,5 @@ class TruthTable:
             answers = np.stack([column[0] for column in columns], 1)
             centred = is_part & answers[middle] & (middle >= 0)[:, None]
             shows = np.where(centred, CENTRE, shows)
+            lacks = np.where(is_part & ~centred, self.beside, lacks)
         return np.where(true >= shows, TRUE, np.where(possible < lacks, FALSE, OPEN)).astype(np.int8)

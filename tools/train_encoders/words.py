@@ -266,11 +266,14 @@ TRUE, FALSE, OPEN = 1, 0, -1
 
 _KNOWN_WORDS = frozenset(
     word
-    for group in (NAMES, SYNONYMS, PARTS, COLOURS, {"": OTHER_WORDS})
+    for group in (
+        NAMES, SYNONYMS, PARTS, COLOURS, {"": OTHER_WORDS},
+        {key: (*quality.phrases, *quality.adjectives) for key, quality in QUALITIES.items()},
+    )
     for phrases in group.values()
     for phrase in phrases
     for word in phrase.split()
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -412,9 +415,9 @@ def _part_phrase(kind: str, part: str, rng: np.random.Generator) -> Phrase:
     return Phrase(f"{word} of {with_article(name, rng)}", kind=kind, part=part)
 
 
-def any_part(rng: np.random.Generator) -> Phrase:
-    """A phrase about any part of anything that has it."""
-    part = _pick(tuple(OWNERS), rng)
+def any_part(rng: np.random.Generator, handles: int = 1) -> Phrase:
+    """A phrase about any part of anything that has it; ``handles`` times as often as any other about a handle."""
+    part = _pick(tuple(part for part in OWNERS for _ in range(handles if part == "handle" else 1)), rng)
     return _part_phrase(_pick(OWNERS[part], rng), part, rng)
 
 
