@@ -33,3 +33,10 @@ class ColourDino:
     def encode_dense(self, image, **settings):
         small = F.avg_pool2d(image[None], 4)[0].permute(1, 2, 0)
         return F.normalize(torch.cat([small - 0.4, torch.full_like(small[..., :1], 0.1)], -1), dim=-1)
+
+
+def install(patch):
+    """Puts both in the place of the encoders that are loaded, by `pytest.MonkeyPatch`; no model is looked for."""
+    patch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColourClip())
+    patch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColourDino())
+    patch.setattr("lexsplat.pipeline.model_folder", lambda *_: None)

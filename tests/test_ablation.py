@@ -5,9 +5,9 @@ import json
 import shutil
 from dataclasses import replace
 
+import colour_encoder
 import numpy as np
 import pytest
-from colour_encoder import ColourClip, ColourDino
 from PIL import Image
 from test_report import Page
 
@@ -36,8 +36,7 @@ CONFIG = BuildConfig(
 def colours():
     """The colour encoders in place of CLIP and DINO."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lexsplat.features.encoders.load_clip", lambda *a: ColourClip())
-        patch.setattr("lexsplat.features.encoders.load_dino", lambda *a: ColourDino())
+        colour_encoder.install(patch)
         yield
 
 

@@ -7,8 +7,8 @@ import shutil
 import time
 from dataclasses import replace
 
+import colour_encoder
 import pytest
-from colour_encoder import ColourClip, ColourDino
 from test_ablation import CONFIG
 from test_report import Page
 
@@ -23,8 +23,7 @@ def compared(tiny_capture, tmp_path_factory):
     """The folder of a comparison of all kinds of methods."""
     folder = tmp_path_factory.mktemp("comparison")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lexsplat.features.encoders.load_clip", lambda *a: ColourClip())
-        patch.setattr("lexsplat.features.encoders.load_dino", lambda *a: ColourDino())
+        colour_encoder.install(patch)
         patch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=3))
         patch.setattr(
             comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
@@ -125,7 +124,7 @@ def test_unknown_methods_are_refused_before_anything_is_made(tiny_capture, tmp_p
 
 
 def test_protocols_are_those_asked_for_and_measured_anew(compared, tiny_capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("lexsplat.features.encoders.load_clip", lambda *a: ColourClip())
+    colour_encoder.install(monkeypatch)
     folder, _ = compared
     for part in ("scene", "codebooks", "runs"):
         shutil.copytree(folder / part, tmp_path / part)
@@ -145,8 +144,7 @@ def test_protocols_are_those_asked_for_and_measured_anew(compared, tiny_capture,
 
 def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_capture, tmp_path, monkeypatch):
     shutil.copytree(compared[0] / "scene", tmp_path / "scene")
-    monkeypatch.setattr("lexsplat.features.encoders.load_clip", lambda *a: ColourClip())
-    monkeypatch.setattr("lexsplat.features.encoders.load_dino", lambda *a: ColourDino())
+    colour_encoder.install(monkeypatch)
     monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=0))
     monkeypatch.setattr(comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=0))
     granted, original = [], feature_rendering.TrainingViews.__init__

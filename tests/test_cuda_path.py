@@ -9,10 +9,10 @@ import io
 import json
 import shutil
 
+import colour_encoder
 import numpy as np
 import pytest
 import torch
-from colour_encoder import ColourClip, ColourDino
 from language_scene import make_scene
 from test_encoders import _save, _seeded, _vit, clip_folder  # noqa: F401  (a fixture: a tiny model of transformers)
 from tiny_capture import write_capture
@@ -310,8 +310,7 @@ def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypa
 
     from lexsplat import baselines, comparison
 
-    monkeypatch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColourClip())
-    monkeypatch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColourDino())
+    colour_encoder.install(monkeypatch)
     monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=2))
     monkeypatch.setattr(
         comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=2, pairs=16)

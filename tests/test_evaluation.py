@@ -60,6 +60,7 @@ class PerfectField:
     def __init__(self, order=(0, 1, 2)):
         codewords = torch.eye(4)[:3] + 0.5 * torch.eye(4)[3]  # a little of "stuff" is in everything
         self.codebook = SimpleNamespace(clip=codewords[list(order)])
+        self.uncertainties = torch.zeros(9999)
         self.sizes = []
 
     def code_probabilities(self):

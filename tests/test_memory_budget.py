@@ -266,6 +266,8 @@ def test_a_budget_that_is_impossible_ends_in_one_line(tiny_capture, tmp_path, ca
         "cpu",
         "--clip",
         "embedded",
+        "--dino",
+        "embedded",
     ]
     assert cli.main([*arguments, "--memory", "100KB"]) == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]

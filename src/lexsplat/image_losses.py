@@ -47,11 +47,14 @@ def ssim_target(image: Tensor) -> SSIMTarget:
             f"image must be [H, W, 3] with sides of at least {SMALLEST_SIDE}, got {list(image.shape)}"
         )
     image = image.detach().contiguous()
-    # In float64: the variance of what is bright and flat is lost in the rounding of its squares.
-    exact = image.double()
-    mean = _blur(exact)
-    variance = (_blur(exact * exact) - mean * mean).clamp_min_(0.0)
-    return SSIMTarget(image, mean.to(image.dtype), variance.to(image.dtype))
+    mean, variance = torch.empty_like(image), torch.empty_like(image)
+    for channel in range(3):  # one at a time: convolution in float64 unfolds its input eleven times
+        # In float64: the variance of what is bright and flat is lost in the rounding of its squares.
+        exact = image[..., channel : channel + 1].double()
+        local = _blur(exact)
+        mean[..., channel] = local[..., 0]
+        variance[..., channel] = (_blur(exact * exact) - local * local).clamp_min_(0.0)[..., 0]
+    return SSIMTarget(image, mean, variance)
 
 
 def l1_loss(image: Tensor, target: Tensor) -> Tensor:
@@ -112,7 +115,7 @@ def _ssim_in_torch(image: Tensor, target: SSIMTarget) -> Tensor:
 
 
 def _blur(image: Tensor) -> Tensor:
-    """The window of SSIM applied to ``[H, W, 3]``, borders reflected."""
+    """The window of SSIM applied to ``[H, W, C]``, borders reflected."""
     taps = torch.exp(-((torch.arange(11.0, dtype=image.dtype, device=image.device) - 5) ** 2) / (2 * 1.5**2))
     taps = taps / taps.sum()
     planes = F.pad(image.permute(2, 0, 1)[:, None], (5, 5, 5, 5), mode="reflect")
