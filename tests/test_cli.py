@@ -295,10 +295,22 @@ def test_bad_captures_end_in_one_line_and_no_half_written_output(tmp_path, capsy
     capture, output = broken(tmp_path, damage), tmp_path / "out"
     arguments = ["build", str(capture), "--output", str(output), *QUICK, "--iterations", "5"]
     fails_in_one_line(capsys, arguments, word)
-    left = [
-        p for p in output.rglob("*") if p.is_file() and p.name not in (".lock", "scene.json", "cameras.json")
-    ]
-    assert left == []
+    assert not output.exists(), sorted(output.rglob("*"))
+
+
+def test_a_bad_capture_takes_nothing_from_a_folder_that_was_there(built, tmp_path, capsys):
+    capture, output = broken(tmp_path, poison_pose), tmp_path / "out"
+    shutil.copytree(built, output)
+    before = {
+        path: path.read_bytes() for path in output.rglob("*") if path.is_file() and path.name != ".lock"
+    }
+    fails_in_one_line(capsys, ["build", str(capture), "--output", str(output), *QUICK], "view_01.png")
+    assert {path: path.read_bytes() for path in before} == before
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "notes.txt").write_text("mine")
+    fails_in_one_line(capsys, ["build", str(capture), "--output", str(mine), *QUICK], "view_01.png")
+    assert (mine / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from lexsplat.checkpoints import Checkpoint
 from lexsplat.codebook import MAX_CODES, Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
-from lexsplat.errors import CaptureError, FileFormatError
+from lexsplat.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.features import FeatureMaps, external_identity, extract_features, load_external_features
 from lexsplat.features.hub import model_folder
 from lexsplat.formats.reading import read_splats
@@ -79,16 +79,22 @@ def build(
     parse_bytes(config.memory)
     folder = SceneFolder(output)
     folder.refuse_foreign_files()
-    with folder.locked():
-        scene = load_capture(capture, folder, config, test_names, listener)
-        load_annotations(scene)  # a mask that belongs to no view is told now, not after the training
-        sizes = [view.capture_size for view in scene.views.values()]
-        config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
-        scene = scene.downscaled(config.downscale or 1.0)
-        _check_photos(scene, parse_bytes(config.memory))
-        if config.features_from is not None:
-            load_external_features(config.features_from, scene)  # that one is missing is told now, too
-        return _Builder(scene, folder, config, device, listener, splats).run(until)
+    is_new = not folder.root.exists()
+    try:
+        with folder.locked():
+            scene = load_capture(capture, folder, config, test_names, listener)
+            load_annotations(scene)  # a mask that belongs to no view is told now, not after the training
+            sizes = [view.capture_size for view in scene.views.values()]
+            config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
+            scene = scene.downscaled(config.downscale or 1.0)
+            _check_photos(scene, parse_bytes(config.memory))
+            if config.features_from is not None:
+                load_external_features(config.features_from, scene)  # that one is missing is told now, too
+            return _Builder(scene, folder, config, device, listener, splats).run(until)
+    except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
+        if is_new:
+            folder.withdraw()
+        raise
 
 
 class _Builder:

@@ -327,6 +327,19 @@ class SceneFolder:
             remove_left_overs(self.root)
             yield
 
+    def withdraw(self) -> None:
+        """Take back the record of a build that ended before anything was made; a folder that holds more stays."""
+        files = [path for path in self.root.rglob("*") if not path.is_dir()]
+        begun = {self.root / name for name in (".lock", "scene.json", "cameras.json")}
+        if self.record["stages"] or not set(files) <= begun:
+            return
+        for path in files:
+            path.unlink(missing_ok=True)
+        folders = sorted(path for path in self.root.rglob("*") if path.is_dir())
+        for path in [*reversed(folders), self.root]:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
     # -- content
 
     def write_cameras(self, views: Mapping[str, tuple[Camera, str]]) -> None:
