@@ -510,3 +510,14 @@ def test_the_scene_that_ships_is_edited_in_a_journal_beside_the_user(tmp_path, m
 def test_the_package_runs_as_a_module_too():
     answer = subprocess.run([sys.executable, "-m", "lexsplat", "--version"], capture_output=True, text=True)
     assert (answer.returncode, answer.stdout.split()[0]) == (0, "lexsplat")
+
+
+@pytest.mark.parametrize("arguments", [("build", "--help"), ("info", "demo")])
+def test_a_reader_that_has_seen_enough_ends_a_command_quietly(arguments):
+    command = [sys.executable, "-m", "lexsplat", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()  # as `| head` does, before the first line
+        error = process.stderr.read()
+    assert "Traceback" not in error
+    assert "Broken pipe" not in error
+    assert process.returncode == 0

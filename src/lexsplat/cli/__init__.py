@@ -64,6 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except KeyboardInterrupt:
         return _stopped()
+    except BrokenPipeError:  # of a long --help, as below
+        return _seen_enough()
     except ValueError as error:  # settings check themselves when they are made
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -74,8 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return _stopped()
-    except BrokenPipeError:  # whoever read our output has seen enough, as in `lexsplat info SCENE | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        return _seen_enough()
     except (MemoryError, RuntimeError) as error:
         # torch says with a RuntimeError what Python says with a MemoryError.
         wants_memory = any(
@@ -96,6 +98,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A full disk or a folder without permission: the system's words and the file are the whole story.
         print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return 1
+    return 0
+
+
+def _seen_enough() -> int:
+    """Whoever read our output has what they wanted, as in `lexsplat info SCENE | head`: the rest goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
