@@ -7,6 +7,7 @@ import pytest
 from tiny_capture import write_capture
 
 import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
+from lexsplat import threads
 
 TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -20,6 +21,13 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.fixture
+def one_thread():
+    """For tensors so small that threads would only wait for each other; also undoes what a test sets."""
+    with threads.one_thread():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -38,13 +38,7 @@ GEOMETRY = ReconstructionConfig(
 LANGUAGE = EmbeddingConfig(iterations=4, pixel_sample=100, smoothing_sample=20)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors are so small that threads would only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

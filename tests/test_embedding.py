@@ -28,13 +28,7 @@ QUICK = EmbeddingConfig(
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Tensors are so small that threads would only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

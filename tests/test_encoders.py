@@ -30,13 +30,7 @@ MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
 PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tiny tensors lose more to threads that wait for each other than they gain."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(autouse=True)

@@ -368,11 +368,7 @@ def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tm
         return real(self, *args, **options)
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
-    jit._cache_folder.cache_clear()
-    try:
-        folder = jit._cache_folder()
-    finally:
-        jit._cache_folder.cache_clear()
+    folder = jit._cache_folder.__wrapped__()
     assert folder.startswith(str(tmp_path / "home" / "lexsplat" / "kernels-"))
 
 
@@ -394,11 +390,7 @@ def test_where_nothing_can_be_written_kernels_go_to_a_temporary_folder(tmp_path,
     monkeypatch.setattr(Path, "mkdir", refused)
     if homeless:
         monkeypatch.setattr(Path, "expanduser", no_home)
-    jit._cache_folder.cache_clear()
-    try:
-        folder = jit._cache_folder()
-    finally:
-        jit._cache_folder.cache_clear()
+    folder = jit._cache_folder.__wrapped__()
     assert folder == str(tmp_path / "lexsplat-kernels-")
 
 

@@ -80,8 +80,8 @@ def build(
     folder = SceneFolder(output)
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
-    try:
-        with folder.locked():
+    with folder.locked():
+        try:
             scene = load_capture(capture, folder, config, test_names, listener)
             load_annotations(scene)  # a mask that belongs to no view is told now, not after the training
             sizes = [view.capture_size for view in scene.views.values()]
@@ -91,10 +91,10 @@ def build(
             if config.features_from is not None:
                 load_external_features(config.features_from, scene)  # that one is missing is told now, too
             return _Builder(scene, folder, config, device, listener, splats).run(until)
-    except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
-        if is_new:
-            folder.withdraw()
-        raise
+        except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
+            if is_new:  # under the lock: nobody else has begun here
+                folder.withdraw()
+            raise
 
 
 class _Builder:

@@ -28,6 +28,18 @@ def _top1(images: Tensor, texts: Tensor, owners: Sequence, truths: Sequence) -> 
     return float(np.mean([owners[place] == truth for place, truth in zip(best, truths)]))
 
 
+def _questions(encode_text: EncodeText) -> tuple[list[str], Tensor, list[tuple[str, str]], Tensor]:
+    """All kinds and how they are asked for, and all pairs of kind and colour."""
+    kinds = list(NAMES)
+    pairs = [(kind, colour) for kind in kinds for colour in COLOURS if colour_is_asked(Label(kind, colour))]
+    return (
+        kinds,
+        encode_text([f"a photo of a {NAMES[kind][0]}" for kind in kinds]),
+        pairs,
+        encode_text([f"a photo of a {colour} {NAMES[kind][0]}" for kind, colour in pairs]),
+    )
+
+
 def zero_shot(
     seen: Sequence[tuple[Crop, Label]],
     unseen: Sequence[tuple[Crop, Label]],
@@ -42,11 +54,7 @@ def zero_shot(
         encode_images: Crops to unit vectors.
         encode_text: Texts to unit vectors.
     """
-    kinds = list(NAMES)
-    usual = encode_text([f"a photo of a {NAMES[kind][0]}" for kind in kinds])
-    pairs = [Label(k, c) for k in kinds for c in COLOURS if colour_is_asked(Label(k, c))]
-    pair_keys = [(label.kind, label.colour) for label in pairs]
-    pair_texts = encode_text([f"a photo of a {label.colour} {NAMES[label.kind][0]}" for label in pairs])
+    kinds, usual, pair_keys, pair_texts = _questions(encode_text)
     images, labels = encode_images([crop for crop, _ in seen]), [label for _, label in seen]
     scores = {"kind": _top1(images, usual, kinds, [label.kind for label in labels])}
     asked = [row for row, label in enumerate(labels) if colour_is_asked(label)]
@@ -76,11 +84,15 @@ def by_pair(
 
     The questions are those of `zero_shot`.
     """
+    kinds, usual, pairs, pair_texts = _questions(encode_text)
+    images = encode_images([crop for crop, _ in unseen])
+    asked = [(label.kind, label.colour) for _, label in unseen]
     found = {}
-    for kind, colour in sorted({(label.kind, label.colour) for _, label in unseen}):
-        mine = [(crop, label) for crop, label in unseen if (label.kind, label.colour) == (kind, colour)]
-        scores = zero_shot(mine, mine, encode_images, encode_text)
-        found[f"{colour} {kind}"] = (scores["unseen_kind"], scores["unseen_pair"], len(mine))
+    for pair in sorted(set(asked)):
+        rows = [row for row, other in enumerate(asked) if other == pair]
+        kind = _top1(images[rows], usual, kinds, [pair[0]] * len(rows))
+        both = _top1(images[rows], pair_texts, pairs, [pair] * len(rows))
+        found[" ".join(reversed(pair))] = (kind, both, len(rows))
     return found
 
 
