@@ -147,6 +147,57 @@ def test_clip_image_embeddings_equal_transformers_own(clip_folder):
     torch.testing.assert_close(encoder.encode_images(images), expected, atol=1e-5, rtol=0)
 
 
+def test_patches_are_the_values_of_the_last_attention_written_out(clip_folder):
+    """Reference: the tower layer by layer, then LayerNorm, two matrices, LayerNorm and the projection by hand."""
+    from transformers import CLIPModel
+
+    images = _images(3, 40)
+    model = CLIPModel.from_pretrained(clip_folder, attn_implementation="eager").eval()
+    tower = model.vision_model
+    with torch.no_grad():
+        hidden = tower(pixel_values=_normalised(images), output_hidden_states=True).hidden_states[-2]
+        last = tower.encoder.layers[-1]
+
+        def norm(x, module):
+            middle = x - x.mean(-1, keepdim=True)
+            return (
+                middle / (middle.square().mean(-1, keepdim=True) + module.eps).sqrt() * module.weight
+                + module.bias
+            )
+
+        value, out = last.self_attn.v_proj, last.self_attn.out_proj
+        tokens = norm(hidden, last.layer_norm1) @ value.weight.T + value.bias
+        tokens = tokens @ out.weight.T + out.bias
+        tokens = norm(tokens, tower.post_layernorm) @ model.visual_projection.weight.T
+    encoder = ClipEncoder(clip_folder, "tiny")
+    whole, patches = encoder.encode_patches(images)
+    torch.testing.assert_close(whole, encoder.encode_images(images))
+    torch.testing.assert_close(patches, _unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
+
+
+def test_threads_get_their_own_patches(clip_folder):
+    encoder = ClipEncoder(clip_folder, "tiny")
+    images = _images(12, 40).split(2)
+    expected = [encoder.encode_patches(pair)[1] for pair in images]
+    barrier = threading.Barrier(3)
+
+    def work(index: int) -> list[torch.Tensor]:
+        barrier.wait()
+        return [encoder.encode_patches(images[i])[1] for i in range(index, 6, 3)]
+
+    with ThreadPoolExecutor(3) as pool:
+        for index, found in enumerate(pool.map(work, range(3))):
+            for tensor, reference in zip(found, expected[index::3]):
+                torch.testing.assert_close(tensor, reference, atol=1e-5, rtol=0)
+
+
+def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_folder):
+    encoder = ClipEncoder(siglip_folder, "tiny siglip")
+    assert not encoder.reads_patches
+    with pytest.raises(ModelError, match="--features.crop-tokens class"):
+        encoder.encode_patches(_images(1, 32))
+
+
 def test_clip_text_embeddings_equal_transformers_own_and_long_prompts_are_cut(clip_folder):
     from transformers import AutoTokenizer, CLIPModel
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from PIL import Image
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from lexsplat.cameras import Camera
@@ -26,7 +27,7 @@ from lexsplat.features import (
     pca_image,
 )
 from lexsplat.features.cache import resize_grid
-from lexsplat.features.pyramid import dense_map, grid_levels
+from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
 
 WIDTH, HEIGHT = 48, 32
 
@@ -58,6 +59,12 @@ class ColourEncoder:
                 raise RuntimeError("stopped in the middle")
         mean = images.mean((-2, -1))
         return F.normalize(torch.cat([mean, torch.ones(len(mean), 1)], 1), dim=-1)
+
+    def encode_patches(self, images):
+        """Quarters of the crops, by their mean colours."""
+        quarters = F.adaptive_avg_pool2d(images, 2).permute(0, 2, 3, 1)
+        ones = torch.ones(*quarters.shape[:3], 1)
+        return self.encode_images(images), F.normalize(torch.cat([quarters, ones], -1), dim=-1)
 
     def encode_text(self, prompts):
         self.texts += len(prompts)
@@ -161,6 +168,46 @@ def test_the_maps_are_those_of_crops_embedded_one_by_one(scene, tmp_path):
         dense = np.concatenate([blocks, np.ones((16, 24, 1))], -1)
         dense = torch.from_numpy(dense / np.linalg.norm(dense, axis=-1, keepdims=True)).float()
         torch.testing.assert_close(found.dino, resize_grid(dense, 12, 8), atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("tokens", ["patch", "both"])
+def test_patches_speak_beside_or_instead_of_the_whole_crops(tokens, scene, tmp_path):
+    config = dataclasses.replace(CONFIG, crop_tokens=tokens)
+    maps = extract_features(scene, ColourEncoder(), None, config, cache_dir=tmp_path / "cache")
+    levels = grid_levels(WIDTH, HEIGHT, CONFIG.crop_sizes, CONFIG.crop_strides)
+    boxes = np.concatenate([level.boxes for level in levels])
+    for name, view in scene.views.items():
+        image = torch.from_numpy(view.load_image()).permute(2, 0, 1)
+        crops = torch.cat(list(cut_crops(image, boxes, 8, 64)))
+        whole, patches = ColourEncoder().encode_patches(crops)
+        expected = patch_map(levels, patches.flatten(1, 2), WIDTH, HEIGHT, 12, 8)
+        if tokens == "both":
+            expected = expected + mean_map(levels, whole, WIDTH, HEIGHT, 12, 8)
+        torch.testing.assert_close(maps[name].clip, F.normalize(expected, dim=-1), atol=2e-3, rtol=0)
+
+
+def test_what_patches_say_is_stored_for_one_size_of_the_maps(scene, tmp_path):
+    config = dataclasses.replace(CONFIG, crop_tokens="both")
+    assert _work(scene, tmp_path) == (True, 5)
+    assert _work(scene, tmp_path, config) == (True, 0)
+    assert _work(scene, tmp_path, dataclasses.replace(config, crop_tokens="patch")) == (False, 0)
+    assert _work(scene, tmp_path, dataclasses.replace(config, map_cells=5)) == (True, 0)
+
+
+def test_a_cached_map_of_patches_that_does_not_fit_is_told(scene, tmp_path):
+    config = dataclasses.replace(CONFIG, crop_tokens="patch")
+    maps = extract_features(scene, ColourEncoder(), None, config, cache_dir=tmp_path)
+    path = sorted(tmp_path.glob("*.clip.safetensors"))[0]
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    for patches in (None, torch.zeros(3, 3, 4), torch.full((8, 12, 4), torch.nan), torch.zeros(8, 12)):
+        changed = {name: value for name, value in tensors.items() if name != "patches"}
+        save_file(changed if patches is None else {**changed, "patches": patches}, path, metadata)
+        with pytest.raises(FileFormatError, match="cached features"):
+            for name in maps:
+                maps.forget()
+                _ = maps[name]
 
 
 def test_maps_are_unit_length_and_without_dino_have_none(scene, tmp_path):
@@ -378,7 +425,7 @@ def test_resizing_a_grid_keeps_cell_centres():
     [
         {"mode": "spiral"}, {"crop_sizes": ()}, {"crop_sizes": (0.1,)}, {"map_cells": 0}, {"memory": 0},
         {"dino_stride": 0}, {"crop_sizes": (0.0,) * 7}, {"random_sizes": (0.4, 0.2)}, {"random_crops": 0},
-        {"dino_facet": "query"},
+        {"dino_facet": "query"}, {"crop_tokens": "words"}, {"crop_tokens": "both", "mode": "random"},
     ],
 )  # fmt: skip
 def test_bad_settings_are_refused_at_once(bad):

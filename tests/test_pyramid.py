@@ -17,6 +17,7 @@ from lexsplat.features.pyramid import (
     dense_map,
     encode_stream,
     grid_levels,
+    patch_map,
     random_levels,
     unique_boxes,
 )
@@ -58,7 +59,9 @@ def position_image(width: int, height: int) -> torch.Tensor:
 def encoded(levels, image, encoder=None, batch=64) -> torch.Tensor:
     encoder = encoder or CentreEncoder()
     boxes, places = unique_boxes(levels)
-    ((_, unique),) = encode_stream(encoder, [(0, cut_crops(image, boxes, encoder.image_size, batch))], batch)
+    ((_, unique),) = encode_stream(
+        encoder.encode_images, [(0, cut_crops(image, boxes, encoder.image_size, batch))], batch
+    )
     return unique[places]
 
 
@@ -109,6 +112,65 @@ def test_random_crops_put_embeddings_at_their_true_centres():
     error = found[inner] - cell_centres(40, 30)[inner]
     assert error.abs().max() < 0.04
     assert error.mean((0, 1)).abs().max() < 0.004
+
+
+def patch_positions(level: CropLevel, width: int, height: int, side: int) -> torch.Tensor:
+    """Embeddings of the patches of all crops, as `CentreEncoder` would make them ``[n, side * side, 3]``."""
+    rows = []
+    for left, top, size in level.boxes.tolist():
+        for down in range(side):
+            for right in range(side):
+                x, y = left + (right + 0.5) * size / side, top + (down + 0.5) * size / side
+                rows.append([x / width, y / height, 9.0])
+    return F.normalize(torch.tensor(rows), dim=-1).reshape(len(level), side * side, 3)
+
+
+@pytest.mark.parametrize("size, stride, side", [(0.2, 0.5, 6), (0.2, 1.0, 2), (0.5, 0.35, 6), (0.4, 0.5, 1)])
+def test_every_patch_speaks_where_it_lies(size, stride, side):
+    width, height, cols, rows = 160, 120, 64, 48
+    (level,) = grid_levels(width, height, [size], [stride])
+    found = positions(
+        patch_map([level], patch_positions(level, width, height, side), width, height, cols, rows)
+    )
+    image, patch = torch.tensor([width, height]), level.size / side
+    inside = torch.minimum(
+        torch.maximum(cell_centres(cols, rows) * image, torch.tensor(patch / 2)), image - patch / 2
+    )
+    # Of crops that do not line up, patches at the rim count less: places bend by a part of a patch, no more.
+    assert (found * image - inside).abs().max() < patch / 2
+
+
+def test_the_map_of_patches_is_a_weighted_mean_by_a_loop():
+    """Reference: every patch of every crop in float64; tents of a patch's size, times the way to the crop's rim."""
+    width, height, cols, rows, dim, side = 57, 41, 9, 7, 5, 3
+    levels = grid_levels(width, height, [0.3, 0.5], [0.6, 0.5])
+    rng = np.random.default_rng(2)
+    vectors = rng.normal(size=(sum(map(len, levels)), side * side, dim))
+    found = patch_map(levels, torch.from_numpy(vectors).float(), width, height, cols, rows).numpy()
+    for i in range(rows):
+        for j in range(cols):
+            expected, start = np.zeros(dim), 0
+            for level in levels:
+                patch, total, weights = level.size / side, np.zeros(dim), 0.0
+                x = np.clip((j + 0.5) * width / cols, patch / 2, width - patch / 2)
+                y = np.clip((i + 0.5) * height / rows, patch / 2, height - patch / 2)
+                for left, top, size in level.boxes.tolist():
+                    for place in range(side * side):
+                        right, down = (place % side + 0.5) * patch, (place // side + 0.5) * patch
+                        tent = max(0, 1 - abs(x - left - right) / patch) * max(
+                            0, 1 - abs(y - top - down) / patch
+                        )
+                        weight = tent * min(right, size - right) * min(down, size - down)
+                        total += weight * vectors[start, place]
+                        weights += weight
+                    start += 1
+                expected += total / weights / len(levels)
+            np.testing.assert_allclose(found[i, j], expected, atol=1e-5)
+
+
+def test_patches_of_random_crops_are_refused():
+    with pytest.raises(ValueError, match="grid"):
+        CropLevel(4, np.array([0], np.int32), np.array([0], np.int32), grid=False, patches=2)
 
 
 @pytest.mark.parametrize("mode", ["grid", "random"])
@@ -276,7 +338,10 @@ def test_batches_run_across_images_are_full_and_come_back_in_order(chunks, batch
         jobs.append((key, [torch.tensor(part).reshape(-1, 1, 1, 1).expand(-1, 3, 2, 2) for part in values]))
         expected.append((key, [number for part in values for number in part]))
     encoder = FirstPixel()
-    found = [(key, vectors[:, 0].tolist()) for key, vectors in encode_stream(encoder, iter(jobs), batch)]
+    found = [
+        (key, vectors[:, 0].tolist())
+        for key, vectors in encode_stream(encoder.encode_images, iter(jobs), batch)
+    ]
     assert found == expected
     assert all(size == batch for size in encoder.batches[:-1])
     assert max(encoder.batches, default=0) <= batch
@@ -290,7 +355,7 @@ def test_an_image_is_handed_back_before_all_later_ones_are_read():
             read.append(key)
             yield key, [torch.zeros(4, 3, 8, 8)]
 
-    stream = encode_stream(CentreEncoder(), jobs(), batch_size=6)
+    stream = encode_stream(CentreEncoder().encode_images, jobs(), batch_size=6)
     next(stream)
     assert len(read) <= 2
 

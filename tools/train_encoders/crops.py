@@ -161,6 +161,18 @@ def cut(frame: Frame, left: float, top: float, side: float) -> Crop:
     return Crop(frame, (left, top, side), seen[known].astype(np.int64), weights[known], grid)
 
 
+def patch_crop(crop: Crop, patch: int, count: int) -> Crop:
+    """One of the ``count`` x ``count`` patches of a crop, everything in it weighing the same."""
+    down, right = divmod(patch, count)
+    side = GRID // count
+    grid = crop.grid[down * side : (down + 1) * side, right * side : (right + 1) * side]
+    seen, counts = np.unique(grid, return_counts=True)
+    left, top, width = crop.box
+    box = left + right * width / count, top + down * width / count, width / count
+    known = seen >= 0
+    return Crop(crop.frame, box, seen[known].astype(np.int64), counts[known] / grid.size, grid)
+
+
 def random_crop(frames: Frames, rng: np.random.Generator) -> Crop:
     """A crop of a random frame: around a thing, around a part, or anywhere; of any size."""
     frame = frames.frames[int(rng.integers(len(frames)))]

@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument(
         "--phases",
         nargs="+",
-        choices=("first", "refine", "parts", "handles", "edges"),
+        choices=("first", "refine", "parts", "handles", "edges", "dense"),
         default=["first", "refine", "parts"],
         help="of the image-text encoder; all but the first go on from the model in OUTPUT; the last two are an "
         "experiment (docs/results.md), not in the weights that ship",

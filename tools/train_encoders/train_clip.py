@@ -29,7 +29,7 @@ import torch
 import torch.distributed
 import torch.nn.functional as F
 from clip_scores import calibration, parts_found, zero_shot
-from crops import GRID, Crop, Frames, dominated_crops, part_crops, random_crop
+from crops import GRID, Crop, Frames, dominated_crops, part_crops, patch_crop, random_crop
 from numpy.typing import NDArray
 from tokenizer import LENGTH, learn_tokenizer
 from torch import Tensor
@@ -59,6 +59,8 @@ from words import (
 from workers import average_gradients
 
 KINDS, TINTS, PART_NAMES = list(NAMES), list(COLOURS), [None, *PARTS]
+PLACES = 8
+"""Patches of a crop that are asked about."""
 UNKNOWN = -100
 """An answer that the loss leaves out."""
 NEAR_HUE = 25.0
@@ -86,6 +88,7 @@ class ClipTraining:
         near: Whether what is near the things belongs to these crops, and as many phrases ask for parts.
         handles: How often handles are among these, and asked for, for once any other part.
         centre: Whether a part also counts as shown where it lies in the very middle (`truth.TruthTable`).
+        dense: Weight of the loss of what patches say by themselves, as MaskCLIP reads them.
         beside: Share of the weight below which a part beside the middle is not what a crop shows.
         light: Standard deviation of the logarithm of the light on a crop.
         kept: Share of the patches that the image tower sees in the first three quarters of the steps.
@@ -111,6 +114,7 @@ class ClipTraining:
     near: bool = False
     handles: int = 1
     centre: bool = False
+    dense: float = 0.0
     beside: float = LACKS_PART
     light: float = 0.2
     kept: float = 0.5
@@ -132,8 +136,11 @@ HANDLES = dataclasses.replace(PARTS_AGAIN, parts=0.45, handles=8, seed=3)
 area .88): a fourteenth of the part crops is too little to learn better from."""
 EDGES = dataclasses.replace(HANDLES, steps=700, rate=2e-4, beside=BESIDE, seed=4)
 """An experiment, after that one. Where a part ends: a place beside it answers as surely as the part itself."""
+DENSE = dataclasses.replace(PARTS_AGAIN, steps=1600, parts=0.45, handles=4, dense=1.0, seed=5)
+"""Patches learn to speak for themselves: what they show is asked of each, by the same phrases."""
 PHASES = {
     "first": ClipTraining(), "refine": REFINEMENT, "parts": PARTS_AGAIN, "handles": HANDLES, "edges": EDGES,
+    "dense": DENSE,
 }  # fmt: skip
 """In this order; each phase goes on from the averaged weights of the one before. The first three made the weights
 that ship."""
@@ -151,6 +158,8 @@ class Batch:
     truth: Tensor
     patches: Tensor
     left_out: Tensor
+    places: Tensor
+    """Truth at single patches ``[B, P, T]``; ``OPEN`` where it was not worked out. Empty ``[B, P, 0]`` if not asked."""
 
 
 def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.random.Generator) -> Batch:
@@ -188,6 +197,7 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     patches, left_out = patch_answers(crops, table.labels, angles, config)
     patches[colourless, :, 1] = UNKNOWN
     corners = [text for _ in range(config.batch // 12) for text in parallelogram(rng)]
+    places = place_truth(phrases, crops, table, angles, colourless, config, rng)
     return Batch(
         torch.from_numpy(pixels).permute(0, 3, 1, 2),
         texts,
@@ -195,7 +205,43 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
         torch.from_numpy(truth),
         torch.from_numpy(patches),
         torch.from_numpy(left_out),
+        torch.from_numpy(places),
     )
+
+
+def place_truth(
+    phrases: list[Phrase],
+    crops: list[Crop],
+    table: TruthTable,
+    angles: NDArray[np.float64],
+    colourless: NDArray[np.bool_],
+    config: ClipTraining,
+    rng: np.random.Generator,
+) -> NDArray[np.int8]:
+    """Truth of the phrases at ``PLACES`` patches of every crop ``[B, P, T]``, ``OPEN`` at the others.
+
+    Half of the patches are drawn anywhere, half so that everything a crop shows is asked about as often.
+    """
+    count = config.image_size // config.patch
+    truth = np.full((len(crops), count**2, len(phrases) if config.dense else 0), OPEN, np.int8)
+    if not config.dense:
+        return truth
+    middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
+    rows, patches = [], []
+    for row, crop in enumerate(crops):
+        codes = crop.grid[np.ix_(middles, middles)].ravel()
+        chosen = set(rng.permutation(count**2)[: PLACES // 2].tolist())
+        shown = rng.permutation(np.unique(codes[codes >= 0]))
+        chosen |= {int(rng.choice(np.flatnonzero(codes == code))) for code in shown[: PLACES // 2]}
+        rows += [row] * len(chosen)
+        patches += sorted(chosen)
+    cut = [patch_crop(crops[row], patch, count) for row, patch in zip(rows, patches)]
+    found = table.at_places(phrases, cut)
+    leave_open(found, phrases, cut, table.labels, angles[rows])
+    asks_colour = np.array([phrase.colour is not None for phrase in phrases])
+    found[np.ix_(colourless[rows], asks_colour)] = OPEN
+    truth[rows, patches] = found
+    return truth
 
 
 def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
@@ -291,7 +337,9 @@ def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batc
     return ready
 
 
-def mirrored(batch: Batch, config: ClipTraining, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+def mirrored(
+    batch: Batch, config: ClipTraining, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Half of the crops mirrored, with what their patches show."""
     count = config.image_size // config.patch
     chosen = torch.rand(len(batch.pixels), generator=generator) < 0.5
@@ -301,7 +349,7 @@ def mirrored(batch: Batch, config: ClipTraining, generator: torch.Generator) -> 
         grid = values.unflatten(1, (count, count))
         return torch.where(chosen[:, None, None, None], grid.flip(2), grid).flatten(1, 2)
 
-    return pixels, of_patches(batch.patches), of_patches(batch.left_out)
+    return pixels, of_patches(batch.patches), of_patches(batch.left_out), of_patches(batch.places)
 
 
 def jittered(pixels: Tensor, generator: torch.Generator, light: float) -> Tensor:
@@ -376,6 +424,10 @@ class Trainer:
         else:
             self.model = CLIPModel.from_pretrained(start, attn_implementation="eager").train()
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
+        self._normed: list[Tensor] = []  # what the last layer's attention sees
+        self.model.vision_model.encoder.layers[-1].layer_norm1.register_forward_hook(
+            lambda _, __, output: self._normed.append(output)
+        )
         self.patch_heads = torch.nn.Linear(config.width, len(KINDS) + len(TINTS) + len(PART_NAMES))
         self.trained = [*self.model.parameters(), *self.patch_heads.parameters()]
         decayed = [p for p in self.trained if p.ndim >= 2]
@@ -397,11 +449,12 @@ class Trainer:
             group["lr"] = self.rate()
         words = self.tokens([*batch.texts, *batch.corners])
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            pixels, patches, left_out = mirrored(batch, self.config, self.generator)
+            pixels, patches, left_out, places = mirrored(batch, self.config, self.generator)
             kept = self.kept_patches(len(pixels))
             patches = patches.gather(1, kept[..., None].expand(-1, -1, 3))
             left_out = left_out.gather(1, kept[..., None].expand(-1, -1, len(KINDS)))
-            images, tokens = self.see(jittered(pixels, self.generator, self.config.light), kept)
+            places = places.gather(1, kept[..., None].expand(-1, -1, places.shape[-1]))
+            images, tokens, values = self.see(jittered(pixels, self.generator, self.config.light), kept)
             if self.done < self.config.heads_alone:
                 tokens = tokens.detach()
             answers = self.patch_heads(tokens).float()
@@ -419,6 +472,18 @@ class Trainer:
         named = patch_loss(answers, patches, left_out)
         composition = composition_loss(F.normalize(corners, dim=-1))
         loss = 0.5 * contrast + relevancy + named + self.config.composition * composition
+        losses = {"contrast": contrast, "relevancy": relevancy, "patches": named, "composition": composition}
+        if self.config.dense:
+            asked = (places != OPEN).any(-1)
+            at = F.normalize(values[asked].float(), dim=-1) @ F.normalize(texts, dim=-1).T
+            truth = places[asked]
+            with_canonical = F.pad(truth, (0, len(CANONICAL)), value=FALSE)
+            dense = 0.5 * contrastive_loss(scale * at, with_canonical)
+            phrases, canonical = at[:, : -len(CANONICAL)], at[:, -len(CANONICAL) :]
+            dense = dense + 0.5 * contrastive_loss(scale * phrases.T, truth.T)
+            dense = dense + relevancy_loss(phrases, canonical, truth, self.config.temperature)
+            loss = loss + self.config.dense * dense
+            losses["dense"] = dense
         self.optimizer.zero_grad()
         loss.backward()
         average_gradients(self.trained)
@@ -429,7 +494,6 @@ class Trainer:
         with torch.no_grad():
             for slow, fast in zip(self.average.parameters(), self.model.parameters()):
                 slow.lerp_(fast, 1 - keep)
-        losses = {"contrast": contrast, "relevancy": relevancy, "patches": named, "composition": composition}
         return {name: round(value.item(), 3) for name, value in losses.items()}
 
     def kept_patches(self, count: int) -> Tensor:
@@ -443,14 +507,22 @@ class Trainer:
         order = torch.rand(count, patches, generator=self.generator).argsort(1)
         return order[:, : max(1, round(share * patches))]
 
-    def see(self, images: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
-        """Embeddings ``[B, D]`` and patch tokens ``[B, P', width]`` from the kept patches ``[B, P']``."""
+    def see(self, images: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Embeddings ``[B, D]``, patch tokens ``[B, P', width]`` and what patches say by themselves ``[B, P', D]``,
+        from the kept patches ``[B, P']``."""
         tower = self.model.vision_model
         hidden = tower.embeddings(images)
         chosen = hidden[:, 1:].gather(1, kept[..., None].expand(-1, -1, hidden.shape[-1]))
         hidden = tower.pre_layrnorm(torch.cat([hidden[:, :1], chosen], 1))
         hidden = tower.encoder(inputs_embeds=hidden).last_hidden_state
-        return self.model.visual_projection(tower.post_layernorm(hidden[:, 0])), hidden[:, 1:]
+        attention = tower.encoder.layers[-1].self_attn
+        values = attention.out_proj(attention.v_proj(self._normed.pop()[:, 1:]))
+        project = self.model.visual_projection
+        return (
+            project(tower.post_layernorm(hidden[:, 0])),
+            hidden[:, 1:],
+            project(tower.post_layernorm(values)),
+        )
 
     def tokens(self, texts: list[str]) -> dict[str, Tensor]:
         encoded = self.tokenizer(texts, padding=True, truncation=True, max_length=LENGTH, return_tensors="pt")

@@ -13,6 +13,8 @@ SHOWS, SHOWS_PART = 0.45, 0.25
 """A phrase is true of a crop if what it names has this share of the weight."""
 LACKS, LACKS_PART = 0.15, 0.04
 """It is false if what it names, or may name, has less than this; between the two it is open."""
+HALF, EIGHTH = 0.5, 0.125
+"""The same two of a patch, of which everything weighs the same."""
 CENTRE = 0.1
 """With this share of the weight a part is shown if it also lies in the very middle."""
 BESIDE = 0.15
@@ -61,3 +63,14 @@ class TruthTable:
             shows = np.where(centred, CENTRE, shows)
             lacks = np.where(is_part & ~centred, self.beside, lacks)
         return np.where(true >= shows, TRUE, np.where(possible < lacks, FALSE, OPEN)).astype(np.int8)
+
+    def at_places(self, phrases: Sequence[Phrase], patches: Sequence[Crop]) -> NDArray[np.int8]:
+        """The same of single patches: true with half of the patch, false with an eighth, else open."""
+        codes = np.unique(np.concatenate([patch.codes for patch in patches]))
+        weights = np.zeros((len(patches), len(codes)), np.float32)
+        for row, patch in enumerate(patches):
+            weights[row, np.searchsorted(codes, patch.codes)] = patch.weights
+        columns = [self._columns(phrase) for phrase in phrases]
+        true = weights @ np.stack([column[0][codes] for column in columns], 1).astype(np.float32)
+        possible = weights @ np.stack([column[1][codes] for column in columns], 1).astype(np.float32)
+        return np.where(true >= HALF, TRUE, np.where(possible <= EIGHTH, FALSE, OPEN)).astype(np.int8)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,10 +23,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lexsplat.errors import FileFormatError
-from lexsplat.features.pyramid import CropLevel, dense_map
+from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
 from lexsplat.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = "1"
+
+Tokens = Literal["class", "patch", "both"]
+"""What of a crop speaks: the whole, its patches, or both."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +126,25 @@ def hash_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def write_crops(path: Path, levels: Sequence[CropLevel], embeddings: Tensor, size: tuple[int, int]) -> None:
-    """Store the crops of a ``size`` = (width, height) image and their embeddings ``[n, D]``."""
+def write_crops(
+    path: Path,
+    levels: Sequence[CropLevel],
+    embeddings: Tensor,
+    size: tuple[int, int],
+    patches: Tensor | None = None,
+) -> None:
+    """Store the crops of a ``size`` = (width, height) image and their embeddings.
+
+    Args:
+        path: Of the file.
+        levels: Crops by size.
+        embeddings: One a crop ``[n, D]``.
+        size: Width and height of the image.
+        patches: The map of their patches ``[h, w, D]`` (`lexsplat.features.pyramid.mean_map`), where they were read.
+    """
     tensors = {"embeddings": embeddings.half().contiguous()}
+    if patches is not None:
+        tensors["patches"] = patches.half().contiguous()
     for index, level in enumerate(levels):
         tensors[f"lefts.{index}"] = torch.from_numpy(level.lefts.astype(np.int32))
         tensors[f"tops.{index}"] = torch.from_numpy(level.tops.astype(np.int32))
@@ -133,14 +152,22 @@ def write_crops(path: Path, levels: Sequence[CropLevel], embeddings: Tensor, siz
     _write(path, tensors, facts)
 
 
-def read_crops(path: Path, cols: int, rows: int) -> Tensor:
-    """The dense map ``[rows, cols, D]`` of stored crops; see `lexsplat.features.pyramid.dense_map`.
+def read_crops(path: Path, cols: int, rows: int, tokens: Tokens = "class") -> Tensor:
+    """The dense map ``[rows, cols, D]`` of stored crops, of their patches, or of both, which then count alike.
+
+    See `lexsplat.features.pyramid.dense_map`.
 
     Raises:
         FileFormatError: If the file is not such a store.
     """
-    levels, embeddings, (width, height) = _stored_crops(path)
-    return dense_map(levels, embeddings, width, height, cols, rows)
+    levels, embeddings, (width, height), patches = _stored_crops(path)
+    if tokens == "class":
+        return dense_map(levels, embeddings, width, height, cols, rows)
+    if patches is None or patches.shape[:2] != (rows, cols) or patches.shape[-1] != embeddings.shape[-1]:
+        raise _damaged(path, ValueError("no patches of this size"))
+    if tokens == "patch":
+        return F.normalize(patches, dim=-1)
+    return F.normalize(patches + mean_map(levels, embeddings, width, height, cols, rows), dim=-1)
 
 
 def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
@@ -151,7 +178,7 @@ def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
     Raises:
         FileFormatError: If the file is not such a store.
     """
-    levels, embeddings, (width, height) = _stored_crops(path)
+    levels, embeddings, (width, height), _ = _stored_crops(path)
     maps = []
     for level in levels:
         maps.append(dense_map([level], embeddings[: len(level)], width, height, cols, rows))
@@ -159,11 +186,14 @@ def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
     return torch.stack(maps), [level.size / width for level in levels]
 
 
-def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int]]:
-    """Levels, embeddings ``[n, D]`` float32, and width and height of the image, checked against each other."""
+def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int], Tensor | None]:
+    """Levels, embeddings ``[n, D]`` float32, width and height of the image, and the map of patches ``[h, w, D]`` float32
+    if there is one; checked against each other.
+    """
     tensors, facts = _read(path)
     try:
         embeddings = tensors["embeddings"].float()
+        patches = tensors["patches"].float() if "patches" in tensors else None
         width, height = facts["size"]
         levels = []
         for i, level in enumerate(facts["levels"]):
@@ -182,7 +212,9 @@ def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int]]
         raise _damaged(path, ValueError("crops and embeddings that do not fit"))
     if len(embeddings) == 0 or not bool(torch.isfinite(embeddings).all()):
         raise _damaged(path, ValueError("no embeddings, or some that are not finite"))
-    return levels, embeddings, (width, height)
+    if patches is not None and (patches.ndim != 3 or not bool(torch.isfinite(patches).all())):
+        raise _damaged(path, ValueError("patches that are no map, or not finite"))
+    return levels, embeddings, (width, height), patches
 
 
 def write_grid(path: Path, features: Tensor) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -52,6 +54,7 @@ class ClipEncoder(PretrainedModel):
         self._text_length = int(config.text_config.max_position_embeddings)
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
         self._mean, self._std = normalisation(folder, default, self.device)
+        self._patches = _PatchReader(self._model) if config.model_type == "clip" else None
         try:
             self._tokenizer = AutoTokenizer.from_pretrained(
                 folder, local_files_only=True, trust_remote_code=False
@@ -74,6 +77,39 @@ class ClipEncoder(PretrainedModel):
         with precision(self.device, crops=True):
             features = _pooled(self._model.get_image_features(**self._vision_inputs(pixels)))
         return F.normalize(features.float(), dim=-1).cpu()
+
+    @property
+    def reads_patches(self) -> bool:
+        """Whether `encode_patches` knows this architecture."""
+        return self._patches is not None
+
+    @torch.inference_mode()
+    def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """The whole of images and each of their patches, read from one evaluation of the model.
+
+        A patch is read as in MaskCLIP (Zhou, Loy and Dai, "Extract free dense labels from CLIP", ECCV 2022): what it
+        would give to the class token in the last attention, its value, projected like the class token itself.
+
+        Args:
+            images: ``[B, 3, h, w]`` in 0..1, of any size.
+
+        Returns:
+            The embeddings of `encode_images` ``[B, D]``, and those of the patches ``[B, P, P, D]``, rows from top to
+            bottom; float32 on the CPU, unit length.
+
+        Raises:
+            ModelError: If the model is not of CLIP's own architecture.
+        """
+        if self._patches is None:
+            raise self._refusal(
+                "a model of CLIP's architecture to read patches",
+                "leave the patches out: `--features.crop-tokens class`",
+            )
+        whole = self.encode_images(images)
+        with precision(self.device, crops=True):
+            values = self._patches.read()
+        side = math.isqrt(values.shape[1])
+        return whole, F.normalize(values.float(), dim=-1).cpu().unflatten(1, (side, side))
 
     @torch.inference_mode()
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
@@ -132,6 +168,25 @@ class ClipEncoder(PretrainedModel):
             "pixel_attention_mask": torch.ones(patches.shape[:2], dtype=torch.int32, device=pixels.device),
             "spatial_shapes": torch.full((len(pixels), 2), side, dtype=torch.long, device=pixels.device),
         }
+
+
+class _PatchReader:
+    """Catches what the last attention of a CLIP image tower sees; each thread gets its own."""
+
+    def __init__(self, model: Any) -> None:
+        self._tower, self._project = model.vision_model, model.visual_projection
+        self._last = self._tower.encoder.layers[-1]
+        self._caught = threading.local()
+        self._last.layer_norm1.register_forward_hook(self._catch)
+
+    def _catch(self, module: torch.nn.Module, inputs: Any, output: Tensor) -> None:
+        self._caught.tokens = output
+
+    def read(self) -> Tensor:
+        """Embeddings of the patches ``[B, P * P, D]`` of this thread's last evaluation."""
+        tokens = self._caught.__dict__.pop("tokens")[:, 1:]  # the class token comes first
+        attention = self._last.self_attn
+        return self._project(self._tower.post_layernorm(attention.out_proj(attention.v_proj(tokens))))
 
 
 def _pooled(output: Any) -> Tensor:

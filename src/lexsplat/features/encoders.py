@@ -45,6 +45,10 @@ class ImageTextEncoder(Protocol):
         """``[B, 3, h, w]`` in 0..1 to ``[B, D]``, float32 on the CPU, unit length."""
         ...
 
+    def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """The same ``[B, D]`` and what their patches say ``[B, P, P, D]``; see `ClipEncoder`."""
+        ...
+
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
         """Prompts to ``[B, D]``, float32 on the CPU, unit length."""
         ...

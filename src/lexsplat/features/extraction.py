@@ -20,6 +20,7 @@ from lexsplat import budget
 from lexsplat.features.cache import (
     FeatureMap,
     FeatureMaps,
+    Tokens,
     hash_file,
     hash_of,
     is_stored,
@@ -36,6 +37,7 @@ from lexsplat.features.pyramid import (
     cut_crops,
     encode_stream,
     grid_levels,
+    patch_map,
     random_levels,
     unique_boxes,
 )
@@ -48,7 +50,7 @@ _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15
 _LONGEST = 16  # in short sides: longer strips get coarser maps, or the memory of a map would know no bound
 _MAX_WORKERS = 4  # beyond this, threads inside an operation pay better than more images in flight
 
-_GRID = ("crop_sizes", "crop_strides")
+_GRID = ("crop_sizes", "crop_strides", "crop_tokens")
 _RANDOM = ("random_crops", "random_levels", "random_sizes", "seed")
 
 
@@ -62,6 +64,8 @@ class FeatureConfig:
         crop_sizes: Grid: sides of the crops as fractions of the image's short side.
         crop_strides: Grid: distance between crops of each size, as a fraction of their side; the overlap is
             the rest.
+        crop_tokens: Grid: what of a crop speaks for a place. "class", the whole of it at its middle (the paper); "patch",
+            each of its patches where it lies, read as in MaskCLIP; "both". Patches need a model of CLIP's architecture.
         random_crops: Random: crops of a view, shared out evenly over the sizes.
         random_levels: Random: number of sizes.
         random_sizes: Random: smallest and largest side as fractions of the image's short side.
@@ -82,6 +86,7 @@ class FeatureConfig:
     mode: Literal["grid", "random"] = "grid"
     crop_sizes: tuple[float, ...] = (0.05, 0.125, 0.2, 0.275, 0.35, 0.425, 0.5)
     crop_strides: tuple[float, ...] = (1.0, 0.625, 0.5, 0.5, 0.5, 0.5, 0.5)
+    crop_tokens: Tokens = "class"
     random_crops: int = 3000
     random_levels: int = 20
     random_sizes: tuple[float, float] = (0.05, 0.2)
@@ -106,6 +111,10 @@ class FeatureConfig:
             raise ValueError("crop sizes and strides must be positive")
         if not 0 < self.random_sizes[0] <= self.random_sizes[1]:
             raise ValueError(f"random_sizes must be positive and in order, got {self.random_sizes}")
+        if self.crop_tokens not in ("class", "patch", "both"):
+            raise ValueError(f"crop_tokens must be 'class', 'patch' or 'both', got {self.crop_tokens!r}")
+        if self.crop_tokens != "class" and self.mode != "grid":
+            raise ValueError(f"crop_tokens={self.crop_tokens} needs mode=grid, random crops speak as wholes")
         if self.dino_facet not in ("key", "token"):
             raise ValueError(f"dino_facet must be 'key' or 'token', got {self.dino_facet!r}")
         sizes = ("map_cells", "max_short_side", "dino_short_side", "dino_stride", "dino_max_tokens")
@@ -137,8 +146,8 @@ class FeatureConfig:
         """
         usual = FeatureConfig()
         given = {name for name in dataclasses.asdict(self) if getattr(self, name) != getattr(usual, name)}
-        if given & set(_GRID):
-            given |= set(_GRID)
+        if given & {"crop_sizes", "crop_strides"}:
+            given |= {"crop_sizes", "crop_strides"}
         return dataclasses.replace(suited, **{name: getattr(self, name) for name in given})
 
     def decisive(self, use_dino: bool) -> FeatureConfig:
@@ -206,7 +215,7 @@ def extract_features(
         entry = entries[name]
         cols, rows = entry.map_size
         grid = None if entry.dino is None else read_grid(entry.dino, cols, rows)
-        return FeatureMap(read_crops(entry.clip, cols, rows), grid)
+        return FeatureMap(read_crops(entry.clip, cols, rows, config.crop_tokens), grid)
 
     return FeatureMaps(list(entries), load, config.memory // 4)
 
@@ -257,6 +266,8 @@ class _Entry:
         settings = dataclasses.asdict(config)
         crops = {name: settings[name] for name in ("mode", *(_GRID if config.mode == "grid" else _RANDOM))}
         dense = {name: settings[name] for name in settings if name.startswith("dino_")}
+        if crops.pop("crop_tokens", "class") != "class":  # what patches say is stored as a map of this size
+            crops["patches"] = map_size
         clip_key = hash_of("clip", clip.content_hash, crops, pixels)
         dino_path = None
         if dino is not None:
@@ -325,15 +336,27 @@ class _Extraction:
     def _work(self, threads: int) -> None:
         torch.set_num_threads(threads)  # the setting is per thread
         try:
-            for (name, levels, places), unique in encode_stream(self.clip, self._jobs(), self.batch_size):
+            for (name, levels, places), unique in encode_stream(self._encode, self._jobs(), self.batch_size):
                 entry = self.entries[name]
-                write_crops(entry.clip, levels, unique[places], entry.image_size)
+                tokens = unique[places]
+                if tokens.ndim == 2:
+                    write_crops(entry.clip, levels, tokens, entry.image_size)
+                else:
+                    patches = patch_map(levels, tokens[:, 1:], *entry.image_size, *entry.map_size)
+                    write_crops(entry.clip, levels, tokens[:, 0], entry.image_size, patches)
                 self._finished.put(name)
         except BaseException:
             self._stop.set()
             raise
         finally:
             self._finished.put(None)
+
+    def _encode(self, crops: Tensor) -> Tensor:
+        """Crops to their embeddings ``[b, D]``, or with those of their patches after them ``[b, 1 + P * P, D]``."""
+        if self.config.crop_tokens == "class":
+            return self.clip.encode_images(crops)
+        whole, patches = self.clip.encode_patches(crops)
+        return torch.cat([whole[:, None], patches.flatten(1, 2)], 1)
 
     def _jobs(self) -> Iterator[tuple[tuple[str, tuple[CropLevel, ...], Tensor], Iterator[Tensor]]]:
         """Views whose crops are missing, with their crops; DINO is done on the way."""

@@ -13,8 +13,10 @@ grid. Crops keep inside the image; beyond the outermost centres the nearest ones
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -24,7 +26,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.features.encoders import ImageTextEncoder, resize_images
+from lexsplat.features.encoders import resize_images
 
 Key = TypeVar("Key")
 
@@ -38,12 +40,18 @@ class CropLevel:
         lefts: Left edges in pixels: ``[nx]`` of the columns of a grid, or ``[n]`` of the random crops.
         tops: Top edges in pixels: ``[ny]`` of the rows of a grid, or ``[n]`` of the random crops.
         grid: Whether the crops are all pairs of rows and columns (row-major) or single ones.
+        patches: Along a side of each crop, when each of them has an embedding of its own; 0 when the crop has one.
     """
 
     size: int
     lefts: NDArray[np.int32]
     tops: NDArray[np.int32]
     grid: bool
+    patches: int = 0
+
+    def __post_init__(self) -> None:
+        if self.patches and not self.grid:
+            raise ValueError("patches need a grid of crops")
 
     @property
     def boxes(self) -> NDArray[np.int32]:
@@ -55,6 +63,11 @@ class CropLevel:
 
     def __len__(self) -> int:
         return len(self.lefts) * len(self.tops) if self.grid else len(self.lefts)
+
+    @property
+    def embeddings(self) -> int:
+        """How many embeddings the crops have together."""
+        return len(self) * max(1, self.patches**2)
 
 
 def grid_levels(
@@ -135,25 +148,34 @@ def dense_map(
 ) -> Tensor:
     """Average the crops' embeddings at their true positions: the dense map of section 3.2.
 
-    Each level gives a map; the maps are averaged over the levels that reach a cell, then normalised.
+    Unit vectors ``[rows, cols, D]`` in the direction of `mean_map`, which see.
+    """
+    return F.normalize(mean_map(levels, embeddings, width, height, cols, rows), dim=-1)
+
+
+def mean_map(
+    levels: Sequence[CropLevel], embeddings: Tensor, width: int, height: int, cols: int, rows: int
+) -> Tensor:
+    """Average of the embeddings that speak for each cell: each level gives a map, and those that reach it count alike.
 
     Args:
         levels: Crops by size.
-        embeddings: One unit vector a crop ``[n, D]``, levels in order.
+        embeddings: One unit vector a crop or patch of one ``[n, D]``, levels in order; patches from left to right and
+            top to bottom within their crop.
         width: Width in pixels of the image the crops were taken from.
         height: Its height.
         cols: Width of the map in cells.
         rows: Height of the map in cells.
 
     Returns:
-        Unit vectors ``[rows, cols, D]``; cell (i, j) is the pixel ((j + .5) width / cols, (i + .5) height /
-        rows).
+        ``[rows, cols, D]``; cell (i, j) is the pixel ((j + .5) width / cols, (i + .5) height / rows).
 
     Raises:
         ValueError: If the number of embeddings is not the number of crops.
     """
-    if len(embeddings) != sum(len(level) for level in levels):
-        raise ValueError(f"{len(embeddings)} embeddings for {sum(len(level) for level in levels)} crops")
+    expected = sum(level.embeddings for level in levels)
+    if len(embeddings) != expected:
+        raise ValueError(f"{len(embeddings)} embeddings where the crops have {expected}")
     xs = (np.arange(cols) + 0.5) * width / cols
     ys = (np.arange(rows) + 0.5) * height / rows
     dim = embeddings.shape[-1]
@@ -163,12 +185,14 @@ def dense_map(
     strips: list[Tensor] = []
     start = 0
     for level in levels:
-        vectors = embeddings[start : start + len(level)].float()
-        start += len(level)
+        vectors = embeddings[start : start + level.embeddings].float()
+        start += level.embeddings
         if level.grid:
-            across = _linear_weights(xs, level.lefts + level.size / 2)
-            strips.append((across @ vectors.reshape(len(level.tops), len(level.lefts), dim)).flatten(1))
-            downs.append(_linear_weights(ys, level.tops + level.size / 2))
+            across, down = _axis_weights(level, level.lefts, xs), _axis_weights(level, level.tops, ys)
+            side = max(1, level.patches)
+            cells = vectors.reshape(len(level.tops), len(level.lefts), side, side, dim).transpose(1, 2)
+            strips.append((across @ cells.reshape(down.shape[1], across.shape[1], dim)).flatten(1))
+            downs.append(down)
             count += 1
         else:
             weights = _tent_weights(level, xs, ys)
@@ -177,11 +201,45 @@ def dense_map(
             count += (reached > 0).float().reshape(rows, cols, 1)
     if downs:
         total += torch.cat(downs, 1) @ torch.cat(strips)
-    total = total.reshape(rows, cols, dim)
+    total = total.reshape(rows, cols, dim) / count.clamp_min(1)
     if bool((count == 0).any()):  # random crops need not reach every corner: the nearest crop speaks for it
         empty = (count == 0).squeeze(-1)
         total[empty] = embeddings[_nearest_crops(levels, xs, ys)[empty]].float()
-    return F.normalize(total, dim=-1)
+    return total
+
+
+def patch_map(
+    levels: Sequence[CropLevel], patches: Tensor, width: int, height: int, cols: int, rows: int
+) -> Tensor:
+    """`mean_map` of what the patches of grids of crops say, each at its own place.
+
+    Args:
+        levels: Crops by size.
+        patches: ``[n, P * P, D]``, crops in the order of the levels.
+        width: Width in pixels of the image the crops were taken from.
+        height: Its height.
+        cols: Width of the map in cells.
+        rows: Height of the map in cells.
+    """
+    side = math.isqrt(patches.shape[1])
+    by_patch = [dataclasses.replace(level, patches=side) for level in levels]
+    return mean_map(by_patch, patches.flatten(0, 1), width, height, cols, rows)
+
+
+def _axis_weights(level: CropLevel, starts: NDArray, positions: NDArray) -> Tensor:
+    """Weights ``[m, n]`` along one axis of the crops with these starts, or of their patches, crop after crop.
+
+    A patch counts within its own size, and more the farther it lies from the rim of its crop, where it sees less.
+    """
+    if not level.patches:
+        return _linear_weights(positions, starts + level.size / 2)
+    side = level.size / level.patches
+    places = (np.arange(level.patches) + 0.5) * side
+    centres = (starts[:, None] + places).ravel()
+    inside = np.clip(positions, centres.min(), centres.max())  # beyond the outermost ones the nearest count
+    tents = np.maximum(0, 1 - np.abs(inside[:, None] - centres) / side)
+    weights = tents * np.tile(np.minimum(places, level.size - places), len(starts))
+    return torch.from_numpy((weights / weights.sum(1, keepdims=True)).astype(np.float32))
 
 
 def _linear_weights(positions: NDArray, centres: NDArray) -> Tensor:
@@ -249,17 +307,17 @@ def cut_crops(image: Tensor, boxes: NDArray[np.int32], image_size: int, chunk: i
 
 
 def encode_stream(
-    encoder: ImageTextEncoder, jobs: Iterable[tuple[Key, Iterable[Tensor]]], batch_size: int
+    encode: Callable[[Tensor], Tensor], jobs: Iterable[tuple[Key, Iterable[Tensor]]], batch_size: int
 ) -> Iterator[tuple[Key, Tensor]]:
     """Encode the crops of many images in full batches that run across sizes and images.
 
     Args:
-        encoder: What embeds the crops.
+        encode: What embeds crops: ``[b, 3, s, s]`` to ``[b, ...]``.
         jobs: For each image a key and its crops in chunks ``[b, 3, s, s]``; read only as far as needed.
         batch_size: Crops encoded at once.
 
     Yields:
-        Each key with its embeddings ``[n, D]``, in the order of the jobs.
+        Each key with its embeddings ``[n, ...]``, in the order of the jobs.
     """
     waiting: deque[tuple[Key, list[Tensor]]] = deque()  # images whose crops are not all encoded yet
     owners: deque[tuple[list[Tensor], int]] = deque()  # whose the buffered crops are, in order
@@ -269,7 +327,7 @@ def encode_stream(
     def flush(limit: int) -> None:
         nonlocal buffered
         crops = torch.cat(buffer)
-        embeddings = encoder.encode_images(crops[:limit])
+        embeddings = encode(crops[:limit])
         buffer[:] = [crops[limit:]] if len(crops) > limit else []
         buffered = len(crops) - len(embeddings)
         while len(embeddings):
