@@ -194,7 +194,7 @@ def test_threads_get_their_own_patches(clip_folder):
 def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_folder):
     encoder = ClipEncoder(siglip_folder, "tiny siglip")
     assert not encoder.reads_patches
-    with pytest.raises(ModelError, match="--features.crop-tokens class"):
+    with pytest.raises(ModelError, match=r"--features\.crop-tokens class"):
         encoder.encode_patches(_images(1, 32))
 
 

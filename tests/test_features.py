@@ -204,10 +204,15 @@ def test_a_cached_map_of_patches_that_does_not_fit_is_told(scene, tmp_path):
     for patches in (None, torch.zeros(3, 3, 4), torch.full((8, 12, 4), torch.nan), torch.zeros(8, 12)):
         changed = {name: value for name, value in tensors.items() if name != "patches"}
         save_file(changed if patches is None else {**changed, "patches": patches}, path, metadata)
-        with pytest.raises(FileFormatError, match="cached features"):
-            for name in maps:
-                maps.forget()
+        maps.forget()
+        refused = []
+        for name in maps:
+            try:
                 _ = maps[name]
+            except FileFormatError as error:
+                refused.append(str(error))
+        assert len(refused) == 1
+        assert "cached features" in refused[0]
 
 
 def test_maps_are_unit_length_and_without_dino_have_none(scene, tmp_path):

@@ -125,7 +125,9 @@ def patch_positions(level: CropLevel, width: int, height: int, side: int) -> tor
     return F.normalize(torch.tensor(rows), dim=-1).reshape(len(level), side * side, 3)
 
 
-@pytest.mark.parametrize("size, stride, side", [(0.2, 0.5, 6), (0.2, 1.0, 2), (0.5, 0.35, 6), (0.4, 0.5, 1)])
+@pytest.mark.parametrize(
+    ("size", "stride", "side"), [(0.2, 0.5, 6), (0.2, 1.0, 2), (0.5, 0.35, 6), (0.4, 0.5, 1)]
+)
 def test_every_patch_speaks_where_it_lies(size, stride, side):
     width, height, cols, rows = 160, 120, 64, 48
     (level,) = grid_levels(width, height, [size], [stride])

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.averaging import features_of_codes
 from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.evaluation import EvaluationConfig
 from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
-from lexsplat.pipeline import make_field
+from lexsplat.pipeline import average, make_field
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import QueryForm
 from lexsplat.scenes.prompt_lists import PromptList
@@ -45,9 +46,15 @@ COLUMNS = (
 
 
 def variants_of(method: str) -> tuple[str, ...]:
-    """The variants that make a difference for a method: a lifted field has no u_G to train and no MLP."""
-    without = {"lifted": "embedding", "trained": "lifting"}.get(method)
-    return tuple(name for name, changes in VARIANTS.items() if without not in changes)
+    """The variants that make a difference for a method: a lifted field has no u_G to train and no MLP, averaged
+    features are quantized by k-means alone.
+    """
+    without = {
+        "averaged": {"codebook", "embedding", "lifting"},
+        "lifted": {"embedding"},
+        "trained": {"lifting"},
+    }
+    return tuple(name for name, changes in VARIANTS.items() if not without.get(method, set()) & set(changes))
 
 
 def with_wrong_labels(
@@ -116,8 +123,8 @@ def ablate(
         config: Settings of the full method; ``config.seed`` is the seed of the Gaussians.
         seeds: Seeds of codebook and language.
         variants: Names out of `VARIANTS`; none takes those that make a difference for the method.
-        methods: "trained", "lifted", "lifted+tuned"; none takes that of the settings. Rows of several are called
-            "METHOD: VARIANT".
+        methods: "averaged", "trained", "lifted", "lifted+tuned"; none takes that of the settings. Rows of several are
+            called "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
         forms: How codes and text are compared, each beside the others: "feature" as in the paper, "code". Names of
             rows end in the form where there are several.
@@ -184,17 +191,33 @@ def paper_evaluation() -> EvaluationConfig:
 def make_language(
     bench: Bench, config: BuildConfig, wrong_labels: float = 0.0
 ) -> tuple[LanguageField, dict[str, float]]:
-    """A language field by the settings, with the seconds of its stages."""
-    codebook, code_maps, fit_seconds = bench.codebook(config.codebook, config.seed)
+    """A language field by the settings, with the seconds of its stages.
+
+    Wrong labels reach averaged features as the features of the wrong codes.
+    """
     cameras = {name: bench.scene.views[name].camera for name in bench.scene.train_names}
+    if config.method == "averaged" and not wrong_labels:
+        start = time.perf_counter()
+        scratch = bench.folder.root / "checkpoints"
+        averaged = average(
+            bench.gaussians, cameras, bench.maps, config.within_memory(), scratch, bench.listener
+        )
+        return averaged, {"embed": time.perf_counter() - start}
+    codebook, code_maps, fit_seconds = bench.codebook(config.codebook, config.seed)
     if wrong_labels:
         code_maps = with_wrong_labels(code_maps, wrong_labels, codebook.num_codes, config.seed)
     start = time.perf_counter()
     bounded = config.within_memory()
+    if config.method == "averaged":
+        said = features_of_codes(code_maps, codebook)
+        averaged = average(bench.gaussians, cameras, said, bounded, None, bench.listener)
+        return averaged, {"codebook": fit_seconds, "embed": time.perf_counter() - start}
     field = make_field(bench.gaussians, cameras, code_maps, codebook, bounded, bench.listener)
     return field, {"codebook": fit_seconds, "embed": time.perf_counter() - start}
 
 
 def language_settings(config: BuildConfig) -> list[Any]:
     """Everything a language depends on beside Gaussians, features and seed."""
-    return [config.method, config.codebook, config.embedding, config.lifting, config.tuning]
+    return [
+        config.method, config.codebook, config.averaging, config.embedding, config.lifting, config.tuning,
+    ]  # fmt: skip

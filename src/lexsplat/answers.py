@@ -169,6 +169,9 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
     config = record.get("config", {})
     stages = record["stages"]
+    codes = stages.get("codebook") or stages.get(
+        "embed", {}
+    )  # averaged features get theirs with the language
     facts: dict[str, Any] = {
         "scene": str(folder.root),
         "capture": record.get("capture"),
@@ -178,8 +181,8 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "finished": ", ".join(stages) or "nothing yet",
         "seconds": folder.stage_seconds(),
         "gaussians": stages.get("reconstruct", {}).get("gaussians"),
-        "codes": stages.get("codebook", {}).get("codes"),
-        "codes_used": stages.get("codebook", {}).get("codes_used"),
+        "codes": codes.get("codes"),
+        "codes_used": codes.get("codes_used"),
         "method": stages.get("embed", {}).get("method"),
         "weight_dropped": stages.get("embed", {}).get("dropped"),
         "clip": config.get("clip"),

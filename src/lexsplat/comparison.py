@@ -19,7 +19,7 @@ from lexsplat.progress import Listener, silent
 from lexsplat.queries import embed_prompts
 from lexsplat.scenes.prompt_lists import PromptList
 
-OURS = ("lifted", "trained", "lifted+tuned")
+OURS = ("averaged", "lifted", "trained", "lifted+tuned")
 """Our fields; with "-feature" behind, answered in the paper's form of relevancy."""
 
 BASELINES = ("dff", "lerf", "3dovs", "nearest")
@@ -35,7 +35,7 @@ def compare(
     output: Path,
     config: BuildConfig,
     *,
-    methods: Sequence[str] = ("lifted", "trained-feature", *BASELINES),
+    methods: Sequence[str] = ("averaged", "lifted", "trained-feature", *BASELINES),
     seeds: Sequence[int] = (0,),
     lpips: bool = True,
     masks: Path | None = None,

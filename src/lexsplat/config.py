@@ -6,8 +6,9 @@ import math
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from lexsplat.averaging import AveragingConfig
 from lexsplat.codebook import CodebookConfig
 from lexsplat.embedding import EmbeddingConfig
 from lexsplat.errors import BackendError
@@ -29,7 +30,7 @@ CUDA_ITERATIONS = 30_000
 """Reconstruction steps on CUDA when none are given: the paper's number."""
 
 
-LanguageMethod = Literal["trained", "lifted", "lifted+tuned"]
+LanguageMethod = Literal["averaged", "trained", "lifted", "lifted+tuned"]
 """Ways from index maps to language on the Gaussians."""
 
 
@@ -55,9 +56,9 @@ class BuildConfig:
         test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
         up: Direction away from the ground in the cameras' axes, as "x,y,z"; none takes it from how the cameras were
             held.
-        method: "lifted" computes each Gaussian's language directly in one pass: better, and 20 to 40 times
-            faster, in our measurements (docs/results.md). "trained" is the paper's optimisation, "lifted+tuned"
-            starts the paper's field from the lifted one.
+        method: "averaged" puts the features of all views on each Gaussian and quantizes them there: the best by our
+            measurements (docs/results.md). "lifted" computes each Gaussian's codes from those of the views, as fast.
+            "trained" is the paper's optimisation, "lifted+tuned" starts the paper's field from the lifted one.
         joint: Train language together with geometry from the first step, as the authors' code does (with
             method "trained"; its steps are then those of the reconstruction).
         poses: Structure from motion, for photos without cameras and videos.
@@ -65,8 +66,9 @@ class BuildConfig:
         features: Dense CLIP and DINO features. What is left at its default takes the value that suits the encoder and
             the device; `scene.json` has the values that were taken.
         codebook: Quantization.
+        averaging: Features of all views on the Gaussians, and codes for them.
         embedding: Training of the language field.
-        lifting: Computing the language field directly.
+        lifting: Computing the language field from the codes of the views.
         tuning: From the lifted field to the paper's form.
 
     Raises:
@@ -85,12 +87,13 @@ class BuildConfig:
     frames: int = DEFAULT_FRAMES
     test_every: int = 8
     up: str | None = None
-    method: LanguageMethod = "lifted"
+    method: LanguageMethod = "averaged"
     joint: bool = False
     poses: PoseConfig = field(default_factory=PoseConfig)
     reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     codebook: CodebookConfig = field(default_factory=CodebookConfig)
+    averaging: AveragingConfig = field(default_factory=AveragingConfig)
     embedding: EmbeddingConfig = field(default_factory=EmbeddingConfig)
     lifting: LiftingConfig = field(default_factory=LiftingConfig)
     tuning: TuningConfig = field(default_factory=TuningConfig)
@@ -127,6 +130,9 @@ class BuildConfig:
             reconstruction=replace(self.reconstruction, image_memory=photos),
             features=replace(self.features, memory=whole),
             embedding=replace(self.embedding, memory_bytes=projections),
+            averaging=replace(
+                self.averaging, memory_bytes=max(1, min(self.averaging.memory_bytes, whole // 4))
+            ),
             lifting=replace(self.lifting, memory_bytes=histogram),
         )
 
@@ -138,13 +144,25 @@ class BuildConfig:
         kept = {
             "reconstruction": {"image_memory": ReconstructionConfig.image_memory},
             "embedding": {"memory_bytes": EmbeddingConfig.memory_bytes},
+            "averaging": {"memory_bytes": AveragingConfig.memory_bytes},
             "lifting": {"memory_bytes": LiftingConfig.memory_bytes},
         }
         parts = {name: replace(getattr(self, name), **fields) for name, fields in kept.items()}
-        if self.method == "lifted":
-            parts |= {"embedding": EmbeddingConfig(), "tuning": TuningConfig()}
-        if self.method == "trained":
-            parts |= {"lifting": LiftingConfig(), "tuning": TuningConfig()}
+        unused: dict[str, dict[str, Any]] = {
+            "averaged": {
+                "embedding": EmbeddingConfig(),
+                "lifting": LiftingConfig(),
+                "tuning": TuningConfig(),
+            },
+            "lifted": {
+                "averaging": AveragingConfig(),
+                "embedding": EmbeddingConfig(),
+                "tuning": TuningConfig(),
+            },
+            "trained": {"averaging": AveragingConfig(), "lifting": LiftingConfig(), "tuning": TuningConfig()},
+            "lifted+tuned": {"averaging": AveragingConfig()},
+        }
+        parts |= unused[self.method]
         return replace(self, features=self.features.decisive(use_dino=self.dino != "none"), **parts)
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:

@@ -110,8 +110,10 @@ class Bench:
     ) -> None:
         check_truth_wishes(capture, masks, prompt_list)
         self.output, self.listener = output, listener
+        # Other methods than the settings' may be measured: features are made with everything that any of them uses.
+        everything = replace(config, method="trained") if config.method == "averaged" else config
         self.folder: SceneFolder = build(
-            capture, output / "scene", config, until="features", listener=listener
+            capture, output / "scene", everything, until="features", listener=listener
         )
         self.device = choose_device(config.device)
         self.scene, resolved = self._load_scene(config)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from lexsplat import budget
+from lexsplat.averaging import average_features, field_from_means
 from lexsplat.cameras import Camera
 from lexsplat.captures import load_capture
 from lexsplat.checkpoints import Checkpoint
@@ -120,11 +121,12 @@ class _Builder:
     def run(self, until: str) -> SceneFolder:
         capture_hash = write_provenance(self.folder, self.scene, self.config)
         config, folder = self.config.decisive(), self.folder
-        models = [model_identity(config.clip, "clip"), model_identity(config.dino, "dino")]
+        dino = config.dino if self.needs_dino else "none"
+        models = [model_identity(config.clip, "clip"), model_identity(dino, "dino")]
         features: list[Any] = [capture_hash, config.features, models]
         if config.features_from is not None:
             features = [capture_hash, external_identity(config.features_from, self.scene), models[0]]
-        language = [config.method, config.embedding, config.lifting, config.tuning]
+        language = [config.method, config.averaging, config.embedding, config.lifting, config.tuning]
         # What each stage is made from (a stage's name stands for all of its inputs), what it does, what it writes.
         stages: dict[str, tuple[list[Any], Callable[[], dict[str, Any]], list[Path]]] = {
             "reconstruct": (
@@ -148,6 +150,10 @@ class _Builder:
             content = file_hash(existing_splats(self.splats))
             stages["reconstruct"] = ([capture_hash, content], self._take_splats, [folder.gaussians_path])
         order: tuple[str, ...] = STAGES
+        if config.method == "averaged":  # finds its codes among the Gaussians, not in the views
+            inputs = ["reconstruct", "features", config.codebook, language, config.seed]
+            stages["embed"] = (inputs, self._average, [folder.language_path])
+            order = ("reconstruct", "features", "embed")
         if config.joint:  # language needs its codes before geometry is trained
             if self.splats is not None:
                 raise ValueError("joint training makes its own Gaussians: leave --splats out")
@@ -156,10 +162,11 @@ class _Builder:
             stages["reconstruct"] = (inputs, self._train_jointly, [*outputs, self._joint_path])
             stages["embed"] = (["reconstruct", language], self._take_joint_language, [folder.language_path])
             order = ("features", "codebook", "reconstruct", "embed")
+        until = until if until in order else "features"
         wanted = order[: order.index(until) + 1]
         if "features" in wanted and not folder.is_finished("features", fingerprint(stages["features"][0])):
             model_folder(config.clip, "clip")  # a missing model is told now, not after the reconstruction
-            if config.dino != "none" and config.features_from is None:
+            if dino != "none" and config.features_from is None:
                 model_folder(config.dino, "dino")
         for name in wanted:
             inputs, work, outputs = stages[name]
@@ -288,11 +295,33 @@ class _Builder:
         dropped = {"dropped": round(field.dropped, 6)} if isinstance(field, LiftedField) else {}
         return {"method": field.method, **dropped}
 
+    def _average(self) -> dict[str, Any]:
+        gaussians = self.folder.read_gaussians().to(self.device)
+        cameras = {name: self.scene.views[name].camera for name in self.scene.train_names}
+        maps = self._feature_maps()
+        scratch = self.folder.root / "checkpoints"
+        field = average(gaussians, cameras, maps, self.bounded, scratch, self.listener)
+        metadata = {**field.metadata(), "reconstruction": self.made_from["reconstruct"]}
+        write_tensors(self.folder.language_path, field.tensors(), metadata)
+        usage = code_usage([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
+        return {
+            "method": field.method,
+            "codes": field.codebook.num_codes,
+            "codes_used": usage.used,
+            "perplexity": round(usage.perplexity, 2),
+        }
+
     # -- what stages share
 
+    @property
+    def needs_dino(self) -> bool:
+        """Whether the language is made of dense features too."""
+        return self.config.method != "averaged"
+
     def _feature_maps(self) -> FeatureMaps:
+        config = self.config if self.needs_dino else replace(self.config, dino="none")
         maps, self.clip_hash = feature_maps(
-            self.scene, self.config, self.folder.features_path, self.device, self.listener
+            self.scene, config, self.folder.features_path, self.device, self.listener
         )
         return maps
 
@@ -383,6 +412,19 @@ def feature_maps(
     return without_masked_cells(maps, scene), clip.content_hash
 
 
+def average(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Any],
+    maps: Mapping[str, Any],
+    config: BuildConfig,
+    scratch: Path | None = None,
+    listener: Listener = silent,
+) -> LiftedField:
+    """The language field of method "averaged": features on the Gaussians first, codes afterwards."""
+    found = average_features(gaussians, cameras, maps, config.averaging, scratch=scratch, listener=listener)
+    return field_from_means(found, config.codebook, config.averaging, seed=config.seed)
+
+
 def make_field(
     gaussians: Gaussians,
     cameras: Mapping[str, Any],
@@ -392,7 +434,7 @@ def make_field(
     listener: Listener = silent,
     checkpoint: Checkpoint | None = None,
 ) -> LanguageField:
-    """The language field by the method the settings name."""
+    """The language field by the method the settings name, one that learns from the codes of the views."""
     if config.method == "trained":
         return train_field(
             gaussians, cameras, code_maps, codebook, config.embedding,

@@ -45,11 +45,11 @@ class Compare:
     output: Path
     methods: tuple[
         Literal[
-            "lifted", "lifted-feature", "trained", "trained-feature", "lifted+tuned", "lifted+tuned-feature",
-            "dff", "lerf", "3dovs", "nearest",
+            "averaged", "averaged-feature", "lifted", "lifted-feature", "trained", "trained-feature",
+            "lifted+tuned", "lifted+tuned-feature", "dff", "lerf", "3dovs", "nearest",
         ],
         ...,
-    ] = ("lifted", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
+    ] = ("averaged", "lifted", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
     seeds: tuple[int, ...] = (0,)
     masks: Path | None = None
     prompt_list: PromptListName | None = None

@@ -64,8 +64,9 @@ class FeatureConfig:
         crop_sizes: Grid: sides of the crops as fractions of the image's short side.
         crop_strides: Grid: distance between crops of each size, as a fraction of their side; the overlap is
             the rest.
-        crop_tokens: Grid: what of a crop speaks for a place. "class", the whole of it at its middle (the paper); "patch",
-            each of its patches where it lies, read as in MaskCLIP; "both". Patches need a model of CLIP's architecture.
+        crop_tokens: Grid: what of a crop speaks for a place. "class", the whole of it at its middle (the paper);
+            "patch", each of its patches where it lies, read as in MaskCLIP, which needs a model of CLIP's own
+            architecture; "both". None is "class", but "both" for the encoders that ship.
         random_crops: Random: crops of a view, shared out evenly over the sizes.
         random_levels: Random: number of sizes.
         random_sizes: Random: smallest and largest side as fractions of the image's short side.
@@ -86,7 +87,7 @@ class FeatureConfig:
     mode: Literal["grid", "random"] = "grid"
     crop_sizes: tuple[float, ...] = (0.05, 0.125, 0.2, 0.275, 0.35, 0.425, 0.5)
     crop_strides: tuple[float, ...] = (1.0, 0.625, 0.5, 0.5, 0.5, 0.5, 0.5)
-    crop_tokens: Tokens = "class"
+    crop_tokens: Tokens | None = None
     random_crops: int = 3000
     random_levels: int = 20
     random_sizes: tuple[float, float] = (0.05, 0.2)
@@ -111,9 +112,9 @@ class FeatureConfig:
             raise ValueError("crop sizes and strides must be positive")
         if not 0 < self.random_sizes[0] <= self.random_sizes[1]:
             raise ValueError(f"random_sizes must be positive and in order, got {self.random_sizes}")
-        if self.crop_tokens not in ("class", "patch", "both"):
+        if self.crop_tokens not in (None, "class", "patch", "both"):
             raise ValueError(f"crop_tokens must be 'class', 'patch' or 'both', got {self.crop_tokens!r}")
-        if self.crop_tokens != "class" and self.mode != "grid":
+        if self.tokens != "class" and self.mode != "grid":
             raise ValueError(f"crop_tokens={self.crop_tokens} needs mode=grid, random crops speak as wholes")
         if self.dino_facet not in ("key", "token"):
             raise ValueError(f"dino_facet must be 'key' or 'token', got {self.dino_facet!r}")
@@ -121,6 +122,11 @@ class FeatureConfig:
         for name in (*sizes, "random_crops", "random_levels", "memory"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+    @property
+    def tokens(self) -> Tokens:
+        """What of a crop speaks."""
+        return self.crop_tokens or "class"
 
     @classmethod
     def sparse(cls) -> FeatureConfig:
@@ -133,7 +139,8 @@ class FeatureConfig:
         return cls(
             crop_sizes=(18 / 240, 44 / 240),
             crop_strides=(0.5, 0.35),
-            map_cells=60,
+            crop_tokens="both",
+            map_cells=120,
             max_short_side=360,
             dino_short_side=320,
             dino_stride=8,
@@ -144,6 +151,8 @@ class FeatureConfig:
 
         Sizes and strides of the grid are one thing: they must have the same length.
         """
+        if self.mode == "random":  # whose crops speak as wholes
+            suited = dataclasses.replace(suited, crop_tokens=None)
         usual = FeatureConfig()
         given = {name for name in dataclasses.asdict(self) if getattr(self, name) != getattr(usual, name)}
         if given & {"crop_sizes", "crop_strides"}:
@@ -154,6 +163,8 @@ class FeatureConfig:
         """The same with those at their defaults that decide nothing: memory, the other mode's, an unused DINO's."""
         usual = FeatureConfig()
         unused = {"memory", *(_RANDOM if self.mode == "grid" else _GRID)}
+        if self.tokens == "class":
+            unused.add("crop_tokens")
         if not use_dino:
             unused |= {name for name in dataclasses.asdict(self) if name.startswith("dino_")}
         return dataclasses.replace(self, **{name: getattr(usual, name) for name in unused})
@@ -215,7 +226,7 @@ def extract_features(
         entry = entries[name]
         cols, rows = entry.map_size
         grid = None if entry.dino is None else read_grid(entry.dino, cols, rows)
-        return FeatureMap(read_crops(entry.clip, cols, rows, config.crop_tokens), grid)
+        return FeatureMap(read_crops(entry.clip, cols, rows, config.tokens), grid)
 
     return FeatureMaps(list(entries), load, config.memory // 4)
 
@@ -266,7 +277,8 @@ class _Entry:
         settings = dataclasses.asdict(config)
         crops = {name: settings[name] for name in ("mode", *(_GRID if config.mode == "grid" else _RANDOM))}
         dense = {name: settings[name] for name in settings if name.startswith("dino_")}
-        if crops.pop("crop_tokens", "class") != "class":  # what patches say is stored as a map of this size
+        crops.pop("crop_tokens", None)
+        if config.tokens != "class":  # what patches say is stored as a map of this size
             crops["patches"] = map_size
         clip_key = hash_of("clip", clip.content_hash, crops, pixels)
         dino_path = None
@@ -353,7 +365,7 @@ class _Extraction:
 
     def _encode(self, crops: Tensor) -> Tensor:
         """Crops to their embeddings ``[b, D]``, or with those of their patches after them ``[b, 1 + P * P, D]``."""
-        if self.config.crop_tokens == "class":
+        if self.config.tokens == "class":
             return self.clip.encode_images(crops)
         whole, patches = self.clip.encode_patches(crops)
         return torch.cat([whole[:, None], patches.flatten(1, 2)], 1)

@@ -156,7 +156,7 @@ def dense_map(
 def mean_map(
     levels: Sequence[CropLevel], embeddings: Tensor, width: int, height: int, cols: int, rows: int
 ) -> Tensor:
-    """Average of the embeddings that speak for each cell: each level gives a map, and those that reach it count alike.
+    """Average of the embeddings that speak for each cell: each level gives a map, those that reach it count alike.
 
     Args:
         levels: Crops by size.
