@@ -187,8 +187,8 @@ def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
 
 
 def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int], Tensor | None]:
-    """Levels, embeddings ``[n, D]`` float32, width and height of the image, and the map of patches ``[h, w, D]`` (float32)
-    if there is one; checked against each other.
+    """Levels, embeddings ``[n, D]`` float32, width and height of the image, and the map of patches ``[h, w, D]``
+    float32 if there is one; checked against each other.
     """
     tensors, facts = _read(path)
     try:
