@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parent.parent / "src" / "lexsplat"
 ORDER = """
     errors budget machine atomic tensor_files threads progress checkpoints divergence metrics cameras boxes world
     scenes gaussians rendering moving image_losses training_images optimizers exposures densification
-    reconstruction features codebook language_field losses embedding joint lifting masking queries thresholds
-    selection presence truth picking phrases relations heatmaps baselines evaluation report formats
+    reconstruction features codebook language_field losses embedding joint lifting averaging masking queries
+    thresholds selection presence truth picking phrases relations heatmaps baselines evaluation report formats
     scene_folder previous_scene config captures search scaling editing exporting provenance pipeline experiments
     ablation comparison answers viewer demo progress_bars cli __init__ __main__
 """.split()  # noqa: SIM905  (thirty quoted names would not read as a list)

@@ -27,13 +27,24 @@ def modified(folder: Path) -> dict[str, int]:
 
 def test_build_writes_the_scene_folder_of_the_design(built):
     names = {p.name for p in built.iterdir()}
-    assert {"scene.json", "cameras.json", "gaussians.ply", "language.safetensors", "codes"} <= names
+    assert {"scene.json", "cameras.json", "gaussians.ply", "language.safetensors"} <= names
     record = json.loads((built / "scene.json").read_text())
-    assert list(record["stages"]) == ["reconstruct", "features", "codebook", "embed"]
+    assert list(record["stages"]) == ["reconstruct", "features", "embed"]
+    assert record["stages"]["embed"]["codes"] == 16
     views = json.loads((built / "cameras.json").read_text())["views"]
     held_out = [v["name"] for v in views if v["split"] == "test"]
     assert held_out == ["view_02.png", "view_06.png", "view_10.png"], "views with masks are held out"
-    codes = {p.stem for p in (built / "codes").iterdir()}
+    assert not list((built / "checkpoints" / "features").glob("*.dino.*")), "averaged features need no DINO"
+
+
+def test_a_language_made_of_codes_of_the_views_leaves_their_index_maps(built, tiny_capture, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(built, copy)
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "lifted"]) == 0
+    record = json.loads((copy / "scene.json").read_text())
+    assert set(record["stages"]) == {"reconstruct", "features", "codebook", "embed"}
+    assert list((copy / "checkpoints" / "features").glob("*.dino.*"))
+    codes = {p.stem for p in (copy / "codes").iterdir()}
     assert codes.isdisjoint({"view_02", "view_06", "view_10"}), "held-out views take no part in the codebook"
     assert len(codes) == 9
 
@@ -50,18 +61,20 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
     copy = tmp_path / "copy"
     shutil.copytree(built, copy)
     before = modified(copy)
-    # The scene is lifted: nothing of a training, nor how much is kept in memory, has a part in it.
-    idle = ["--embedding.no-use-smoothing", "--tuning.iterations", "9", "--lifting.memory-bytes", "999999"]
+    # Features are averaged: no other way to the language, nor how much is kept in memory, has a part in it.
+    idle = ["--embedding.no-use-smoothing", "--tuning.iterations", "9", "--averaging.memory-bytes", "999999"]
+    idle += ["--lifting.top", "3", "--features.dino-stride", "9"]
     idle += ["--features.random-crops", "7", "--reconstruction.image-memory", "999999", "--memory", "3GB"]
     assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, *idle]) == 0
     after = modified(copy)
     assert {name for name in before if after[name] != before[name]} <= {"scene.json", "cameras.json", ".lock"}
-    arguments = [*QUICK, "--lifting.top", "3"]
+    arguments = [*QUICK, "--averaging.top", "3"]
     assert cli.main(["build", str(tiny_capture), "--output", str(copy), *arguments]) == 0
     after = modified(copy)
     assert after["language.safetensors"] != before["language.safetensors"]
-    for kept in ("gaussians.ply", "checkpoints/codebook.safetensors", "codes/view_01.png"):
-        assert after[kept] == before[kept], kept
+    for kept in before:
+        if kept.startswith("checkpoints/features/") or kept == "gaussians.ply":
+            assert after[kept] == before[kept], kept
 
 
 def test_other_encoders_under_the_name_embedded_make_features_anew(
@@ -77,7 +90,7 @@ def test_other_encoders_under_the_name_embedded_make_features_anew(
     before = modified(copy)
     assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK]) == 0
     after = modified(copy)
-    assert after["checkpoints/codebook.safetensors"] != before["checkpoints/codebook.safetensors"]
+    assert after["language.safetensors"] != before["language.safetensors"]
     assert after["gaussians.ply"] == before["gaussians.ply"]
     assert cli.main(["query", str(copy), "red ball", "--json"]) == 0
 
@@ -243,7 +256,16 @@ def test_an_unknown_model_says_the_three_ways_to_get_one(tiny_capture, tmp_path,
         capsys, [*arguments, "--clip", "nobody/nothing"], "nobody/nothing", "embedded", "folder"
     )
     assert not (output / "language.safetensors").exists()
-    arguments = ["build", *arguments[1:], "--clip", "embedded", "--dino", "nobody/nothing"]
+    arguments = [
+        "build",
+        *arguments[1:],
+        "--clip",
+        "embedded",
+        "--dino",
+        "nobody/nothing",
+        "--method",
+        "lifted",
+    ]
     fails_in_one_line(capsys, arguments, "nobody/nothing", "--dino embedded")
     assert not (output / "gaussians.ply").exists(), "it is told before the long part"
 

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lexsplat.averaging import AveragingConfig
 from lexsplat.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import EmbeddingConfig
 from lexsplat.errors import BackendError
@@ -59,7 +60,8 @@ def test_features_suit_the_encoder_and_the_device():
 @pytest.mark.parametrize(("clip", "suited"), [("embedded", "embedded"), ("some/clip", "sparse")])
 def test_one_setting_of_the_features_leaves_the_others_as_they_suit(clip, suited):
     suited = getattr(FeatureConfig, suited)()
-    for change in ({"dino_facet": "token"}, {"mode": "random"}, {"map_cells": 9}, {"seed": 3}):
+    random = {"mode": "random", "crop_tokens": None}  # whose crops speak as wholes
+    for change in ({"dino_facet": "token"}, random, {"map_cells": 9}, {"seed": 3}, {"crop_tokens": "class"}):
         config = BuildConfig(clip=clip, features=FeatureConfig(**change)).resolved("cpu", (10, 10))
         assert config.features == replace(suited, **change)
         assert config.resolved("cpu", (10, 10)) == config
@@ -84,19 +86,27 @@ def test_fingerprints_hold_what_decides_a_result_and_nothing_else():
         replace(config, features=FeatureConfig(random_crops=9)),
         replace(config, embedding=EmbeddingConfig(iterations=9)),
         replace(config, tuning=TuningConfig(iterations=9)),
-        replace(config, lifting=LiftingConfig(memory_bytes=9)),
+        replace(config, lifting=LiftingConfig(top=3)),
+        replace(config, averaging=AveragingConfig(memory_bytes=9)),
+        replace(config, features=FeatureConfig(dino_stride=9)),
+        replace(config, features=FeatureConfig(crop_tokens="class")),
     ]
     assert all(other.decisive() == config.decisive() for other in idle)
     touched = [
         replace(config, features=FeatureConfig(map_cells=9)),
-        replace(config, features=FeatureConfig(dino_stride=9)),
+        replace(config, features=FeatureConfig(crop_tokens="both")),
         replace(config, features=FeatureConfig(mode="random")),
-        replace(config, lifting=LiftingConfig(top=3)),
+        replace(config, averaging=AveragingConfig(top=3)),
         replace(config, method="lifted+tuned"),
     ]
     assert all(other.decisive() != config.decisive() for other in touched)
     random = replace(config, features=FeatureConfig(mode="random", random_crops=9))
     assert random.decisive() != replace(random, features=FeatureConfig(mode="random")).decisive()
+    lifted = replace(config, method="lifted")
+    assert replace(lifted, averaging=AveragingConfig(top=3)).decisive() == lifted.decisive()
+    assert replace(lifted, lifting=LiftingConfig(top=3)).decisive() != lifted.decisive()
+    assert replace(lifted, lifting=LiftingConfig(memory_bytes=9)).decisive() == lifted.decisive()
+    assert replace(lifted, features=FeatureConfig(dino_stride=9)).decisive() != lifted.decisive()
     trained = replace(config, method="trained")
     assert replace(trained, lifting=LiftingConfig(top=3)).decisive() == trained.decisive()
     longer = replace(trained, embedding=EmbeddingConfig(iterations=9))
@@ -104,7 +114,7 @@ def test_fingerprints_hold_what_decides_a_result_and_nothing_else():
     both = replace(config, method="lifted+tuned")
     for part in ({"lifting": LiftingConfig(top=3)}, {"tuning": TuningConfig(iterations=9)}):
         assert replace(both, **part).decisive() != both.decisive()
-    plain = replace(config, dino="none")
+    plain = replace(lifted, dino="none")
     assert replace(plain, features=FeatureConfig(dino_stride=9)).decisive() == plain.decisive()
 
 

@@ -644,8 +644,8 @@ def test_embedded_settings_with_the_embedded_encoders_find_the_red_half(tmp_path
         scene, clip, load_dino("embedded"), FeatureConfig.embedded(), cache_dir=tmp_path / "c"
     )
     found = maps["a.png"]
-    assert found.clip.shape == (60, 80, 128)
-    assert found.dino.shape == (60, 80, 128)
+    assert found.clip.shape == (120, 160, 128)
+    assert found.dino.shape == (120, 160, 128)
     red, blue = clip.encode_text(["something red", "something blue"])
     reddish = found.clip @ (red - blue)
-    assert reddish[:, :36].min() > 0 > reddish[:, 44:].max()
+    assert reddish[:, :72].min() > 0 > reddish[:, 88:].max()

@@ -110,12 +110,14 @@ def test_memory_bounds_the_store_of_every_stage_and_no_setting_that_decides_a_re
     assert bounded.reconstruction.image_memory == quarter
     assert bounded.embedding.memory_bytes == quarter
     assert bounded.lifting.memory_bytes == quarter
+    assert bounded.averaging.memory_bytes == quarter
     assert bounded.features.memory == 4 * quarter
     again = replace(
         bounded,
         reconstruction=config.reconstruction,
         embedding=config.embedding,
         lifting=config.lifting,
+        averaging=config.averaging,
         features=config.features,
     )
     assert again == config

@@ -186,7 +186,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "method": stages.get("embed", {}).get("method"),
         "weight_dropped": stages.get("embed", {}).get("dropped"),
         "clip": config.get("clip"),
-        "dino": config.get("dino"),
+        "dino": config.get("dino") if stages.get("embed", {}).get("method") != "averaged" else None,
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         "language_bytes": folder.bytes_on_disk(folder.language_path),
         "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),

@@ -163,7 +163,12 @@ class BuildConfig:
             "lifted+tuned": {"averaging": AveragingConfig()},
         }
         parts |= unused[self.method]
-        return replace(self, features=self.features.decisive(use_dino=self.dino != "none"), **parts)
+        return replace(self, features=self.features.decisive(use_dino=self.uses_dino), **parts)
+
+    @property
+    def uses_dino(self) -> bool:
+        """Whether the language is made of dense features too: averaged features are quantized without."""
+        return self.dino != "none" and self.method != "averaged"
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
         """The same settings with nothing left open.

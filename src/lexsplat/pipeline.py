@@ -121,7 +121,7 @@ class _Builder:
     def run(self, until: str) -> SceneFolder:
         capture_hash = write_provenance(self.folder, self.scene, self.config)
         config, folder = self.config.decisive(), self.folder
-        dino = config.dino if self.needs_dino else "none"
+        dino = config.dino if config.uses_dino else "none"
         models = [model_identity(config.clip, "clip"), model_identity(dino, "dino")]
         features: list[Any] = [capture_hash, config.features, models]
         if config.features_from is not None:
@@ -313,13 +313,8 @@ class _Builder:
 
     # -- what stages share
 
-    @property
-    def needs_dino(self) -> bool:
-        """Whether the language is made of dense features too."""
-        return self.config.method != "averaged"
-
     def _feature_maps(self) -> FeatureMaps:
-        config = self.config if self.needs_dino else replace(self.config, dino="none")
+        config = self.config if self.config.uses_dino else replace(self.config, dino="none")
         maps, self.clip_hash = feature_maps(
             self.scene, config, self.folder.features_path, self.device, self.listener
         )
