@@ -15,6 +15,7 @@ from PIL import Image
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 SCENES = Path(str(resources.files("lexsplat"))) / "demo" / "scenes"
+CLIP = Path(str(resources.files("lexsplat"))) / "demo" / "encoders" / "clip"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -325,3 +326,286 @@ def test_what_a_part_lies_beside_can_be_said_not_to_show_it():
     assert strict.of(handle, crops).ravel().tolist() == [FALSE, FALSE, TRUE, OPEN], (
         "in the middle it stays open"
     )
+
+
+def handle_crop(scale=1, left=40.0, top=18.0, side=24.0):
+    """A crop of the mug with a handle in which every sample is a pixel."""
+    from crops import cut
+
+    frames = frames_with_a_handle(scale)
+    return frames, cut(frames.frames[0], left, top, side)
+
+
+def test_a_patch_of_a_crop_shows_what_lies_in_it_all_of_it_weighing_the_same():
+    from crops import patch_crop
+
+    _, crop = handle_crop()
+    # Third row, third column: x = 48 to 52, y = 26 to 30. The mug ends at x = 50, its handle begins there, at y = 27.
+    patch = patch_crop(crop, 14, 6)
+    assert patch.box == (48.0, 26.0, 4.0)
+    assert patch.grid.tolist() == [[0, 0, 2, 2], [0, 0, 1, 1], [0, 0, 1, 1], [0, 0, 1, 1]]
+    assert dict(zip(patch.codes.tolist(), patch.weights.tolist())) == {0: 8 / 16, 1: 6 / 16, 2: 2 / 16}
+    tiles = [[patch_crop(crop, row * 6 + column, 6).grid for column in range(6)] for row in range(6)]
+    np.testing.assert_array_equal(np.block(tiles), crop.grid)
+    with pytest.raises(ValueError, match="divisor of 24, found 7"):
+        patch_crop(crop, 0, 7)
+
+
+def test_where_nothing_is_weighs_in_a_patch_and_is_no_label():
+    from crops import Frame, cut, patch_crop
+
+    codes = np.full((24, 24), -1, np.int32)
+    codes[0, :3] = 5
+    crop = cut(Frame("scene", Image.new("RGB", (24, 24)), codes, np.zeros((24, 24), np.uint8)), 0, 0, 24)
+    first, second = (patch_crop(crop, number, 6) for number in (0, 1))
+    assert (first.codes.tolist(), first.weights.tolist()) == ([5], [3 / 16])
+    assert second.codes.size == second.weights.size == 0
+
+
+def test_a_patch_shows_what_half_of_it_is_and_not_what_an_eighth_of_it_is():
+    from crops import Crop
+    from truth import TruthTable
+    from words import FALSE, OPEN, TRUE, Label, Phrase
+
+    table = TruthTable(
+        [Label("ball", "green"), Label("mug", "red"), Label("table", "blue"), Label("ring", "gold")]
+    )
+
+    def patch(*sixteenths):
+        codes = np.array([code for code, count in enumerate(sixteenths) if count], np.int64)
+        weights = np.array([count / 16 for count in sixteenths if count])
+        return Crop(None, (0.0, 0.0, 1.0), codes, weights, np.zeros((4, 4), np.int32))
+
+    patches = [
+        patch(0, 8, 8),
+        patch(0, 7, 9),
+        patch(0, 3, 13),
+        patch(0, 2, 14),
+        patch(0, 0, 16),
+        patch(0, 0, 0),
+    ]
+    patches.append(patch(0, 0, 0, 16))  # gold may be called yellow: what is possible is not false
+    phrases = [Phrase("mug", kind="mug"), Phrase("blue", colour="blue"), Phrase("yellow", colour="yellow")]
+    assert table.at_places(phrases, patches).tolist() == [
+        [TRUE, TRUE, FALSE],
+        [OPEN, TRUE, FALSE],
+        [OPEN, TRUE, FALSE],
+        [FALSE, TRUE, FALSE],
+        [FALSE, TRUE, FALSE],
+        [FALSE, FALSE, FALSE],
+        [FALSE, FALSE, OPEN],
+    ]
+
+
+def place_questions():
+    from words import Phrase
+
+    return [
+        Phrase("mug handle", kind="mug", part="handle"), Phrase("mug", kind="mug"), Phrase("red", colour="red"),
+        Phrase("table", kind="table"),
+    ]  # fmt: skip
+
+
+def place_answers(frames, crops, seed=0, colourless=None, angles=None):
+    from train_clip import ClipTraining, place_truth
+    from truth import TruthTable
+
+    count = len(crops)
+    return place_truth(
+        place_questions(),
+        crops,
+        TruthTable(frames.labels),
+        np.zeros(count) if angles is None else angles,
+        np.zeros(count, bool) if colourless is None else np.array(colourless),
+        ClipTraining(dense=1.0),
+        np.random.default_rng(seed),
+    )
+
+
+def test_a_handle_is_asked_for_at_its_patches_and_is_false_at_the_patches_of_the_body():
+    from words import FALSE, OPEN, TRUE
+
+    # Four pixels for one: the handle fills patches of four pixels, as the body and the table do.
+    frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
+    assert np.unique(crop.grid).tolist() == [0, 1, 2]
+    answers = place_answers(frames, [crop] * 8)
+    assert answers.shape == (8, 36, 4)
+    whole = {0: [FALSE, TRUE, TRUE, FALSE], 1: [TRUE, TRUE, TRUE, FALSE], 2: [FALSE, FALSE, FALSE, TRUE]}
+    for row in answers:
+        asked = [number for number in range(36) if (row[number] != OPEN).any()]
+        assert 4 <= len(asked) <= 8
+        seen = set()
+        for number in asked:
+            (code,) = np.unique(crop.grid[number // 6 * 4 :, number % 6 * 4 :][:4, :4])
+            assert row[number].tolist() == whole[int(code)], number
+            seen.add(int(code))
+        assert seen == {0, 1, 2}, "all that the crop shows has its turn"
+    assert len({row.tobytes() for row in answers}) > 1, "not the same patches every time"
+
+
+def test_colours_are_not_asked_of_patches_of_crops_without_them():
+    from words import OPEN, TRUE
+
+    frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
+    coloured, grey = place_answers(frames, [crop, crop], colourless=[False, True])
+    assert (coloured[:, 2] == TRUE).any()
+    assert (grey[:, 2] == OPEN).all()
+    assert (grey[:, 1] == TRUE).any(), "kinds are asked"
+
+
+def test_a_patch_that_is_blue_is_not_told_to_be_no_bear_either():
+    from train_clip import ClipTraining, place_truth
+    from truth import TruthTable
+    from words import FALSE, OPEN, Phrase
+
+    frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
+    bear = [Phrase("bear", kind="teddy"), Phrase("ring", kind="ring")]
+    rng = np.random.default_rng(0)
+    answers = place_truth(
+        bear, [crop], TruthTable(frames.labels), np.zeros(1), np.zeros(1, bool), ClipTraining(dense=1.0), rng
+    )[0]
+    shown = crop.grid[2::4, 2::4].ravel()
+    asked = (answers != OPEN).any(1)
+    # The table is blue, and no ring is held out in blue; the mug is red, and a red ring is.
+    assert answers[asked & (shown == 2)].tolist() == [[OPEN, FALSE]] * int((asked & (shown == 2)).sum())
+    assert answers[asked & (shown != 2)].tolist() == [[FALSE, OPEN]] * int((asked & (shown != 2)).sum())
+    assert set(shown[asked]) == {0, 1, 2}
+
+
+def small_training(**settings):
+    from train_clip import ClipTraining
+
+    return ClipTraining(batch=12, width=64, layers=2, text_width=64, text_layers=1, dim=32, **settings)
+
+
+def batch_of(config, seed=0):
+    from train_clip import make_batch
+    from truth import TruthTable
+
+    frames = frames_with_a_handle(scale=4)
+    return make_batch(frames, TruthTable(frames.labels), config, np.random.default_rng(seed))
+
+
+def trainer_of(config, start=None):
+    from train_clip import Trainer
+    from transformers import CLIPTokenizer
+
+    return Trainer(CLIPTokenizer.from_pretrained(CLIP), config, start)
+
+
+def test_what_patches_of_a_mirrored_crop_are_asked_stays_on_them():
+    import torch
+    from train_clip import Batch, mirrored
+
+    config = small_training(dense=1.0)
+    # Each patch is of one brightness, which all that belongs to it repeats.
+    marks = torch.arange(8 * 36).reshape(8, 36) % 100
+    pixels = (
+        marks.unflatten(1, (1, 6, 6)).expand(-1, 3, -1, -1).repeat_interleave(8, 2).repeat_interleave(8, 3)
+    )
+    batch = Batch(
+        pixels=pixels.byte(),
+        texts=[],
+        corners=[],
+        truth=torch.empty(8, 0),
+        patches=marks[..., None].expand(-1, -1, 3),
+        left_out=marks[..., None].expand(-1, -1, 22) % 2 == 1,
+        places=marks[..., None].expand(-1, -1, 5).to(torch.int8),
+    )
+    seen, patches, left_out, places = mirrored(batch, config, torch.Generator().manual_seed(0))
+    now = seen[:, 0, 4::8, 4::8].flatten(1)
+    turned = (now != marks).any(1)
+    assert turned.any()
+    assert not turned.all()
+    assert torch.equal(patches, now[..., None].expand(-1, -1, 3).long())
+    assert torch.equal(left_out, now[..., None].expand(-1, -1, 22) % 2 == 1)
+    assert torch.equal(places, now[..., None].expand(-1, -1, 5).to(torch.int8))
+
+
+def test_only_the_last_phase_of_the_weights_that_ship_asks_patches():
+    from train_clip import PHASES, ClipTraining
+
+    assert ClipTraining().dense == 0
+    assert [name for name, config in PHASES.items() if config.dense] == ["dense"]
+    config = small_training()
+    batch = batch_of(config)
+    assert batch.places.shape == (12, 36, 0)
+    assert "dense" not in trainer_of(config).losses(batch)
+
+
+def test_what_patches_are_asked_reaches_the_image_tower_but_not_where_its_last_attention_looks():
+    config = small_training(dense=1.0)
+    trainer = trainer_of(config)
+    trainer.losses(batch_of(config))["dense"].backward()
+    tower = trainer.model.vision_model
+    first, last = tower.encoder.layers[0].self_attn, tower.encoder.layers[-1].self_attn
+    for module in (tower.embeddings.patch_embedding, first.q_proj, first.v_proj, last.v_proj, last.out_proj):
+        assert module.weight.grad.abs().max() > 0
+    assert trainer.model.text_model.embeddings.token_embedding.weight.grad.abs().max() > 0
+    # A patch is read by its own value: neither queries nor keys of the last attention have a part in that.
+    assert last.q_proj.weight.grad is None
+    assert last.k_proj.weight.grad is None
+    assert trainer.patch_heads.weight.grad is None
+
+
+def test_patches_that_are_not_asked_cost_nothing_and_right_answers_cost_less_than_wrong_ones():
+    import torch
+    from train_clip import dense_loss
+    from words import CANONICAL, FALSE, OPEN, TRUE
+
+    axes = torch.eye(8)
+    texts = torch.cat([axes[:2], axes[2].expand(len(CANONICAL), -1)])  # two phrases, all canonical ones alike
+    places = torch.full((1, 3, 2), OPEN)
+    places[0, 0], places[0, 1] = torch.tensor([TRUE, FALSE]), torch.tensor([FALSE, TRUE])
+
+    def cost(*patches):
+        return float(dense_loss(torch.stack(patches)[None], texts, places, torch.tensor(20.0), 10.0))
+
+    right = cost(axes[0], 3 * axes[1], axes[4])
+    assert right == cost(axes[0], axes[1], -axes[0]), "lengths and the third patch do not matter"
+    assert right < 0.01 + 2 * np.log(2) < cost(axes[1], axes[0], axes[4])
+    # By hand: contrast is as good as 0; relevancy is 10 for the right phrase, 0 for the wrong one.
+    assert right == pytest.approx(np.log1p(np.exp(-10)) + np.log(2), abs=1e-6)
+
+
+def test_what_training_reads_at_patches_is_what_the_encoder_reads_there(tmp_path, monkeypatch):
+    import torch
+    from train_clip import MEAN, STD, save
+
+    from lexsplat.features import pretrained
+    from lexsplat.features.clip import ClipEncoder
+
+    monkeypatch.setattr(pretrained, "_computes_in_bfloat16", lambda: False)
+    trainer = trainer_of(small_training(seed=3))
+    save(trainer, tmp_path)
+    images = torch.rand(4, 3, 48, 48, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(36, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        whole, _, said = trainer.see((images - MEAN) / STD, order.expand(4, -1))
+    wholes, patches = ClipEncoder(tmp_path, "made").encode_patches(images)
+    unit = torch.nn.functional.normalize
+    torch.testing.assert_close(unit(whole, dim=-1), wholes, atol=1e-5, rtol=0)
+    torch.testing.assert_close(unit(said, dim=-1), patches.flatten(1, 2)[:, order], atol=1e-5, rtol=0)
+    assert (patches.flatten(1, 2)[:, :1] - patches.flatten(1, 2)[:, 1:]).abs().amax(-1).min() > 1e-3, (
+        "they differ"
+    )
+
+
+def test_the_model_may_see_between_two_steps_without_a_trace():
+    import torch
+
+    config = small_training(dense=1.0, grey=0.0, turned=0.0)
+    batch = batch_of(config)
+
+    def dense(before):
+        trainer = trainer_of(config)
+        with torch.no_grad():
+            before(trainer.model)
+        return trainer.losses(batch)["dense"].item()
+
+    expected = dense(lambda model: None)
+    images = torch.zeros(2, 3, 48, 48)
+    assert dense(lambda model: model.get_image_features(pixel_values=images)) == expected
+    trainer = trainer_of(config)
+    trainer.losses(batch)
+    assert not trainer.model.vision_model.encoder.layers[-1].layer_norm1._forward_hooks

@@ -162,13 +162,21 @@ def cut(frame: Frame, left: float, top: float, side: float) -> Crop:
 
 
 def patch_crop(crop: Crop, patch: int, count: int) -> Crop:
-    """One of the ``count`` x ``count`` patches of a crop, everything in it weighing the same."""
+    """One of the patches of a crop as a crop of its own, everything in it weighing the same.
+
+    Args:
+        crop: A whole crop.
+        patch: Number of the patch, from left to right, then from top to bottom.
+        count: Patches along a side; divides ``GRID``.
+    """
+    if GRID % count:
+        raise ValueError(f"patches along a side: expected a divisor of {GRID}, found {count}")
     down, right = divmod(patch, count)
     side = GRID // count
     grid = crop.grid[down * side : (down + 1) * side, right * side : (right + 1) * side]
     seen, counts = np.unique(grid, return_counts=True)
     left, top, width = crop.box
-    box = left + right * width / count, top + down * width / count, width / count
+    box = (left + right * width / count, top + down * width / count, width / count)
     known = seen >= 0
     return Crop(crop.frame, box, seen[known].astype(np.int64), counts[known] / grid.size, grid)
 

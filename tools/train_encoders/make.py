@@ -101,10 +101,11 @@ def main() -> None:
     parser.add_argument(
         "--phases",
         nargs="+",
-        choices=("first", "refine", "parts", "handles", "edges", "dense"),
-        default=["first", "refine", "parts"],
-        help="of the image-text encoder; all but the first go on from the model in OUTPUT; the last two are an "
-        "experiment (docs/results.md), not in the weights that ship",
+        choices=("first", "refine", "parts", "dense", "handles", "edges"),
+        default=["first", "refine", "parts", "dense"],
+        help="of the image-text encoder; all but the first go on from the model in OUTPUT; the first four made the "
+        "weights that ship; handles (after parts) and edges (after handles) are experiments (docs/results.md), "
+        "not in them",
     )
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)

@@ -1,6 +1,6 @@
 """Trains the image-text encoder: contrast between crops and phrases, and relevancy as LERF asks it.
 
-Four losses on a batch of crops and phrases, of which `truth.py` knows which are true of which:
+Five losses on a batch of crops and phrases, of which `truth.py` knows which are true of which:
 
 - contrast: among all phrases, softmax of a crop's similarities falls on those that are true of it, and for a
   phrase on the crops it is true of (several right answers a row);
@@ -9,7 +9,8 @@ Four losses on a batch of crops and phrases, of which `truth.py` knows which are
 - composition: the words of two kinds in two colours form a parallelogram, so pairs never seen have their place;
 - relevancy: sigmoid(10 (cos(crop, phrase) - max over the canonical phrases of cos(crop, canonical))), which is
   LERF's relevancy, is a probability: cross-entropy with the truth. So the right phrase comes to lie above
-  "object", "things", "stuff", "texture", and a wrong one below them.
+  "object", "things", "stuff", "texture", and a wrong one below them;
+- dense, in one phase only: contrast and relevancy again, of single patches, read as in MaskCLIP.
 """
 
 from __future__ import annotations
@@ -130,20 +131,20 @@ gray could not be told from white."""
 PARTS_AGAIN = dataclasses.replace(
     REFINEMENT, steps=1200, rate=3e-4, parts=0.4, near=True, centre=True, seed=2
 )
-"""The end: parts against what only looks like them."""
+"""Parts against what only looks like them."""
+DENSE = dataclasses.replace(PARTS_AGAIN, steps=1600, parts=0.45, handles=4, dense=1.0, seed=5)
+"""The end, after `PARTS_AGAIN`: patches learn to speak for themselves, asked the same phrases as crops."""
 HANDLES = dataclasses.replace(PARTS_AGAIN, parts=0.45, handles=8, seed=3)
-"""An experiment. Of crops beside handles two in five are taken for one, in the scenes of the training as well (ROC
-area .88): a fourteenth of the part crops is too little to learn better from."""
+"""An experiment, after the third phase. Of crops beside handles two in five are taken for one, in the scenes of the
+training as well (ROC area .88): a fourteenth of the part crops is too little to learn better from."""
 EDGES = dataclasses.replace(HANDLES, steps=700, rate=2e-4, beside=BESIDE, seed=4)
 """An experiment, after that one. Where a part ends: a place beside it answers as surely as the part itself."""
-DENSE = dataclasses.replace(PARTS_AGAIN, steps=1600, parts=0.45, handles=4, dense=1.0, seed=5)
-"""Patches learn to speak for themselves: what they show is asked of each, by the same phrases."""
 PHASES = {
-    "first": ClipTraining(), "refine": REFINEMENT, "parts": PARTS_AGAIN, "handles": HANDLES, "edges": EDGES,
-    "dense": DENSE,
+    "first": ClipTraining(), "refine": REFINEMENT, "parts": PARTS_AGAIN, "dense": DENSE,
+    "handles": HANDLES, "edges": EDGES,
 }  # fmt: skip
-"""In this order; each phase goes on from the averaged weights of the one before. The first three made the weights
-that ship."""
+"""The first four, in this order, made the weights that ship; each goes on from the averaged weights of the last.
+``handles``, which went on from ``parts``, and ``edges``, from ``handles``, are experiments that are not in them."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ class Batch:
     patches: Tensor
     left_out: Tensor
     places: Tensor
-    """Truth at single patches ``[B, P, T]``; ``OPEN`` where it was not worked out. Empty ``[B, P, 0]`` if not asked."""
+    """Truth at single patches ``[B, P, T]``, ``OPEN`` where they are not asked; ``[B, P, 0]`` if none is."""
 
 
 def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.random.Generator) -> Batch:
@@ -167,19 +168,7 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     of_parts = round(config.parts * config.batch)
     crops = [random_crop(frames, rng) for _ in range(config.batch - of_parts)]
     crops += part_crops(frames, of_parts, rng, near=config.near, handles=config.handles)
-    phrases = []
-    for number, crop in enumerate(crops):
-        chosen = (
-            int(rng.choice(len(crop.codes), p=crop.weights / crop.weights.sum())) if len(crop.codes) else -1
-        )
-        if chosen < 0:
-            continue
-        label = frames.labels[crop.codes[chosen]]
-        phrases.append(phrase_for(label, rng))
-        if number % 2:
-            phrases.append(near_miss(label, rng))
-    phrases += [any_phrase(rng) for _ in range(config.batch // 4)]
-    phrases += [any_part(rng, config.handles) for _ in range(of_parts // 3 if config.near else 0)]
+    phrases = batch_phrases(crops, frames.labels, config, rng)
     truth = table.of(phrases, crops)
     pixels = np.stack([crop.pixels(config.image_size) for crop in crops])
     draw = rng.random(len(crops))
@@ -191,8 +180,7 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
         pixels[row] = turned_hues(pixels[row], angles[row])
     leave_open(truth, phrases, crops, table.labels, angles)
     colourless = grey | turned
-    asks_colour = np.array([phrase.colour is not None for phrase in phrases])
-    truth[np.ix_(colourless, asks_colour)] = OPEN
+    open_colours(truth, phrases, colourless)
     texts = [in_sentence(phrase, rng) for phrase in phrases] + list(CANONICAL)
     patches, left_out = patch_answers(crops, table.labels, angles, config)
     patches[colourless, :, 1] = UNKNOWN
@@ -209,6 +197,23 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     )
 
 
+def batch_phrases(
+    crops: list[Crop], labels: list[Label], config: ClipTraining, rng: np.random.Generator
+) -> list[Phrase]:
+    """The phrases of a batch: of what its crops show, near misses of that, about anything, and about any part."""
+    phrases = []
+    for number, crop in enumerate(crops):
+        if not len(crop.codes):
+            continue
+        label = labels[crop.codes[int(rng.choice(len(crop.codes), p=crop.weights / crop.weights.sum()))]]
+        phrases.append(phrase_for(label, rng))
+        if number % 2:
+            phrases.append(near_miss(label, rng))
+    phrases += [any_phrase(rng) for _ in range(config.batch // 4)]
+    of_parts = round(config.parts * config.batch)
+    return phrases + [any_part(rng, config.handles) for _ in range(of_parts // 3 if config.near else 0)]
+
+
 def place_truth(
     phrases: list[Phrase],
     crops: list[Crop],
@@ -218,18 +223,28 @@ def place_truth(
     config: ClipTraining,
     rng: np.random.Generator,
 ) -> NDArray[np.int8]:
-    """Truth of the phrases at ``PLACES`` patches of every crop ``[B, P, T]``, ``OPEN`` at the others.
+    """Truth of the phrases at up to ``PLACES`` patches of every crop, ``OPEN`` at the others.
 
     Half of the patches are drawn anywhere, half so that everything a crop shows is asked about as often.
+
+    Args:
+        phrases: ``T`` of them.
+        crops: ``B`` of them.
+        table: Knows which labels a phrase is true of.
+        angles: By which the hues of the crops are turned, degrees ``[B]``.
+        colourless: Crops of which no colour is asked ``[B]``.
+        config: Says how large the patches are, and with `dense` whether they are asked at all.
+        rng: Draws the patches.
+
+    Returns:
+        ``[B, P, T]``; ``[B, P, 0]`` if patches are not asked.
     """
     count = config.image_size // config.patch
-    truth = np.full((len(crops), count**2, len(phrases) if config.dense else 0), OPEN, np.int8)
     if not config.dense:
-        return truth
-    middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
+        return np.empty((len(crops), count**2, 0), np.int8)
     rows, patches = [], []
     for row, crop in enumerate(crops):
-        codes = crop.grid[np.ix_(middles, middles)].ravel()
+        codes = middle_codes(crop, count)
         chosen = set(rng.permutation(count**2)[: PLACES // 2].tolist())
         shown = rng.permutation(np.unique(codes[codes >= 0]))
         chosen |= {int(rng.choice(np.flatnonzero(codes == code))) for code in shown[: PLACES // 2]}
@@ -238,10 +253,22 @@ def place_truth(
     cut = [patch_crop(crops[row], patch, count) for row, patch in zip(rows, patches)]
     found = table.at_places(phrases, cut)
     leave_open(found, phrases, cut, table.labels, angles[rows])
-    asks_colour = np.array([phrase.colour is not None for phrase in phrases])
-    found[np.ix_(colourless[rows], asks_colour)] = OPEN
+    open_colours(found, phrases, colourless[rows])
+    truth = np.full((len(crops), count**2, len(phrases)), OPEN, np.int8)
     truth[rows, patches] = found
     return truth
+
+
+def middle_codes(crop: Crop, count: int) -> NDArray[np.int32]:
+    """What the middle of each of ``count`` x ``count`` patches shows ``[count * count]``, -1 where nothing is."""
+    middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
+    return crop.grid[np.ix_(middles, middles)].ravel()
+
+
+def open_colours(truth: NDArray[np.int8], phrases: list[Phrase], colourless: NDArray[np.bool_]) -> None:
+    """Opens what phrases with a colour say of the rows ``[B]`` whose colours are not those of their labels."""
+    asks_colour = np.array([phrase.colour is not None for phrase in phrases])
+    truth[np.ix_(colourless, asks_colour)] = OPEN
 
 
 def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
@@ -308,8 +335,7 @@ def patch_answers(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Kind, colour and part at the middle of every patch ``[B, P, 3]``, and the kinds that it is not asked about."""
     count = config.image_size // config.patch
-    middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
-    codes = np.stack([crop.grid[np.ix_(middles, middles)].ravel() for crop in crops])
+    codes = np.stack([middle_codes(crop, count) for crop in crops])
     answers = [
         (KINDS.index(label.kind), TINTS.index(label.colour), PART_NAMES.index(label.part)) for label in labels
     ]
@@ -324,10 +350,8 @@ def patch_answers(
 def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batch]:
     """Batches made ahead by a thread of their own; every process makes others."""
     ready: queue.Queue[Batch] = queue.Queue(4)
-    table, rng = (
-        TruthTable(frames.labels, centre=config.centre, beside=config.beside),
-        np.random.default_rng([config.seed, rank]),
-    )
+    table = TruthTable(frames.labels, centre=config.centre, beside=config.beside)
+    rng = np.random.default_rng([config.seed, rank])
 
     def work() -> None:
         while True:
@@ -340,7 +364,7 @@ def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batc
 def mirrored(
     batch: Batch, config: ClipTraining, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Half of the crops mirrored, with what their patches show."""
+    """Half of the crops mirrored, with what their patches show: pixels, patches, left out, places."""
     count = config.image_size // config.patch
     chosen = torch.rand(len(batch.pixels), generator=generator) < 0.5
     pixels = torch.where(chosen[:, None, None, None], batch.pixels.flip(-1), batch.pixels)
@@ -413,6 +437,42 @@ def relevancy_loss(similarity: Tensor, canonical: Tensor, truth: Tensor, tempera
     return F.softplus(-logits[truth == TRUE]).mean() + F.softplus(logits[truth == FALSE]).mean()
 
 
+def asking_losses(
+    similarity: Tensor, truth: Tensor, scale: Tensor, temperature: float
+) -> tuple[Tensor, Tensor]:
+    """Contrast, of images among phrases plus of phrases among images, and relevancy.
+
+    Args:
+        similarity: Of crops or patches and texts ``[B, T + C]``, the canonical phrases last.
+        truth: Of the phrases before those ``[B, T]``.
+        scale: Of the similarities in the contrast; a scalar, which is trained too.
+        temperature: Of the relevancy.
+    """
+    phrases, canonical = similarity[:, : -len(CANONICAL)], similarity[:, -len(CANONICAL) :]
+    # Canonical phrases stand among the wrong answers, so a right phrase is drawn above them.
+    with_canonical = F.pad(truth, (0, len(CANONICAL)), value=FALSE)
+    contrast = contrastive_loss(scale * similarity, with_canonical) + contrastive_loss(
+        scale * phrases.T, truth.T
+    )
+    return contrast, relevancy_loss(phrases, canonical, truth, temperature)
+
+
+def dense_loss(values: Tensor, texts: Tensor, places: Tensor, scale: Tensor, temperature: float) -> Tensor:
+    """What patches say by themselves: contrast and relevancy as of crops, of the patches that are asked.
+
+    Args:
+        values: What the patches say ``[B, P, D]`` (`Trainer.see`), of any length.
+        texts: Unit vectors of the phrases, the canonical ones last ``[T + C, D]``.
+        places: Truth of the phrases ``[B, P, T]``; a patch of which all is ``OPEN`` is not asked.
+        scale: As in `asking_losses`.
+        temperature: Of the relevancy.
+    """
+    asked = (places != OPEN).any(-1)
+    similarity = F.normalize(values[asked].float(), dim=-1) @ texts.T
+    contrast, relevancy = asking_losses(similarity, places[asked], scale, temperature)
+    return 0.5 * contrast + relevancy
+
+
 class Trainer:
     """The model, its average over the steps, and what encodes with them."""
 
@@ -424,10 +484,6 @@ class Trainer:
         else:
             self.model = CLIPModel.from_pretrained(start, attn_implementation="eager").train()
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
-        self._normed: list[Tensor] = []  # what the last layer's attention sees
-        self.model.vision_model.encoder.layers[-1].layer_norm1.register_forward_hook(
-            lambda _, __, output: self._normed.append(output)
-        )
         self.patch_heads = torch.nn.Linear(config.width, len(KINDS) + len(TINTS) + len(PART_NAMES))
         self.trained = [*self.model.parameters(), *self.patch_heads.parameters()]
         decayed = [p for p in self.trained if p.ndim >= 2]
@@ -445,45 +501,12 @@ class Trainer:
         return self.config.rate * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * along)))
 
     def step(self, batch: Batch) -> dict[str, float]:
+        """One step of the optimizer and of the average; what each loss was before it, by name."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate()
-        words = self.tokens([*batch.texts, *batch.corners])
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            pixels, patches, left_out, places = mirrored(batch, self.config, self.generator)
-            kept = self.kept_patches(len(pixels))
-            patches = patches.gather(1, kept[..., None].expand(-1, -1, 3))
-            left_out = left_out.gather(1, kept[..., None].expand(-1, -1, len(KINDS)))
-            places = places.gather(1, kept[..., None].expand(-1, -1, places.shape[-1]))
-            images, tokens, values = self.see(jittered(pixels, self.generator, self.config.light), kept)
-            if self.done < self.config.heads_alone:
-                tokens = tokens.detach()
-            answers = self.patch_heads(tokens).float()
-            texts = pooled(self.model.get_text_features(**words))
-        texts, corners = texts.float().split([len(batch.texts), len(batch.corners)])
-        similarity = F.normalize(images.float(), dim=-1) @ F.normalize(texts, dim=-1).T
-        phrases, canonical = similarity[:, : -len(CANONICAL)], similarity[:, -len(CANONICAL) :]
-        scale = self.model.logit_scale.exp().clamp(max=50)
-        # Canonical phrases stand among the wrong answers, so a right phrase is drawn above them.
-        with_canonical = F.pad(batch.truth, (0, len(CANONICAL)), value=FALSE)
-        contrast = contrastive_loss(scale * similarity, with_canonical) + contrastive_loss(
-            scale * phrases.T, batch.truth.T
-        )
-        relevancy = relevancy_loss(phrases, canonical, batch.truth, self.config.temperature)
-        named = patch_loss(answers, patches, left_out)
-        composition = composition_loss(F.normalize(corners, dim=-1))
-        loss = 0.5 * contrast + relevancy + named + self.config.composition * composition
-        losses = {"contrast": contrast, "relevancy": relevancy, "patches": named, "composition": composition}
-        if self.config.dense:
-            asked = (places != OPEN).any(-1)
-            at = F.normalize(values[asked].float(), dim=-1) @ F.normalize(texts, dim=-1).T
-            truth = places[asked]
-            with_canonical = F.pad(truth, (0, len(CANONICAL)), value=FALSE)
-            dense = 0.5 * contrastive_loss(scale * at, with_canonical)
-            phrases, canonical = at[:, : -len(CANONICAL)], at[:, -len(CANONICAL) :]
-            dense = dense + 0.5 * contrastive_loss(scale * phrases.T, truth.T)
-            dense = dense + relevancy_loss(phrases, canonical, truth, self.config.temperature)
-            loss = loss + self.config.dense * dense
-            losses["dense"] = dense
+        losses = self.losses(batch)
+        weights = {"contrast": 0.5, "composition": self.config.composition, "dense": self.config.dense}
+        loss = sum(weights.get(name, 1.0) * value for name, value in losses.items())
         self.optimizer.zero_grad()
         loss.backward()
         average_gradients(self.trained)
@@ -495,6 +518,35 @@ class Trainer:
             for slow, fast in zip(self.average.parameters(), self.model.parameters()):
                 slow.lerp_(fast, 1 - keep)
         return {name: round(value.item(), 3) for name, value in losses.items()}
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """The losses by name, before they are weighed; ``dense`` only where it has a weight."""
+        words = self.tokens([*batch.texts, *batch.corners])
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            pixels, patches, left_out, places = mirrored(batch, self.config, self.generator)
+            kept = self.kept_patches(len(pixels))
+            patches, left_out, places = (
+                values.gather(1, kept[..., None].expand(-1, -1, values.shape[-1]))
+                for values in (patches, left_out, places)
+            )
+            images, tokens, values = self.see(jittered(pixels, self.generator, self.config.light), kept)
+            if self.done < self.config.heads_alone:
+                tokens = tokens.detach()
+            answers = self.patch_heads(tokens).float()
+            texts = pooled(self.model.get_text_features(**words))
+        texts, corners = F.normalize(texts.float(), dim=-1).split([len(batch.texts), len(batch.corners)])
+        similarity = F.normalize(images.float(), dim=-1) @ texts.T
+        scale = self.model.logit_scale.exp().clamp(max=50)
+        contrast, relevancy = asking_losses(similarity, batch.truth, scale, self.config.temperature)
+        losses = {
+            "contrast": contrast,
+            "relevancy": relevancy,
+            "patches": patch_loss(answers, patches, left_out),
+            "composition": composition_loss(corners),
+        }
+        if self.config.dense:
+            losses["dense"] = dense_loss(values, texts, places, scale, self.config.temperature)
+        return losses
 
     def kept_patches(self, count: int) -> Tensor:
         """Which patches the image tower sees ``[count, P]``: half of them at first, all at the end.
@@ -508,21 +560,27 @@ class Trainer:
         return order[:, : max(1, round(share * patches))]
 
     def see(self, images: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Embeddings ``[B, D]``, patch tokens ``[B, P', width]`` and what patches say by themselves ``[B, P', D]``,
-        from the kept patches ``[B, P']``."""
-        tower = self.model.vision_model
+        """What the image tower makes of the kept patches ``[B, P']`` of images ``[B, 3, s, s]``.
+
+        What a patch says by itself is read as in MaskCLIP (and as in lexsplat's own `ClipEncoder.encode_patches`):
+        its value in the last attention, which is what it would give to the class token, projected like that one.
+
+        Returns:
+            Embeddings of the images ``[B, D]``, patch tokens ``[B, P', width]``, and what the patches say by
+            themselves ``[B, P', D]``.
+        """
+        tower, project = self.model.vision_model, self.model.visual_projection
         hidden = tower.embeddings(images)
         chosen = hidden[:, 1:].gather(1, kept[..., None].expand(-1, -1, hidden.shape[-1]))
         hidden = tower.pre_layrnorm(torch.cat([hidden[:, :1], chosen], 1))
-        hidden = tower.encoder(inputs_embeds=hidden).last_hidden_state
-        attention = tower.encoder.layers[-1].self_attn
-        values = attention.out_proj(attention.v_proj(self._normed.pop()[:, 1:]))
-        project = self.model.visual_projection
-        return (
-            project(tower.post_layernorm(hidden[:, 0])),
-            hidden[:, 1:],
-            project(tower.post_layernorm(values)),
-        )
+        last, caught = tower.encoder.layers[-1], []
+        # What the last attention sees is no output of the tower.
+        with last.layer_norm1.register_forward_hook(lambda _, __, output: caught.append(output)):
+            hidden = tower.encoder(inputs_embeds=hidden).last_hidden_state
+        (seen,) = caught
+        values = last.self_attn.out_proj(last.self_attn.v_proj(seen[:, 1:]))
+        whole, said = (project(tower.post_layernorm(part)) for part in (hidden[:, 0], values))
+        return whole, hidden[:, 1:], said
 
     def tokens(self, texts: list[str]) -> dict[str, Tensor]:
         encoded = self.tokenizer(texts, padding=True, truncation=True, max_length=LENGTH, return_tensors="pt")

@@ -45,32 +45,45 @@ class TruthTable:
             self._known[meaning] = (answers == TRUE, answers != FALSE)
         return self._known[meaning]
 
+    def _shares(
+        self, phrases: Sequence[Phrase], crops: Sequence[Crop], shown: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The weight of what each phrase is true of, and of what it may be true of ``[len(crops), len(phrases)]``.
+
+        Args:
+            phrases: The phrases.
+            crops: The crops, or patches of them.
+            shown: Rising codes, of all labels or of those that occur in the crops, so that few patches are quick.
+        """
+        weights = np.zeros((len(crops), len(shown)), np.float32)
+        for row, crop in enumerate(crops):
+            weights[row, np.searchsorted(shown, crop.codes)] = crop.weights
+        columns = [self._columns(phrase) for phrase in phrases]
+        true, possible = (
+            weights @ np.stack([column[which][shown] for column in columns], 1).astype(np.float32)
+            for which in (0, 1)
+        )
+        return true, possible
+
     def of(self, phrases: Sequence[Phrase], crops: Sequence[Crop]) -> NDArray[np.int8]:
         """``TRUE``, ``FALSE`` or ``OPEN`` of each phrase and crop ``[len(crops), len(phrases)]``."""
-        weights = np.zeros((len(crops), len(self.labels)), np.float32)
-        for row, crop in enumerate(crops):
-            weights[row, crop.codes] = crop.weights
-        columns = [self._columns(phrase) for phrase in phrases]
-        true = weights @ np.stack([column[0] for column in columns], 1).astype(np.float32)
-        possible = weights @ np.stack([column[1] for column in columns], 1).astype(np.float32)
+        true, possible = self._shares(phrases, crops, np.arange(len(self.labels)))
         is_part = np.array([phrase.part is not None for phrase in phrases])
         shows = np.where(is_part, SHOWS_PART, SHOWS)
         lacks = np.where(is_part, LACKS_PART, LACKS)
         if self.centre:
             middle = np.array([crop.grid[GRID // 2, GRID // 2] for crop in crops])
-            answers = np.stack([column[0] for column in columns], 1)
+            answers = np.stack([self._columns(phrase)[0] for phrase in phrases], 1)
             centred = is_part & answers[middle] & (middle >= 0)[:, None]
             shows = np.where(centred, CENTRE, shows)
             lacks = np.where(is_part & ~centred, self.beside, lacks)
         return np.where(true >= shows, TRUE, np.where(possible < lacks, FALSE, OPEN)).astype(np.int8)
 
     def at_places(self, phrases: Sequence[Phrase], patches: Sequence[Crop]) -> NDArray[np.int8]:
-        """The same of single patches: true with half of the patch, false with an eighth, else open."""
-        codes = np.unique(np.concatenate([patch.codes for patch in patches]))
-        weights = np.zeros((len(patches), len(codes)), np.float32)
-        for row, patch in enumerate(patches):
-            weights[row, np.searchsorted(codes, patch.codes)] = patch.weights
-        columns = [self._columns(phrase) for phrase in phrases]
-        true = weights @ np.stack([column[0][codes] for column in columns], 1).astype(np.float32)
-        possible = weights @ np.stack([column[1][codes] for column in columns], 1).astype(np.float32)
+        """The same of single patches (`crops.patch_crop`) ``[len(patches), len(phrases)]``.
+
+        A phrase is true with ``HALF`` of the patch or more, false with an ``EIGHTH`` or less, else open.
+        """
+        shown = np.unique(np.concatenate([patch.codes for patch in patches]))
+        true, possible = self._shares(phrases, patches, shown)
         return np.where(true >= HALF, TRUE, np.where(possible <= EIGHTH, FALSE, OPEN)).astype(np.int8)
