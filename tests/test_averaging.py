@@ -19,6 +19,8 @@ from lexsplat.averaging import (
     field_from_means,
 )
 from lexsplat.codebook import CodebookConfig
+from lexsplat.config import parse_bytes
+from lexsplat.errors import MemoryBudgetError
 from lexsplat.features import FeatureMap
 from lexsplat.language_field import LiftedField
 
@@ -196,6 +198,18 @@ def test_views_are_taken_at_the_size_of_their_maps_and_weights_are_cells_all_the
     first = average_features(classic, cameras, maps, AveragingConfig(shortest_side=24))
     second = average_features(classic, cameras, maps, AveragingConfig(shortest_side=96))
     assert torch.equal(first.totals, second.totals)
+
+
+def test_a_sample_of_gaussians_that_does_not_fit_is_refused_with_one_that_does() -> None:
+    found = MeanFeatures(np.ones((5000, 64), np.float16), torch.ones(5000))
+    with pytest.raises(MemoryBudgetError, match=r"sample-size \d+") as refusal:
+        field_from_means(found, CODES, AveragingConfig(), memory=2_000_000)
+    message = str(refusal.value)
+    fits = int(message.split("sample-size ")[1].split()[0].rstrip(".,)"))
+    enough = parse_bytes(message.split("give --memory ")[1].split(",")[0].replace(" ", ""))
+    field_from_means(found, CODES, AveragingConfig(), memory=enough)
+    assert 100 < fits < 5000
+    field_from_means(found, replace(CODES, sample_size=fits), AveragingConfig(), memory=2_000_000)
 
 
 def test_codes_out_of_range_are_no_features(scene) -> None:

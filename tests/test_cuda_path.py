@@ -18,6 +18,7 @@ from test_encoders import _save, _seeded, _vit, clip_folder  # noqa: F401  (a fi
 from tiny_capture import write_capture
 from viewer_scene import WORDS, ball_scene
 
+from lexsplat.averaging import AveragingConfig, average_features, features_of_codes, field_from_means
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.editing import Editor, Motion
 from lexsplat.embedding import EmbeddingConfig, EmbeddingTrainer, train_field
@@ -133,6 +134,13 @@ def test_features_and_codes_on_the_gpu(pretended_gpu, scene, clip_folder, tmp_pa
         dense = DinoEncoder(tmp_path / "dino", "tiny", device)
         maps[device] = extract_features(few, clip, dense, config, cache_dir=tmp_path / device)
         assert devices([clip.encode_text(["a red apple"])]) == {"cpu"}
+    both = dataclasses.replace(config, crop_tokens="both")
+    spoken = {
+        d: extract_features(few, ClipEncoder(clip_folder, "tiny", d), None, both, cache_dir=tmp_path / d)
+        for d in maps
+    }
+    for name in views:
+        assert (spoken["cpu"][name].clip * spoken["cuda"][name].clip).sum(-1).min() > 0.99
     for name in views:  # in half precision on the GPU
         for part in ("clip", "dino"):
             here, there = (getattr(maps[device][name], part) for device in ("cpu", "cuda"))
@@ -159,6 +167,20 @@ def test_lifting_on_the_gpu_finds_the_same_codes(pretended_gpu, balls, options):
     torch.testing.assert_close(there.code_probabilities().cpu(), here.code_probabilities(), atol=0.02, rtol=0)
     again = field_from_tensors({n: t.cpu() for n, t in there.tensors().items()}, there.metadata())
     assert torch.equal(again.codes, there.codes.cpu())
+
+
+@pytest.mark.parametrize("options", [{}, {"memory_bytes": 9000}])
+def test_averaging_on_the_gpu_finds_the_same_means_and_codes(pretended_gpu, balls, options):
+    config = AveragingConfig(**options)
+    maps = features_of_codes(balls.code_maps, balls.codebook)
+    found = {d: average_features(balls.gaussians.to(d), balls.cameras, maps, config) for d in ("cpu", "cuda")}
+    means = [torch.from_numpy(np.asarray(mean.means, np.float32)) for mean in found.values()]
+    torch.testing.assert_close(means[1], means[0], atol=0.01, rtol=0)
+    settings = CodebookConfig(num_codes=8, sample_size=50)
+    field = field_from_means(found["cuda"], settings, config)
+    assert devices(field.tensors().values()) - {"cpu"} == {"cuda:0"}
+    same = [dataclasses.replace(found["cpu"], means=found["cuda"].means, totals=found["cuda"].totals.cpu())]
+    assert torch.equal(field_from_means(same[0], settings, config).codes, field.codes.cpu())
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from lexsplat import budget
 from lexsplat.cameras import Camera
 from lexsplat.codebook import Codebook, CodebookConfig
 from lexsplat.codebook.fitting import spherical_kmeans
@@ -161,7 +162,12 @@ def features_of_codes(code_maps: Mapping[str, NDArray[np.integer]], codebook: Co
 
 
 def field_from_means(
-    found: MeanFeatures, codebook_config: CodebookConfig, config: AveragingConfig, *, seed: int = 0
+    found: MeanFeatures,
+    codebook_config: CodebookConfig,
+    config: AveragingConfig,
+    *,
+    seed: int = 0,
+    memory: int = budget.DEFAULT_MEMORY,
 ) -> LiftedField:
     """Codes among the Gaussians, and the distribution of each over its nearest ones.
 
@@ -170,7 +176,13 @@ def field_from_means(
         codebook_config: K, k-means iterations and sample size; what is about DINO or gradient steps has no part.
         config: Settings.
         seed: Of the sample and the start of k-means.
+        memory: Bytes half of which the sample and k-means may take; the rest is for means and maps.
+
+    Raises:
+        MemoryBudgetError: If the sample does not fit.
     """
+    rows_looked_at = min(codebook_config.sample_size, len(found.totals))
+    _check_sample(rows_looked_at, found.means.shape[1], codebook_config, memory)
     device, count = found.totals.device, len(found.totals)
     visible = found.visible(config)
     with one_thread():  # the last bit of a similarity may decide between two codes
@@ -189,6 +201,15 @@ def field_from_means(
     believed = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
     uncertainties = torch.where(visible, 1 - agreement * believed, torch.ones_like(believed))
     return LiftedField(Codebook(codewords), codes, weights, uncertainties, method="averaged")
+
+
+def _check_sample(rows: int, dimensions: int, config: CodebookConfig, memory: int) -> None:
+    """Refuse a sample of Gaussians that does not fit into half of the memory, with the size that would."""
+    need = budget.sample_bytes(rows, dimensions, config.num_codes, 0)
+    least = budget.sample_bytes(0, dimensions, config.num_codes, 0)
+    fewer = max(1, (memory // 2 - least) // budget.sample_bytes(1, dimensions, 0, 0))
+    what = f"a sample of {rows:,} Gaussians"
+    budget.require("embed", 2 * need, memory, what, f"codebook.sample-size {fewer}")
 
 
 def _fit(found: MeanFeatures, visible: Tensor, config: CodebookConfig, seed: int) -> Tensor:

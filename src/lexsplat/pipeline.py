@@ -417,7 +417,8 @@ def average(
 ) -> LiftedField:
     """The language field of method "averaged": features on the Gaussians first, codes afterwards."""
     found = average_features(gaussians, cameras, maps, config.averaging, scratch=scratch, listener=listener)
-    return field_from_means(found, config.codebook, config.averaging, seed=config.seed)
+    memory = parse_bytes(config.memory)
+    return field_from_means(found, config.codebook, config.averaging, seed=config.seed, memory=memory)
 
 
 def make_field(

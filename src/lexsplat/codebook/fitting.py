@@ -60,7 +60,7 @@ def fit_codebook(
     if not names:
         raise ValueError("a codebook needs at least one training view")
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    _check_sample(feature_maps[names[0]], len(names), config, memory * 3 // 4)
+    _check_sample(feature_maps[names[0]], len(names), config, memory)
     clip, dino = sample_features(feature_maps, names, config, generator=generator)
     clip, dino = clip.to(device), None if dino is None else dino.to(device)
     lambda_dino = config.lambda_dino
@@ -168,7 +168,7 @@ class _Rows:
 
 
 def _check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory: int) -> None:
-    """Refuse a sample of ``views`` maps like the first that does not fit.
+    """Refuse a sample of ``views`` maps like the first that does not fit into three quarters of the memory.
 
     Raises:
         MemoryBudgetError: With the sample size that would.
@@ -180,9 +180,9 @@ def _check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory:
     batch = min(config.batch_size, rows)
     need = budget.sample_bytes(rows, dimensions, config.num_codes, batch)
     least = budget.sample_bytes(0, dimensions, config.num_codes, batch)
-    fewer = max(1, (memory - least) // budget.sample_bytes(1, dimensions, 0, 0))
+    fewer = max(1, (memory * 3 // 4 - least) // budget.sample_bytes(1, dimensions, 0, 0))
     what = f"a sample of {rows:,} features"
-    budget.require("codebook", need, memory, what, f"codebook.sample-size {fewer}")
+    budget.require("codebook", -(-need * 4 // 3), memory, what, f"codebook.sample-size {fewer}")
 
 
 @torch.no_grad()
