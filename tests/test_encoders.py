@@ -16,7 +16,7 @@ from PIL import Image
 
 from lexsplat.errors import ModelError
 from lexsplat.features import hub
-from lexsplat.features.clip import _plain_attention
+from lexsplat.features.clip import _plain_attention, check_patches
 from lexsplat.features.dino import _ramp, _window_starts
 from lexsplat.features.encoders import (
     ClipEncoder,
@@ -172,6 +172,7 @@ def test_patches_are_the_values_of_the_last_attention_written_out(clip_folder):
     encoder = ClipEncoder(clip_folder, "tiny")
     whole, patches = encoder.encode_patches(images)
     torch.testing.assert_close(whole, encoder.encode_images(images))
+    assert encoder.patches == 5
     torch.testing.assert_close(patches, _unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
 
 
@@ -191,11 +192,14 @@ def test_threads_get_their_own_patches(clip_folder):
                 torch.testing.assert_close(tensor, reference, atol=1e-5, rtol=0)
 
 
-def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_folder):
+def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_folder, clip_folder):
     encoder = ClipEncoder(siglip_folder, "tiny siglip")
-    assert not encoder.reads_patches
+    assert encoder.patches == 0
     with pytest.raises(ModelError, match=r"--features\.crop-tokens class"):
         encoder.encode_patches(_images(1, 32))
+    with pytest.raises(ModelError, match=r"found siglip.*--features\.crop-tokens class"):
+        check_patches(siglip_folder, "tiny siglip")
+    check_patches(clip_folder, "tiny")
 
 
 def test_clip_text_embeddings_equal_transformers_own_and_long_prompts_are_cut(clip_folder):

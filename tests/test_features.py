@@ -16,7 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from lexsplat.cameras import Camera
-from lexsplat.errors import CaptureError, FileFormatError
+from lexsplat.errors import CaptureError, FileFormatError, MemoryBudgetError
 from lexsplat.features import (
     FeatureConfig,
     FeatureMap,
@@ -44,7 +44,7 @@ def two_threads():
 class ColourEncoder:
     """Embeds the mean colour; counts its work."""
 
-    name, image_size, dim = "colour", 8, 4
+    name, image_size, dim, patches = "colour", 8, 4, 2
     device = torch.device("cpu")
 
     def __init__(self, content_hash="colour", fail_after=None):
@@ -184,6 +184,17 @@ def test_patches_speak_beside_or_instead_of_the_whole_crops(tokens, scene, tmp_p
         if tokens == "both":
             expected = expected + mean_map(levels, whole, WIDTH, HEIGHT, 12, 8)
         torch.testing.assert_close(maps[name].clip, F.normalize(expected, dim=-1), atol=2e-3, rtol=0)
+
+
+def test_patches_that_do_not_fit_are_refused_with_a_budget_that_does(scene, tmp_path):
+    class Fine(ColourEncoder):
+        patches = 100
+
+    config = dataclasses.replace(CONFIG, crop_tokens="both", memory=4 << 20)
+    with pytest.raises(MemoryBudgetError, match=r"features\.crop-tokens class"):
+        extract_features(scene, Fine(), None, config, cache_dir=tmp_path)
+    whole = dataclasses.replace(config, crop_tokens="class")
+    assert len(extract_features(scene, Fine(), None, whole, cache_dir=tmp_path)) == 5
 
 
 def test_what_patches_say_is_stored_for_one_size_of_the_maps(scene, tmp_path):

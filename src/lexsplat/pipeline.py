@@ -26,6 +26,7 @@ from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
 from lexsplat.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.features import FeatureMaps, external_identity, extract_features, load_external_features
+from lexsplat.features.clip import check_patches
 from lexsplat.features.hub import model_folder
 from lexsplat.formats.reading import read_splats
 from lexsplat.gaussians import Gaussians
@@ -165,7 +166,11 @@ class _Builder:
         until = until if until in order else "features"
         wanted = order[: order.index(until) + 1]
         if "features" in wanted and not folder.is_finished("features", fingerprint(stages["features"][0])):
-            model_folder(config.clip, "clip")  # a missing model is told now, not after the reconstruction
+            clip = model_folder(
+                config.clip, "clip"
+            )  # a missing model is told now, not after the reconstruction
+            if config.features.tokens != "class" and config.features_from is None:
+                check_patches(clip, config.clip)
             if dino != "none" and config.features_from is None:
                 model_folder(config.dino, "dino")
         for name in wanted:

@@ -96,7 +96,7 @@ class Calibration:
         return "yes" if probability >= self.yes else "no" if probability <= self.no else "unsure"
 
 
-CALIBRATION = Calibration(bias=-1.581, height=0.0, rank=0.123, yes=0.512, no=0.512, peak=3.874)
+CALIBRATION = Calibration(bias=-1.869, height=0.0, rank=0.353, yes=0.457, no=0.457, peak=3.32)
 
 
 class PresenceJudge:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import threading
@@ -79,9 +80,11 @@ class ClipEncoder(PretrainedModel):
         return F.normalize(features.float(), dim=-1).cpu()
 
     @property
-    def reads_patches(self) -> bool:
-        """Whether `encode_patches` knows this architecture."""
-        return self._patches is not None
+    def patches(self) -> int:
+        """Patches along a side of an image that `encode_patches` reads; 0 where it does not know the architecture."""
+        if self._patches is None:
+            return 0
+        return self.image_size // int(self._model.config.vision_config.patch_size)
 
     @torch.inference_mode()
     def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,6 +171,25 @@ class ClipEncoder(PretrainedModel):
             "pixel_attention_mask": torch.ones(patches.shape[:2], dtype=torch.int32, device=pixels.device),
             "spatial_shapes": torch.full((len(pixels), 2), side, dtype=torch.long, device=pixels.device),
         }
+
+
+def check_patches(folder: Path, name: str) -> None:
+    """Whether the patches of a model can be read, from its configuration alone.
+
+    Raises:
+        ModelError: If it is not of CLIP's own architecture.
+    """
+    try:
+        kind = json.loads((folder / "config.json").read_text()).get("model_type")
+    except (OSError, ValueError, AttributeError):
+        return  # that it is no model at all is told when it is loaded
+    if kind != "clip":
+        raise ModelError(
+            f"model {name}",
+            expected="a model of CLIP's architecture, whose patches can be read",
+            found=str(kind),
+            remedy="let whole crops speak: `--features.crop-tokens class`",
+        )
 
 
 class _PatchReader:

@@ -41,6 +41,11 @@ class ImageTextEncoder(Protocol):
     dim: int
     device: torch.device
 
+    @property
+    def patches(self) -> int:
+        """Patches along a side that `encode_patches` reads; 0 where it reads none."""
+        ...
+
     def encode_images(self, images: Tensor) -> Tensor:
         """``[B, 3, h, w]`` in 0..1 to ``[B, D]``, float32 on the CPU, unit length."""
         ...

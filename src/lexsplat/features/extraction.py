@@ -197,7 +197,8 @@ def extract_features(
 
     Raises:
         CaptureError: If an image cannot be read.
-        MemoryBudgetError: If a photo is too large for the memory of the settings.
+        MemoryBudgetError: If a photo, or the patches of its crops, are too large for the memory of the settings.
+        ModelError: If patches are to speak and the encoder's cannot be read.
     """
     config = config or FeatureConfig()
     cache_dir = Path(cache_dir)
@@ -212,7 +213,9 @@ def extract_features(
     for name, entry in entries.items():
         photo = scene.views[name].lens.width, scene.views[name].lens.height
         budget.check_photo(photo, config.memory, entry.image_size)
-        largest = max(largest, budget.photo_bytes(photo, entry.image_size))
+        largest = max(
+            largest, budget.photo_bytes(photo, entry.image_size) + _patch_bytes(entry, clip, config)
+        )
     workers = max(1, min(workers, config.memory // 2 // largest))
     pictures: dict[tuple[Path, Path | None], list[str]] = {}  # views with the same picture share their files
     for name in missing:
@@ -229,6 +232,21 @@ def extract_features(
         return FeatureMap(read_crops(entry.clip, cols, rows, config.tokens), grid)
 
     return FeatureMaps(list(entries), load, config.memory // 4)
+
+
+def _patch_bytes(entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig) -> int:
+    """What the patches of all crops of a view take while they wait to be put together, with a copy; 0 without them.
+
+    Raises:
+        MemoryBudgetError: If that is more than half of the memory of the settings.
+    """
+    if config.tokens == "class":
+        return 0
+    crops = sum(map(len, grid_levels(*entry.image_size, config.crop_sizes, config.crop_strides)))
+    need = 2 * 4 * crops * (1 + clip.patches**2) * clip.dim
+    what, remedy = f"the patches of {crops:,} crops", "features.crop-tokens class"
+    budget.require("features", 2 * need, config.memory, what, remedy)
+    return need
 
 
 def load_level_maps(
