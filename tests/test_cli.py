@@ -543,3 +543,10 @@ def test_a_reader_that_has_seen_enough_ends_a_command_quietly(arguments):
     assert "Traceback" not in error
     assert "Broken pipe" not in error
     assert process.returncode == 0
+
+
+def test_info_says_what_averaged_features_are_made_of(built, capsys):
+    assert cli.main(["info", str(built), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["method"], facts["codes"], facts["dino"]) == ("averaged", 16, "not used")
+    assert "weight_dropped" not in facts

@@ -169,8 +169,9 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
     config = record.get("config", {})
     stages = record["stages"]
-    codes = stages.get("codebook") or stages.get(
-        "embed", {}
+    averaged = stages.get("embed", {}).get("method") == "averaged"
+    codes = stages.get(
+        "embed" if averaged else "codebook", {}
     )  # averaged features get theirs with the language
     facts: dict[str, Any] = {
         "scene": str(folder.root),
@@ -184,9 +185,9 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
         "method": stages.get("embed", {}).get("method"),
-        "weight_dropped": stages.get("embed", {}).get("dropped"),
+        **({} if averaged else {"weight_dropped": stages.get("embed", {}).get("dropped")}),
         "clip": config.get("clip"),
-        "dino": config.get("dino") if stages.get("embed", {}).get("method") != "averaged" else None,
+        "dino": "not used" if averaged else config.get("dino"),
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         "language_bytes": folder.bytes_on_disk(folder.language_path),
         "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
