@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import threading
@@ -174,6 +175,17 @@ def test_patches_are_the_values_of_the_last_attention_written_out(clip_folder):
     torch.testing.assert_close(whole, encoder.encode_images(images))
     assert encoder.patches == 5
     torch.testing.assert_close(patches, _unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
+
+
+def test_nothing_of_an_evaluation_is_held_once_it_is_answered(clip_folder):
+    encoder = ClipEncoder(clip_folder, "tiny")
+    encoder.encode_images(_images(2, 40))
+    encoder.encode_patches(_images(2, 40))
+    encoder.encode_images(_images(2, 40))
+    held = [
+        o for o in gc.get_objects() if issubclass(type(o), torch.Tensor) and o.shape[:2] == (2, 26)
+    ]  # 25 patches, class
+    assert held == []
 
 
 def test_threads_get_their_own_patches(clip_folder):

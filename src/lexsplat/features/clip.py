@@ -6,7 +6,8 @@ import json
 import logging
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -108,9 +109,10 @@ class ClipEncoder(PretrainedModel):
                 "a model of CLIP's architecture to read patches",
                 "leave the patches out: `--features.crop-tokens class`",
             )
-        whole = self.encode_images(images)
+        with self._patches.caught() as tokens:
+            whole = self.encode_images(images)
         with precision(self.device, crops=True):
-            values = self._patches.read()
+            values = self._patches.read(tokens[0])
         side = math.isqrt(values.shape[1])
         return whole, F.normalize(values.float(), dim=-1).cpu().unflatten(1, (side, side))
 
@@ -193,7 +195,7 @@ def check_patches(folder: Path, name: str) -> None:
 
 
 class _PatchReader:
-    """Catches what the last attention of a CLIP image tower sees; each thread gets its own."""
+    """Catches what the last attention of a CLIP image tower sees, where it is asked to; each thread gets its own."""
 
     def __init__(self, model: Any) -> None:
         self._tower, self._project = model.vision_model, model.visual_projection
@@ -201,14 +203,25 @@ class _PatchReader:
         self._caught = threading.local()
         self._last.layer_norm1.register_forward_hook(self._catch)
 
-    def _catch(self, module: torch.nn.Module, inputs: Any, output: Tensor) -> None:
-        self._caught.tokens = output
+    @contextmanager
+    def caught(self) -> Iterator[list[Tensor]]:
+        """A list that gets the tokens ``[B, 1 + P * P, width]`` of what this thread evaluates meanwhile."""
+        tokens: list[Tensor] = []
+        self._caught.tokens = tokens
+        try:
+            yield tokens
+        finally:
+            del self._caught.tokens  # whole batches would stay in memory
 
-    def read(self) -> Tensor:
-        """Embeddings of the patches ``[B, P * P, D]`` of this thread's last evaluation."""
-        tokens = self._caught.__dict__.pop("tokens")[:, 1:]  # the class token comes first
+    def _catch(self, module: torch.nn.Module, inputs: Any, output: Tensor) -> None:
+        if hasattr(self._caught, "tokens"):
+            self._caught.tokens.append(output)
+
+    def read(self, tokens: Tensor) -> Tensor:
+        """Embeddings of the patches ``[B, P * P, D]`` from the tokens that were caught."""
         attention = self._last.self_attn
-        return self._project(self._tower.post_layernorm(attention.out_proj(attention.v_proj(tokens))))
+        values = attention.out_proj(attention.v_proj(tokens[:, 1:]))  # the class token comes first
+        return self._project(self._tower.post_layernorm(values))
 
 
 def _pooled(output: Any) -> Tensor:
