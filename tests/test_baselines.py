@@ -22,13 +22,13 @@ from lexsplat.baselines import (
     fit_3dovs,
     fit_lerf,
 )
-from lexsplat.baselines.feature_rendering import TrainingViews, average_features, render_cosines, spread
+from lexsplat.baselines.feature_rendering import TrainingViews, average_features, render_cosines
 from lexsplat.baselines.lerf import level_weights, smooth_alike
 from lexsplat.baselines.ovs3d import alignment_loss, js_divergence
 from lexsplat.evaluation import Method
 from lexsplat.features import FeatureMap
 from lexsplat.queries import QueryConfig, pairwise_relevancy
-from lexsplat.rendering import render
+from lexsplat.rendering import render, spread
 
 BALLS = len(CENTRES)
 DIM = BALLS + 1  # one direction for each ball, one for everything else
@@ -83,11 +83,12 @@ def pixel_accuracy(method, scene, maps_shape=(24, 32)):
 
 def test_spreading_is_the_transpose_of_rendering(scene):
     views = TrainingViews(scene.gaussians, scene.cameras, lambda name: (16, 12))
-    camera, _ = views.prepared("view0")
+    camera, prepared = views.prepared("view0")
     weights = render(scene.gaussians, camera, features=torch.eye(len(scene.gaussians)), color=False).features
-    values = torch.randn(camera.height, camera.width, 35, generator=torch.Generator().manual_seed(0))
+    values = torch.randn(camera.height, camera.width, 70, generator=torch.Generator().manual_seed(0))
     expected = torch.einsum("hwn,hwc->nc", weights.double(), values.double())
-    torch.testing.assert_close(spread(views, "view0", values).double(), expected, atol=1e-4, rtol=1e-4)
+    found = spread(scene.gaussians, camera, values, prepared)
+    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=1e-4)
 
 
 def test_the_average_of_a_constant_is_that_constant_where_something_was_seen(scene):

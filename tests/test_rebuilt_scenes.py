@@ -134,7 +134,7 @@ def test_a_build_keeps_the_scene_until_the_new_one_is_whole(scene, tiny_capture,
         raise KeyboardInterrupt
 
     before = open_scene(scene, device="cpu").gaussians.means
-    monkeypatch.setattr("lexsplat.pipeline.average", stop)
+    monkeypatch.setattr("lexsplat.pipeline.make_averaged_field", stop)
     changed = [*QUICK_BUILD, "--seed", "5"]
     assert cli.main(["build", str(tiny_capture), "--output", str(scene), *changed]) == 130
     assert seen == ["previous"]

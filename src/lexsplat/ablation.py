@@ -22,7 +22,7 @@ from lexsplat.config import BuildConfig, LanguageMethod
 from lexsplat.evaluation import EvaluationConfig
 from lexsplat.experiments import Bench, Results, with_seed
 from lexsplat.language_field import LanguageField
-from lexsplat.pipeline import average, make_field
+from lexsplat.pipeline import make_averaged_field, make_field
 from lexsplat.progress import Listener, silent
 from lexsplat.queries import QueryForm
 from lexsplat.scenes.prompt_lists import PromptList
@@ -196,24 +196,21 @@ def make_language(
     Wrong labels reach averaged features as the features of the wrong codes.
     """
     cameras = {name: bench.scene.views[name].camera for name in bench.scene.train_names}
-    if config.method == "averaged" and not wrong_labels:
-        start = time.perf_counter()
-        scratch = bench.folder.root / "checkpoints"
-        averaged = average(
-            bench.gaussians, cameras, bench.maps, config.within_memory(), scratch, bench.listener
-        )
-        return averaged, {"embed": time.perf_counter() - start}
-    codebook, code_maps, fit_seconds = bench.codebook(config.codebook, config.seed)
-    if wrong_labels:
-        code_maps = with_wrong_labels(code_maps, wrong_labels, codebook.num_codes, config.seed)
+    bounded, seconds = config.within_memory(), {}
+    averaged = config.method == "averaged"
+    if not averaged or wrong_labels:
+        codebook, code_maps, seconds["codebook"] = bench.codebook(config.codebook, config.seed)
+        if wrong_labels:
+            code_maps = with_wrong_labels(code_maps, wrong_labels, codebook.num_codes, config.seed)
     start = time.perf_counter()
-    bounded = config.within_memory()
-    if config.method == "averaged":
-        said = features_of_codes(code_maps, codebook)
-        averaged = average(bench.gaussians, cameras, said, bounded, None, bench.listener)
-        return averaged, {"codebook": fit_seconds, "embed": time.perf_counter() - start}
-    field = make_field(bench.gaussians, cameras, code_maps, codebook, bounded, bench.listener)
-    return field, {"codebook": fit_seconds, "embed": time.perf_counter() - start}
+    field: LanguageField
+    if averaged:
+        maps = features_of_codes(code_maps, codebook) if wrong_labels else bench.maps
+        scratch = bench.folder.root / "checkpoints"
+        field = make_averaged_field(bench.gaussians, cameras, maps, bounded, scratch, bench.listener)
+    else:
+        field = make_field(bench.gaussians, cameras, code_maps, codebook, bounded, bench.listener)
+    return field, {**seconds, "embed": time.perf_counter() - start}
 
 
 def language_settings(config: BuildConfig) -> list[Any]:

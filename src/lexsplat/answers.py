@@ -170,9 +170,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     config = record.get("config", {})
     stages = record["stages"]
     averaged = stages.get("embed", {}).get("method") == "averaged"
-    codes = stages.get(
-        "embed" if averaged else "codebook", {}
-    )  # averaged features get theirs with the language
+    codes = stages.get("embed" if averaged else "codebook", {})  # where they were found
     facts: dict[str, Any] = {
         "scene": str(folder.root),
         "capture": record.get("capture"),

@@ -34,11 +34,8 @@ from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.gaussians import Gaussians
 from lexsplat.language_field import LiftedField
 from lexsplat.progress import Event, Listener, silent
-from lexsplat.rendering import PreparedView, prepare, render
+from lexsplat.rendering import SPREAD_CHANNELS, prepare, spread
 from lexsplat.threads import one_thread
-
-CHANNELS = 64
-"""Channels of the features that are spread over the Gaussians at a time."""
 
 ROWS = 16_384
 """Gaussians handled at a time outside rendering."""
@@ -181,9 +178,10 @@ def field_from_means(
     Raises:
         MemoryBudgetError: If the sample does not fit.
     """
-    rows_looked_at = min(codebook_config.sample_size, len(found.totals))
-    _check_sample(rows_looked_at, found.means.shape[1], codebook_config, memory)
-    device, count = found.totals.device, len(found.totals)
+    device, (count, dimensions) = found.totals.device, found.means.shape
+    looked_at = min(codebook_config.sample_size, count)
+    what, number = f"a sample of {looked_at:,} Gaussians", codebook_config.num_codes
+    budget.require_sample("embed", what, looked_at, dimensions, number, 0, memory, share=0.5)
     visible = found.visible(config)
     with one_thread():  # the last bit of a similarity may decide between two codes
         codewords = _fit(found, visible, codebook_config, seed)
@@ -201,15 +199,6 @@ def field_from_means(
     believed = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
     uncertainties = torch.where(visible, 1 - agreement * believed, torch.ones_like(believed))
     return LiftedField(Codebook(codewords), codes, weights, uncertainties, method="averaged")
-
-
-def _check_sample(rows: int, dimensions: int, config: CodebookConfig, memory: int) -> None:
-    """Refuse a sample of Gaussians that does not fit into half of the memory, with the size that would."""
-    need = budget.sample_bytes(rows, dimensions, config.num_codes, 0)
-    least = budget.sample_bytes(0, dimensions, config.num_codes, 0)
-    fewer = max(1, (memory // 2 - least) // budget.sample_bytes(1, dimensions, 0, 0))
-    what = f"a sample of {rows:,} Gaussians"
-    budget.require("embed", 2 * need, memory, what, f"codebook.sample-size {fewer}")
 
 
 def _fit(found: MeanFeatures, visible: Tensor, config: CodebookConfig, seed: int) -> Tensor:
@@ -234,10 +223,7 @@ def _weighted_sum(
     sums: Tensor,
     weights: Tensor | None,
 ) -> None:
-    """Add alpha T F(p) over the pixels of a view to ``sums [N, len(columns)]``, and alpha T to ``weights [N]``.
-
-    Rendering is linear in what the Gaussians carry, so this is its gradient under the features.
-    """
+    """Add alpha T F(p) over the pixels of a view to ``sums [N, len(columns)]``, and alpha T to ``weights [N]``."""
     pixels = torch.arange(camera.height * camera.width)
     cells = torch.arange(features.shape[0] * features.shape[1]).view(features.shape[:2])
     at = codes_at_pixels(cells, camera.height, camera.width, pixels)
@@ -246,23 +232,14 @@ def _weighted_sum(
     # A pixel of the view is so much of a cell of the map: weights do not depend on the size that views are taken at.
     share = features.shape[0] * features.shape[1] / (camera.height * camera.width)
     prepared = prepare(gaussians, camera)
-    for start in range(columns.start, columns.stop, CHANNELS):
-        stop = min(start + CHANNELS, columns.stop)
-        wanted = flat[at, start:stop].float() * share
-        sums[:, start - columns.start : stop - columns.start] += _spread(gaussians, camera, prepared, wanted)
+    size = camera.height, camera.width
+    for start in range(columns.start, columns.stop, SPREAD_CHANNELS):
+        stop = min(start + SPREAD_CHANNELS, columns.stop)
+        values = (flat[at, start:stop].float() * share).unflatten(0, size).to(gaussians.device)
+        sums[:, start - columns.start : stop - columns.start] += spread(gaussians, camera, values, prepared)
     if weights is not None:
-        weights += _spread(gaussians, camera, prepared, (known * share)[:, None])[:, 0]
-
-
-def _spread(gaussians: Gaussians, camera: Camera, prepared: PreparedView, wanted: Tensor) -> Tensor:
-    """Sum of alpha T times ``wanted [H W, C]`` over the pixels, for each Gaussian ``[N, C]``."""
-    channels = wanted.shape[1]
-    carried = torch.zeros(len(gaussians), channels, device=gaussians.device, requires_grad=True)
-    with torch.enable_grad():
-        image = render(gaussians, camera, features=carried, color=False, prepared=prepared).features
-        wanted = wanted.view(camera.height, camera.width, channels).to(gaussians.device)
-        (gradient,) = torch.autograd.grad(image, carried, wanted)
-    return gradient
+        values = (known * share).view(*size, 1).to(gaussians.device)
+        weights += spread(gaussians, camera, values, prepared)[:, 0]
 
 
 def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragingConfig) -> Camera:
@@ -278,7 +255,7 @@ def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: Av
 
 def _ranges(dimensions: int, count: int, memory_bytes: int) -> Iterator[range]:
     """Dimensions in ranges so small that their sums, with one copy in work, keep to the bound."""
-    width = max(1, min(dimensions, memory_bytes // (4 * max(count, 1)) - CHANNELS))
+    width = max(1, min(dimensions, memory_bytes // (4 * max(count, 1)) - SPREAD_CHANNELS))
     for start in range(0, dimensions, width):
         yield range(start, min(start + width, dimensions))
 

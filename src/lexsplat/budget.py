@@ -7,6 +7,8 @@ by existing comes beside these numbers.
 
 from __future__ import annotations
 
+import math
+
 from lexsplat.errors import MemoryBudgetError
 
 DEFAULT_MEMORY = 4 << 30
@@ -94,6 +96,30 @@ def mapping_bytes(features: int, matches: int) -> int:
 def sample_bytes(rows: int, dimensions: int, codes: int, batch: int) -> int:
     """Fitting ``codes`` codes to a sample of features: the sample, itself again as joint vectors, blocks, a batch."""
     return 4 * (rows * (2 * dimensions + 8) + 4 * batch * (dimensions + codes) + 6 * codes * dimensions)
+
+
+def require_sample(
+    stage: str, what: str, rows: int, dimensions: int, codes: int, batch: int, memory: int, share: float
+) -> None:
+    """Refuse a sample that does not fit into its share of the memory, with a sample and a budget that would.
+
+    Args:
+        stage: Its name, for people.
+        what: The sample, such as "a sample of 50,000 features".
+        rows: Features in it.
+        dimensions: Of a feature.
+        codes: How many are fitted.
+        batch: Features a gradient step.
+        memory: Bytes there are.
+        share: Of them that the sample and the fit may take.
+
+    Raises:
+        MemoryBudgetError: If they need more.
+    """
+    need = sample_bytes(rows, dimensions, codes, batch)
+    least = sample_bytes(0, dimensions, codes, batch)
+    fewer = max(1, (int(share * memory) - least) // sample_bytes(1, dimensions, 0, 0))
+    require(stage, math.ceil(need / share), memory, what, f"codebook.sample-size {fewer}")
 
 
 def gaussian_bytes(count: int) -> int:

@@ -163,12 +163,11 @@ class _Builder:
             stages["reconstruct"] = (inputs, self._train_jointly, [*outputs, self._joint_path])
             stages["embed"] = (["reconstruct", language], self._take_joint_language, [folder.language_path])
             order = ("features", "codebook", "reconstruct", "embed")
-        until = until if until in order else "features"
+        until = until if until in order else "features"  # without a stage for the codes, what comes before it
         wanted = order[: order.index(until) + 1]
         if "features" in wanted and not folder.is_finished("features", fingerprint(stages["features"][0])):
-            clip = model_folder(
-                config.clip, "clip"
-            )  # a missing model is told now, not after the reconstruction
+            # What is wrong with a model is told now, not after the reconstruction.
+            clip = model_folder(config.clip, "clip")
             if config.features.tokens != "class" and config.features_from is None:
                 check_patches(clip, config.clip)
             if dino != "none" and config.features_from is None:
@@ -305,7 +304,7 @@ class _Builder:
         cameras = {name: self.scene.views[name].camera for name in self.scene.train_names}
         maps = self._feature_maps()
         scratch = self.folder.root / "checkpoints"
-        field = average(gaussians, cameras, maps, self.bounded, scratch, self.listener)
+        field = make_averaged_field(gaussians, cameras, maps, self.bounded, scratch, self.listener)
         metadata = {**field.metadata(), "reconstruction": self.made_from["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)
         usage = code_usage([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
@@ -412,7 +411,7 @@ def feature_maps(
     return without_masked_cells(maps, scene), clip.content_hash
 
 
-def average(
+def make_averaged_field(
     gaussians: Gaussians,
     cameras: Mapping[str, Any],
     maps: Mapping[str, Any],

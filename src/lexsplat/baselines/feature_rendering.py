@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lexsplat.cameras import Camera
 from lexsplat.gaussians import Gaussians
-from lexsplat.rendering import PreparedView, accumulate_weights, prepare, render
+from lexsplat.rendering import PreparedView, accumulate_weights, prepare, render, spread
 
 CHANNELS = 32
 """Feature channels rendered in one pass."""
@@ -83,17 +83,6 @@ def resized_map(values: Tensor, camera: Camera) -> Tensor:
     return planes[0].permute(1, 2, 0)
 
 
-def spread(views: TrainingViews, name: str, values: Tensor) -> Tensor:
-    """A map ``[H, W, C]`` of a view spread over the Gaussians by their blending weights: ``[N, C]``, A^T values."""
-    count = len(views.gaussians)
-    parts = []
-    for part in values.split(CHANNELS, dim=-1):
-        carried = torch.zeros(count, part.shape[-1], device=part.device, requires_grad=True)
-        (gradient,) = torch.autograd.grad(views.render(name, carried), carried, part.contiguous())
-        parts.append(gradient)
-    return torch.cat(parts, dim=1)
-
-
 def average_features(
     views: TrainingViews, map_of: Callable[[str, Camera], Tensor], *, tell: Callable[[int], None]
 ) -> tuple[Tensor, Tensor]:
@@ -111,7 +100,7 @@ def average_features(
     weights = torch.zeros(len(views.gaussians), device=views.gaussians.device)
     for done, name in enumerate(views.names, start=1):
         camera, prepared = views.prepared(name)
-        found = spread(views, name, map_of(name, camera).to(weights.device))
+        found = spread(views.gaussians, camera, map_of(name, camera).to(weights.device), prepared)
         total = found if total is None else total + found
         weights += accumulate_weights(views.gaussians, camera, prepared=prepared)
         tell(done)

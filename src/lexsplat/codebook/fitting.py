@@ -178,11 +178,8 @@ def _check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory:
         dimensions += first.dino.shape[-1]
     rows = min(-(-config.sample_size // views), cells) * views
     batch = min(config.batch_size, rows)
-    need = budget.sample_bytes(rows, dimensions, config.num_codes, batch)
-    least = budget.sample_bytes(0, dimensions, config.num_codes, batch)
-    fewer = max(1, (memory * 3 // 4 - least) // budget.sample_bytes(1, dimensions, 0, 0))
     what = f"a sample of {rows:,} features"
-    budget.require("codebook", -(-need * 4 // 3), memory, what, f"codebook.sample-size {fewer}")
+    budget.require_sample("codebook", what, rows, dimensions, config.num_codes, batch, memory, share=0.75)
 
 
 @torch.no_grad()

@@ -31,11 +31,14 @@ __all__ = [
     "accumulate_weights",
     "prepare",
     "render",
+    "spread",
 ]
 
 Backend = Literal["auto", "cpu", "gsplat"]
 NEAR = 0.01
 """Gaussians nearer than this are not drawn, world units."""
+SPREAD_CHANNELS = 64
+"""Channels that `spread` takes at a time."""
 IGNORED_CODE = 255
 """In code maps with at most 255 codes: a pixel without a code."""
 
@@ -277,6 +280,30 @@ def accumulate_codes(
     with torch.no_grad():
         module.accumulate_codes(prepared.projected, prepared.pairs, codes, num_codes, out)
     return out
+
+
+def spread(gaussians: Gaussians, camera: Camera, values: Tensor, prepared: PreparedView) -> Tensor:
+    """A map spread over the Gaussians by their blending weights, the transpose of rendering: sum of alpha T values.
+
+    Rendering is linear in what the Gaussians carry, so this is its gradient; `SPREAD_CHANNELS` are taken at a time.
+
+    Args:
+        gaussians: The scene.
+        camera: The view of the map, of its size.
+        values: ``[H, W, C]``, on the device of the Gaussians.
+        prepared: See `render`.
+
+    Returns:
+        ``[N, C]``.
+    """
+    parts = []
+    with torch.enable_grad():
+        for part in values.split(SPREAD_CHANNELS, dim=-1):
+            carried = torch.zeros(len(gaussians), part.shape[-1], device=gaussians.device, requires_grad=True)
+            image = render(gaussians, camera, features=carried, color=False, prepared=prepared).features
+            (gradient,) = torch.autograd.grad(image, carried, part.contiguous())
+            parts.append(gradient)
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
 def accumulate_weights(gaussians: Gaussians, camera: Camera, **options: Any) -> Tensor:
