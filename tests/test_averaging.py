@@ -88,6 +88,35 @@ def test_cells_without_a_feature_count_for_nothing(small) -> None:
     np.testing.assert_allclose(found.means[seen], sums[seen] / totals[seen, None], atol=2e-3)
 
 
+def test_masked_pixels_count_for_nothing_also_within_a_cell_that_counts(small) -> None:
+    """Cells of 4 x 3 pixels; the mask ends in the middle of some."""
+    coarse = {
+        name: FeatureMap(normalize(torch.randn(5, 5, 7, generator=torch.Generator().manual_seed(0)), dim=-1))
+        for name in small.cameras
+    }
+    mask = np.ones((15, 20), bool)
+    mask[4:, :9] = False
+    asked = []
+
+    def valid(name: str, size: tuple[int, int]) -> np.ndarray | None:
+        asked.append(size)
+        return mask if name != "view1" else None
+
+    found = average_features(small.gaussians, small.cameras, coarse, FULL_SIZE, valid=valid)
+    fine = {}
+    for name, camera in small.cameras.items():
+        pixels = coarse[name].clip.repeat_interleave(3, 0).repeat_interleave(4, 1)
+        assert pixels.shape[:2] == (camera.height, camera.width)
+        fine[name] = FeatureMap(
+            pixels * torch.from_numpy(mask if name != "view1" else mask | True)[..., None]
+        )
+    sums, totals = reference(small.gaussians, small.cameras, fine)
+    np.testing.assert_allclose(found.totals.numpy(), totals / 12, rtol=1e-4, atol=1e-5)  # in cells
+    seen = totals > 0.12
+    np.testing.assert_allclose(found.means[seen], sums[seen] / totals[seen, None], atol=2e-3)
+    assert set(asked) == {(20, 15)}
+
+
 @pytest.mark.parametrize("memory", [1, 30 * 4 * 67, 30 * 4 * 70])
 def test_a_small_bound_of_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_path) -> None:
     maps = random_features(small.cameras)

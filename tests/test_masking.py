@@ -1,6 +1,7 @@
 """Masked pixels have no say: not in pictures, features, codes, language or geometry, whatever is painted there."""
 
 import dataclasses
+import math
 import shutil
 
 import numpy as np
@@ -12,11 +13,14 @@ from language_scene import make_scene
 from PIL import Image
 
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
+from lexsplat.config import BuildConfig
 from lexsplat.embedding import MASKED_CODE, EmbeddingConfig, EmbeddingTrainer
 from lexsplat.errors import CaptureError
-from lexsplat.features import FeatureConfig, extract_features
+from lexsplat.features import FeatureConfig, FeatureMap, extract_features
+from lexsplat.gaussians import gaussians_from_points
 from lexsplat.lifting import LiftingConfig, accumulate_histogram
 from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
+from lexsplat.pipeline import make_averaged_field
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.scenes import initial_points, load_scene
 from lexsplat.scenes.scene import filled
@@ -214,3 +218,17 @@ def test_masks_that_fit_no_photo_are_told(tmp_path, caplog):
     Image.new("L", (48, 64)).save(tmp_path / "masks" / "b.png")
     with pytest.raises(CaptureError, match=r"b\.png.*48x64"):
         load_scene(tmp_path)
+
+
+def test_a_gaussian_that_only_masked_pixels_show_gets_no_language(tmp_path):
+    """Every cell has a feature, those of the hole too; behind its middle lies a small Gaussian."""
+    view = masked_capture(tmp_path, PINHOLE, paint=None).views["a.png"]
+    camera, points = view.camera, []
+    for x, y in ((28.0, 20.0), (5.0, 40.0)):  # behind the hole, and beside it
+        ray = np.linalg.inv(camera.K) @ [x, y, 1.0]
+        points.append(np.linalg.inv(camera.viewmat)[:3] @ [*(2.0 * ray), 1.0])
+    gaussians = gaussians_from_points(np.array(points), np.full((2, 3), 0.5), sh_degree=0, opacity=0.9)
+    gaussians.log_scales.fill_(math.log(0.02))
+    maps = {"a.png": FeatureMap(torch.eye(4)[:1].expand(12, 16, 4))}
+    field = make_averaged_field(gaussians, {"a.png": view}, maps, BuildConfig())
+    assert field.weights.sum(1).tolist() == pytest.approx([0.0, 1.0])

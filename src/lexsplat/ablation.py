@@ -195,7 +195,7 @@ def make_language(
 
     Wrong labels reach averaged features as the features of the wrong codes.
     """
-    cameras = {name: bench.scene.views[name].camera for name in bench.scene.train_names}
+    views = {name: bench.scene.views[name] for name in bench.scene.train_names}
     bounded, seconds = config.within_memory(), {}
     averaged = config.method == "averaged"
     if not averaged or wrong_labels:
@@ -207,8 +207,9 @@ def make_language(
     if averaged:
         maps = features_of_codes(code_maps, codebook) if wrong_labels else bench.maps
         scratch = bench.folder.root / "checkpoints"
-        field = make_averaged_field(bench.gaussians, cameras, maps, bounded, scratch, bench.listener)
+        field = make_averaged_field(bench.gaussians, views, maps, bounded, scratch, bench.listener)
     else:
+        cameras = {name: view.camera for name, view in views.items()}
         field = make_field(bench.gaussians, cameras, code_maps, codebook, bounded, bench.listener)
     return field, {**seconds, "embed": time.perf_counter() - start}
 

@@ -15,7 +15,7 @@ its nearest ones. The length of the mean of unit vectors tells how far the views
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,12 +94,21 @@ class MeanFeatures:
         return (self.totals >= config.min_visibility) & (self.totals > 0)
 
 
+Valid = Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]
+"""Which pixels ``[H, W]`` of a view count, by its name and (width, height); None for all."""
+
+
+def all_valid(name: str, size: tuple[int, int]) -> None:
+    """Views without masks."""
+
+
 def average_features(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
     feature_maps: Mapping[str, FeatureMap],
     config: AveragingConfig,
     *,
+    valid: Valid = all_valid,
     scratch: Path | None = None,
     listener: Listener = silent,
 ) -> MeanFeatures:
@@ -110,6 +119,7 @@ def average_features(
         cameras: The training views by name, and only these.
         feature_maps: Dense features by view name; cells whose feature is zero count for nothing.
         config: Settings.
+        valid: Which pixels of a view ``[H, W]`` count, by its name and (width, height); None for all.
         scratch: Folder for the file that the means lie in where memory does not do; the system's if None.
         listener: Hears of stage "average".
 
@@ -132,7 +142,9 @@ def average_features(
                     f"features of {name} have {features.shape[-1]} dimensions, those of {names[0]} {dimensions}"
                 )
             camera = _at_map_size(cameras[name], features, gaussians.antialiased, config)
-            _weighted_sum(gaussians, camera, features, columns, sums, weights=totals if part == 0 else None)
+            counting = valid(name, (camera.width, camera.height))
+            weights = totals if part == 0 else None
+            _weighted_sum(gaussians, camera, features, counting, columns, sums, weights)
             listener(Event("average", part * len(names) + done, len(ranges) * len(names)))
         for start in range(0, count, ROWS):
             rows = slice(start, start + ROWS)
@@ -219,6 +231,7 @@ def _weighted_sum(
     gaussians: Gaussians,
     camera: Camera,
     features: Tensor,
+    counting: NDArray[np.bool_] | None,
     columns: range,
     sums: Tensor,
     weights: Tensor | None,
@@ -228,17 +241,19 @@ def _weighted_sum(
     cells = torch.arange(features.shape[0] * features.shape[1]).view(features.shape[:2])
     at = codes_at_pixels(cells, camera.height, camera.width, pixels)
     flat = features.flatten(0, 1)
-    known = flat.any(-1)[at].float()
     # A pixel of the view is so much of a cell of the map: weights do not depend on the size that views are taken at.
     share = features.shape[0] * features.shape[1] / (camera.height * camera.width)
+    counts = torch.full((len(pixels),), share)
+    if counting is not None:
+        counts *= torch.from_numpy(counting).flatten()
     prepared = prepare(gaussians, camera)
     size = camera.height, camera.width
     for start in range(columns.start, columns.stop, SPREAD_CHANNELS):
         stop = min(start + SPREAD_CHANNELS, columns.stop)
-        values = (flat[at, start:stop].float() * share).unflatten(0, size).to(gaussians.device)
+        values = (flat[at, start:stop].float() * counts[:, None]).unflatten(0, size).to(gaussians.device)
         sums[:, start - columns.start : stop - columns.start] += spread(gaussians, camera, values, prepared)
     if weights is not None:
-        values = (known * share).view(*size, 1).to(gaussians.device)
+        values = (counts * flat.any(-1)[at]).view(*size, 1).to(gaussians.device)
         weights += spread(gaussians, camera, values, prepared)[:, 0]
 
 

@@ -25,7 +25,13 @@ from lexsplat.codebook import MAX_CODES, Codebook, assign_code_maps, code_usage,
 from lexsplat.config import BuildConfig, choose_device, parse_bytes
 from lexsplat.embedding import train_field
 from lexsplat.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
-from lexsplat.features import FeatureMaps, external_identity, extract_features, load_external_features
+from lexsplat.features import (
+    FeatureMap,
+    FeatureMaps,
+    external_identity,
+    extract_features,
+    load_external_features,
+)
 from lexsplat.features.clip import check_patches
 from lexsplat.features.hub import model_folder
 from lexsplat.formats.reading import read_splats
@@ -40,7 +46,7 @@ from lexsplat.provenance import file_hash, model_identity, write_provenance
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
 from lexsplat.scene_folder import SceneFolder, fingerprint
-from lexsplat.scenes import Scene, load_annotations
+from lexsplat.scenes import Scene, View, load_annotations
 from lexsplat.scenes.triangulation import initial_points
 from lexsplat.tensor_files import read_tensors, write_tensors
 
@@ -301,10 +307,10 @@ class _Builder:
 
     def _average(self) -> dict[str, Any]:
         gaussians = self.folder.read_gaussians().to(self.device)
-        cameras = {name: self.scene.views[name].camera for name in self.scene.train_names}
+        views = {name: self.scene.views[name] for name in self.scene.train_names}
         maps = self._feature_maps()
         scratch = self.folder.root / "checkpoints"
-        field = make_averaged_field(gaussians, cameras, maps, self.bounded, scratch, self.listener)
+        field = make_averaged_field(gaussians, views, maps, self.bounded, scratch, self.listener)
         metadata = {**field.metadata(), "reconstruction": self.made_from["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)
         usage = code_usage([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
@@ -413,14 +419,21 @@ def feature_maps(
 
 def make_averaged_field(
     gaussians: Gaussians,
-    cameras: Mapping[str, Any],
-    maps: Mapping[str, Any],
+    views: Mapping[str, View],
+    maps: Mapping[str, FeatureMap],
     config: BuildConfig,
     scratch: Path | None = None,
     listener: Listener = silent,
 ) -> LiftedField:
     """The language field of method "averaged": features on the Gaussians first, codes afterwards."""
-    found = average_features(gaussians, cameras, maps, config.averaging, scratch=scratch, listener=listener)
+    cameras = {name: view.camera for name, view in views.items()}
+
+    def valid(name: str, size: tuple[int, int]) -> np.ndarray | None:
+        return views[name].load_valid(size)
+
+    found = average_features(
+        gaussians, cameras, maps, config.averaging, valid=valid, scratch=scratch, listener=listener
+    )
     memory = parse_bytes(config.memory)
     return field_from_means(found, config.codebook, config.averaging, seed=config.seed, memory=memory)
 
