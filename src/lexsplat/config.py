@@ -31,7 +31,7 @@ CUDA_ITERATIONS = 30_000
 
 
 LanguageMethod = Literal["averaged", "trained", "lifted", "lifted+tuned"]
-"""Ways from index maps to language on the Gaussians."""
+"""Ways to language on the Gaussians."""
 
 
 @dataclass(frozen=True)
