@@ -34,13 +34,13 @@ import numpy as np
 import torch
 from render import three_shells
 
-from lexsplat.cameras import Camera, look_at
 from lexsplat.codebook import Codebook
-from lexsplat.gaussians import Gaussians
-from lexsplat.image_losses import photometric_loss, ssim_target
-from lexsplat.language_field import LanguageField, LiftedField, TrainedField
-from lexsplat.optimizers import Adam
-from lexsplat.queries import code_relevancy, probability_relevancy
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields import LanguageField, LiftedField, TrainedField
+from lexsplat.queries.relevancy import code_relevancy, probability_relevancy
+from lexsplat.reconstruction.adam import Adam
+from lexsplat.reconstruction.image_losses import photometric_loss, ssim_target
 from lexsplat.rendering import render
 
 RESULTS = Path(__file__).parent / "results"

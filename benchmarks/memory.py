@@ -75,10 +75,10 @@ def make_capture(folder: Path, views: int, width: int, height: int) -> None:
 
 def extract(capture: Path, memory: str) -> dict[str, float]:
     """The feature stage at full size; GiB and seconds."""
-    from lexsplat.config import BuildConfig
+    from lexsplat.captures import load_scene
     from lexsplat.features.encoders import load_clip, load_dino
-    from lexsplat.pipeline import feature_maps
-    from lexsplat.scenes import load_scene
+    from lexsplat.pipeline.build import feature_maps
+    from lexsplat.pipeline.config import BuildConfig
 
     load_clip("embedded"), load_dino("embedded")
     bare = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

@@ -21,7 +21,7 @@ import time
 
 import torch
 
-from lexsplat.queries import QueryConfig, code_relevancy, probability_relevancy
+from lexsplat.queries.relevancy import QueryConfig, code_relevancy, probability_relevancy
 
 DIMENSION = 512
 METHODS = ("published", "feature", "code", "gaussians")

@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from lexsplat.config import BuildConfig
-from lexsplat.demo.demo import demo_capture
-from lexsplat.metrics import psnr, ssim
-from lexsplat.progress_bars import ProgressBars
+from lexsplat.captures import InitialPoints, Scene, View, initial_points, load_scene
+from lexsplat.cli.progress import ProgressBars
+from lexsplat.evaluation.demo import demo_capture
+from lexsplat.evaluation.metrics import psnr, ssim
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.rendering import render
-from lexsplat.scenes import InitialPoints, Scene, View, initial_points, load_scene
 
 VALIDATION_EVERY = 6
 VARIANTS: dict[str, dict[str, Any]] = {

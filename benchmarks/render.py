@@ -30,8 +30,8 @@ import numba
 import numpy as np
 import torch
 
-from lexsplat.cameras import Camera, look_at
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import cpu_backend, prepare, render
 from lexsplat.rendering.kernels import binning, blending, lanes
 from lexsplat.rendering.kernels.jit import parallel

@@ -21,12 +21,18 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from selection_ground_truth import (
+    TruthView,
+    lift_labels,
+    selection_f1,
+    surface_points,
+    true_box,
+)
 
 import lexsplat
-from lexsplat.boxes import box_iou, gravity_up
-from lexsplat.cameras import camera_from_opengl
-from lexsplat.presence import CALIBRATION, fit_calibration
-from lexsplat.truth import TruthView, lift_labels, selection_f1, surface_points, true_box
+from lexsplat.geometry.boxes import box_iou, gravity_up
+from lexsplat.geometry.cameras import camera_from_opengl
+from lexsplat.queries.presence import CALIBRATION, fit_calibration
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant", "table lamp",
@@ -117,7 +123,7 @@ def presence(folder: Path, truth: Path, calibration) -> dict:
 
 
 def evidence_values(group: dict):
-    from lexsplat.presence import Evidence
+    from lexsplat.queries.presence import Evidence
 
     return [Evidence(*numbers) for _, *numbers in group["each"].values()]
 
@@ -154,7 +160,7 @@ def accuracy(folder: Path, truth: Path, stride: int) -> dict:
 
 def best_box_iou(scene, lifted, views, meanings, up) -> float:
     """What boxes around the right Gaussians reach: the limit that reconstruction sets."""
-    from lexsplat.selection import Selection
+    from lexsplat.queries.selection import Selection
 
     found = []
     for indices in meanings.values():

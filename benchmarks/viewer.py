@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 import lexsplat
-from lexsplat.cameras import look_at
 from lexsplat.codebook import Codebook
-from lexsplat.gaussians import Gaussians
-from lexsplat.language_field import LiftedField
-from lexsplat.scene_folder import StoredView
-from lexsplat.search import SearchableScene
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields import LiftedField
+from lexsplat.scenes.folder import StoredView
+from lexsplat.scenes.scene import SearchableScene
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
 from lexsplat.viewer.splats import BYTES_PER_SPLAT
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from lexsplat.cameras import look_at
-from lexsplat.gaussians import gaussians_from_points
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.rendering import render
 
 rng = np.random.default_rng(0)

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 
 import lexsplat
-from lexsplat.heatmaps import overlay_heatmap
+from lexsplat.queries.heatmaps import overlay_heatmap
 
 folder, prompts = Path(sys.argv[1]), sys.argv[2:] or ["red apple", "blue mug"]
 scene = lexsplat.open_scene(folder)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import lexsplat
-from lexsplat.formats.ply import write_ply
+from lexsplat.scenes.formats.ply import write_ply
 
 folder, prompt, output = sys.argv[1], sys.argv[2], Path(sys.argv[3])
 scene = lexsplat.open_scene(folder)

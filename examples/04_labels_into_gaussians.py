@@ -9,8 +9,8 @@ for every Gaussian how much of each label it carries.
 import numpy as np
 import torch
 
-from lexsplat.cameras import look_at
-from lexsplat.gaussians import gaussians_from_points
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.rendering import accumulate_codes, render
 
 # Two clouds of points: label 0 on the left, label 1 on the right.

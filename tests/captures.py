@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lexsplat.cameras import OPENGL_TO_OPENCV, look_at
+from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, look_at
 
 WIDTH, HEIGHT = 64, 48
 FOCAL = 60.0

@@ -7,7 +7,7 @@ import pytest
 from tiny_capture import write_capture
 
 import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
-from lexsplat import threads
+from lexsplat.runtime import device as threads
 
 TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

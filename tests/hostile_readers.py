@@ -102,7 +102,7 @@ def check_gaussians(gaussians: Any) -> None:
     """Gaussians that are finite and can be drawn."""
     import torch
 
-    from lexsplat.cameras import look_at
+    from lexsplat.geometry.cameras import look_at
     from lexsplat.rendering import render
 
     finite(*gaussians.tensors().values())
@@ -133,7 +133,7 @@ def check_open_scene(scene: Any) -> None:
 def small_gaussians(count: int = 4, degree: int = 1) -> Any:
     import torch
 
-    from lexsplat.gaussians import gaussians_from_points
+    from lexsplat.geometry.gaussians import gaussians_from_points
 
     rng = np.random.default_rng(3)
     made = gaussians_from_points(
@@ -176,7 +176,7 @@ def make_colmap_text(folder: Path) -> None:
 
 
 def load(folder: Path) -> Any:
-    from lexsplat.scenes import load_scene
+    from lexsplat.captures import load_scene
 
     return load_scene(folder)
 
@@ -237,8 +237,8 @@ def split_file() -> Reader:
 
 @reader
 def splat_ply() -> Reader:
-    from lexsplat.formats.ply import write_ply
-    from lexsplat.formats.reading import read_splats
+    from lexsplat.scenes.formats.ply import write_ply
+    from lexsplat.scenes.formats.reading import read_splats
 
     def headers(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
         end = content.index(b"end_header\n") + 11
@@ -264,8 +264,8 @@ def point_cloud() -> bytes:
 
 @reader
 def splat() -> Reader:
-    from lexsplat.formats.reading import read_splats
-    from lexsplat.formats.splat import write_splat
+    from lexsplat.scenes.formats.reading import read_splats
+    from lexsplat.scenes.formats.splat import write_splat
 
     return Reader(
         lambda folder: write_splat(small_gaussians(), folder / "a.splat"),
@@ -276,8 +276,8 @@ def splat() -> Reader:
 
 def compressed(ending: str, count: int) -> Callable[[], Reader]:
     def make() -> Reader:
-        from lexsplat.formats.compressed import COMPRESSED, write_compressed
-        from lexsplat.formats.reading import read_splats
+        from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
+        from lexsplat.scenes.formats.reading import read_splats
 
         return Reader(
             lambda folder: write_compressed(small_gaussians(), folder / f"a{ending}", COMPRESSED[ending]),
@@ -300,7 +300,7 @@ def small_field(trained: bool) -> Any:
     import torch
 
     from lexsplat.codebook import Codebook
-    from lexsplat.language_field import LiftedField, TrainedField
+    from lexsplat.language.fields import LiftedField, TrainedField
 
     generator = torch.Generator().manual_seed(0)
     clip, dino = torch.randn(3, 6, generator=generator), torch.randn(3, 4, generator=generator)
@@ -316,8 +316,8 @@ def small_field(trained: bool) -> Any:
 def make_folder(folder: Path, *, trained: bool = False) -> None:
     from captures import cameras_around
 
-    from lexsplat.scene_folder import SceneFolder
-    from lexsplat.tensor_files import write_tensors
+    from lexsplat.runtime.files import write_tensors
+    from lexsplat.scenes.folder import SceneFolder
 
     made = SceneFolder(folder)
     names = ["a.png", "дом/b.png", "c.jpg"]
@@ -341,8 +341,8 @@ def make_folder(folder: Path, *, trained: bool = False) -> None:
 
 
 def open_folder(folder: Path) -> Any:
-    from lexsplat.answers import scene_facts
-    from lexsplat.search import open_scene
+    from lexsplat.scenes.answers import scene_facts
+    from lexsplat.scenes.scene import open_scene
 
     scene = open_scene(folder, device="cpu")
     scene_facts(scene.folder)
@@ -378,7 +378,7 @@ def trained_scene_folder() -> Reader:
 
 @reader
 def code_maps() -> Reader:
-    from lexsplat.scene_folder import SceneFolder
+    from lexsplat.scenes.folder import SceneFolder
 
     def check(codes: Any) -> None:
         assert codes.dtype == np.uint8
@@ -409,7 +409,7 @@ def png(content: bytes, rng: np.random.Generator, count: int) -> Iterator[mutate
 @reader
 def codebook() -> Reader:
     from lexsplat.codebook import Codebook
-    from lexsplat.tensor_files import read_tensors, write_tensors
+    from lexsplat.runtime.files import read_tensors, write_tensors
 
     def check(book: Any) -> None:
         finite(book.clip, book.lambda_dino)
@@ -428,8 +428,9 @@ def checkpoints() -> Reader:
     """A damaged checkpoint is told and left aside; then the training must stand at its very beginning."""
     from language_scene import make_scene
 
-    from lexsplat.checkpoints import Checkpoint
-    from lexsplat.embedding import EmbeddingConfig, EmbeddingTrainer
+    from lexsplat.language.methods.trained_settings import EmbeddingConfig
+    from lexsplat.language.methods.trainer import EmbeddingTrainer
+    from lexsplat.runtime.checkpoints import Checkpoint
 
     scene = make_scene(per_ball=2, views=1, width=8, height=6)
     config = EmbeddingConfig(iterations=10, pixel_sample=8, smoothing_sample=4)
@@ -474,10 +475,10 @@ def reconstruction_checkpoints() -> Reader:
     """The same for the training of geometry."""
     from tiny_capture import write_capture
 
-    from lexsplat.checkpoints import Checkpoint
+    from lexsplat.captures import load_scene
+    from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-    from lexsplat.scenes import load_scene
-    from lexsplat.scenes.triangulation import InitialPoints
+    from lexsplat.runtime.checkpoints import Checkpoint
 
     config = ReconstructionConfig(iterations=10, max_gaussians=5, sh_degree=1, exposure=True)
     points = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
@@ -524,9 +525,9 @@ def reconstruction_checkpoints() -> Reader:
 def journal() -> Reader:
     import torch
 
-    from lexsplat.editing import Editor, Motion
-    from lexsplat.search import open_scene
-    from lexsplat.selection import Selection
+    from lexsplat.queries.selection import Selection
+    from lexsplat.scenes.editing import Editor, Motion
+    from lexsplat.scenes.scene import open_scene
 
     kept: dict[str, Any] = {}
 
@@ -571,7 +572,7 @@ def journal() -> Reader:
 
 @reader
 def viewer_memory() -> Reader:
-    from lexsplat.viewer.memory import Memory
+    from lexsplat.viewer.history import Memory
 
     def make(folder: Path) -> None:
         (folder / "viewer.json").write_text(
@@ -590,9 +591,9 @@ def viewer_memory() -> Reader:
 @reader
 def phrases() -> Reader:
     """Phrases as people and programs type them: the bytes are the phrase."""
-    from lexsplat.answers import file_name
-    from lexsplat.phrases import parse
-    from lexsplat.queries import check_prompts
+    from lexsplat.queries.phrases import parse
+    from lexsplat.queries.relevancy import check_prompts
+    from lexsplat.scenes.answers import file_name
 
     def read(folder: Path) -> Any:
         raw = (folder / "phrase.txt").read_bytes().decode("utf-8", "surrogateescape")
@@ -619,8 +620,8 @@ def make_masks(folder: Path) -> None:
 
 
 def read_truth(folder: Path) -> Any:
-    from lexsplat.scenes import load_annotations, load_scene
-    from lexsplat.scenes.annotations import load_truth
+    from lexsplat.captures import load_annotations, load_scene
+    from lexsplat.captures.ground_truth.layouts import load_truth
 
     scene = load_scene(folder)
     truth = load_annotations(scene)
@@ -684,7 +685,7 @@ def pictures_of(ending: str, **options: Any) -> Callable[[], Reader]:
         Image.fromarray(values).save(folder / f"a{ending}", **options)
 
     def read(folder: Path) -> Any:
-        from lexsplat.scenes.images import image_size, read_image, read_mask
+        from lexsplat.captures.images.reading import image_size, read_image, read_mask
 
         image_size(folder / f"a{ending}")
         read_mask(folder / f"a{ending}")
@@ -787,7 +788,14 @@ def safetensors_features() -> Reader:
 def feature_cache() -> Reader:
     import torch
 
-    from lexsplat.features.cache import is_stored, read_crops, read_grid, read_levels, write_crops, write_grid
+    from lexsplat.features.cache import (
+        is_stored,
+        read_crops,
+        read_grid,
+        read_levels,
+        write_crops,
+        write_grid,
+    )
     from lexsplat.features.pyramid import CropLevel
 
     def make(folder: Path) -> None:
@@ -850,7 +858,7 @@ def text_cache() -> Reader:
 @reader
 def points_cache() -> Reader:
     """Kept points that are damaged are made anew: None."""
-    from lexsplat.scenes.triangulation import _read_cache, _write_cache
+    from lexsplat.captures.sfm.triangulation import _read_cache, _write_cache
 
     def check(result: Any) -> None:
         if result is not None:
@@ -929,7 +937,7 @@ def summary(result: Any) -> bytes:
 
 def attempt(target: Reader, folder: Path, report: Report, about: str, whole: bytes | None) -> None:
     """Read once and judge what comes of it; ``whole`` is what a part of the file must say, if it says anything."""
-    from lexsplat.errors import LexsplatError
+    from lexsplat.runtime.errors import LexsplatError
 
     allowed = (LexsplatError, ValueError) if target.value_errors else (LexsplatError,)
     signal.setitimer(signal.ITIMER_REAL, SECONDS)

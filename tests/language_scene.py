@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from lexsplat.cameras import Camera, look_at
 from lexsplat.codebook import Codebook
-from lexsplat.gaussians import Gaussians, gaussians_from_points
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 
 CENTRES = np.array([[-0.9, 0.0, 0.0], [0.9, 0.0, 0.1], [0.0, 0.9, -0.1], [0.0, -0.9, 0.0], [0.0, 0.0, 0.9]])
 RADIUS = 0.42

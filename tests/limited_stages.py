@@ -63,7 +63,8 @@ def place_photos(folder: Path, memory: int) -> str:
 
 def triangulate_points(folder: Path, memory: int) -> str:
     """Points under known poses, at the size of features of the small photos."""
-    from lexsplat.scenes import load_scene, triangulation
+    from lexsplat.captures import load_scene
+    from lexsplat.captures.sfm import triangulation
 
     triangulation.MAX_SIDE, triangulation.MAX_FEATURES = SIDE, FEATURES
     points, _ = triangulation.triangulate(load_scene(folder, test_every=0), memory=memory)
@@ -72,9 +73,9 @@ def triangulate_points(folder: Path, memory: int) -> str:
 
 def undistort_giant(folder: Path, memory: int) -> str:
     """A giant photo with a mask, through its lens, smaller and with its valid pixels."""
-    from lexsplat.cameras import Camera
-    from lexsplat.scenes.scene import View
-    from lexsplat.scenes.undistortion import Lens, pinhole_of
+    from lexsplat.captures.capture import View
+    from lexsplat.captures.images.undistortion import Lens, pinhole_of
+    from lexsplat.geometry.cameras import Camera
 
     lens = Lens("SIMPLE_RADIAL", *GIANT, (0.9 * GIANT[0], GIANT[0] / 2, GIANT[1] / 2, -0.04))
     width, height, K = pinhole_of(lens)
@@ -88,7 +89,7 @@ def undistort_giant(folder: Path, memory: int) -> str:
 
 def turn_giant(folder: Path, memory: int) -> str:
     """The upright copy of a giant photo that is stored turned."""
-    from lexsplat.scenes.preparation import _look_at, _write_upright
+    from lexsplat.captures.sfm.preparation import _look_at, _write_upright
 
     target = folder / "upright.jpg"
     _write_upright(_look_at(folder, "giant.jpg"), folder / "giant.jpg", target)
@@ -122,7 +123,7 @@ def fit_codes(folder: Path, memory: int) -> str:
 
 def budgets() -> dict[str, tuple[Callable[[Path, int], str], int]]:
     """Each stage with the least memory that it asks for, by the functions that the stages use."""
-    from lexsplat import budget
+    from lexsplat.runtime import memory as budget
 
     searching = budget.extraction_bytes(LARGE, SIDE, FEATURES, 1)
     reading = budget.photo_bytes(LARGE, SIZE)
@@ -170,14 +171,10 @@ def main() -> None:
     folder, beside = Path(sys.argv[1]), int(sys.argv[2])
     if hasattr(os, "sched_setaffinity"):  # as many threads on any machine
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
-    import pycolmap  # noqa: F401
-    import torch  # noqa: F401
-
-    import lexsplat.cli
-    import lexsplat.codebook
-    import lexsplat.features.cache
     import lexsplat.progress_bars
     import lexsplat.scenes.photos  # noqa: F401
+    import pycolmap  # noqa: F401
+    import torch  # noqa: F401
 
     report = {name: run_limited(work, folder, memory, beside) for name, (work, memory) in budgets().items()}
     print(json.dumps(report))

@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from lexsplat.cameras import Camera, look_at
 from lexsplat.codebook import Codebook
-from lexsplat.gaussians import Gaussians, gaussians_from_points
-from lexsplat.language_field import LiftedField
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
+from lexsplat.language.fields import LiftedField
 
 
 def texts(count, dim, seed):

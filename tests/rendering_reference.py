@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.cameras import Camera, look_at
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians
 
 
 def to_float64(gaussians: Gaussians) -> dict[str, Tensor]:

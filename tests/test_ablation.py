@@ -11,13 +11,16 @@ import pytest
 from PIL import Image
 from test_report import Page
 
-from lexsplat import ablation, cli, experiments
+from lexsplat import cli
 from lexsplat.codebook import CodebookConfig
-from lexsplat.config import BuildConfig, parse_bytes
-from lexsplat.embedding import EmbeddingConfig
-from lexsplat.errors import CaptureError
+from lexsplat.evaluation import ablate as ablation
+from lexsplat.evaluation import experiments
 from lexsplat.features import FeatureConfig
-from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.memory import parse_bytes
 
 CONFIG = BuildConfig(
     clip="colour",
@@ -176,7 +179,7 @@ def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_captur
 
 
 def test_memory_granted_bounds_codebook_and_language(ablated, tiny_capture, tmp_path, monkeypatch):
-    from lexsplat import experiments
+    from lexsplat.evaluation import experiments
 
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     granted = []
@@ -236,7 +239,7 @@ def test_wrong_wishes_are_told_before_anything_is_made(tiny_capture, tmp_path):
 
 
 def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
-    from lexsplat import experiments
+    from lexsplat.evaluation import experiments
 
     empty = experiments.Annotations("segmentations", tiny_capture, {})
     monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
@@ -308,7 +311,7 @@ def test_truth_that_cannot_be_had_is_told_before_anything_is_made(
 def test_the_command_line_hands_on_which_truth_and_protocols_are_meant(
     tiny_capture, tmp_path, monkeypatch, command
 ):
-    from lexsplat import comparison
+    from lexsplat.evaluation import compare as comparison
 
     module = {"ablate": ablation, "compare": comparison}[command]
     wishes = {}

@@ -11,10 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.draw import polygon2mask
 
-from lexsplat.errors import CaptureError, FileFormatError
-from lexsplat.scenes import load_annotations, load_scene
-from lexsplat.scenes.annotations import layout_of, load_truth, polygon_mask
-from lexsplat.scenes.prompt_lists import SCENES, evaluation_views, prompt_names, prompts_of
+from lexsplat.captures import load_annotations, load_scene
+from lexsplat.captures.ground_truth.layouts import layout_of, load_truth, polygon_mask
+from lexsplat.captures.ground_truth.prompt_lists import (
+    SCENES,
+    evaluation_views,
+    prompt_names,
+    prompts_of,
+)
+from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 NAMES = [f"{number:02d}.jpg" for number in range(6)]
 FRAMES = [f"frame_{number:05d}.jpg" for number in range(1, 7)]

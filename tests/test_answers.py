@@ -8,7 +8,7 @@ import torch
 from conftest import QUICK_BUILD
 
 from lexsplat import cli
-from lexsplat.tensor_files import read_tensors
+from lexsplat.runtime.files import read_tensors
 
 pytestmark = pytest.mark.xdist_group("built")
 

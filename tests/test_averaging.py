@@ -11,18 +11,18 @@ from language_scene import label_accuracy, make_scene
 from rendering_reference import blend, front_camera, project, random_gaussians, to_float64
 from torch.nn.functional import normalize
 
-from lexsplat.averaging import (
+from lexsplat.codebook import CodebookConfig
+from lexsplat.features import FeatureMap
+from lexsplat.language.fields import LiftedField
+from lexsplat.language.methods.averaged import (
     AveragingConfig,
     MeanFeatures,
     average_features,
     features_of_codes,
     field_from_means,
 )
-from lexsplat.codebook import CodebookConfig
-from lexsplat.config import parse_bytes
-from lexsplat.errors import MemoryBudgetError
-from lexsplat.features import FeatureMap
-from lexsplat.language_field import LiftedField
+from lexsplat.runtime.errors import MemoryBudgetError
+from lexsplat.runtime.memory import parse_bytes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from language_scene import CENTRES, IGNORED, make_scene
 from scipy.spatial.distance import jensenshannon
 
-from lexsplat.baselines import (
+from lexsplat.evaluation import Method
+from lexsplat.evaluation.baselines import (
     DffConfig,
     DistilledFeatures,
     LerfConfig,
@@ -22,12 +23,11 @@ from lexsplat.baselines import (
     fit_3dovs,
     fit_lerf,
 )
-from lexsplat.baselines.feature_rendering import TrainingViews, average_features, render_cosines
-from lexsplat.baselines.lerf import level_weights, smooth_alike
-from lexsplat.baselines.ovs3d import alignment_loss, js_divergence
-from lexsplat.evaluation import Method
+from lexsplat.evaluation.baselines.feature_rendering import TrainingViews, average_features, render_cosines
+from lexsplat.evaluation.baselines.lerf import level_weights, smooth_alike
+from lexsplat.evaluation.baselines.ovs3d import alignment_loss, js_divergence
 from lexsplat.features import FeatureMap
-from lexsplat.queries import QueryConfig, pairwise_relevancy
+from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
 from lexsplat.rendering import render, spread
 
 BALLS = len(CENTRES)

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat.boxes import Box, box_iou, fit_box, gravity_up
-from lexsplat.cameras import look_at
+from lexsplat.geometry.boxes import Box, box_iou, fit_box, gravity_up
+from lexsplat.geometry.cameras import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 

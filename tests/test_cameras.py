@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lexsplat.cameras import Camera, camera_extent, camera_from_opengl, invert_pose, look_at
+from lexsplat.geometry.cameras import Camera, camera_extent, camera_from_opengl, invert_pose, look_at
 
 K = np.array([[100.0, 0, 32], [0, 110.0, 24], [0, 0, 1]])
 unit = st.floats(-1, 1)

@@ -20,11 +20,11 @@ from test_scenes_photos import (
 from test_scenes_triangulation import texture
 
 from lexsplat import cli
-from lexsplat.captures import reload_capture
-from lexsplat.errors import SceneFolderError
-from lexsplat.progress import Event
-from lexsplat.scene_folder import SceneFolder
-from lexsplat.scenes import load_annotations, load_scene, poses_from_photos
+from lexsplat.captures import load_annotations, load_scene, poses_from_photos
+from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.progress import Event
+from lexsplat.scenes.folder import SceneFolder
 
 QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4"]
 

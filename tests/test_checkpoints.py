@@ -7,11 +7,11 @@ import signal
 import pytest
 import torch
 
-from lexsplat.checkpoints import Checkpoint
 from lexsplat.codebook import CodebookConfig
-from lexsplat.config import BuildConfig
-from lexsplat.errors import TrainingError
-from lexsplat.pipeline import build
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.checkpoints import Checkpoint
+from lexsplat.runtime.errors import TrainingError
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +47,7 @@ def test_a_saved_state_comes_back_exactly(tmp_path):
 
 def test_the_time_of_a_stopped_training_counts(tmp_path, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("lexsplat.checkpoints.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("lexsplat.runtime.checkpoints.time.perf_counter", lambda: now[0])
     path = tmp_path / "state"
     for begun, expected in ((100.0, 0.0), (500.0, 7.0), (900.0, 14.0)):
         now[0] = begun

@@ -16,7 +16,7 @@ from tiny_capture import write_capture
 
 from lexsplat import cli, open_scene
 from lexsplat.features import hub
-from lexsplat.scene_folder import SHIPPED_SCENE
+from lexsplat.scenes.folder import SHIPPED_SCENE
 
 pytestmark = pytest.mark.xdist_group("built")
 
@@ -428,7 +428,7 @@ STOPPED = "stopped; run the same command again to go on\n"
 
 
 def test_the_second_of_two_at_one_output_says_who_holds_it_and_stops(tiny_capture, tmp_path, capsys):
-    from lexsplat.scene_folder import SceneFolder
+    from lexsplat.scenes.folder import SceneFolder
 
     with SceneFolder(tmp_path / "out").locked():
         for arguments in (["poses", str(tiny_capture / "images")], ["build", str(tiny_capture), *QUICK]):

@@ -12,10 +12,11 @@ import pytest
 from test_ablation import CONFIG
 from test_report import Page
 
-from lexsplat import baselines, comparison
-from lexsplat.baselines import feature_rendering
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.config import parse_bytes
+from lexsplat.evaluation import baselines
+from lexsplat.evaluation import compare as comparison
+from lexsplat.evaluation.baselines import feature_rendering
+from lexsplat.runtime.memory import parse_bytes
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +161,8 @@ def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_cap
 
 
 def test_the_scenes_that_ship_have_names_and_the_demos_settings(tmp_path, monkeypatch):
-    from lexsplat.config import BuildConfig
-    from lexsplat.demo.demo import DEMO_CONFIG
+    from lexsplat.evaluation.demo import DEMO_CONFIG
+    from lexsplat.pipeline.config import BuildConfig
 
     monkeypatch.chdir(tmp_path)
     folder, settings = capture_and_settings("second", BuildConfig())

@@ -7,13 +7,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lexsplat.averaging import AveragingConfig
-from lexsplat.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig, choose_device, parse_bytes
-from lexsplat.embedding import EmbeddingConfig
-from lexsplat.errors import BackendError
 from lexsplat.features import FeatureConfig
-from lexsplat.lifting import LiftingConfig, TuningConfig
+from lexsplat.language.methods.averaged import AveragingConfig
+from lexsplat.language.methods.lifted import LiftingConfig, TuningConfig
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.pipeline.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig
+from lexsplat.runtime.device import choose_device
+from lexsplat.runtime.errors import BackendError
+from lexsplat.runtime.memory import parse_bytes
 
 
 @pytest.mark.parametrize(

@@ -18,20 +18,27 @@ from test_encoders import _save, _seeded, _vit, clip_folder  # noqa: F401  (a fi
 from tiny_capture import write_capture
 from viewer_scene import WORDS, ball_scene
 
-from lexsplat.averaging import AveragingConfig, average_features, features_of_codes, field_from_means
+from lexsplat.captures import load_scene
+from lexsplat.captures.sfm.triangulation import initial_points
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
-from lexsplat.editing import Editor, Motion
-from lexsplat.embedding import EmbeddingConfig, EmbeddingTrainer, train_field
 from lexsplat.features import FeatureConfig, extract_features
 from lexsplat.features.clip import ClipEncoder
 from lexsplat.features.dino import DinoEncoder
-from lexsplat.joint import JointTrainer
-from lexsplat.language_field import TrainedField, field_from_tensors
-from lexsplat.lifting import LiftingConfig, TuningConfig, lift, tune
+from lexsplat.language.fields import TrainedField, field_from_tensors
+from lexsplat.language.methods.averaged import (
+    AveragingConfig,
+    average_features,
+    features_of_codes,
+    field_from_means,
+)
+from lexsplat.language.methods.joint import JointTrainer
+from lexsplat.language.methods.lifted import LiftingConfig, TuningConfig, lift, tune
+from lexsplat.language.methods.trained import train_field
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.trainer import EmbeddingTrainer
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.rendering import prepare, render
-from lexsplat.scenes import load_scene
-from lexsplat.scenes.triangulation import initial_points
+from lexsplat.scenes.editing import Editor, Motion
 
 GEOMETRY = ReconstructionConfig(
     iterations=6, sh_degree=1, max_gaussians=230, densify_min_every=2, grow_gradient=1e-7, exposure=True
@@ -274,8 +281,8 @@ def test_a_scene_is_edited_on_the_gpu(on_gpu):
 
 
 def test_the_viewer_answers_on_the_gpu(on_gpu):
-    from lexsplat.viewer.colouring import MODES
-    from lexsplat.viewer.memory import Memory
+    from lexsplat.viewer.coloring import MODES
+    from lexsplat.viewer.history import Memory
     from lexsplat.viewer.session import Session
 
     scene, truth = on_gpu
@@ -324,7 +331,8 @@ def test_every_command_runs_with_device_cuda(pretended_gpu, built, tiny_capture,
 def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypatch):
     from test_ablation import CONFIG
 
-    from lexsplat import baselines, comparison
+    from lexsplat import baselines
+    from lexsplat.evaluation import compare as comparison
 
     colour_encoder.install(monkeypatch)
     monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=2))

@@ -144,7 +144,7 @@ def test_scene_is_small(name):
 
 
 def test_loads_as_a_scene_with_its_own_split_and_masks(name):
-    scenes = pytest.importorskip("lexsplat.scenes", reason="scenes are not there yet")
+    scenes = pytest.importorskip("lexsplat.captures", reason="scenes are not there yet")
     if not hasattr(scenes, "load_scene"):
         pytest.skip("load_scene is not there yet")
     _, views, count, points, _ = EXPECTED[name]

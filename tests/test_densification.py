@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from lexsplat.densification import DensityControl, DensitySchedule, covariances, density_schedule, relocate
+from lexsplat.reconstruction.densification import (
+    DensityControl,
+    DensitySchedule,
+    covariances,
+    density_schedule,
+    relocate,
+)
 
 SCHEDULE = DensitySchedule(start=2, stop=100, every=5, reset_every=20)
 

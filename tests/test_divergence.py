@@ -13,12 +13,14 @@ from language_scene import make_scene
 from PIL import Image
 from tiny_capture import write_capture
 
-from lexsplat.divergence import ATTEMPTS, Guard
-from lexsplat.embedding import EmbeddingConfig, EmbeddingTrainer, train_field
-from lexsplat.errors import TrainingError
+from lexsplat.captures import load_scene
+from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.language.methods.trained import train_field
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.trainer import EmbeddingTrainer
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.scenes import load_scene
-from lexsplat.scenes.triangulation import initial_points
+from lexsplat.runtime.divergence import ATTEMPTS, Guard
+from lexsplat.runtime.errors import TrainingError
 
 ITERATIONS = 60
 

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from language_scene import make_scene
 from scipy.spatial.transform import Rotation
 
-from lexsplat.editing import Editor, Motion, Step, recoloured
-from lexsplat.errors import FileFormatError, QueryError, SceneFolderError
-from lexsplat.formats.language import write_field
-from lexsplat.language_field import LiftedField
-from lexsplat.scene_folder import SceneFolder, StoredView
-from lexsplat.search import SearchableScene, open_scene
-from lexsplat.selection import Selection
+from lexsplat.language.fields import LiftedField
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
+from lexsplat.scenes.editing import Editor, Motion, Step, recoloured
+from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.scene import SearchableScene, open_scene
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from language_scene import IGNORED, label_accuracy, make_scene
 
-from lexsplat.checkpoints import Checkpoint
-from lexsplat.embedding import EmbeddingConfig, EmbeddingTrainer, codes_at_pixels, train_field
-from lexsplat.errors import TrainingError
-from lexsplat.progress import Event
+from lexsplat.language.code_maps import codes_at_pixels
+from lexsplat.language.methods.trained import train_field
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.trainer import EmbeddingTrainer
+from lexsplat.runtime.checkpoints import Checkpoint
+from lexsplat.runtime.errors import TrainingError
+from lexsplat.runtime.progress import Event
 
 QUICK = EmbeddingConfig(
     iterations=80,

@@ -15,17 +15,11 @@ import pytest
 import torch
 from PIL import Image
 
-from lexsplat.errors import ModelError
 from lexsplat.features import hub
 from lexsplat.features.clip import _plain_attention, check_patches
 from lexsplat.features.dino import _ramp, _window_starts
-from lexsplat.features.encoders import (
-    ClipEncoder,
-    DinoEncoder,
-    load_clip,
-    load_dino,
-    resize_images,
-)
+from lexsplat.features.encoders import ClipEncoder, DinoEncoder, load_clip, load_dino, resize_images
+from lexsplat.runtime.errors import ModelError
 
 MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
 PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]

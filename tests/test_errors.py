@@ -2,8 +2,8 @@ import pickle
 
 import pytest
 
-from lexsplat import errors
-from lexsplat.errors import CaptureError, LexsplatError
+from lexsplat.runtime import errors
+from lexsplat.runtime.errors import CaptureError, LexsplatError
 
 KINDS = [
     kind

@@ -12,6 +12,7 @@ import pytest
 import torch
 from tiny_capture import SPHERES, trace
 
+from lexsplat.captures import load_scene
 from lexsplat.evaluation import (
     EvaluationConfig,
     Metrics,
@@ -22,11 +23,10 @@ from lexsplat.evaluation import (
     precision_curves,
     summarize_language,
 )
+from lexsplat.evaluation.metrics import average_precision, threshold_counts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
-from lexsplat.gaussians import gaussians_from_points
-from lexsplat.metrics import average_precision, threshold_counts
-from lexsplat.queries import QueryConfig
-from lexsplat.scenes import load_scene
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.queries.relevancy import QueryConfig
 
 WORDS = {"red apple": 1, "blue ball": 2}
 
@@ -152,7 +152,7 @@ def test_automatic_thresholds_never_see_the_truth(scene, gaussians, perfect):
 
 
 def test_automatic_thresholds_look_at_training_views_only(scene, gaussians, monkeypatch):
-    from lexsplat import presence
+    from lexsplat.queries import presence
 
     cameras = []
     original = presence.scene_threshold

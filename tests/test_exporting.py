@@ -13,12 +13,12 @@ import torch
 from conftest import QUICK_BUILD as QUICK
 
 from lexsplat import cli, open_scene
-from lexsplat.exporting import best_labels, export_gaussians
-from lexsplat.formats.ply import read_ply
-from lexsplat.formats.reading import read_splats
-from lexsplat.formats.splat import write_splat
-from lexsplat.gaussians import Gaussians
-from lexsplat.selection import Selection
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.selection import Selection
+from lexsplat.scenes.exporting import best_labels, export_gaussians
+from lexsplat.scenes.formats.ply import read_ply
+from lexsplat.scenes.formats.reading import read_splats
+from lexsplat.scenes.formats.splat import write_splat
 
 pytestmark = pytest.mark.xdist_group("built")
 
@@ -59,7 +59,7 @@ def test_selections_are_those_of_find_and_are_told(built, tmp_path, monkeypatch,
         found = scene.select("red apple", 2.0 if "giraffe" in phrase else limit)
         return replace(found, phrase="as understood", present="no" if "giraffe" in phrase else "yes")
 
-    monkeypatch.setattr("lexsplat.search.SearchableScene.find", find)
+    monkeypatch.setattr("lexsplat.scenes.scene.SearchableScene.find", find)
     view = next(iter(open_scene(built).views))
     phrases = ["apple left of the ball", "giraffe"]
     assert export(built, tmp_path / "l.json", "--select", *phrases, "--view", view) == 0

@@ -16,9 +16,9 @@ from tiny_capture import SPHERES, camera_poses, trace
 
 from lexsplat import cli
 from lexsplat.codebook import Codebook
-from lexsplat.errors import FileFormatError, MemoryBudgetError
 from lexsplat.features import FeatureMap, external_identity, load_external_features
 from lexsplat.features.encoders import load_clip
+from lexsplat.runtime.errors import FileFormatError, MemoryBudgetError
 
 VIEWS, SIZE = 12, (96, 72)
 

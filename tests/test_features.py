@@ -15,8 +15,6 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from lexsplat.cameras import Camera
-from lexsplat.errors import CaptureError, FileFormatError, MemoryBudgetError
 from lexsplat.features import (
     FeatureConfig,
     FeatureMap,
@@ -28,6 +26,8 @@ from lexsplat.features import (
 )
 from lexsplat.features.cache import resize_grid
 from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
+from lexsplat.geometry.cameras import Camera
+from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError
 
 WIDTH, HEIGHT = 48, 32
 

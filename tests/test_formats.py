@@ -10,19 +10,19 @@ import torch
 from safetensors import safe_open
 from test_ply import make
 
-from lexsplat.boxes import Up
 from lexsplat.codebook import Codebook
-from lexsplat.errors import BackendError, FileFormatError
-from lexsplat.formats.compressed import COMPRESSED, read_compressed, write_compressed
-from lexsplat.formats.gltf import write_glb
-from lexsplat.formats.language import codebook_path, ply_columns, stored_language, write_codebook
-from lexsplat.formats.ply import read_ply, write_ply
-from lexsplat.formats.reading import read_splats
-from lexsplat.formats.splat import read_splat, write_splat
-from lexsplat.formats.tables import write_labels_csv, write_points_ply
-from lexsplat.gaussians import Gaussians
-from lexsplat.language_field import LiftedField
-from lexsplat.world import World
+from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.world import World
+from lexsplat.language.fields import LiftedField
+from lexsplat.runtime.errors import BackendError, FileFormatError
+from lexsplat.scenes.formats.compressed import COMPRESSED, read_compressed, write_compressed
+from lexsplat.scenes.formats.gltf import write_glb
+from lexsplat.scenes.formats.language import codebook_path, ply_columns, stored_language, write_codebook
+from lexsplat.scenes.formats.ply import read_ply, write_ply
+from lexsplat.scenes.formats.reading import read_splats
+from lexsplat.scenes.formats.splat import read_splat, write_splat
+from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
 
 
 def language(count: int, codes_each: int = 3, num_codes: int = 6):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from lexsplat.search import open_scene
+from lexsplat.scenes.scene import open_scene
 
 LONGEST = 3000
 """Seconds after which a command hangs, however busy the machine is: a build takes ten when it is not."""

@@ -5,7 +5,7 @@ import pytest
 import torch
 from sklearn.neighbors import NearestNeighbors
 
-from lexsplat.gaussians import SH_C0, Gaussians, gaussians_from_points
+from lexsplat.geometry.gaussians import SH_C0, Gaussians, gaussians_from_points
 
 
 def some_points(count: int = 50, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from lexsplat import heatmaps
+from lexsplat.queries import heatmaps
 
 GREY = np.full((6, 8, 3), 128, np.uint8)
 

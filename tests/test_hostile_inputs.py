@@ -22,10 +22,10 @@ from captures import write_colmap, write_transforms
 from PIL import Image
 from tiny_capture import write_capture
 
-from lexsplat.errors import CaptureError, FileFormatError, LexsplatError
-from lexsplat.formats.reading import read_splats
-from lexsplat.scenes import load_scene
-from lexsplat.tensor_files import PICKLES, read_tensors
+from lexsplat.captures import load_scene
+from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
+from lexsplat.runtime.files import PICKLES, read_tensors
+from lexsplat.scenes.formats.reading import read_splats
 
 pytestmark = [
     pytest.mark.xdist_group("hostile"),  # the corpus runs once, for all tests of this file
@@ -195,11 +195,11 @@ def same_pose(model: Path) -> None:
 def test_captures_that_make_no_scene_end_well_or_in_one_line(tmp_path, kind):
     """Cameras that see nothing, one view only, views at one place: a scene of finite numbers, or a typed error."""
     from lexsplat.codebook import CodebookConfig
-    from lexsplat.config import BuildConfig
     from lexsplat.features import FeatureConfig
-    from lexsplat.pipeline import build
+    from lexsplat.pipeline.build import build
+    from lexsplat.pipeline.config import BuildConfig
     from lexsplat.reconstruction import ReconstructionConfig
-    from lexsplat.search import open_scene
+    from lexsplat.scenes.scene import open_scene
 
     capture = write_capture(tmp_path / "capture", views=1 if kind == "one view" else 3, width=32, height=24)
     shutil.rmtree(capture / "segmentations", ignore_errors=True)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lexsplat.errors import CaptureError
-from lexsplat.scenes.images import image_size, open_image, read_image, read_mask, resize_image
+from lexsplat.captures.images.reading import image_size, open_image, read_image, read_mask, resize_image
+from lexsplat.runtime.errors import CaptureError
 
 WIDTH, HEIGHT = 24, 16
 
@@ -193,8 +193,8 @@ def test_large_photos_made_smaller_in_bands_are_as_if_made_smaller_at_once(tmp_p
     (image if mode == "I;16" else image.convert(mode)).save(tmp_path / name)
     whole = resize_image(read_image(tmp_path / name), size)
     np.testing.assert_array_equal(read_image(tmp_path / name, size=size), whole)
-    monkeypatch.setattr("lexsplat.scenes.bands.LARGE_PIXELS", 0)
-    monkeypatch.setattr("lexsplat.scenes.bands.BAND_PIXELS", 4 * 48)
+    monkeypatch.setattr("lexsplat.captures.images.bands.LARGE_PIXELS", 0)
+    monkeypatch.setattr("lexsplat.captures.images.bands.BAND_PIXELS", 4 * 48)
     np.testing.assert_allclose(read_image(tmp_path / name, size=size), whole, atol=1e-6)
 
 

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat import image_loss_kernels, image_losses
-from lexsplat.image_losses import l1_loss, photometric_loss, ssim, ssim_target
+from lexsplat.reconstruction import image_loss_kernels, image_losses
+from lexsplat.reconstruction.image_losses import l1_loss, photometric_loss, ssim, ssim_target
 
 
 def two_images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -141,7 +141,7 @@ def test_ssim_is_deaf_to_mirroring(height, width, seed):
 @settings(max_examples=20, deadline=None)
 @given(st.integers(6, 40))
 def test_transposed_taps_are_the_transpose_of_the_reflected_blur(length):
-    from lexsplat.image_loss_kernels import RADIUS, TAPS, reflected_taps
+    from lexsplat.reconstruction.image_loss_kernels import RADIUS, TAPS, reflected_taps
 
     dense = []
     for taps in reflected_taps(length):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from lexsplat.checkpoints import Checkpoint
+from lexsplat.captures import load_scene
+from lexsplat.captures.sfm.triangulation import initial_points
 from lexsplat.codebook import Codebook
-from lexsplat.config import BuildConfig
-from lexsplat.embedding import EmbeddingConfig
-from lexsplat.joint import JointTrainer
+from lexsplat.language.methods.joint import JointTrainer
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.scenes import load_scene
-from lexsplat.scenes.triangulation import initial_points
+from lexsplat.runtime.checkpoints import Checkpoint
 
 GEOMETRY = ReconstructionConfig(iterations=120, sh_degree=1, densify_min_every=10, max_gaussians=3000)
 LANGUAGE = EmbeddingConfig(pixel_sample=256, smoothing_sample=64)

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from lexsplat.language_field import (
+from lexsplat.language.fields import (
     INITIAL_UNCERTAINTY,
     LanguageField,
     LiftedField,

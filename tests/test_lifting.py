@@ -11,9 +11,8 @@ import torch
 from language_scene import IGNORED, label_accuracy, make_codebook, make_scene
 from rendering_reference import blend, front_camera, project, random_gaussians, to_float64
 
-from lexsplat.embedding import EmbeddingConfig
-from lexsplat.language_field import TrainedField
-from lexsplat.lifting import (
+from lexsplat.language.fields import TrainedField
+from lexsplat.language.methods.lifted import (
     CodeHistogram,
     LiftingConfig,
     TuningConfig,
@@ -24,6 +23,7 @@ from lexsplat.lifting import (
     smooth_codes,
     tune,
 )
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
 
 EXACT = LiftingConfig(top=5, use_smoothing=False)
 EMBEDDING = EmbeddingConfig(pixel_sample=200, smoothing_sample=100)

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat.losses import (
+from lexsplat.language.losses import (
     cross_entropy_loss,
     semantic_loss,
     smoothing_loss,

@@ -12,18 +12,20 @@ from colour_encoder import ColourClip, ColourDino
 from language_scene import make_scene
 from PIL import Image
 
+from lexsplat.captures import initial_points, load_scene
+from lexsplat.captures.capture import filled
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
-from lexsplat.config import BuildConfig
-from lexsplat.embedding import MASKED_CODE, EmbeddingConfig, EmbeddingTrainer
-from lexsplat.errors import CaptureError
 from lexsplat.features import FeatureConfig, FeatureMap, extract_features
-from lexsplat.gaussians import gaussians_from_points
-from lexsplat.lifting import LiftingConfig, accumulate_histogram
-from lexsplat.masking import MaskedCodeMaps, mark_masked_cells, without_masked_cells
-from lexsplat.pipeline import make_averaged_field
+from lexsplat.features.masking import without_masked_cells
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.language.code_maps import MASKED_CODE, MaskedCodeMaps, mark_masked_cells
+from lexsplat.language.methods.lifted import LiftingConfig, accumulate_histogram
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.trainer import EmbeddingTrainer
+from lexsplat.pipeline.build import make_averaged_field
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.scenes import initial_points, load_scene
-from lexsplat.scenes.scene import filled
+from lexsplat.runtime.errors import CaptureError
 
 DISTORTED = {"model": 4, "params": (60.0, 60.0, 32.0, 24.0, -0.12, 0.03, 0.001, -0.001)}  # OPENCV
 PINHOLE = {}

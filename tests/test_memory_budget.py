@@ -16,13 +16,14 @@ import torch
 from PIL import Image
 from tiny_capture import camera_poses, quaternion
 
-from lexsplat import budget, cli
+from lexsplat import cli
+from lexsplat.captures.sfm import feature_budget
 from lexsplat.codebook import CodebookConfig, fit_codebook
-from lexsplat.config import BuildConfig
-from lexsplat.errors import MemoryBudgetError
 from lexsplat.features import FeatureMap
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, check_gaussians
-from lexsplat.scenes import feature_budget
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import MemoryBudgetError
 
 MEGABYTE = 1 << 20
 VIEWS, WIDTH, HEIGHT = 50, 960, 720
@@ -129,7 +130,7 @@ LIBRARIES = 320 * MEGABYTE
 """Address space that linear algebra libraries and stacks of threads reserve, most of it never touched."""
 
 SLACK = 32 * MEGABYTE
-"""What may be resident beyond the numbers of `lexsplat.budget`: heaps not given back, code that is loaded."""
+"""What may be resident beyond the numbers of `lexsplat.runtime.memory`: heaps not given back, code that is loaded."""
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from skimage.metrics import peak_signal_noise_ratio
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from lexsplat import metrics
+from lexsplat.evaluation import metrics
 
 MASKS = arrays(bool, (5, 7))
 # Few distinct values, so that ties are common.

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from test_ply import make
 
-from lexsplat.cameras import Camera, look_at
-from lexsplat.gaussians import Gaussians
-from lexsplat.moving import moved, quaternion_of, rotated_harmonics
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
 from lexsplat.rendering.posing import multiplied
+from lexsplat.scenes.transforms import moved, quaternion_of, rotated_harmonics
 
 
 def cloud(degree: int = 3, count: int = 80) -> Gaussians:

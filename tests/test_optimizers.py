@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lexsplat.optimizers import Adam, load_optimizer_tensors, optimizer_tensors
+from lexsplat.reconstruction.adam import Adam, load_optimizer_tensors, optimizer_tensors
 
 
 def gradients(shape: tuple[int, ...], count: int, seed: int = 0) -> list[torch.Tensor]:

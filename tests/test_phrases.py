@@ -2,8 +2,8 @@
 
 import pytest
 
-from lexsplat.errors import QueryError
-from lexsplat.phrases import Both, Except, Pick, Related, Thing, parse
+from lexsplat.queries.phrases import Both, Except, Pick, Related, Thing, parse
+from lexsplat.runtime.errors import QueryError
 
 MUG, CLOTH, DUCK = Thing("mug"), Thing("cloth"), Thing("duck")
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 from language_scene import CENTRES, RADIUS, make_scene
 
-from lexsplat.cameras import look_at
-from lexsplat.errors import QueryError
-from lexsplat.language_field import LiftedField
-from lexsplat.picking import Hit, field_scores, likeness_to, select_hit, surface_at
+from lexsplat.geometry.cameras import look_at
+from lexsplat.language.fields import LiftedField
+from lexsplat.queries.picking import Hit, field_scores, likeness_to, select_hit, surface_at
+from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat.errors import FileFormatError
-from lexsplat.formats.ply import read_ply, write_ply
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.ply import read_ply, write_ply
 
 
 def make(count: int, degree: int, seed: int = 0, antialiased: bool = False) -> Gaussians:

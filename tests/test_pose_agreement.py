@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from lexsplat.scenes.pose_agreement import agreements, misplaced, place_again, sampson_errors
-from lexsplat.scenes.triangulation import quiet_pycolmap
+from lexsplat.captures.sfm.pose_agreement import agreements, misplaced, place_again, sampson_errors
+from lexsplat.captures.sfm.triangulation import quiet_pycolmap
 
 WRONG = 4
 

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from language_scene import make_scene
 
-from lexsplat.language_field import LiftedField
-from lexsplat.presence import (
+from lexsplat.language.fields import LiftedField
+from lexsplat.queries.presence import (
     Calibration,
     Evidence,
     PresenceJudge,
     fit_calibration,
     found_thresholds,
 )
-from lexsplat.queries import gaussian_relevancy
+from lexsplat.queries.relevancy import gaussian_relevancy
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +115,6 @@ def test_only_what_is_judged_absent_falls_back_to_half(parts, monkeypatch, verdi
     second = gaussian_relevancy(field, texts, negatives)[1]
     judge = PresenceJudge(gaussians, field, references, negatives, 10.0)
     monkeypatch.setattr(judge, "judge", lambda row: verdict if torch.equal(row, second) else "yes")
-    monkeypatch.setattr("lexsplat.presence.scene_threshold", lambda *_: torch.tensor([0.4, 0.3]))
+    monkeypatch.setattr("lexsplat.queries.presence.scene_threshold", lambda *_: torch.tensor([0.4, 0.3]))
     found = found_thresholds(judge, gaussians, [], texts, negatives)
     assert found.tolist() == pytest.approx([0.4, expected])

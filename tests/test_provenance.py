@@ -5,10 +5,10 @@ from pathlib import Path
 
 from captures import write_transforms
 
-from lexsplat.config import BuildConfig
-from lexsplat.provenance import model_identity, write_provenance
-from lexsplat.scene_folder import SceneFolder
-from lexsplat.scenes import load_scene
+from lexsplat.captures import load_scene
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.provenance import model_identity, write_provenance
+from lexsplat.scenes.folder import SceneFolder
 
 
 def test_a_model_folder_is_found_again_from_any_folder(tmp_path, monkeypatch):

@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from question_scene import lifted_cloud, texts
 
-from lexsplat import queries
-from lexsplat.errors import QueryError
-from lexsplat.queries import QueryConfig
+from lexsplat.queries import relevancy as queries
+from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.runtime.errors import QueryError
 
 FORMS = ("feature", "code")
 

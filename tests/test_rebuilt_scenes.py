@@ -10,10 +10,10 @@ import torch
 from conftest import QUICK_BUILD
 
 from lexsplat import cli, open_scene
-from lexsplat.errors import SceneFolderError
-from lexsplat.previous_scene import drop_previous, keep_previous
-from lexsplat.scene_folder import SceneFolder
-from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.previous import drop_previous, keep_previous
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_a_build_keeps_the_scene_until_the_new_one_is_whole(scene, tiny_capture,
         raise KeyboardInterrupt
 
     before = open_scene(scene, device="cpu").gaussians.means
-    monkeypatch.setattr("lexsplat.pipeline.make_averaged_field", stop)
+    monkeypatch.setattr("lexsplat.pipeline.build.make_averaged_field", stop)
     changed = [*QUICK_BUILD, "--seed", "5"]
     assert cli.main(["build", str(tiny_capture), "--output", str(scene), *changed]) == 130
     assert seen == ["previous"]

@@ -8,10 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
-from lexsplat.errors import TrainingError
+from lexsplat.captures import load_scene
+from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, reconstruct
-from lexsplat.scenes import load_scene
-from lexsplat.scenes.triangulation import InitialPoints, initial_points
+from lexsplat.runtime.errors import TrainingError
 
 SHORT = ReconstructionConfig(
     iterations=24, sh_degree=1, max_gaussians=1_300, densify_min_every=5, warm_up=0.2, reset_opacities=True

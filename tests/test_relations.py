@@ -8,11 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat.cameras import look_at
-from lexsplat.gaussians import gaussians_from_points
-from lexsplat.phrases import parse
-from lexsplat.relations import answer, distance, frame_of, holds, nearest, related
-from lexsplat.selection import Selection
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.queries.phrases import parse
+from lexsplat.queries.relations import answer, distance, frame_of, holds, nearest, related
+from lexsplat.queries.selection import Selection
 
 UP = np.array([0.0, 0.0, 1.0])
 THINGS = {  # a table top, things on it, a lamp over it, a pea in a bowl, a ball on the floor

@@ -8,10 +8,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rendering_reference import front_camera, random_gaussians
 
-from lexsplat.cameras import Camera
-from lexsplat.errors import BackendError
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import accumulate_codes, accumulate_weights, prepare, render
+from lexsplat.runtime.errors import BackendError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 

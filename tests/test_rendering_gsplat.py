@@ -16,8 +16,8 @@ import torch
 from rendering_reference import front_camera, random_gaussians
 
 from lexsplat import rendering
-from lexsplat.errors import BackendError
 from lexsplat.rendering import accumulate_codes, gsplat_backend, prepare, render
+from lexsplat.runtime.errors import BackendError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 COUNT, WIDTH, HEIGHT = 60, 50, 37

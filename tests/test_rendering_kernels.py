@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numba.core.caching import NullCache
 from rendering_reference import front_camera, random_gaussians
 
-from lexsplat.cameras import look_at
+from lexsplat.geometry.cameras import look_at
 from lexsplat.rendering import cpu_backend, pairs
 from lexsplat.rendering.kernels import binning, blending, gradients, lanes
 from lexsplat.rendering.kernels.jit import parallel
@@ -327,7 +327,7 @@ def test_what_is_never_compiled_is_not_announced(tmp_path):
 
 
 def test_every_compilation_of_ours_is_announced_once_and_nobody_elses(monkeypatch, caplog):
-    from lexsplat import optimizer_kernels
+    from lexsplat.reconstruction import adam_kernel as optimizer_kernels
     from lexsplat.rendering.kernels import jit
 
     monkeypatch.setattr(jit, "_announced", False)

@@ -9,9 +9,16 @@ import pytest
 from PIL import Image
 
 from lexsplat.evaluation import Metrics, PairResult, ViewPictures, precision_curves, summarize_language
+from lexsplat.evaluation.metrics import average_precision, threshold_counts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
-from lexsplat.metrics import average_precision, threshold_counts
-from lexsplat.report import Gallery, format_rows, format_table, table_rows, write_report, write_rows
+from lexsplat.evaluation.report import (
+    Gallery,
+    format_rows,
+    format_table,
+    table_rows,
+    write_report,
+    write_rows,
+)
 
 NASTY = '<script>alert("x")</script> & more'
 PROMPTS = ("red apple", NASTY)

@@ -5,7 +5,7 @@ import shutil
 import pytest
 from test_report import evaluated
 
-from lexsplat.report import write_report
+from lexsplat.evaluation.report import write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(12)}

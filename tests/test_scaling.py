@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lexsplat import cli, open_scene
-from lexsplat.boxes import gravity_up
-from lexsplat.scene_folder import SHIPPED_SCENE, SceneFolder
+from lexsplat.geometry.boxes import gravity_up
+from lexsplat.scenes.folder import SHIPPED_SCENE, SceneFolder
 
 
 @pytest.fixture

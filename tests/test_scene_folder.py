@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from lexsplat.atomic import atomic_path
-from lexsplat.cameras import look_at
-from lexsplat.errors import FileFormatError, SceneFolderError
-from lexsplat.scene_folder import (
-    SceneFolder,
-    fingerprint,
-    read_json,
-    write_json,
-)
-from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.geometry.cameras import look_at
+from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.scenes.folder import SceneFolder
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):

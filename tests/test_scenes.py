@@ -16,8 +16,8 @@ from captures import (
 )
 from PIL import Image
 
-from lexsplat.errors import CaptureError, FileFormatError, LexsplatError
-from lexsplat.scenes import load_mask, load_masks, load_scene, stem_of
+from lexsplat.captures import load_mask, load_masks, load_scene, stem_of
+from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
 
 NAMES = [f"{index:04d}.png" for index in range(1, 18)]
 

@@ -8,9 +8,9 @@ import pytest
 from captures import HEIGHT, WIDTH, cameras_around, colmap_bytes, shared_data, write_colmap, write_images
 from test_scenes import assert_tells, fails
 
-from lexsplat.errors import CaptureError, FileFormatError, LexsplatError
-from lexsplat.scenes import load_masks, load_scene
-from lexsplat.scenes.colmap import read_colmap
+from lexsplat.captures import load_masks, load_scene
+from lexsplat.captures.readers.colmap import read_colmap
+from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
 
 NAMES = [f"sub/{index}.png" for index in range(6)]
 FILES = ("cameras.bin", "images.bin", "points3D.bin")

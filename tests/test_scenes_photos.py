@@ -11,11 +11,12 @@ from test_pose_agreement import move
 from test_scenes import assert_tells, fails
 from test_scenes_triangulation import texture
 
-from lexsplat.cameras import look_at
-from lexsplat.errors import CaptureError
-from lexsplat.scenes import PoseConfig, load_scene, photos, poses_from_photos
-from lexsplat.scenes.photos import find_photos
-from lexsplat.scenes.preparation import prepare_photos, turned_upright
+from lexsplat.captures import PoseConfig, load_scene, poses_from_photos
+from lexsplat.captures.sfm import photos
+from lexsplat.captures.sfm.photos import find_photos
+from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
+from lexsplat.geometry.cameras import look_at
+from lexsplat.runtime.errors import CaptureError
 
 SIZE = (240, 180)
 COUNT = 9

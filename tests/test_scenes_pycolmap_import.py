@@ -65,7 +65,7 @@ print(len(pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2
 
 
 def test_sigterm_ends_a_build_at_once_with_what_is_saved(tiny_capture, tmp_path):
-    from lexsplat.tensor_files import read_tensors
+    from lexsplat.runtime.files import read_tensors
 
     command = [
         sys.executable,

@@ -3,9 +3,9 @@ import pytest
 from captures import save, write_json, write_transforms
 from scipy.ndimage import gaussian_filter
 
-from lexsplat.cameras import OPENGL_TO_OPENCV, look_at
-from lexsplat.scenes import initial_points, load_scene, random_points_in_frusta, triangulate
-from lexsplat.scenes.triangulation import matching_pairs
+from lexsplat.captures import initial_points, load_scene, random_points_in_frusta, triangulate
+from lexsplat.captures.sfm.triangulation import matching_pairs
+from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, look_at
 
 SIZE = (160, 120)
 
@@ -102,7 +102,7 @@ def test_masked_pixels_are_not_matched(tmp_path):
 
 
 def test_kept_points_are_used_until_a_pose_changes_or_the_file_breaks(wall, points, monkeypatch):
-    from lexsplat.scenes import triangulation
+    from lexsplat.captures.sfm import triangulation
 
     positions, _, cache, _ = points
     (file,) = cache.iterdir()

@@ -4,11 +4,11 @@ import pytest
 from captures import picture, save
 from PIL import Image
 
-from lexsplat.budget import BAND_BYTES
-from lexsplat.cameras import Camera
-from lexsplat.scenes.images import resize_image
-from lexsplat.scenes.scene import View
-from lexsplat.scenes.undistortion import Lens, pinhole_of, undistort
+from lexsplat.captures.capture import View
+from lexsplat.captures.images.reading import resize_image
+from lexsplat.captures.images.undistortion import Lens, pinhole_of, undistort
+from lexsplat.geometry.cameras import Camera
+from lexsplat.runtime.memory import BAND_BYTES
 
 SIZE = (96, 72)
 CENTER = (47.0, 37.0)
@@ -168,8 +168,8 @@ def test_large_photos_and_masks_come_out_of_bands_as_they_come_at_once(tmp_path,
         (width + 9, height + 4),
     ]
     at_once = [(view.load_image(size), view.valid_share(size)) for size in sizes]
-    monkeypatch.setattr("lexsplat.scenes.bands.LARGE_PIXELS", 0)
-    monkeypatch.setattr("lexsplat.scenes.bands.BAND_PIXELS", 5 * width)
+    monkeypatch.setattr("lexsplat.captures.images.bands.LARGE_PIXELS", 0)
+    monkeypatch.setattr("lexsplat.captures.images.bands.BAND_PIXELS", 5 * width)
     for size, (image, share) in zip(sizes, at_once):
         np.testing.assert_allclose(view.load_image(size), image, atol=2e-5)
         if share is not None:

@@ -8,8 +8,14 @@ import pytest
 from PIL import Image, ImageFilter
 from test_scenes import assert_tells
 
-from lexsplat.errors import BackendError, CaptureError
-from lexsplat.scenes.video import FrameMeasures, choose_frames, is_video, measure_frames, sample_video
+from lexsplat.captures.readers.video import (
+    FrameMeasures,
+    choose_frames,
+    is_video,
+    measure_frames,
+    sample_video,
+)
+from lexsplat.runtime.errors import BackendError, CaptureError
 
 av = pytest.importorskip("av", reason="needs the extra `video` (PyAV)")
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from language_scene import CENTRES, RADIUS, make_scene
 
-from lexsplat.errors import QueryError
-from lexsplat.selection import Selection
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")

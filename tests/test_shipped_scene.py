@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from lexsplat import cli, open_scene
-from lexsplat.demo.demo import demo_capture
+from lexsplat.captures import load_mask
+from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.encoders import load_clip
-from lexsplat.scene_folder import SHIPPED_SCENE
-from lexsplat.scenes import load_mask
+from lexsplat.scenes.folder import SHIPPED_SCENE
 
 
 @pytest.fixture(scope="module")

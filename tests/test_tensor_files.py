@@ -1,6 +1,6 @@
 import torch
 
-from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.runtime.files import read_tensors, write_tensors
 
 
 def test_what_is_read_starts_where_vectors_start(tmp_path):

@@ -5,8 +5,9 @@ import pytest
 import torch
 from question_scene import lifted_cloud, texts
 
-from lexsplat import queries, thresholds
-from lexsplat.queries import QueryConfig
+from lexsplat.queries import relevancy as queries
+from lexsplat.queries import thresholds
+from lexsplat.queries.relevancy import QueryConfig
 
 
 @pytest.fixture(scope="module")

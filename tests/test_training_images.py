@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from lexsplat.image_losses import ssim_target
-from lexsplat.scenes import load_scene
-from lexsplat.training_images import TrainingImages
+from lexsplat.captures import load_scene
+from lexsplat.reconstruction.image_losses import ssim_target
+from lexsplat.reconstruction.photos import TrainingImages
 
 PHOTO_BYTES = 96 * 72 * 3
 MOMENT_BYTES = 2 * 4 * PHOTO_BYTES

@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 import torch
 from language_scene import CENTRES, RADIUS, make_scene, trace
+from selection_ground_truth import (
+    TruthView,
+    lift_labels,
+    selection_f1,
+    surface_points,
+    true_box,
+)
 
-from lexsplat.cameras import Camera
-from lexsplat.truth import TruthView, lift_labels, selection_f1, surface_points, true_box
+from lexsplat.geometry.cameras import Camera
 
 
 def traced(camera: Camera) -> TruthView:

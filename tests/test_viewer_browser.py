@@ -234,7 +234,7 @@ def test_a_screenshot_is_downloaded_and_shows_the_scene(page, viewer, tmp_path):
 
 
 def test_a_click_on_a_camera_in_the_scene_goes_there(page, viewer):
-    from lexsplat.cameras import Camera
+    from lexsplat.geometry.cameras import Camera
 
     clear(page, viewer)
     view = viewer.session.scene.views["view1"].camera

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from language_scene import make_codebook, make_scene
 from sklearn.decomposition import PCA
 
-from lexsplat.heatmaps import colorize
-from lexsplat.language_field import LiftedField
-from lexsplat.viewer.colouring import (
+from lexsplat.language.fields import LiftedField
+from lexsplat.queries.heatmaps import colorize
+from lexsplat.viewer.coloring import (
     MODES,
     PROMPT_COLORS,
     Colouring,
@@ -174,7 +174,7 @@ def test_marked_and_amount_agree_with_a_loop(values, threshold):
 
 
 def test_a_trained_field_has_all_pictures(scene):
-    from lexsplat.language_field import TrainedField
+    from lexsplat.language.fields import TrainedField
 
     field = TrainedField.initial(
         scene.gaussians, make_codebook(7), generator=torch.Generator().manual_seed(0)

@@ -6,10 +6,10 @@ import socket
 import pytest
 from viewer_scene import WORDS, ball_scene
 
-from lexsplat.cameras import look_at
-from lexsplat.errors import BackendError
+from lexsplat.geometry.cameras import look_at
+from lexsplat.runtime.errors import BackendError
 from lexsplat.viewer.guard import Guard
-from lexsplat.viewer.memory import Memory
+from lexsplat.viewer.history import Memory
 from lexsplat.viewer.server import ViewerConfig, ViewerServer, is_loopback
 
 pytest.importorskip("viser")

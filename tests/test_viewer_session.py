@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from PIL import Image
 from viewer_scene import WORDS, ball_scene
 
-from lexsplat.errors import QueryError
+from lexsplat.runtime.errors import QueryError
 from lexsplat.viewer import pages
-from lexsplat.viewer.memory import MAX_HISTORY, Memory
+from lexsplat.viewer.history import MAX_HISTORY, Memory
 from lexsplat.viewer.recording import encode_png, encode_video, looking_at, orbit
 from lexsplat.viewer.session import MAX_QUESTIONS, Session, is_plain
 from lexsplat.viewer.vocabulary import MAX_PHRASES, clean_phrases, default_vocabulary, suggestions
@@ -275,7 +275,7 @@ def test_an_orbit_from_above_is_refused():
 
 
 def test_looking_at_is_the_camera_of_cameras():
-    from lexsplat.cameras import look_at
+    from lexsplat.geometry.cameras import look_at
 
     place, target, up = np.array([1.0, -2, 0.5]), np.array([0.3, 0.2, 0]), np.array([0.1, 0, 1])
     camera = look_at(place, target, up, 8, 8, 1.0)

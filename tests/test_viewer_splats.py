@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.spatial.transform import Rotation
 
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.viewer.splats import SplatBlocks, covariances_of, level_of_detail, morton_order
 
 

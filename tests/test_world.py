@@ -5,10 +5,10 @@ import pytest
 from test_boxes import UP
 from test_boxes import cameras as tilted_cameras
 
-from lexsplat.cameras import look_at
-from lexsplat.config import BuildConfig
-from lexsplat.errors import SceneFolderError
-from lexsplat.world import World, parse_vector, stored_world, world_of
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.world import World, parse_vector, stored_world, world_of
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.errors import SceneFolderError
 
 
 def by_name(cameras) -> dict:

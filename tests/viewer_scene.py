@@ -7,10 +7,10 @@ import torch
 from language_scene import LanguageScene, make_scene
 
 from lexsplat.codebook import Codebook
-from lexsplat.language_field import LiftedField
-from lexsplat.queries import CANONICAL_PHRASES
-from lexsplat.scene_folder import StoredView
-from lexsplat.search import SearchableScene
+from lexsplat.language.fields import LiftedField
+from lexsplat.queries.relevancy import CANONICAL_PHRASES
+from lexsplat.scenes.folder import StoredView
+from lexsplat.scenes.scene import SearchableScene
 
 WORDS = [f"ball {number}" for number in range(5)]
 

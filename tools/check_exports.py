@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lexsplat.exporting import export_scene
-from lexsplat.gaussians import SH_C0, Gaussians
-from lexsplat.search import open_scene
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.scenes.exporting import export_scene
+from lexsplat.scenes.scene import open_scene
 
 VALIDATE = """
 import validator from 'gltf-validator'; import fs from 'fs';

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import lexsplat
-from lexsplat.heatmaps import overlay_heatmap
+from lexsplat.queries.heatmaps import overlay_heatmap
 
 WIDTH = 360
 

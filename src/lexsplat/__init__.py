@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
-    from lexsplat.search import SearchableScene, open_scene
+    from lexsplat.scenes.scene import SearchableScene, open_scene
 
 __version__ = "0.1.0"
 
@@ -27,7 +27,7 @@ __all__ = ["SearchableScene", "__version__", "open_scene"]
 def __getattr__(name: str) -> Any:
     # Loaded when first used, so that `import lexsplat` and `lexsplat --help` stay quick.
     if name in ("open_scene", "SearchableScene"):
-        from lexsplat import search
+        from lexsplat.scenes import scene as search
 
         return getattr(search, name)
     raise AttributeError(f"module 'lexsplat' has no attribute {name!r}")

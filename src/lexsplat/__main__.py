@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from lexsplat.errors import STOPPED
+from lexsplat.runtime.errors import STOPPED
 
 
 def main() -> int:

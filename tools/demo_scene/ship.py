@@ -13,12 +13,12 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from lexsplat.answers import evaluate_scene
-from lexsplat.demo.demo import DEMO_CONFIG, demo_capture
-from lexsplat.pipeline import build
-from lexsplat.progress_bars import ProgressBars
-from lexsplat.scene_folder import SHIPPED_SCENE
-from lexsplat.search import open_scene
+from lexsplat.cli.progress import ProgressBars
+from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
+from lexsplat.evaluation.scenes import evaluate_scene
+from lexsplat.pipeline.build import build
+from lexsplat.scenes.folder import SHIPPED_SCENE
+from lexsplat.scenes.scene import open_scene
 
 KEPT = ("cameras.json", "gaussians.ply", "language.safetensors")
 

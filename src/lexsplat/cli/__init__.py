@@ -27,7 +27,7 @@ from lexsplat.cli.poses import Poses
 from lexsplat.cli.query import Query
 from lexsplat.cli.scale import Scale
 from lexsplat.cli.view import View
-from lexsplat.errors import STOPPED, LexsplatError
+from lexsplat.runtime.errors import STOPPED, LexsplatError
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]

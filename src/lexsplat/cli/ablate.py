@@ -10,7 +10,7 @@ import tyro
 
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import PromptListName, Settings, check_seeds, print_json_file
-from lexsplat.config import BuildConfig, LanguageMethod
+from lexsplat.pipeline.config import BuildConfig, LanguageMethod
 
 
 @dataclasses.dataclass
@@ -71,9 +71,9 @@ class Ablate:
 
     def run(self) -> None:
         """Measure and print the table."""
-        from lexsplat import ablation
-        from lexsplat.progress_bars import ProgressBars
-        from lexsplat.report import format_rows
+        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.evaluation import ablate as ablation
+        from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
         if self.as_in_paper:

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from lexsplat.cli.options import Settings
-from lexsplat.config import BuildConfig
+from lexsplat.pipeline.config import BuildConfig
 
 
 @dataclasses.dataclass
@@ -36,8 +36,8 @@ class Build:
 
     def run(self) -> None:
         """Build up to the last stage of this command."""
-        from lexsplat.pipeline import build
-        from lexsplat.progress_bars import ProgressBars
+        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.pipeline.build import build
 
         with ProgressBars() as bars:
             folder = build(

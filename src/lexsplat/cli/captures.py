@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from lexsplat.config import BuildConfig
+from lexsplat.pipeline.config import BuildConfig
 
 EMBEDDED = ("demo", "second")
 """Captures that ship with the package, by name."""
@@ -17,7 +17,7 @@ def capture_and_settings(capture: str, settings: BuildConfig) -> tuple[Path, Bui
     path = Path(capture)
     if capture not in EMBEDDED or path.exists():
         return path, settings
-    from lexsplat.demo.demo import DEMO_CONFIG, demo_capture
+    from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
 
     changes: dict[str, Any] = {}
     for name in ("clip", "dino", "codebook"):

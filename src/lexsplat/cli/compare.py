@@ -17,7 +17,7 @@ from lexsplat.cli.options import (
     check_seeds,
     print_json_file,
 )
-from lexsplat.config import BuildConfig
+from lexsplat.pipeline.config import BuildConfig
 
 
 @dataclasses.dataclass
@@ -63,9 +63,9 @@ class Compare:
 
     def run(self) -> None:
         """Measure and print the table."""
-        from lexsplat.comparison import compare
-        from lexsplat.progress_bars import ProgressBars
-        from lexsplat.report import format_rows
+        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.evaluation.compare import compare
+        from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
         with ProgressBars() as bars:

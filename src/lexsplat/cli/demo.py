@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from lexsplat.cli.options import Device, print_evaluation
-from lexsplat.config import BuildConfig, LanguageMethod
+from lexsplat.pipeline.config import BuildConfig, LanguageMethod
 
 
 @dataclasses.dataclass
@@ -39,8 +39,8 @@ class Demo:
 
     def run(self) -> None:
         """Build, evaluate, print the table."""
-        from lexsplat.demo.demo import run_demo
-        from lexsplat.progress_bars import ProgressBars
+        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.evaluation.demo import run_demo
 
         with ProgressBars() as bars:
             result = run_demo(

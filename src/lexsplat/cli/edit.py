@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from lexsplat.cli.options import Device, check_relevancy, open_scene
-from lexsplat.errors import QueryError
+from lexsplat.runtime.errors import QueryError
 
 if TYPE_CHECKING:
-    from lexsplat.editing import Editor
-    from lexsplat.search import SearchableScene
+    from lexsplat.scenes.editing import Editor
+    from lexsplat.scenes.scene import SearchableScene
 
 
 @dataclasses.dataclass
@@ -91,8 +91,8 @@ class Edit:
 
     def run(self) -> None:
         """Do one thing and say what the scene is now."""
-        from lexsplat.editing import Editor
-        from lexsplat.previous_scene import require_current
+        from lexsplat.scenes.editing import Editor
+        from lexsplat.scenes.previous import require_current
 
         scene = open_scene(self.scene, self.device, self.clip)
         if scene.folder is not None:
@@ -114,8 +114,8 @@ class Edit:
         print(f"{len(editor.scene.gaussians):,} Gaussians, {len(editor.undone)} steps undone")
 
     def _change(self, editor: Editor) -> None:
-        from lexsplat.boxes import rotation_about
-        from lexsplat.editing import Motion
+        from lexsplat.geometry.boxes import rotation_about
+        from lexsplat.scenes.editing import Motion
 
         chosen = editor.scene.find(self.select or "", self.view, threshold=self.threshold)
         chosen = chosen.largest() if self.largest else chosen

@@ -50,8 +50,8 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate and print the table."""
-        from lexsplat.answers import evaluate_scene
-        from lexsplat.progress_bars import ProgressBars
+        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.evaluation.scenes import evaluate_scene
 
         scene = open_scene(self.scene, self.device, self.clip)
         if self.form:

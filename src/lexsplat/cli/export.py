@@ -44,9 +44,9 @@ class Export:
 
     def run(self) -> None:
         """Write the file."""
-        from lexsplat.exporting import ending_of, export_gaussians, export_scene, found_by
-        from lexsplat.scene_folder import SceneFolder
-        from lexsplat.world import world_of
+        from lexsplat.geometry.world import world_of
+        from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene, found_by
+        from lexsplat.scenes.folder import SceneFolder
 
         ending_of(self.file)
         SceneFolder.open(Path(self.scene)).refuse_own_file(self.file)

@@ -41,7 +41,7 @@ class Find:
 
     def run(self) -> None:
         """Find and print."""
-        from lexsplat.answers import find_phrases
+        from lexsplat.scenes.answers import find_phrases
 
         scene = open_scene(self.scene, self.device, self.clip)
         answers = find_phrases(scene, self.phrases, self.view, self.threshold)

@@ -24,8 +24,8 @@ class Info:
 
     def run(self) -> None:
         """Print the facts."""
-        from lexsplat.answers import scene_facts
-        from lexsplat.scene_folder import SceneFolder
+        from lexsplat.scenes.answers import scene_facts
+        from lexsplat.scenes.folder import SceneFolder
 
         facts = scene_facts(SceneFolder.open(Path(self.scene)))
         if self.json:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.config import BuildConfig, check_seed
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.device import check_seed
 
 if TYPE_CHECKING:
-    from lexsplat.search import SearchableScene
+    from lexsplat.scenes.scene import SearchableScene
 
 Settings = Annotated[BuildConfig, tyro.conf.arg(name="")]
 Device = Literal["auto", "cpu", "cuda"]
@@ -25,7 +26,7 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 
 def open_scene(path: str, device: str, clip: str | None) -> SearchableScene:
     """The scene a command was given, ready to be asked."""
-    from lexsplat import search
+    from lexsplat.scenes import scene as search
 
     return search.open_scene(path, device=device, clip=clip)
 
@@ -37,7 +38,7 @@ def print_json(document: Any) -> None:
 
 def print_evaluation(result: dict, folder: Path) -> None:
     """The table of one evaluated scene, and where its report lies."""
-    from lexsplat.report import format_table
+    from lexsplat.evaluation.report import format_table
 
     print(format_table(result))
     print(f"report: {folder / 'report.html'}")

@@ -9,9 +9,10 @@ from typing import Annotated
 
 import tyro
 
-from lexsplat.config import check_seed, parse_bytes
-from lexsplat.scenes.photos import PoseConfig
-from lexsplat.scenes.video import DEFAULT_FRAMES
+from lexsplat.captures.readers.video import DEFAULT_FRAMES
+from lexsplat.captures.sfm.photos import PoseConfig
+from lexsplat.runtime.device import check_seed
+from lexsplat.runtime.memory import parse_bytes
 
 
 @dataclasses.dataclass
@@ -46,10 +47,10 @@ class Poses:
 
     def run(self) -> None:
         """Write the model and say how many photos were placed, and which were not."""
-        from lexsplat.progress_bars import ProgressBars
-        from lexsplat.scene_folder import SceneFolder
-        from lexsplat.scenes import poses_from_photos
-        from lexsplat.scenes.video import is_video, sample_video
+        from lexsplat.captures import poses_from_photos
+        from lexsplat.captures.readers.video import is_video, sample_video
+        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.scenes.folder import SceneFolder
 
         photos, memory = self.photos, parse_bytes(self.memory)
         with SceneFolder(self.output).locked(), ProgressBars() as bars:

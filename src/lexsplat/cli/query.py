@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from lexsplat.cli.options import PRESENCE, Device, check_relevancy, open_scene, print_json
-from lexsplat.queries import QueryConfig
+from lexsplat.queries.relevancy import QueryConfig
 
 if TYPE_CHECKING:
-    from lexsplat.search import SearchableScene
+    from lexsplat.scenes.scene import SearchableScene
 
 
 @dataclasses.dataclass
@@ -65,7 +65,7 @@ class Query:
 
     def run(self) -> None:
         """Answer and write pictures."""
-        from lexsplat.answers import answer_queries
+        from lexsplat.scenes.answers import answer_queries
 
         scene = open_scene(self.scene, self.device, self.clip)
         scene.query = self._changed(scene.query)

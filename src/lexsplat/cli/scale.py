@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from lexsplat.cli.options import Device, open_scene, print_json
-from lexsplat.world import World, parse_vector, world_of
+from lexsplat.geometry.world import World, parse_vector, world_of
 
 
 @dataclasses.dataclass
@@ -62,8 +62,8 @@ class Scale:
 
     def run(self) -> None:
         """Measure, store, print."""
-        from lexsplat.scaling import store_world
-        from lexsplat.scene_folder import SceneFolder
+        from lexsplat.scenes.folder import SceneFolder
+        from lexsplat.scenes.scale import store_world
 
         folder = SceneFolder.open(Path(self.scene))
         scale = None
@@ -89,7 +89,7 @@ class Scale:
 
     def _length(self) -> float:
         """The given distance as it is in the scene, in world units."""
-        from lexsplat.scaling import height_of, length_between, length_of_points
+        from lexsplat.scenes.scale import height_of, length_between, length_of_points
 
         if self.points is not None:
             return length_of_points(parse_vector(self.points[0]), parse_vector(self.points[1]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lexsplat.codebook.settings import MAX_CODES
 from lexsplat.codebook.space import Codebook
-from lexsplat.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features import FeatureMap

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lexsplat import budget
 from lexsplat.codebook.losses import quantization_loss
 from lexsplat.codebook.settings import CodebookConfig
 from lexsplat.codebook.space import BLOCK_ROWS, Codebook
-from lexsplat.errors import TrainingError
-from lexsplat.progress import Event, Listener, silent
-from lexsplat.threads import one_thread
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.device import one_thread
+from lexsplat.runtime.errors import TrainingError
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features import FeatureMap

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lexsplat.codebook.settings import MAX_CODES
-from lexsplat.threads import one_thread
+from lexsplat.runtime.device import one_thread
 
 if TYPE_CHECKING:
     from lexsplat.features import FeatureMap

@@ -22,14 +22,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.cameras import Camera
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import FieldMethod, Method, method_thresholds
-from lexsplat.evaluation.protocols import PROTOCOLS, lerf_2d_scores, official_scores, silhouette_iou
-from lexsplat.evaluation.results import Boxes, Masks, Metrics, PairResult, ViewPictures
-from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kinds, summarize_language
-from lexsplat.gaussians import Gaussians
-from lexsplat.metrics import (
+from lexsplat.evaluation.metrics import (
     THRESHOLDS,
     Perceptual,
     average_precision,
@@ -40,13 +35,18 @@ from lexsplat.metrics import (
     ssim,
     threshold_counts,
 )
-from lexsplat.presence import REFERENCE_PHRASES
-from lexsplat.progress import Event, Listener, silent
-from lexsplat.queries import QueryConfig, TextEncoder, embed_prompts
+from lexsplat.evaluation.protocols import PROTOCOLS, lerf_2d_scores, official_scores, silhouette_iou
+from lexsplat.evaluation.results import Boxes, Masks, Metrics, PairResult, ViewPictures
+from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kinds, summarize_language
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.presence import REFERENCE_PHRASES
+from lexsplat.queries.relevancy import QueryConfig, TextEncoder, embed_prompts
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.language_field import LanguageField
-    from lexsplat.scenes import Scene, View
+    from lexsplat.captures import Scene, View
+    from lexsplat.language.fields import LanguageField
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def evaluate(
     """
     config = config or EvaluationConfig()
     if masks is None:
-        from lexsplat.scenes import load_annotations
+        from lexsplat.captures import load_annotations
 
         found = load_annotations(scene)
         masks, boxes = found.masks, found.boxes if boxes is None else boxes

@@ -1,6 +1,6 @@
 """What an evaluation asks of a method that finds words in a scene: maps, and scores of Gaussians if it has them.
 
-Language fields (`language_field.LanguageField`) are one kind; the rebuilt methods of `lexsplat.baselines` others.
+Language fields (`language_field.LanguageField`) are one kind; the rebuilt methods of `lexsplat.evaluation.baselines` others.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from lexsplat.cameras import Camera
-from lexsplat.gaussians import Gaussians
-from lexsplat.presence import PresenceJudge, found_thresholds
-from lexsplat.queries import QueryConfig, gaussian_relevancy, render_relevancy
-from lexsplat.thresholds import automatic_threshold
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.presence import PresenceJudge, found_thresholds
+from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
+from lexsplat.queries.thresholds import automatic_threshold
 
 if TYPE_CHECKING:
-    from lexsplat.language_field import LanguageField
+    from lexsplat.language.fields import LanguageField
 
 
 @runtime_checkable

@@ -6,7 +6,7 @@
 - **lerf-3d**: Gaussians are selected in 3D, then rendered alone (OpenGaussian's evaluation on LERF-OVS); the two
   LERF-OVS protocols cannot be compared (`silhouette_iou`).
 
-The strict protocol, which is ours, stands in `lexsplat.metrics`. Arrays in, numbers out, never a disk.
+The strict protocol, which is ours, stands in `lexsplat.evaluation.metrics`. Arrays in, numbers out, never a disk.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.evaluation.metrics import ThresholdCounts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
-from lexsplat.metrics import ThresholdCounts
 
 THRESHOLD_KINDS = ("auto", "fixed", "oracle")
 

@@ -22,9 +22,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.errors import FileFormatError
 from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
-from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import read_tensors, write_tensors
 
 FORMAT_VERSION = "1"
 

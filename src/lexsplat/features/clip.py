@@ -15,7 +15,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.errors import ModelError
 from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
@@ -23,6 +22,7 @@ from lexsplat.features.pretrained import (
     precision,
     resize_images,
 )
+from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat import budget
-from lexsplat.errors import FileFormatError
 from lexsplat.features.cache import FeatureMap, FeatureMaps
-from lexsplat.tensor_files import PICKLES, refuse_pickle
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import PICKLES, refuse_pickle
 
 if TYPE_CHECKING:
-    from lexsplat.scenes import Scene, View
+    from lexsplat.captures import Scene, View
 
 _FLOATS = ("F64", "F32", "F16", "BF16")
 

@@ -16,7 +16,6 @@ import torch
 import tyro
 from torch import Tensor
 
-from lexsplat import budget
 from lexsplat.features.cache import (
     FeatureMap,
     FeatureMaps,
@@ -41,10 +40,11 @@ from lexsplat.features.pyramid import (
     random_levels,
     unique_boxes,
 )
-from lexsplat.progress import Event, Listener, silent
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.scenes import Scene, View
+    from lexsplat.captures import Scene, View
 
 _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15 % slower at 256
 _LONGEST = 16  # in short sides: longer strips get coarser maps, or the memory of a map would know no bound

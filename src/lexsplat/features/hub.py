@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lexsplat.errors import ModelError
+from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 

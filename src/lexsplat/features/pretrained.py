@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.errors import ModelError
 from lexsplat.features.hub import content_hash, read_json
+from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 

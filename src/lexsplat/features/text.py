@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lexsplat.errors import FileFormatError
 from lexsplat.features.encoders import ImageTextEncoder
-from lexsplat.tensor_files import read_tensors, write_tensors
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import read_tensors, write_tensors
 
 log = logging.getLogger("lexsplat")
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from lexsplat import budget
-from lexsplat.gaussians import Gaussians
-from lexsplat.progress import Listener, silent
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
 from lexsplat.reconstruction.trainer import EVENT_EVERY, STAGE, Reconstructor
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.progress import Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.checkpoints import Checkpoint
-    from lexsplat.scenes import Scene
+    from lexsplat.captures import Scene
+    from lexsplat.runtime.checkpoints import Checkpoint
 
 __all__ = [
     "EVENT_EVERY",
@@ -58,7 +58,7 @@ def reconstruct(
         CaptureError: If a photo cannot be read.
         MemoryBudgetError: If the Gaussians, or the photos while they are triangulated, do not fit into ``memory``.
     """
-    from lexsplat.scenes.triangulation import initial_points
+    from lexsplat.captures.sfm.triangulation import initial_points
 
     check_gaussians(config, device, memory)
     points = initial_points(scene, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 import tyro
 
-from lexsplat.densification import REFERENCE_ITERATIONS
+from lexsplat.reconstruction.densification import REFERENCE_ITERATIONS
 
 LONG_TRAINING = 15_000
 """From here on opacities are reset and all iterations run at full resolution, unless a setting says otherwise."""

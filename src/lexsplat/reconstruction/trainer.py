@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from lexsplat.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
-from lexsplat.divergence import KEEP_EVERY, Guard
-from lexsplat.errors import TrainingError
-from lexsplat.exposures import Exposures
-from lexsplat.gaussians import Gaussians, gaussians_from_points
-from lexsplat.optimizers import (
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
+from lexsplat.reconstruction.adam import (
     Adam,
     below_prefix,
     load_optimizer_tensors,
     optimizer_tensors,
     with_prefix,
 )
-from lexsplat.progress import Event, Listener, silent
+from lexsplat.reconstruction.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
+from lexsplat.reconstruction.exposures import Exposures
 from lexsplat.reconstruction.settings import ReconstructionConfig
+from lexsplat.runtime.divergence import KEEP_EVERY, Guard
+from lexsplat.runtime.errors import TrainingError
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.checkpoints import Checkpoint
-    from lexsplat.scenes import Scene, View
-    from lexsplat.scenes.triangulation import InitialPoints
+    from lexsplat.captures import Scene, View
+    from lexsplat.captures.sfm.triangulation import InitialPoints
+    from lexsplat.runtime.checkpoints import Checkpoint
 
 STAGE = "reconstruct"
 """Name of the stage in events."""
@@ -51,7 +51,7 @@ class Reconstructor:
     Args:
         scene: Views and split.
         config: Settings.
-        points: Where Gaussians start, from `lexsplat.scenes.triangulation.initial_points`.
+        points: Where Gaussians start, from `lexsplat.captures.sfm.triangulation.initial_points`.
         device: Where to train.
         seed: Of the order of views and of density control.
 
@@ -68,7 +68,7 @@ class Reconstructor:
         device: torch.device | str = "cpu",
         seed: int = 0,
     ) -> None:
-        from lexsplat.image_losses import SMALLEST_SIDE
+        from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
         self.config = config
         self.device = torch.device(device)
@@ -123,7 +123,7 @@ class Reconstructor:
 
     @property
     def rate_factor(self) -> float:
-        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.divergence`)."""
+        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.runtime.divergence`)."""
         return self._rate_factor
 
     @rate_factor.setter
@@ -162,7 +162,7 @@ class Reconstructor:
         Raises:
             TrainingError: If the loss is no longer finite.
         """
-        from lexsplat.image_losses import photometric_loss
+        from lexsplat.reconstruction.image_losses import photometric_loss
         from lexsplat.rendering import render
 
         index = self._next_view()
@@ -230,7 +230,7 @@ class Reconstructor:
         Raises:
             ValueError: If there is no view.
         """
-        from lexsplat.metrics import psnr
+        from lexsplat.evaluation.metrics import psnr
         from lexsplat.rendering import render
 
         scores = []
@@ -344,7 +344,7 @@ class Reconstructor:
 
     def _training_images(self) -> Any:
         """The photos at the present resolution; those of the warm-up are dropped after it."""
-        from lexsplat.training_images import TrainingImages
+        from lexsplat.reconstruction.photos import TrainingImages
 
         shrink = 2.0 if self.steps_done < self.config.warm_up_iterations and self._can_shrink else 1.0
         if shrink != self._images_shrink:

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.cameras import Camera
-from lexsplat.errors import BackendError
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import posing
+from lexsplat.runtime.errors import BackendError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lexsplat.cameras import Camera
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering.kernels import blending, code_weights, gradients, projection, spherical_harmonics
 from lexsplat.rendering.kernels.jit import parallel
 from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs

@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.cameras import Camera
-from lexsplat.errors import BackendError
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.errors import BackendError
 
 TILE = 16
 CHANNELS = 32

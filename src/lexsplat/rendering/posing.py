@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.cameras import Camera
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
 
 
 def in_camera_frame(gaussians: Gaussians, viewmat: Tensor) -> Gaussians:

@@ -1,293 +1,362 @@
-"""What every other stage sees of a capture: views with pinhole cameras, keyed by image name, and points."""
+"""A finished scene, open for questions: the Python face of lexsplat.
+
+import lexsplat
+scene = lexsplat.open_scene("output/demo")
+relevancy = scene.relevancy(["red apple"], view="frame_0005.jpg")  # [1, H, W]
+scores = scene.scores(["red apple"])  # [1, N], one for each Gaussian
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from torch import Tensor
 
-from lexsplat.cameras import Camera, camera_extent
-from lexsplat.errors import CaptureError
-from lexsplat.scenes.bands import FilledRows, MaskRows, Rows, is_large, reduced, whole
-from lexsplat.scenes.images import (
-    image_size,
-    read_image,
-    read_mask,
-    read_rows,
-    resize_image,
-    sizes_agree,
+from lexsplat.features.text import TextCache, encode_each
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.world import World, world_of
+from lexsplat.language.fields import LanguageField, field_from_tensors
+from lexsplat.queries.phrases import parse
+from lexsplat.queries.picking import select_hit, surface_at
+from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceJudge, found_thresholds
+from lexsplat.queries.relations import answer
+from lexsplat.queries.relevancy import (
+    CANONICAL_PHRASES,
+    QueryConfig,
+    check_prompts,
+    embed_prompts,
+    gaussian_relevancy,
+    render_relevancy,
 )
-from lexsplat.scenes.undistortion import Lens, RemappedRows, undistort, undistort_large
+from lexsplat.queries.selection import Selection
+from lexsplat.rendering import Rendering, render
+from lexsplat.runtime.errors import FileFormatError, ModelError, QueryError, SceneFolderError
+from lexsplat.runtime.files import read_tensors
+from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.previous import previous_of
+
+if TYPE_CHECKING:
+    from lexsplat.features.encoders import ImageTextEncoder
 
 
-def stem_of(name: str) -> str:
-    """An image name without its suffix; folders stay: ``"left/0001.jpg"`` gives ``"left/0001"``."""
-    folder, slash, file = name.rpartition("/")
-    head, dot, _ = file.rpartition(".")
-    return f"{folder}{slash}{head if dot and head else file}"
-
-
-@dataclass(frozen=True)
-class View:
-    """One photo and the pinhole camera it is seen through after undistortion.
+class SearchableScene:
+    """Gaussians, their language and the views they were made from.
 
     Args:
-        name: Path of the image relative to the image folder, with "/": the key of everything about this view.
-        image_path: The photo on disk, not undistorted.
-        camera: Pinhole camera at the working resolution.
-        capture_size: Width and height of the undistorted photo at full resolution, in pixels.
-        lens: The lens the photo was taken through, for photos of the size on disk.
-        background: Colour behind transparent pixels, RGB in 0..1.
-        ignore_path: A picture that is black where pixels take no part in any loss (``masks/`` of a
-            capture); None where all pixels count.
+        gaussians: Geometry and appearance.
+        field: Their language.
+        views: The views by name.
+        clip: Name or folder of the encoder the language was made with.
+        query: How questions are answered.
+        folder: Where the scene was opened from, if from disk.
     """
 
-    name: str
-    image_path: Path
-    camera: Camera
-    capture_size: tuple[int, int]
-    lens: Lens
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ignore_path: Path | None = None
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        field: LanguageField,
+        views: Mapping[str, StoredView],
+        clip: str,
+        query: QueryConfig | None = None,
+        folder: SceneFolder | None = None,
+    ) -> None:
+        self.gaussians, self.field, self.views = gaussians, field, dict(views)
+        self.clip, self.query, self.folder = clip, query or QueryConfig(), folder
+        self._encoder: ImageTextEncoder | None = None
+        self._cache: TextCache | None = None
+        self._texts: dict[str, Tensor] = {}
+        self._judge: PresenceJudge | None = None
+        self._world: World | None = None
 
-    @property
-    def stem(self) -> str:
-        """The name without its suffix; folders stay."""
-        return stem_of(self.name)
+    def with_content(self, gaussians: Gaussians, field: LanguageField) -> SearchableScene:
+        """The same views and encoder with other Gaussians and their language, as after an edit."""
+        other = SearchableScene(gaussians, field, self.views, self.clip, self.query, self.folder)
+        other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
+        return other
 
-    def load_image(self, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-        """The undistorted photo ``[H, W, 3]`` in 0..1, read from disk at every call.
+    # -- text
 
-        Masked pixels have the mean colour of the others, so that nothing depends on what was there: not the pixels
-        beside them in a smaller picture, not the window of a loss, not the crop of an encoder.
-
-        Args:
-            size: Width and height of the result; None takes the camera's.
+    def embed(self, prompts: Sequence[str]) -> Tensor:
+        """Unit text embeddings ``[P, D]``; each prompt is encoded once.
 
         Raises:
-            CaptureError: If the file is missing, damaged, or no longer has the size it had.
-            ValueError: If ``size`` is not positive.
+            QueryError: If there is no prompt or one is empty.
+            ModelError: If the text encoder cannot be loaded.
         """
-        size = self._checked_size(size)
-        found = image_size(self.image_path)
-        if found != (self.lens.width, self.lens.height):
-            raise CaptureError(
-                self.image_path,
-                expected=f"{self.lens.width}x{self.lens.height} pixels",
-                found=f"{found[0]}x{found[1]}",
-                remedy="the file changed since the capture was loaded; load it again",
+        import torch
+
+        if not prompts:
+            raise QueryError("query", expected="at least one prompt", found="none")
+        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._texts]
+        if new:  # by one call: the cache on disk is written once
+            self._texts.update(zip(new, embed_prompts(new, self.encode_text, self.query.templates)))
+        return torch.stack([self._texts[prompt] for prompt in prompts])
+
+    def encode_text(self, texts: list[str]) -> Tensor:
+        """Embeddings ``[T, D]`` of whole sentences, by the encoder the language was made with.
+
+        They are kept in the scene folder, so that a question asked twice loads no model.
+
+        Raises:
+            ModelError: If the encoder cannot be loaded, or is not the one the language was made with.
+        """
+        known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
+        writable = self.folder and not self.folder.is_shipped and os.access(self.folder.root, os.W_OK)
+        if self.folder is None or known is None or not writable:
+            return encode_each(self._load_encoder(known), texts)
+        if self._cache is None:
+            self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
+        return self._cache.encode(known, texts, lambda: self._load_encoder(known))
+
+    def encoder_identity(self) -> dict[str, str]:
+        """Name and content hash (where known) of the encoder of the texts, for files of other programs."""
+        known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
+        return {"encoder": self.clip, **({"encoder_hash": known} if known else {})}
+
+    def preload(self) -> None:
+        """Load the text encoder now, so that the first question need not wait for it.
+
+        Raises:
+            ModelError: If it cannot be loaded.
+        """
+        self._load_encoder(self.encoder_identity().get("encoder_hash"))
+
+    def _load_encoder(self, known: str | None) -> ImageTextEncoder:
+        from lexsplat.features.encoders import load_clip
+
+        if self._encoder is None:
+            self._encoder = load_clip(self.clip, str(self.gaussians.device))
+        if known is not None and self._encoder.content_hash != known:
+            raise ModelError(
+                self.clip,
+                expected="the encoder the scene was made with",
+                found="another one",
+                remedy="name the right one with --clip, or build the scene again with this one",
             )
-        if self.ignore_path is None and not self.lens.distorts:
-            return read_image(self.image_path, self.background, size=size)
-        if is_large(*found):
-            return self._load_large(size)
-        image = read_image(self.image_path, self.background)
-        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
-        if mask is not None and self._is_undistorted(mask):
-            image = undistort(image, self.lens, self.capture_size)
-            return resize_image(filled(image, mask), size)
-        if mask is not None:
-            self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-            image = filled(image, _resize_nearest(mask, found))
-        if self.lens.distorts:
-            return undistort(image, self.lens, size)
-        return resize_image(image, size)
+        return self._encoder
 
-    def _load_large(self, size: tuple[int, int]) -> NDArray[np.float32]:
-        """A photo that is masked or distorted, in bands."""
-        source: Rows = read_rows(self.image_path, self.background)
-        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
-        if mask is not None and self._is_undistorted(mask):
-            source = FilledRows(RemappedRows(source, self.lens, self.capture_size), mask)
-        else:
-            if mask is not None:
-                self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-                source = FilledRows(source, _resize_nearest(mask, (source.width, source.height)))
-            if self.lens.distorts:
-                return undistort_large(source, self.lens, size)
-        if size[0] <= source.width and size[1] <= source.height:
-            return reduced(source, size)
-        return resize_image(whole(source), size)
+    def _negatives(self) -> Tensor:
+        return self.embed(list(self.query.negatives or CANONICAL_PHRASES))
 
-    def load_mask(self, path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-        """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, nearest pixel.
+    # -- answers
+
+    def relevancy(self, prompts: Sequence[str], view: str | Camera) -> Tensor:
+        """Relevancy maps ``[P, H, W]`` in 0..1 of the prompts in a view (a name or any camera)."""
+        camera = view if isinstance(view, Camera) else self.view(view).camera
+        positives = self.embed(prompts)
+        return render_relevancy(self.field, self.gaussians, camera, positives, self._negatives(), self.query)
+
+    def scores(self, prompts: Sequence[str]) -> Tensor:
+        """Relevancy ``[P, N]`` in 0..1 of every Gaussian for the prompts."""
+        return gaussian_relevancy(self.field, self.embed(prompts), self._negatives(), self.query)
+
+    def thresholds(self, prompts: Sequence[str]) -> Tensor:
+        """An automatic threshold ``[P]`` for each prompt, from the scene alone; 0.5 for what is not there."""
+        return found_thresholds(self.presence_judge, self.gaussians, self._threshold_cameras(),
+                                self.embed(prompts), self._negatives(), self.query)  # fmt: skip
+
+    def select(self, phrase: str, threshold: float | None = None) -> Selection:
+        """The Gaussians that answer to a phrase, as a set with instances, boxes and a best view.
 
         Args:
-            path: The mask: a picture of the photo's aspect, drawn on the photo as it is on disk, or on the
-                undistorted photo where it has exactly that one's size.
-            size: Width and height of the result; None keeps the mask's own resolution.
+            phrase: What to look for.
+            threshold: Score from which a Gaussian belongs to it; none chooses one from the scene, and leaves out
+                instances that answer far worse than the best one (`Selection.convincing`).
 
         Raises:
-            CaptureError: If the mask cannot be read or its aspect is not the photo's.
+            QueryError: If the phrase is empty.
         """
-        return self.place_mask(read_mask(path), path, size)
-
-    def place_mask(
-        self, mask: NDArray[np.bool_], subject: Path, size: tuple[int, int] | None = None
-    ) -> NDArray[np.bool_]:
-        """A mask ``[h, w]`` drawn on the photo, as `load_mask` gives it.
-
-        Args:
-            mask: What was drawn.
-            subject: The file to name in messages.
-            size: Width and height of the result; None keeps the mask's own resolution.
-
-        Raises:
-            CaptureError: If the aspect of the mask is not the photo's.
-        """
-        height, width = mask.shape
-        self._check_aspect(subject, (width, height))
-        if self._is_undistorted(mask) or not self.lens.distorts:
-            return mask if size is None else _resize_nearest(mask, self._checked_size(size))
-        if size is None:
-            full = self.capture_size
-            size = (
-                max(1, round(full[0] * width / self.lens.width)),
-                max(1, round(full[1] * height / self.lens.height)),
-            )
-        pixels = mask[..., None].astype(np.float32)
-        return undistort(pixels, self.lens, self._checked_size(size), nearest=True)[..., 0] > 0.5
-
-    def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
-        """Which pixels take part in losses, ``[H, W]`` bool at the camera's size, or None for all.
-
-        A pixel takes part when no masked pixel of the photo has a share in it.
-
-        Raises:
-            CaptureError: As :meth:`load_mask`.
-        """
-        share = self.valid_share(size)
-        return None if share is None else share > 1 - 1e-4
-
-    def valid_share(self, size: tuple[int, int] | None = None) -> NDArray[np.float32] | None:
-        """Share of each pixel ``[H, W]`` in 0..1 that is not masked in the photo, or None where there is no mask.
-
-        Where the photo is undistorted, the reach of its interpolation counts as masked too.
-
-        Raises:
-            CaptureError: As :meth:`load_mask`.
-        """
-        if self.ignore_path is None:
-            return None
-        size = self._checked_size(size)
-        mask = read_mask(self.ignore_path, nonzero=True)
-        self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
-        undistorted = self._is_undistorted(mask)
-        masked = ~_resize_nearest(
-            mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
+        (phrase,) = check_prompts([phrase])
+        scores = self.scores([phrase])[0]
+        limit = float(self.thresholds([phrase])[0]) if threshold is None else float(threshold)
+        present = self.presence_judge.judge(scores)
+        chosen = Selection(
+            self.gaussians, self.cameras, scores >= limit, scores, limit, present, phrase, self.world
         )
-        large = is_large(masked.shape[1], masked.shape[0])
-        shrinks = size[0] <= masked.shape[1] and size[1] <= masked.shape[0]
-        if large and (undistorted or not self.lens.distorts) and shrinks:
-            return 1.0 - reduced(MaskRows(masked), size)[..., 0]
-        if large and not undistorted and self.lens.distorts:
-            return 1.0 - undistort_large(MaskRows(masked, reach=2), self.lens, size)[..., 0]
-        if undistorted or not self.lens.distorts:
-            return 1.0 - resize_image(masked[..., None].astype(np.float32), size)[..., 0]
-        # Bicubic interpolation reaches two pixels far.
-        reach = binary_dilation(masked, np.ones((5, 5), bool))[..., None].astype(np.float32)
-        return 1.0 - undistort(reach, self.lens, size)[..., 0]
+        chosen = chosen.without_specks()
+        return chosen.convincing() if threshold is None else chosen
 
-    def check_mask(self, path: Path) -> None:
-        """Compare a mask's size with the photo's, from the headers alone.
+    @property
+    def presence_judge(self) -> PresenceJudge:
+        """What decides whether a phrase is in the scene at all; made when it is first needed."""
+        if self._judge is None:
+            references = self.embed(list(REFERENCE_PHRASES))
+            self._judge = PresenceJudge(
+                self.gaussians, self.field, references, self._negatives(), self.query.temperature
+            )
+        return self._judge
+
+    def find(
+        self, phrase: str, view: str | Camera | None = None, *, threshold: float | None = None
+    ) -> Selection:
+        """What a phrase with relations asks for, such as "mug on the cloth" (`lexsplat.queries.phrases`).
+
+        Args:
+            phrase: What to look for.
+            view: Whose left and right are meant; none takes the view that shows best what they refer to.
+            threshold: See `select`.
 
         Raises:
-            CaptureError: If the mask cannot be read or its aspect is not the photo's.
+            QueryError: If the phrase has an empty part.
         """
-        self._check_aspect(path, image_size(path))
+        chosen = view if view is None or isinstance(view, Camera) else self.view(view).camera
 
-    def _is_undistorted(self, mask: NDArray[np.bool_]) -> bool:
-        """Whether a mask was drawn on the undistorted photo: it has exactly that one's size, and not the photo's."""
-        found = (mask.shape[1], mask.shape[0])
-        return found == self.capture_size != (self.lens.width, self.lens.height)
+        def viewer(reference: Selection) -> Camera | None:
+            return chosen or self.cameras.get(reference.best_view)
 
-    def _check_aspect(self, path: Path, found: tuple[int, int]) -> None:
-        expected = (self.lens.width, self.lens.height)
-        if not (sizes_agree(found, expected) or sizes_agree(found, self.capture_size)):
-            raise CaptureError(
-                path,
-                expected=f"a mask of {self.name}, {expected[0]}x{expected[1]} pixels or scaled uniformly",
-                found=f"{found[0]}x{found[1]}",
-                remedy="draw the mask on this photo, or remove it",
+        return answer(parse(phrase), lambda text: self.select(text, threshold), viewer)
+
+    def click(self, view: str | Camera, x: float, y: float, *, likeness: float | None = None) -> Selection:
+        """What a click on a picture hits: the surface there and what is joined to it and says the same.
+
+        Args:
+            view: Name of a view, or any camera.
+            x: Pixels from the left, 0.5 being the middle of the first.
+            y: Pixels from the top.
+            likeness: How alike in language a Gaussian must be, in 0..1; none finds a limit in the scene.
+
+        Raises:
+            QueryError: If the pixel lies outside the picture or shows nothing.
+        """
+        camera = view if isinstance(view, Camera) else self.view(view).camera
+        hit = surface_at(self.gaussians, camera, x, y)
+        return select_hit(hit, self.gaussians, self.field, self.cameras, likeness, self.world)
+
+    @property
+    def world(self) -> World:
+        """Which way is up, and what a unit is in metres, where that is known (``lexsplat scale``)."""
+        if self._world is None:
+            self._world = world_of(self.folder.record if self.folder else {}, self.cameras)
+        return self._world
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """The cameras of all views by name."""
+        return {name: view.camera for name, view in self.views.items()}
+
+    def render(self, view: str | Camera) -> Rendering:
+        """The scene in colour."""
+        import torch
+
+        camera = view if isinstance(view, Camera) else self.view(view).camera
+        with torch.no_grad():
+            return render(self.gaussians, camera)
+
+    def view(self, name: str) -> StoredView:
+        """The view called ``name``, with or without its suffix.
+
+        Raises:
+            QueryError: If there is none.
+        """
+        if name in self.views:
+            return self.views[name]
+        matches = [view for key, view in self.views.items() if Path(key).stem == Path(name).stem]
+        if len(matches) != 1:
+            known = ", ".join(list(self.views)[:5])
+            raise QueryError(
+                f"view {name!r}",
+                expected="the name of a view",
+                found="none such" if not matches else f"{len(matches)} such",
+                remedy=f"the scene has {len(self.views)} views, such as {known}",
             )
+        return matches[0]
 
-    def _checked_size(self, size: tuple[int, int] | None) -> tuple[int, int]:
-        width, height = (self.camera.width, self.camera.height) if size is None else size
-        if width < 1 or height < 1:
-            raise ValueError(f"size must be positive, got {width}x{height}")
-        return int(width), int(height)
-
-
-def filled(image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """A picture ``[H, W, C]`` with the mean of the valid pixels ``[H, W]`` in place of the others."""
-    if valid.all():
-        return image
-    kept = image[valid]
-    mean = kept.mean(0, dtype=np.float64) if len(kept) else np.zeros(image.shape[2])
-    return np.where(valid[..., None], image, mean.astype(np.float32))
+    def _threshold_cameras(self) -> list[Camera]:
+        """Up to eight training cameras, spread over the capture."""
+        cameras = [view.camera for view in self.views.values() if view.split == "train"]
+        step = max(1, len(cameras) // 8)
+        return cameras[::step][:8]
 
 
-def _resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
-    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
-    return mask[rows[:, None], columns[None, :]]
-
-
-def _no_points() -> NDArray[np.float32]:
-    return np.zeros((0, 3), dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A capture: views, their split, and what else lies beside them.
+def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> SearchableScene:
+    """Open a scene folder for questions.
 
     Args:
-        root: The capture folder.
-        views: All views by name, sorted by name.
-        train_names: Names of the views that may be learned from, sorted.
-        test_names: Names of the views that are only measured on, sorted.
-        points: Points of structure from motion ``[P, 3]``, world; P may be 0.
-        point_colors: Their colours ``[P, 3]``, RGB in 0..1.
-        segmentations: Folder with ``STEM/PROMPT.png``, or None.
-        warnings: What was left out and why, one line each.
-        source: Where the cameras came from: ``"colmap"`` or ``"transforms"``.
-        background: Colour behind transparent pixels, RGB in 0..1.
+        path: A folder that ``lexsplat build`` or ``lexsplat demo`` made, or the word ``demo`` for the scene that
+            ships with the package.
+        device: "auto", "cpu" or "cuda".
+        clip: Name or folder of the text encoder, if it is not where the build found it.
+
+    Raises:
+        SceneFolderError: If the folder is not a finished scene.
+        FileFormatError: If one of its files is damaged.
     """
+    from lexsplat.runtime.device import choose_device
 
-    root: Path
-    views: Mapping[str, View]
-    train_names: tuple[str, ...]
-    test_names: tuple[str, ...] = ()
-    points: NDArray[np.float32] = field(default_factory=_no_points)
-    point_colors: NDArray[np.float32] = field(default_factory=_no_points)
-    segmentations: Path | None = None
-    warnings: tuple[str, ...] = ()
-    source: str = "colmap"
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    place = choose_device(device)
+    folder, cameras, gaussians, field = _read_whole(Path(path), place)
+    clip = clip or folder.record.get("config", {}).get("clip", "embedded")
+    return SearchableScene(gaussians, field, cameras, clip, folder=folder)
 
-    @property
-    def train_views(self) -> tuple[View, ...]:
-        """The views that may be learned from, by name."""
-        return tuple(self.views[name] for name in self.train_names)
 
-    @property
-    def test_views(self) -> tuple[View, ...]:
-        """The views that are only measured on, by name."""
-        return tuple(self.views[name] for name in self.test_names)
+_Content = tuple[SceneFolder, dict[str, StoredView], Gaussians, LanguageField]
+_ATTEMPTS = 5
+"""A build may end, and the next begin, while a scene is read; more often than this it is no coincidence."""
 
-    def downscaled(self, factor: float) -> Scene:
-        """The same capture to be worked on ``factor`` times smaller than the undistorted photos."""
-        views = {
-            name: replace(view, camera=view.camera.resized(*view.capture_size).downscaled(factor))
-            for name, view in self.views.items()
-        }
-        return replace(self, views=views)
 
-    @property
-    def extent(self) -> float:
-        """Radius of the training cameras' positions times 1.1, in world units: the scene scale of 3DGS."""
-        return camera_extent(view.camera for view in self.train_views)
+def _read_whole(path: Path, device: str) -> _Content:
+    """The scene in a folder, or while that is built again, the scene before.
+
+    Raises:
+        SceneFolderError: If there is neither.
+        FileFormatError: If a file is damaged.
+    """
+    attempts = 0
+    while True:
+        folder = SceneFolder.open(path)
+        attempts += 1
+        try:
+            kept = previous_of(folder) if folder.record.get("building") else None
+            return _read_content(kept or folder, device)
+        except (SceneFolderError, FileFormatError):
+            if attempts == _ATTEMPTS or _state(SceneFolder.open(path)) == _state(folder):
+                raise
+
+
+def _state(folder: SceneFolder) -> tuple[Any, Any]:
+    """What a build changes in the record before it touches a file."""
+    return folder.record["stages"], folder.record.get("building")
+
+
+def _read_content(folder: SceneFolder, device: str) -> _Content:
+    """One version of a scene.
+
+    Raises:
+        SceneFolderError: If it is not whole.
+        FileFormatError: If a file is damaged.
+    """
+    if "embed" not in folder.record["stages"] or not folder.language_path.exists():
+        finished = ", ".join(folder.record["stages"]) or "none"
+        raise SceneFolderError(
+            folder.root,
+            expected="a scene with language",
+            found=f"finished stages: {finished}",
+            remedy="run the build again to finish it",
+        )
+    cameras, gaussians = folder.read_cameras(), folder.read_gaussians()
+    tensors, metadata = read_tensors(folder.language_path)
+    # A build takes a stage out of the record before it touches its files: what was read is of one build if the record
+    # is still the same.
+    changed = _state(SceneFolder(folder.root, folder.content)) != _state(folder)
+    try:
+        field = field_from_tensors({name: tensor.to(device) for name, tensor in tensors.items()}, metadata)
+    except ValueError as error:
+        raise FileFormatError(
+            folder.language_path,
+            expected="a language field",
+            found=str(error)[:200],
+            remedy="run the build again",
+        ) from error
+    made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
+    if changed or metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
+        raise SceneFolderError(
+            folder.root,
+            expected="language made for these Gaussians",
+            found="files that change" if changed else "language of an earlier reconstruction",
+            remedy="the scene is being rebuilt or was left half way: run the build again",
+        )
+    return folder, cameras, gaussians.to(device), field

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.cameras import Camera
-from lexsplat.scene_folder import StoredView
-from lexsplat.search import SearchableScene
+from lexsplat.geometry.cameras import Camera
+from lexsplat.scenes.folder import StoredView
+from lexsplat.scenes.scene import SearchableScene
 from lexsplat.viewer.recording import looking_at, orbit
 from lexsplat.viewer.splats import SplatBlocks
 

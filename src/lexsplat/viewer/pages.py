@@ -10,8 +10,8 @@ from html import escape
 import numpy as np
 from PIL import Image
 
-from lexsplat.heatmaps import color_scale
-from lexsplat.viewer.colouring import Mode
+from lexsplat.queries.heatmaps import color_scale
+from lexsplat.viewer.coloring import Mode
 from lexsplat.viewer.session import Answer, Question
 
 _MUTED = "color:#6b7280"

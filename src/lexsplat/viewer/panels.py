@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lexsplat.cameras import Camera
-from lexsplat.errors import LexsplatError
-from lexsplat.scene_folder import StoredView
+from lexsplat.geometry.cameras import Camera
+from lexsplat.runtime.errors import LexsplatError
+from lexsplat.scenes.folder import StoredView
 from lexsplat.viewer import pages
-from lexsplat.viewer.colouring import MODES
+from lexsplat.viewer.coloring import MODES
 from lexsplat.viewer.display import Display, page_camera
 from lexsplat.viewer.recording import encode_png, encode_video
 from lexsplat.viewer.session import EXPORT_ENDINGS, Question, Session

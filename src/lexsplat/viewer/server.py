@@ -8,10 +8,10 @@ import logging
 import socket
 from dataclasses import dataclass
 
-from lexsplat.errors import BackendError
-from lexsplat.search import SearchableScene
+from lexsplat.runtime.errors import BackendError
+from lexsplat.scenes.scene import SearchableScene
 from lexsplat.viewer.guard import Guard, Limits
-from lexsplat.viewer.memory import Memory
+from lexsplat.viewer.history import Memory
 from lexsplat.viewer.session import Session
 
 logger = logging.getLogger("lexsplat")

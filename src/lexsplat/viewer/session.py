@@ -15,21 +15,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.answers import file_name
-from lexsplat.cameras import Camera
-from lexsplat.errors import QueryError
-from lexsplat.exporting import export_gaussians
-from lexsplat.heatmaps import overlay_mask
-from lexsplat.phrases import Thing, parse
-from lexsplat.picking import select_hit, surface_at
-from lexsplat.presence import REFERENCE_PHRASES, PresenceJudge
-from lexsplat.queries import check_prompts, probability_relevancy
+from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.heatmaps import overlay_mask
+from lexsplat.queries.phrases import Thing, parse
+from lexsplat.queries.picking import select_hit, surface_at
+from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceJudge
+from lexsplat.queries.relevancy import check_prompts, probability_relevancy
+from lexsplat.queries.selection import Selection
+from lexsplat.queries.thresholds import BORDER
 from lexsplat.rendering import render
-from lexsplat.search import SearchableScene
-from lexsplat.selection import Selection
-from lexsplat.thresholds import BORDER
-from lexsplat.viewer.colouring import PROMPT_COLORS, Colouring, Layer, Mode, quick_threshold
-from lexsplat.viewer.memory import Memory
+from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.answers import file_name
+from lexsplat.scenes.exporting import export_gaussians
+from lexsplat.scenes.scene import SearchableScene
+from lexsplat.viewer.coloring import PROMPT_COLORS, Colouring, Layer, Mode, quick_threshold
+from lexsplat.viewer.history import Memory
 from lexsplat.viewer.vocabulary import MAX_LENGTH
 
 MAX_QUESTIONS = len(PROMPT_COLORS)
@@ -147,7 +147,7 @@ class Session:
     def refine(self, question: Question, viewpoint: Camera | None = None) -> None:
         """Find the scene's own threshold for a prompt, and the Gaussians it selects.
 
-        A phrase with relations ("mug on the cloth", see `lexsplat.phrases`) is answered as by ``scene.find``.
+        A phrase with relations ("mug on the cloth", see `lexsplat.queries.phrases`) is answered as by ``scene.find``.
 
         Args:
             question: The prompt.
@@ -310,7 +310,7 @@ class Session:
 def is_plain(phrase: str) -> bool:
     """Whether a phrase is a thing by itself; "something to sit on" is one, whatever it ends in.
 
-    Phrases with parts, articles or counts ("how many mugs") are for `lexsplat.phrases`.
+    Phrases with parts, articles or counts ("how many mugs") are for `lexsplat.queries.phrases`.
     """
     try:
         return parse(phrase) == Thing(phrase)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians
 
 BYTES_PER_SPLAT = 32
 """What one Gaussian costs on the wire, whatever changed of it (position, covariance, colour and opacity)."""

@@ -1,0 +1,129 @@
+"""Exact truth in 3D: labels of pixels, known for every view, lifted to labels of Gaussians and to boxes.
+
+A Gaussian belongs to the thing that most of its visible weight (alpha T over all pixels of all views) falls on,
+where the exact depth agrees with its own: weight that a Gaussian gets through a hole in something nearer, or
+from beyond a surface, says nothing about what it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.geometry.boxes import Box, fit_box
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering import accumulate_codes, prepare
+
+
+@dataclass(frozen=True)
+class TruthView:
+    """What a view shows, exactly.
+
+    Args:
+        camera: The view, of the size of the maps.
+        labels: Number of the thing at each pixel ``[H, W]``, 0 for nothing.
+        depth: Distance along the view axis ``[H, W]``, world units; not positive where nothing is.
+    """
+
+    camera: Camera
+    labels: NDArray[np.integer]
+    depth: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class GaussianLabels:
+    """The truth about Gaussians.
+
+    Args:
+        labels: The thing each belongs to ``[N]`` int64, 0 for none.
+        weights: How much of the views it makes up ``[N]``, in pixels: Gaussians that show count by this.
+        purity: Share of its weight that falls on its thing ``[N]`` in 0..1.
+    """
+
+    labels: Tensor
+    weights: Tensor
+    purity: Tensor
+
+
+@torch.no_grad()
+def lift_labels(
+    gaussians: Gaussians, views: Iterable[TruthView], num_labels: int, *, tolerance: float = 0.02
+) -> GaussianLabels:
+    """Labels of Gaussians from labels of pixels.
+
+    Args:
+        gaussians: The scene.
+        views: Exact views, enough to see every thing from all sides.
+        num_labels: Labels are 0 to this, exclusive.
+        tolerance: How far a Gaussian may lie before or behind the exact surface, as a share of its depth, beyond
+            three standard deviations of its own.
+    """
+    totals = torch.zeros(len(gaussians), num_labels)
+    for view in views:
+        camera = view.camera
+        prepared = prepare(gaussians, camera)
+        at_surface = _near_surface(gaussians, view, tolerance)
+        weights = accumulate_codes(
+            gaussians, camera, view.labels.astype(np.int32), num_labels, prepared=prepared
+        )
+        totals += weights.cpu() * at_surface[:, None]
+    weights = totals.sum(1)
+    best, labels = totals.max(1)
+    purity = best / weights.clamp_min(1e-12)
+    labels = torch.where(weights > 0, labels, 0)
+    return GaussianLabels(labels, weights, torch.where(weights > 0, purity, 0.0))
+
+
+def surface_points(views: Iterable[TruthView], label: int, *, stride: int = 2) -> NDArray[np.float64]:
+    """Exact points of a thing in the world ``[M, 3]``, from the depth of every ``stride``-th pixel."""
+    found = []
+    for view in views:
+        rows, columns = np.nonzero((view.labels == label) & (view.depth > 0))
+        kept = (rows % stride == 0) & (columns % stride == 0)
+        rows, columns = rows[kept], columns[kept]
+        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1)
+        local = pixels @ np.linalg.inv(view.camera.K).T * view.depth[rows, columns, None]
+        found.append((local - view.camera.viewmat[:3, 3]) @ view.camera.viewmat[:3, :3])
+    return np.concatenate(found) if found else np.zeros((0, 3))
+
+
+def true_box(points: NDArray[np.float64], up: NDArray[np.float64]) -> Box:
+    """The upright box of exact points, without trimming but for a thousandth at each end (edges of masks)."""
+    return fit_box(points, up, trim=0.001)
+
+
+def selection_f1(mask: Tensor, truth: Tensor, weights: Tensor) -> tuple[float, float, float]:
+    """F1, precision and recall of a selection, every Gaussian counted by how much of the views it makes up.
+
+    Args:
+        mask: What was selected ``[N]`` bool.
+        truth: What belongs to the thing ``[N]`` bool.
+        weights: ``[N]``, not negative.
+    """
+    mask, truth, weights = mask.cpu(), truth.cpu(), weights.cpu().double()
+    hit = float(weights[mask & truth].sum())
+    precision = hit / max(float(weights[mask].sum()), 1e-12)
+    recall = hit / max(float(weights[truth].sum()), 1e-12)
+    return 2 * precision * recall / max(precision + recall, 1e-12), precision, recall
+
+
+def _near_surface(gaussians: Gaussians, view: TruthView, tolerance: float) -> Tensor:
+    """Which Gaussians lie at the exact surface where their centre is seen ``[N]`` as 0 or 1."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    local = means @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+    depth = np.maximum(local[:, 2], 1e-9)
+    pixels = local @ view.camera.K.T / depth[:, None]
+    height, width = view.depth.shape
+    column, row = (np.floor(pixels[:, i]).astype(int) for i in (0, 1))
+    inside = (local[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    exact = view.depth[row.clip(0, height - 1), column.clip(0, width - 1)]
+    reach = tolerance * depth + 3 * gaussians.scales.detach().cpu().double().numpy().min(1)
+    # Just outside a silhouette the centre's own pixel shows something far behind: that is no contradiction
+    # to the front, so only what lies clearly behind the exact surface is left out.
+    return torch.from_numpy(inside & (exact > 0) & (depth <= exact + reach)).float()

@@ -1,0 +1,293 @@
+"""What every other stage sees of a capture: views with pinhole cameras, keyed by image name, and points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from lexsplat.captures.images.bands import FilledRows, MaskRows, Rows, is_large, reduced, whole
+from lexsplat.captures.images.reading import (
+    image_size,
+    read_image,
+    read_mask,
+    read_rows,
+    resize_image,
+    sizes_agree,
+)
+from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_large
+from lexsplat.geometry.cameras import Camera, camera_extent
+from lexsplat.runtime.errors import CaptureError
+
+
+def stem_of(name: str) -> str:
+    """An image name without its suffix; folders stay: ``"left/0001.jpg"`` gives ``"left/0001"``."""
+    folder, slash, file = name.rpartition("/")
+    head, dot, _ = file.rpartition(".")
+    return f"{folder}{slash}{head if dot and head else file}"
+
+
+@dataclass(frozen=True)
+class View:
+    """One photo and the pinhole camera it is seen through after undistortion.
+
+    Args:
+        name: Path of the image relative to the image folder, with "/": the key of everything about this view.
+        image_path: The photo on disk, not undistorted.
+        camera: Pinhole camera at the working resolution.
+        capture_size: Width and height of the undistorted photo at full resolution, in pixels.
+        lens: The lens the photo was taken through, for photos of the size on disk.
+        background: Colour behind transparent pixels, RGB in 0..1.
+        ignore_path: A picture that is black where pixels take no part in any loss (``masks/`` of a
+            capture); None where all pixels count.
+    """
+
+    name: str
+    image_path: Path
+    camera: Camera
+    capture_size: tuple[int, int]
+    lens: Lens
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ignore_path: Path | None = None
+
+    @property
+    def stem(self) -> str:
+        """The name without its suffix; folders stay."""
+        return stem_of(self.name)
+
+    def load_image(self, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+        """The undistorted photo ``[H, W, 3]`` in 0..1, read from disk at every call.
+
+        Masked pixels have the mean colour of the others, so that nothing depends on what was there: not the pixels
+        beside them in a smaller picture, not the window of a loss, not the crop of an encoder.
+
+        Args:
+            size: Width and height of the result; None takes the camera's.
+
+        Raises:
+            CaptureError: If the file is missing, damaged, or no longer has the size it had.
+            ValueError: If ``size`` is not positive.
+        """
+        size = self._checked_size(size)
+        found = image_size(self.image_path)
+        if found != (self.lens.width, self.lens.height):
+            raise CaptureError(
+                self.image_path,
+                expected=f"{self.lens.width}x{self.lens.height} pixels",
+                found=f"{found[0]}x{found[1]}",
+                remedy="the file changed since the capture was loaded; load it again",
+            )
+        if self.ignore_path is None and not self.lens.distorts:
+            return read_image(self.image_path, self.background, size=size)
+        if is_large(*found):
+            return self._load_large(size)
+        image = read_image(self.image_path, self.background)
+        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
+        if mask is not None and self._is_undistorted(mask):
+            image = undistort(image, self.lens, self.capture_size)
+            return resize_image(filled(image, mask), size)
+        if mask is not None:
+            self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
+            image = filled(image, _resize_nearest(mask, found))
+        if self.lens.distorts:
+            return undistort(image, self.lens, size)
+        return resize_image(image, size)
+
+    def _load_large(self, size: tuple[int, int]) -> NDArray[np.float32]:
+        """A photo that is masked or distorted, in bands."""
+        source: Rows = read_rows(self.image_path, self.background)
+        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
+        if mask is not None and self._is_undistorted(mask):
+            source = FilledRows(RemappedRows(source, self.lens, self.capture_size), mask)
+        else:
+            if mask is not None:
+                self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
+                source = FilledRows(source, _resize_nearest(mask, (source.width, source.height)))
+            if self.lens.distorts:
+                return undistort_large(source, self.lens, size)
+        if size[0] <= source.width and size[1] <= source.height:
+            return reduced(source, size)
+        return resize_image(whole(source), size)
+
+    def load_mask(self, path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+        """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, nearest pixel.
+
+        Args:
+            path: The mask: a picture of the photo's aspect, drawn on the photo as it is on disk, or on the
+                undistorted photo where it has exactly that one's size.
+            size: Width and height of the result; None keeps the mask's own resolution.
+
+        Raises:
+            CaptureError: If the mask cannot be read or its aspect is not the photo's.
+        """
+        return self.place_mask(read_mask(path), path, size)
+
+    def place_mask(
+        self, mask: NDArray[np.bool_], subject: Path, size: tuple[int, int] | None = None
+    ) -> NDArray[np.bool_]:
+        """A mask ``[h, w]`` drawn on the photo, as `load_mask` gives it.
+
+        Args:
+            mask: What was drawn.
+            subject: The file to name in messages.
+            size: Width and height of the result; None keeps the mask's own resolution.
+
+        Raises:
+            CaptureError: If the aspect of the mask is not the photo's.
+        """
+        height, width = mask.shape
+        self._check_aspect(subject, (width, height))
+        if self._is_undistorted(mask) or not self.lens.distorts:
+            return mask if size is None else _resize_nearest(mask, self._checked_size(size))
+        if size is None:
+            full = self.capture_size
+            size = (
+                max(1, round(full[0] * width / self.lens.width)),
+                max(1, round(full[1] * height / self.lens.height)),
+            )
+        pixels = mask[..., None].astype(np.float32)
+        return undistort(pixels, self.lens, self._checked_size(size), nearest=True)[..., 0] > 0.5
+
+    def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
+        """Which pixels take part in losses, ``[H, W]`` bool at the camera's size, or None for all.
+
+        A pixel takes part when no masked pixel of the photo has a share in it.
+
+        Raises:
+            CaptureError: As :meth:`load_mask`.
+        """
+        share = self.valid_share(size)
+        return None if share is None else share > 1 - 1e-4
+
+    def valid_share(self, size: tuple[int, int] | None = None) -> NDArray[np.float32] | None:
+        """Share of each pixel ``[H, W]`` in 0..1 that is not masked in the photo, or None where there is no mask.
+
+        Where the photo is undistorted, the reach of its interpolation counts as masked too.
+
+        Raises:
+            CaptureError: As :meth:`load_mask`.
+        """
+        if self.ignore_path is None:
+            return None
+        size = self._checked_size(size)
+        mask = read_mask(self.ignore_path, nonzero=True)
+        self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
+        undistorted = self._is_undistorted(mask)
+        masked = ~_resize_nearest(
+            mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
+        )
+        large = is_large(masked.shape[1], masked.shape[0])
+        shrinks = size[0] <= masked.shape[1] and size[1] <= masked.shape[0]
+        if large and (undistorted or not self.lens.distorts) and shrinks:
+            return 1.0 - reduced(MaskRows(masked), size)[..., 0]
+        if large and not undistorted and self.lens.distorts:
+            return 1.0 - undistort_large(MaskRows(masked, reach=2), self.lens, size)[..., 0]
+        if undistorted or not self.lens.distorts:
+            return 1.0 - resize_image(masked[..., None].astype(np.float32), size)[..., 0]
+        # Bicubic interpolation reaches two pixels far.
+        reach = binary_dilation(masked, np.ones((5, 5), bool))[..., None].astype(np.float32)
+        return 1.0 - undistort(reach, self.lens, size)[..., 0]
+
+    def check_mask(self, path: Path) -> None:
+        """Compare a mask's size with the photo's, from the headers alone.
+
+        Raises:
+            CaptureError: If the mask cannot be read or its aspect is not the photo's.
+        """
+        self._check_aspect(path, image_size(path))
+
+    def _is_undistorted(self, mask: NDArray[np.bool_]) -> bool:
+        """Whether a mask was drawn on the undistorted photo: it has exactly that one's size, and not the photo's."""
+        found = (mask.shape[1], mask.shape[0])
+        return found == self.capture_size != (self.lens.width, self.lens.height)
+
+    def _check_aspect(self, path: Path, found: tuple[int, int]) -> None:
+        expected = (self.lens.width, self.lens.height)
+        if not (sizes_agree(found, expected) or sizes_agree(found, self.capture_size)):
+            raise CaptureError(
+                path,
+                expected=f"a mask of {self.name}, {expected[0]}x{expected[1]} pixels or scaled uniformly",
+                found=f"{found[0]}x{found[1]}",
+                remedy="draw the mask on this photo, or remove it",
+            )
+
+    def _checked_size(self, size: tuple[int, int] | None) -> tuple[int, int]:
+        width, height = (self.camera.width, self.camera.height) if size is None else size
+        if width < 1 or height < 1:
+            raise ValueError(f"size must be positive, got {width}x{height}")
+        return int(width), int(height)
+
+
+def filled(image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """A picture ``[H, W, C]`` with the mean of the valid pixels ``[H, W]`` in place of the others."""
+    if valid.all():
+        return image
+    kept = image[valid]
+    mean = kept.mean(0, dtype=np.float64) if len(kept) else np.zeros(image.shape[2])
+    return np.where(valid[..., None], image, mean.astype(np.float32))
+
+
+def _resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
+    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
+    return mask[rows[:, None], columns[None, :]]
+
+
+def _no_points() -> NDArray[np.float32]:
+    return np.zeros((0, 3), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A capture: views, their split, and what else lies beside them.
+
+    Args:
+        root: The capture folder.
+        views: All views by name, sorted by name.
+        train_names: Names of the views that may be learned from, sorted.
+        test_names: Names of the views that are only measured on, sorted.
+        points: Points of structure from motion ``[P, 3]``, world; P may be 0.
+        point_colors: Their colours ``[P, 3]``, RGB in 0..1.
+        segmentations: Folder with ``STEM/PROMPT.png``, or None.
+        warnings: What was left out and why, one line each.
+        source: Where the cameras came from: ``"colmap"`` or ``"transforms"``.
+        background: Colour behind transparent pixels, RGB in 0..1.
+    """
+
+    root: Path
+    views: Mapping[str, View]
+    train_names: tuple[str, ...]
+    test_names: tuple[str, ...] = ()
+    points: NDArray[np.float32] = field(default_factory=_no_points)
+    point_colors: NDArray[np.float32] = field(default_factory=_no_points)
+    segmentations: Path | None = None
+    warnings: tuple[str, ...] = ()
+    source: str = "colmap"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """The views that may be learned from, by name."""
+        return tuple(self.views[name] for name in self.train_names)
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """The views that are only measured on, by name."""
+        return tuple(self.views[name] for name in self.test_names)
+
+    def downscaled(self, factor: float) -> Scene:
+        """The same capture to be worked on ``factor`` times smaller than the undistorted photos."""
+        views = {
+            name: replace(view, camera=view.camera.resized(*view.capture_size).downscaled(factor))
+            for name, view in self.views.items()
+        }
+        return replace(self, views=views)
+
+    @property
+    def extent(self) -> float:
+        """Radius of the training cameras' positions times 1.1, in world units: the scene scale of 3DGS."""
+        return camera_extent(view.camera for view in self.train_views)

@@ -1,0 +1,1 @@
+"""Annotations to measure against: masks, boxes and lists of prompts."""

@@ -1,0 +1,358 @@
+"""Truth as data sets have it, by their own layout; nothing has to be copied or renamed by hand.
+
+- **segmentations**: ``segmentations/STEM/PROMPT.png``, the layout of the authors' Mip-NeRF 360 and LERF folders
+  and ours (`masks.load_masks`).
+- **3d-ovs**: ``segmentations/NN/CLASS.png`` and ``segmentations/classes.txt``; NN counts the images in order.
+- **lerf-ovs**: LangSplat's ``label/SCENE/frame_*.json`` beside the capture ``SCENE``: polygons and boxes.
+
+A test holds each reader to small fixtures in its layout. Views with truth are the views to hold out.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from lexsplat.captures.capture import Scene, View, stem_of
+from lexsplat.captures.ground_truth.masks import load_masks
+from lexsplat.captures.ground_truth.prompt_lists import PromptList, capture_prompt_names
+from lexsplat.captures.images.reading import IMAGE_SUFFIXES, MAX_PIXELS
+from lexsplat.captures.images.undistortion import MAX_SIDE
+from lexsplat.captures.readers.camera_files import checked_name
+from lexsplat.captures.readers.transforms_json import read_json
+from lexsplat.captures.splits import mask_folders, match_stem
+from lexsplat.runtime.errors import CaptureError, FileFormatError
+
+log = logging.getLogger("lexsplat")
+
+LAYOUTS = ("segmentations", "3d-ovs", "lerf-ovs")
+"""Names of the layouts."""
+
+CLASSES_FILE = "classes.txt"
+"""Of 3D-OVS: the names of the classes, one a line."""
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """Truth by view and prompt.
+
+    Args:
+        layout: One of `LAYOUTS`.
+        origin: The folder it was read from.
+        masks: ``{view: {prompt: mask}}``: a file for `View.load_mask`, or an array ``[H, W]`` bool on the
+            undistorted image.
+        boxes: ``{view: {prompt: boxes}}``, ``[B, 4]`` as x0, y0, x1, y1 in pixels of the mask; only where the data
+            set has boxes.
+        classes: Names of all classes, where the data set lists them.
+    """
+
+    layout: str
+    origin: Path
+    masks: Mapping[str, Mapping[str, Path | NDArray[np.bool_]]]
+    boxes: Mapping[str, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
+    classes: tuple[str, ...] = ()
+
+    def prompts(self) -> tuple[str, ...]:
+        """All prompts that have truth somewhere, sorted."""
+        return tuple(sorted({prompt for prompts in self.masks.values() for prompt in prompts}))
+
+    def origin_facts(self, prompt_list: PromptList | None) -> dict[str, str | None]:
+        """Where the truth lay and which list was asked, as results record it."""
+        return {"folder": str(self.origin), "layout": self.layout, "prompt_list": prompt_list}
+
+    def renamed(self, names: Mapping[str, str]) -> Annotations:
+        """The same truth under other words; prompts that ``names`` does not list are left out."""
+
+        def change(table: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+            kept = {
+                view: {names[p]: value for p, value in prompts.items() if p in names}
+                for view, prompts in table.items()
+            }
+            return {view: prompts for view, prompts in kept.items() if prompts}
+
+        classes = tuple(names[name] for name in self.classes if name in names)
+        return Annotations(self.layout, self.origin, change(self.masks), change(self.boxes), classes)
+
+
+def find_annotations(root: Path) -> tuple[str, Path] | None:
+    """Layout and folder of the truth that belongs to a capture, or None.
+
+    Masks in ``segmentations/`` of the capture come first; else LERF-OVS labels in ``label/`` beside the capture.
+    """
+    segmentations = root / "segmentations"
+    if segmentations.is_dir() and mask_folders(segmentations):
+        return layout_of(segmentations), segmentations
+    absolute = root.resolve()
+    for folder in (absolute.parent / "label" / absolute.name, root / "label" / absolute.name, root / "label"):
+        if folder.is_dir() and any(folder.glob("frame_*.json")):
+            return "lerf-ovs", folder
+    return None
+
+
+def layout_of(folder: Path) -> str:
+    """The layout of a folder with truth: one of `LAYOUTS`."""
+    if any(folder.glob("frame_*.json")):
+        return "lerf-ovs"
+    return "3d-ovs" if (folder / CLASSES_FILE).is_file() else "segmentations"
+
+
+def annotated_names(layout: str, folder: Path, names: Collection[str], image_folder: Path) -> set[str]:
+    """Which of the images ``names`` have truth. What matches no image is told by `load_annotations`."""
+    if layout == "lerf-ovs":
+        stems = [path.stem for path in folder.glob("frame_*.json")]
+    else:
+        stems = [path.relative_to(folder).as_posix() for path in mask_folders(folder)]
+    found = (_images_meant(stem, layout, names, image_folder) for stem in stems)
+    return {matches[0] for matches in found if len(matches) == 1}
+
+
+def check_truth_wishes(root: Path, folder: Path | None, prompt_list: PromptList | None) -> None:
+    """Refuse what `load_annotations` could not use, before hours are spent on a scene.
+
+    Args:
+        root: The folder of the capture.
+        folder: Where the truth is said to be, if not in or beside the capture.
+        prompt_list: Whose words are to be asked, if not what the masks are called.
+
+    Raises:
+        CaptureError: If the folder is none, or the capture is called like no scene that has prompt lists.
+    """
+    if folder is not None and not folder.is_dir():
+        raise CaptureError(folder, expected="a folder with masks or labels", found="no such folder")
+    if prompt_list is not None:
+        capture_prompt_names(root, prompt_list)
+
+
+def load_annotations(
+    scene: Scene, folder: Path | None = None, prompt_list: PromptList | None = None
+) -> Annotations:
+    """The truth of a capture, in whichever layout it is.
+
+    Args:
+        scene: The capture.
+        folder: Where the truth is; None looks in and beside the capture (`find_annotations`).
+        prompt_list: Ask the words of the paper or of the released code, for captures called like its scenes;
+            None asks what the masks are called. Masks may be called in the words of either; others are left out.
+
+    Returns:
+        Masks and boxes; empty where the capture has none.
+
+    Raises:
+        CaptureError: If a file belongs to no view or several, does not fit its photo, a class is missing, the
+            folder is none, the capture has no prompt lists, or no mask is called like one of their prompts.
+        FileFormatError: If a label file is not what LangSplat's reader expects.
+    """
+    check_truth_wishes(scene.root, folder, prompt_list)
+    truth = _read_truth(scene, folder)
+    return _in_words_of(truth, scene.root, prompt_list) if prompt_list else truth
+
+
+def _in_words_of(truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
+    """The truth that a list asks for, in its words; what is left out is told."""
+    names = capture_prompt_names(root, prompt_list)
+    left_out = [prompt for prompt in truth.prompts() if prompt not in names]
+    found = truth.renamed(names)
+    if left_out and not found.masks:
+        raise CaptureError(
+            truth.origin,
+            expected="masks called like prompts of the paper",
+            found=f"none in the words of the list {prompt_list!r}, but {', '.join(left_out[:3])}",
+            remedy="leave the prompt list out: prompts are then what the masks are called",
+        )
+    if left_out:
+        some = ", ".join(left_out[:5]) + (" and more" if len(left_out) > 5 else "")
+        log.warning("%s: not in the prompt list %r and not asked: %s", truth.origin, prompt_list, some)
+    return found
+
+
+def _read_truth(scene: Scene, folder: Path | None) -> Annotations:
+    if folder is None:
+        found = find_annotations(scene.root)
+        if scene.segmentations is not None:
+            found = layout_of(scene.segmentations), scene.segmentations
+        if found is None:
+            return Annotations("segmentations", scene.root / "segmentations", {})
+        layout, folder = found
+    else:
+        layout = layout_of(folder)
+    if layout == "lerf-ovs":
+        return _read_lerf_ovs(scene, folder)
+    if layout == "3d-ovs":
+        return _read_3d_ovs(scene, folder)
+    if folder != scene.segmentations:
+        scene = replace(scene, segmentations=folder)
+    return Annotations(layout, folder, load_masks(scene))
+
+
+# 3D-OVS
+
+
+def _read_3d_ovs(scene: Scene, folder: Path) -> Annotations:
+    classes = _read_classes(folder / CLASSES_FILE)
+    masks: dict[str, dict[str, Path]] = {}
+    for view_folder in mask_folders(folder):
+        stem = view_folder.relative_to(folder).as_posix()
+        view = scene.views[_the_image(stem, "3d-ovs", scene, view_folder)]
+        prompts = masks.setdefault(view.name, {})
+        for name in classes:
+            path = view_folder / f"{name}.png"
+            if not path.is_file():
+                raise CaptureError(
+                    view_folder,
+                    expected=f"a mask for each of the {len(classes)} classes of {CLASSES_FILE}",
+                    found=f"no {name}.png",
+                    remedy="draw it, black where the class is not seen, or take the class out of the list",
+                )
+            view.check_mask(path)
+            prompts[name] = path
+    ordered = {name: dict(sorted(masks[name].items())) for name in sorted(masks)}
+    return Annotations("3d-ovs", folder, ordered, classes=tuple(sorted(classes)))
+
+
+def _read_classes(path: Path) -> tuple[str, ...]:
+    """The names of ``classes.txt``, each one of a file in a view's folder.
+
+    Raises:
+        CaptureError: If a name leads elsewhere.
+        FileFormatError: If it is no text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileFormatError(path, expected="names of classes, one a line", found=str(error)) from error
+    classes = tuple(checked_name(line.strip(), path) for line in lines if line.strip())
+    if any("/" in name for name in classes):
+        raise FileFormatError(path, expected="names of classes", found="names of folders")
+    return classes
+
+
+def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: Path) -> list[str]:
+    """The images a folder or file of the truth can mean; in 3D-OVS a number counts the images in order."""
+    matches = match_stem(stem, names)
+    if layout != "3d-ovs" or not stem.isdigit() or not image_folder.is_dir():
+        return matches
+    images = sorted(p.name for p in image_folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    counted = [images[int(stem)]] if int(stem) < len(images) else []
+    if not matches:
+        return [name for name in counted if name in names]
+    return matches if counted == matches else sorted({*matches, *counted})
+
+
+def _the_image(stem: str, layout: str, scene: Scene, subject: Path) -> str:
+    matches = _images_meant(stem, layout, scene.views, scene.root / "images")
+    if len(matches) != 1:
+        found = "no view of that name" if not matches else f"views {' and '.join(matches[:3])}"
+        raise CaptureError(
+            subject,
+            expected="truth for one view",
+            found=found,
+            remedy="name it like the image, or remove it",
+        )
+    return matches[0]
+
+
+# LERF-OVS
+
+
+def _read_lerf_ovs(scene: Scene, folder: Path) -> Annotations:
+    masks: dict[str, dict[str, NDArray[np.bool_]]] = {}
+    boxes: dict[str, dict[str, NDArray[np.float64]]] = {}
+    for path in sorted(folder.glob("frame_*.json")):
+        name, size, objects = _read_labels(path)
+        view = scene.views[_the_image(stem_of(name), "lerf-ovs", scene, path)]
+        parts: dict[str, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {}
+        for category, box, polygon in objects:
+            mask = polygon_mask(polygon, *size)
+            placed = view.place_mask(mask, path)
+            if view.lens.distorts:  # the box stood around the object in the photo as it is on disk
+                box = _box_around(placed)
+            parts.setdefault(category, []).append((placed, box))
+        masks[view.name] = {
+            category: np.logical_or.reduce([mask for mask, _ in found])
+            for category, found in sorted(parts.items())
+        }
+        boxes[view.name] = {
+            category: np.stack([box for _, box in found]) for category, found in sorted(parts.items())
+        }
+    return Annotations("lerf-ovs", folder, masks, boxes)
+
+
+def _read_labels(
+    path: Path,
+) -> tuple[str, tuple[int, int], list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]]:
+    """Image name, (width, height) and objects (category, box, polygon) of one label file."""
+    content = read_json(path)
+    try:
+        info = content["info"]
+        name, size = str(info["name"]), (int(info["width"]), int(info["height"]))
+        objects = [
+            (
+                str(entry["category"]),
+                np.asarray(entry["bbox"], dtype=np.float64).reshape(4),
+                np.asarray(entry["segmentation"], dtype=np.float64).reshape(-1, 2),
+            )
+            for entry in content["objects"]
+        ]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise FileFormatError(
+            path,
+            expected="info (name, width, height) and objects (category, bbox, segmentation)",
+            found=repr(error)[:200],
+            remedy="use LangSplat's label files",
+        ) from error
+    numbers = [part for _, box, polygon in objects for part in (box, polygon)]
+    if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
+        raise FileFormatError(
+            path, expected="a size and finite coordinates", found=f"size {size[0]}x{size[1]}"[:60]
+        )
+    # Beyond the picture a corner may lie, but not where whole numbers end or a line takes minutes to draw.
+    if not all((np.abs(part) <= 10 * MAX_SIDE).all() for part in numbers):
+        raise FileFormatError(path, expected="finite coordinates in and around the photo", found="others")
+    return name, size, objects
+
+
+def polygon_mask(points: Sequence[Sequence[float]] | NDArray, width: int, height: int) -> NDArray[np.bool_]:
+    """A filled polygon ``[H, W]`` as LangSplat draws it: corners cut to whole pixels, the outline included.
+
+    Agrees with OpenCV's ``fillPoly`` but for 0.2 % of the pixels, all on the outline.
+
+    Args:
+        points: Corners ``[n, 2]`` as x, y in pixels.
+        width: Of the mask.
+        height: Of the mask.
+    """
+    from skimage.measure import points_in_poly
+
+    corners = np.asarray(points, dtype=np.float64).reshape(-1, 2).astype(np.int32)
+    mask = np.zeros((height, width), dtype=bool)
+    if len(corners) == 0:
+        return mask
+    low = np.clip(corners.min(0), 0, (width, height))
+    high = np.clip(corners.max(0) + 1, 0, (width, height))
+    if (high > low).all() and len(corners) > 2:
+        ys, xs = np.mgrid[low[1] : high[1], low[0] : high[0]]
+        inside = points_in_poly(np.stack([xs.ravel(), ys.ravel()], axis=1), corners)
+        mask[low[1] : high[1], low[0] : high[0]] = inside.reshape(ys.shape)
+    picture = Image.fromarray(mask)
+    closed = [(int(x), int(y)) for x, y in [*corners, corners[0]]]
+    ImageDraw.Draw(picture).line(closed, fill=1)
+    return np.asarray(picture, dtype=bool)
+
+
+def _box_around(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return np.full(4, -1.0)
+    return np.array([columns.min(), rows.min(), columns.max(), rows.max()], dtype=np.float64)
+
+
+def load_truth(view: View, mask: Path | NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A mask of `Annotations` as an array ``[H, W]`` on the undistorted image."""
+    return mask.astype(bool) if isinstance(mask, np.ndarray) else view.load_mask(mask)

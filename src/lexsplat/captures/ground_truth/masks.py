@@ -1,0 +1,54 @@
+"""Ground-truth masks of views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.captures.capture import Scene
+from lexsplat.captures.images.reading import read_mask
+from lexsplat.captures.splits import mask_folders, match_stem
+from lexsplat.runtime.errors import CaptureError
+
+
+def load_mask(path: Path) -> NDArray[np.bool_]:
+    """A mask as ``[H, W]`` bool as it lies on disk: true where the picture is brighter than half.
+
+    Raises:
+        CaptureError: If the file is missing or damaged.
+    """
+    return read_mask(path)
+
+
+def load_masks(scene: Scene) -> dict[str, dict[str, Path]]:
+    """Where the masks of each view are: view name to prompt to file, both sorted.
+
+    "_" in a file name means a space: ``plastic_box.png`` answers "plastic box". Sizes are checked from
+    headers; read a mask with ``scene.views[name].load_mask(path)``, which also undistorts it.
+
+    Raises:
+        CaptureError: If a folder matches no view or several, or a mask does not have its photo's aspect.
+    """
+    if scene.segmentations is None:
+        return {}
+    found: dict[str, dict[str, Path]] = {}
+    for folder in mask_folders(scene.segmentations):
+        stem = folder.relative_to(scene.segmentations).as_posix()
+        matches = match_stem(stem, scene.views)
+        if len(matches) != 1:
+            what = (
+                "no view of that name" if not matches else f"{len(matches)} views of that name: {matches[:3]}"
+            )
+            raise CaptureError(
+                folder,
+                expected="a folder named like one image, without suffix",
+                found=what,
+                remedy="rename the folder, with the image's subfolder if it has one, or remove it",
+            )
+        prompts = found.setdefault(matches[0], {})
+        for path in sorted(folder.glob("*.png")):
+            scene.views[matches[0]].check_mask(path)
+            prompts[path.stem.replace("_", " ")] = path
+    return {name: dict(sorted(found[name].items())) for name in sorted(found)}

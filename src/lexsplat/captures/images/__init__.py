@@ -1,0 +1,1 @@
+"""Photos and masks: reading, undistortion, reduction in bands."""

@@ -1,0 +1,276 @@
+"""Pictures on disk as arrays: every mode Pillow knows, and typed errors for what it cannot read."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lexsplat.captures.images.bands import band_ranges, is_large, reduced
+from lexsplat.runtime.errors import CaptureError
+
+HEIC_SUFFIXES = (".heic", ".heif")
+"""Suffixes of what phones of Apple write; it takes the library pi-heif to read it."""
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIC_SUFFIXES)
+"""Suffixes taken for pictures, in the order in which they are tried where a capture names none."""
+
+MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+"""Largest picture that is opened: 179 million pixels. What claims more is a decompression bomb."""
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """A picture opened by Pillow, its pixels not read yet.
+
+    The EXIF orientation is not applied: cameras that come with a capture were computed on the pixels as
+    they are stored (COLMAP, nerfstudio and instant-ngp ignore the tag); turning them would break the poses.
+
+    Raises:
+        CaptureError: If the file is missing, is no picture, is cut off, would unpack to an absurd size, or needs a
+            library that is not installed.
+    """
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise CaptureError(path, expected="an image", found=found, remedy="restore the file")
+    if path.suffix.lower() in HEIC_SUFFIXES:
+        _register_heic(path)
+    try:
+        with warnings.catch_warnings():
+            # Between one and two times the limit Pillow only warns; such photos are large but honest.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with _BoundedFile(path) as file, Image.open(file) as image:
+                yield image
+    except Image.DecompressionBombError as error:
+        raise CaptureError(
+            path,
+            expected=f"at most {MAX_PIXELS:,} pixels",
+            found="more",
+            remedy="scale the image down before building",
+        ) from error
+    except Image.UnidentifiedImageError as error:
+        raise CaptureError(
+            path,
+            expected="an image",
+            found=f"{path.stat().st_size} bytes that are none Pillow can read",
+            remedy="replace it with a JPEG or PNG, or remove it from the capture",
+        ) from error
+    except CaptureError:
+        raise
+    except MemoryError as error:
+        raise CaptureError(
+            path,
+            expected="an image that fits into memory",
+            found="one that does not",
+            remedy="scale the image down before building",
+        ) from error
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        LookupError,
+        TypeError,
+        ArithmeticError,
+        struct.error,
+    ) as error:
+        # Pillow's decoders fail in all these ways on damaged files; nothing of ours runs inside the block.
+        raise CaptureError(
+            path,
+            expected="a whole image",
+            found=f"damaged data ({error or type(error).__name__})",
+            remedy="copy the file again, or remove it from the capture",
+        ) from error
+
+
+class _BoundedFile(io.BufferedReader):
+    """A file of which no more is read than there is: a damaged length must not become memory."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._end = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Bytes up to the end of the file, or up to ``size`` of them."""
+        left = max(0, self._end - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def _register_heic(path: Path) -> None:
+    try:
+        from pi_heif import register_heif_opener
+    except ImportError as error:
+        raise CaptureError(
+            path,
+            expected="the library pi-heif, which reads HEIC pictures",
+            found="it is not installed",
+            remedy='pip install "lexsplat[heic]", or save the photos as JPEG',
+        ) from error
+    register_heif_opener()
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels from the header alone.
+
+    Raises:
+        CaptureError: As :func:`open_image`, and for an image without pixels.
+    """
+    with open_image(path) as image:
+        width, height = image.size
+    if width < 1 or height < 1:
+        raise CaptureError(
+            path, expected="at least one pixel", found=f"{width}x{height}", remedy="replace the file"
+        )
+    return width, height
+
+
+def read_image(
+    path: Path,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    size: tuple[int, int] | None = None,
+) -> NDArray[np.float32]:
+    """A picture as ``[H, W, 3]`` float32 in 0..1; alpha is composited on ``background``.
+
+    Args:
+        path: The file.
+        background: Colour behind transparent pixels.
+        size: Width and height of the result, as by :func:`resize_image`; a large photo never is in memory as
+            floats then (`lexsplat.captures.images.bands`). None keeps the picture's.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    with open_image(path) as image:
+        shrinks = size is not None and size[0] <= image.width and size[1] <= image.height
+        if size is not None and shrinks and is_large(*image.size):
+            return reduced(PhotoRows(image, background), size)
+        whole = _as_floats(image, background)
+    return whole if size is None else resize_image(whole, size)
+
+
+class PhotoRows:
+    """An opened picture as a source of rows, composited on ``background``."""
+
+    def __init__(self, image: Image.Image, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        image.load()
+        self._image, self._background = image, background
+        self.width, self.height = image.size
+
+    def rows(self, first: int, last: int) -> NDArray[np.float32]:
+        """Rows ``[last - first, W, 3]``, in 0..1."""
+        return _as_floats(self._image.crop((0, first, self.width, last)), self._background)
+
+
+def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PhotoRows:
+    """A picture as a source of rows: in memory as it is decoded, three or four bytes a pixel.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    with open_image(path) as image:
+        return PhotoRows(image, background)
+
+
+def read_bytes(path: Path) -> NDArray[np.uint8]:
+    """A picture as ``[H, W, 3]`` bytes, as `read_image` gives it on black, rounded.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    source = read_rows(path)
+    found = np.empty((source.height, source.width, 3), np.uint8)
+    for first, last in band_ranges(source.height, source.width):
+        found[first:last] = (source.rows(first, last) * 255.0).round()
+    return found
+
+
+def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> NDArray[np.float32]:
+    """All pixels of a picture, whatever its mode."""
+    image.load()
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image, dtype=np.float32)
+        # Pillow hands out 16-bit grey as I or I;16; float pictures hold 0..1 by convention.
+        grey = values if image.mode == "F" else values / 65535.0
+        grey = np.clip(np.nan_to_num(grey, nan=0.0), 0.0, 1.0)
+        return np.repeat(grey[..., None], 3, axis=2)
+    if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+        alpha = rgba[..., 3:]
+        return rgba[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1.0 - alpha)
+    pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
+    if not pixels.flags.writeable:
+        pixels = pixels.copy()
+    pixels /= np.float32(255.0)  # in place: a large photo takes enough memory as it is
+    return pixels
+
+
+def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
+    """A mask as ``[H, W]`` bool: true where the picture is brighter than half.
+
+    A picture with values 0 and 1 only counts 1 as true. What is transparent is outside.
+
+    Args:
+        path: The picture.
+        nonzero: True is every pixel that is not black, however dark: what COLMAP takes masks for.
+
+    Raises:
+        CaptureError: As :func:`open_image`, and for a mask that is dark and not black: of its labels nobody knows
+            which is meant.
+    """
+    with open_image(path) as image:
+        image.load()
+        values = np.asarray(image if image.mode.startswith(("I", "F", "1")) else image.convert("L"))
+        if image.has_transparency_data:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+            values = np.where(alpha > 127, values, 0)
+    if values.dtype == np.bool_:
+        return values
+    if nonzero:
+        return values > 0
+    highest = float(values.max(initial=0))
+    if highest <= 1:
+        return values > 0.5
+    half = 127 if highest <= 255 else 32767
+    # A little over black is the noise of a JPEG. More of it is a mask in colours, such as labels in a palette.
+    if half / 4 < highest <= half:
+        raise CaptureError(
+            path,
+            expected="a mask in black and white",
+            found=f"nothing brighter than half, and yet not all black (up to {highest:g})",
+            remedy="save it in black and white",
+        )
+    return values > half
+
+
+def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """A picture ``[H, W, C]`` at another ``(width, height)``.
+
+    Each new pixel is the mean over the area it covers when the picture shrinks, and bilinear when it grows.
+    """
+    height, width = image.shape[:2]
+    if (width, height) == tuple(size):
+        return image
+    shrinks = size[0] <= width and size[1] <= height
+    resample = Image.Resampling.BOX if shrinks else Image.Resampling.BILINEAR
+    channels = [
+        np.asarray(Image.fromarray(np.ascontiguousarray(image[..., c])).resize(size, resample))
+        for c in range(image.shape[2])
+    ]
+    return np.stack(channels, axis=-1)
+
+
+def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
+    """Whether one size is the other scaled uniformly, each side rounded by less than a pixel."""
+    low, high = 0.0, np.inf
+    for a, b in zip(found, expected):
+        low, high = max(low, (a - 1) / b), min(high, (a + 1) / b)
+    return bool(low < high)

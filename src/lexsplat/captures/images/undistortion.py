@@ -1,0 +1,223 @@
+"""Lenses: from any COLMAP camera model to a pinhole image without invalid borders.
+
+pycolmap owns the models: it chooses the pinhole camera (the largest one in which every pixel is seen by the
+lens, COLMAP's ``blank_pixels = 0``) and maps its rays into the distorted photo; we only resample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.captures.images.bands import ArrayRows, Rows, reduced, whole
+from lexsplat.captures.images.reading import resize_image
+
+if TYPE_CHECKING:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+MAX_SIDE = 65535
+"""Longest image side in pixels (the limit of JPEG); a camera that claims more is damaged."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A COLMAP camera: model and intrinsics for images of one size.
+
+    Args:
+        model: Name of the model in COLMAP, such as ``"OPENCV"``.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        params: The model's parameters in COLMAP's order; lengths in pixels, pixel centres at +0.5.
+
+    Raises:
+        ValueError: If the numbers cannot belong to a perspective camera of this model.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+        if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
+            raise ValueError(f"image size {self.width}x{self.height}")
+        if self.model not in pycolmap.CameraModelId.__members__ or self.model == "INVALID":
+            raise ValueError(f"camera model {self.model!r}")
+        if not np.isfinite(self.params).all():
+            raise ValueError("an intrinsic that is not finite")
+        camera = self.to_pycolmap()
+        if not camera.verify_params():
+            raise ValueError(f"{len(self.params)} parameters for model {self.model} ({camera.params_info})")
+        if not camera.is_perspective():
+            raise ValueError(f"a {self.model} camera, which no pinhole image can replace")
+        side = max(self.width, self.height)
+        for focal in (camera.focal_length_x, camera.focal_length_y):
+            if not 1e-2 * side <= focal <= 1e3 * side:
+                raise ValueError(f"focal length {focal:g} for images of {self.width}x{self.height}")
+        # A picture cut out of a larger one has it outside, but not by a hundred pictures.
+        for center in (camera.principal_point_x, camera.principal_point_y):
+            if abs(center) > 1e2 * side:
+                raise ValueError(f"principal point at {center:g} for images of {self.width}x{self.height}")
+
+    def to_pycolmap(self) -> pycolmap.Camera:
+        """The same camera as pycolmap's object."""
+        from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+        return pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens for photos of another size (the field of view stays)."""
+        if (width, height) == (self.width, self.height):
+            return self
+        camera = self.to_pycolmap()
+        camera.rescale(width, height)
+        return Lens(self.model, width, height, tuple(float(p) for p in camera.params))
+
+    @property
+    def distorts(self) -> bool:
+        """Whether photos have to be resampled; false for a pinhole and for distortion of zero."""
+        return not self.to_pycolmap().is_undistorted()
+
+
+@lru_cache(maxsize=4096)
+def pinhole_of(lens: Lens) -> tuple[int, int, NDArray[np.float64]]:
+    """The pinhole camera that replaces a lens: width, height and ``K [3, 3]``.
+
+    Without distortion size and intrinsics stay as they are; otherwise COLMAP's undistortion chooses the
+    largest image without invalid pixels, between 0.2 and 2 times the photo.
+
+    Raises:
+        ValueError: If the distortion is so strong that no such image exists.
+    """
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    camera = lens.to_pycolmap()
+    if lens.distorts:
+        camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    K = np.asarray(camera.calibration_matrix(), dtype=np.float64)
+    if not np.isfinite(K).all() or min(camera.width, camera.height) < 1 or not _covers(lens, camera):
+        raise ValueError(f"distortion of {lens.model} {list(lens.params)} that cannot be undone")
+    K.setflags(write=False)
+    return int(camera.width), int(camera.height), K
+
+
+def _covers(lens: Lens, pinhole: pycolmap.Camera) -> bool:
+    """Whether a grid of the pinhole image's pixels falls into the photo, give or take a fiftieth.
+
+    COLMAP searches its pinhole camera by Newton steps, which wild parameters send anywhere without a word.
+    """
+    steps = np.linspace(0, 1, 9)
+    u, v = np.meshgrid(steps * pinhole.width, steps * pinhole.height)
+    rays = np.ones((81, 3))
+    rays[:, :2] = pinhole.cam_from_img(np.stack([u.ravel(), v.ravel()], axis=1))
+    where = np.asarray(lens.to_pycolmap().img_from_cam(rays)) / [lens.width, lens.height]
+    slack = 0.02 + 2.0 / min(lens.width, lens.height)  # COLMAP rounds sizes to whole pixels
+    return bool(((where >= -slack) & (where <= 1 + slack)).all())
+
+
+def undistort(
+    image: NDArray[Any], lens: Lens, size: tuple[int, int], *, nearest: bool = False
+) -> NDArray[np.float32]:
+    """A photo ``[H, W, C]`` taken through ``lens`` as its pinhole image at ``size`` (width, height).
+
+    When the result is much smaller, the photo is averaged down first and the remapped image once more, so
+    that no pixel of the photo is skipped.
+
+    Args:
+        image: The photo, float32; its size may be any uniform scale of the lens's.
+        lens: The lens.
+        size: Width and height of the result in pixels.
+        nearest: Take the nearest pixel instead of interpolating, for masks; straight to ``size``.
+
+    Raises:
+        ValueError: If the lens maps a pixel nowhere.
+    """
+    width, height, _ = pinhole_of(lens)
+    shrink = 1 if nearest else max(1, int(min(width / size[0], height / size[1]) / 2))
+    if shrink > 1:
+        reduced = (max(1, image.shape[1] // shrink), max(1, image.shape[0] // shrink))
+        image = resize_image(image, reduced)
+    enlarges = nearest or size[0] > width or size[1] > height
+    between = size if enlarges else (max(1, round(width / shrink)), max(1, round(height / shrink)))
+    remapped = _remap(image, _sampling_grid(lens, between), nearest)
+    return remapped if between == tuple(size) else resize_image(remapped, size)
+
+
+def undistort_large(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
+    """As `undistort`, of a photo that is never in memory as floats but for a band of it and the result."""
+    width, height, _ = pinhole_of(lens)
+    shrink = max(1, int(min(width / size[0], height / size[1]) / 2))
+    if shrink > 1:
+        smaller = (max(1, source.width // shrink), max(1, source.height // shrink))
+        source = ArrayRows(reduced(source, smaller))
+    enlarges = size[0] > width or size[1] > height
+    between = size if enlarges else (max(1, round(width / shrink)), max(1, round(height / shrink)))
+    remapped = RemappedRows(source, lens, between)
+    shrinks = between[0] >= size[0] and between[1] >= size[1]
+    return reduced(remapped, size) if shrinks else resize_image(whole(remapped), size)
+
+
+class RemappedRows:
+    """The pinhole image of a source, of which only the rows of the photo are read that a band looks at."""
+
+    def __init__(self, source: Rows, lens: Lens, size: tuple[int, int]) -> None:
+        self._source, self._lens = source, lens
+        self.width, self.height = size
+
+    def rows(self, first: int, last: int) -> NDArray[np.float32]:
+        """Rows of the pinhole image."""
+        grid = _grid_rows(self._lens, (self.width, self.height), first, last)
+        height = self._source.height
+        y = (grid[..., 1].astype(np.float64) + 1.0) * (height / 2)  # pixels from the upper edge of the photo
+        # Bicubic interpolation reaches two pixels far; beyond the photo its edge goes on.
+        top = int(np.clip(np.floor(y.min()) - 3, 0, height - 1))
+        bottom = int(np.clip(np.ceil(y.max()) + 3, top + 1, height))
+        grid[..., 1] = (y - top) * (2.0 / (bottom - top)) - 1.0
+        return _remap(self._source.rows(top, bottom), grid, nearest=False)
+
+
+@lru_cache(maxsize=2)
+def _sampling_grid(lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Where in the photo each pinhole pixel lies: ``[h, w, 2]``, x and y from -1 to 1 edge to edge."""
+    return _grid_rows(lens, size, 0, size[1])
+
+
+def _grid_rows(lens: Lens, size: tuple[int, int], first: int, last: int) -> NDArray[np.float32]:
+    """Rows ``first`` to ``last`` of the sampling grid."""
+    width, height, K = pinhole_of(lens)
+    camera = lens.to_pycolmap()
+    x = ((np.arange(size[0]) + 0.5) * (width / size[0]) - K[0, 2]) / K[0, 0]
+    y = ((np.arange(size[1]) + 0.5) * (height / size[1]) - K[1, 2]) / K[1, 1]
+    grid = np.empty((last - first, size[0], 2), dtype=np.float32)
+    scale = 2.0 / np.array([lens.width, lens.height])
+    rays = np.ones((size[0], 3))
+    rays[:, 0] = x
+    for row in range(first, last):  # a large photo's rays in float64 would take more than the photo
+        rays[:, 1] = y[row]
+        grid[row - first] = np.asarray(camera.img_from_cam(rays)) * scale - 1.0
+    if not np.isfinite(grid).all():
+        raise ValueError(f"distortion of {lens.model} {list(lens.params)} that maps a pixel nowhere")
+    return grid
+
+
+def _remap(image: NDArray[Any], grid: NDArray[np.float32], nearest: bool) -> NDArray[np.float32]:
+    import torch
+
+    source = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
+    # Its convention without align_corners, -1 and 1 at the outer edges, is that of pixel centres at +0.5.
+    sampled = torch.nn.functional.grid_sample(
+        source,
+        torch.from_numpy(grid)[None],
+        mode="nearest" if nearest else "bicubic",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return sampled[0].permute(1, 2, 0).clamp(0.0, 1.0).contiguous().numpy()

@@ -1,0 +1,234 @@
+"""From a capture folder to a scene: find the camera files, check every photo's header, choose the split."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from lexsplat.captures.capture import Scene, View, stem_of
+from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
+from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
+from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree
+from lexsplat.captures.images.undistortion import pinhole_of
+from lexsplat.captures.readers.camera_files import Capture, Photo
+from lexsplat.captures.readers.colmap import find_model, read_colmap
+from lexsplat.captures.readers.transforms_json import find_transforms, read_transforms
+from lexsplat.captures.readers.video import is_video
+from lexsplat.captures.splits import choose_test_names, mask_folders
+from lexsplat.geometry.cameras import Camera
+from lexsplat.runtime.errors import CaptureError
+
+SEGMENTATIONS = "segmentations"
+"""Folder of a capture with ``STEM/PROMPT.png``: masks to measure against."""
+
+
+def load_scene(
+    path: str | Path,
+    *,
+    downscale: float = 1.0,
+    test_every: int = 8,
+    test_names: Sequence[str] | None = None,
+    images: str | Path | None = None,
+    beside: str | Path | None = None,
+) -> Scene:
+    """Load a capture: COLMAP (binary or text), ``transforms.json`` (nerfstudio, instant-ngp, NeRF-synthetic).
+
+    Photos are not read beyond their headers. Where a capture has both a COLMAP model and a
+    ``transforms.json``, the model is taken, because it also has points; give the JSON file as ``path`` to
+    take that.
+
+    Args:
+        path: The capture folder, or its ``transforms.json``.
+        downscale: How many times smaller than the undistorted photos to work, at least 1 as a rule.
+        test_every: Hold out every n-th view, counting from the first by name; 0 holds out nothing.
+        test_names: Names or stems of the views to hold out, instead of every other rule.
+        images: Where the photos of a COLMAP model are, if not in the capture folder.
+        beside: Folder with ``segmentations/`` and ``test_views.json`` where these do not lie with the cameras: that
+            of the photos, where the cameras were estimated. Masks (``masks/``) always lie with the cameras.
+
+    Raises:
+        CaptureError: If there are no cameras or photos, or one of them cannot be used.
+        FileFormatError: If a camera file is damaged.
+        ValueError: If ``downscale`` is not positive and finite or ``test_every`` makes no sense.
+    """
+    if not 0 < downscale < 1e6:
+        raise ValueError(f"downscale must be positive, got {downscale:g}")
+    capture = _read_capture(Path(path), None if images is None else Path(images))
+    warnings = [*capture.warnings, *_told_missing(capture)]
+    masked, strays = find_ignore_masks([capture.root / IGNORE_FOLDER], [p.name for p in capture.photos])
+    # Masks of photos that found no place are no mistake: `prepare_photos` has told which fit none.
+    warnings += strays if beside is None else []
+    views = {
+        photo.name: _make_view(photo, capture, downscale, masked.get(photo.name))
+        for photo in sorted(capture.photos, key=lambda photo: photo.name)
+    }
+    _check_names([photo.name for photo in capture.photos], capture.origin)
+    root = capture.root if beside is None else Path(beside)
+    segmentations = root / SEGMENTATIONS
+    has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
+    chosen, split_warnings = choose_test_names(
+        list(views),
+        root=root,
+        test_names=test_names,
+        listed=capture.test_names,
+        annotated=_annotated(root, list(views)),
+        test_every=test_every,
+    )
+    warnings += split_warnings
+    for warning in warnings:
+        logging.getLogger("lexsplat").warning(warning)
+    return Scene(
+        root=root,
+        views=views,
+        train_names=tuple(name for name in views if name not in set(chosen)),
+        test_names=chosen,
+        points=capture.points,
+        point_colors=capture.point_colors,
+        segmentations=segmentations if has_masks else None,
+        warnings=tuple(warnings),
+        source=capture.source,
+        background=capture.background,
+    )
+
+
+def _told_missing(capture: Capture) -> list[str]:
+    """A warning that lists the images without a file, if there are any.
+
+    Raises:
+        CaptureError: If none is there.
+    """
+    if not capture.photos:
+        raise CaptureError(
+            capture.origin,
+            expected="images with files",
+            found=f"{len(capture.missing)} images, none of which is there",
+            remedy="put the images where the capture names them, for COLMAP into images/",
+        )
+    if not capture.missing:
+        return []
+    total = len(capture.photos) + len(capture.missing)
+    names = ", ".join(sorted(capture.missing))
+    return [
+        f"{capture.origin}: {len(capture.missing)} of {total} images have no file and are skipped: {names}"
+    ]
+
+
+def _check_names(names: list[str], origin: Path) -> None:
+    """Refuse an image that comes twice, and images whose names differ in their endings only: index maps, masks and
+    heatmaps are named by stems.
+
+    Raises:
+        CaptureError: If there are two.
+    """
+    stems: dict[str, str] = {}
+    for name in names:
+        twice = stem_of(name) in stems
+        other = stems.setdefault(stem_of(name), name)
+        if twice and other == name:
+            raise CaptureError(
+                origin,
+                expected="every image once",
+                found=f"{name} twice",
+                remedy="remove one of the two from the file",
+            )
+        if other != name:
+            raise CaptureError(
+                origin,
+                expected="names of images that differ in more than their endings",
+                found=f"{other} and {name}",
+                remedy="rename or remove one of the two",
+            )
+
+
+def _annotated(root: Path, names: list[str]) -> set[str]:
+    """Names of the views with truth beside them, in any layout."""
+    found = find_annotations(root)
+    return set() if found is None else annotated_names(*found, names, root / "images")
+
+
+def _read_capture(path: Path, images: Path | None) -> Capture:
+    if path.is_file() and path.suffix == ".json":
+        return read_transforms(path)
+    if not path.is_dir():
+        found = "a file" if path.exists() else "no such folder"
+        raise CaptureError(path, expected="a capture folder", found=found, remedy="check the path")
+    model = find_model(path)
+    if model is not None:
+        return read_colmap(path, model, images)
+    transforms = find_transforms(path)
+    if transforms is not None:
+        return read_transforms(transforms)
+    photos = _photos_of(path)
+    if photos:
+        raise CaptureError(
+            path,
+            expected="cameras (a COLMAP model in sparse/0, or transforms.json)",
+            found=f"{len(photos)} photos without cameras",
+            remedy=f"run: lexsplat poses {path}",
+        )
+    raise CaptureError(
+        path,
+        expected="photos with a COLMAP model in sparse/0 or a transforms.json",
+        found="an empty folder" if not any(path.iterdir()) else "neither cameras nor photos",
+        remedy="give the folder of a capture",
+    )
+
+
+def is_photo_folder(path: Path) -> bool:
+    """Whether a folder holds photos but no cameras, so that cameras have to be estimated first.
+
+    A video counts as such a folder: its frames are the photos.
+    """
+    return is_video(path) or (
+        path.is_dir()
+        and find_model(path) is None
+        and find_transforms(path) is None
+        and bool(_photos_of(path))
+    )
+
+
+def _photos_of(path: Path) -> list[Path]:
+    folders = [folder for folder in (path, path / "images") if folder.is_dir()]
+    return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def _make_view(photo: Photo, capture: Capture, downscale: float, mask: Path | None) -> View:
+    """Fit the lens to the photo's real size and replace it by a pinhole camera; ``mask`` says which pixels count."""
+    found = image_size(photo.path)
+    stated = (photo.lens.width, photo.lens.height)
+    # Photos scaled after the cameras were computed are common (images_4 of Mip-NeRF 360); another aspect
+    # means that the photo was cropped, turned or exchanged, and no camera can be derived.
+    if not sizes_agree(found, stated):
+        turned = " (turned on its side)" if sizes_agree(found[::-1], stated) else ""
+        raise CaptureError(
+            photo.path,
+            expected=f"{stated[0]}x{stated[1]} pixels as in {capture.origin}, or scaled uniformly",
+            found=f"{found[0]}x{found[1]}{turned}",
+            remedy="use the photos the cameras were computed from, not cropped or rotated",
+        )
+    try:
+        lens = photo.lens.resized(*found)
+        width, height, K = pinhole_of(lens)
+        camera = Camera(width, height, K, photo.viewmat)
+    except ValueError as error:
+        raise CaptureError(
+            capture.origin,
+            expected=f"a usable camera for image {photo.name}",
+            found=str(error),
+            remedy="correct the camera, or run COLMAP again with a simpler camera model",
+        ) from error
+    view = View(
+        name=photo.name,
+        image_path=photo.path,
+        camera=camera if downscale == 1 else camera.downscaled(downscale),
+        capture_size=(width, height),
+        lens=lens,
+        background=capture.background,
+        ignore_path=photo.ignore_path or mask,
+    )
+    if view.ignore_path is not None:
+        view.check_mask(
+            view.ignore_path
+        )  # a mask that does not fit is told now, not in the middle of a training
+    return view

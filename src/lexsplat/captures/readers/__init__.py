@@ -1,0 +1,1 @@
+"""Readers of camera files and videos: COLMAP, ``transforms.json``, video."""

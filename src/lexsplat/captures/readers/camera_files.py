@@ -1,0 +1,113 @@
+"""What a reader of camera files hands over: photos with lenses and poses, sizes not checked yet."""
+
+from __future__ import annotations
+
+import unicodedata
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.captures.images.undistortion import Lens
+from lexsplat.runtime.errors import CaptureError
+
+MAX_COORDINATE = 1e7
+"""Largest coordinate of a camera or point in world units; beyond, float32 no longer resolves a scene."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image name with its camera, as a capture's files say.
+
+    Args:
+        name: Path relative to the image folder, with "/".
+        path: The image file.
+        lens: The lens, for the size the camera files state.
+        viewmat: World to camera ``[4, 4]``, OpenCV axes.
+        ignore_path: Picture that is black where pixels take no part in losses, or None.
+    """
+
+    name: str
+    path: Path
+    lens: Lens
+    viewmat: NDArray[np.float64]
+    ignore_path: Path | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The content of a capture's camera files.
+
+    Args:
+        root: The capture folder.
+        origin: The file or folder the cameras were read from, for messages.
+        photos: The photos that have a file.
+        source: ``"colmap"`` or ``"transforms"``.
+        points: Points ``[P, 3]`` float32, world.
+        point_colors: Their colours ``[P, 3]`` float32 in 0..1.
+        missing: Names of images that have a camera but no file.
+        test_names: The split the files themselves prescribe, or None.
+        background: Colour behind transparent pixels.
+        warnings: What was left out and why.
+    """
+
+    root: Path
+    origin: Path
+    photos: list[Photo]
+    source: str
+    points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    point_colors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    missing: list[str] = field(default_factory=list)
+    test_names: list[str] | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    warnings: list[str] = field(default_factory=list)
+
+
+def checked_name(name: str, origin: Path) -> str:
+    """An image name as a plain relative path with "/".
+
+    Raises:
+        CaptureError: If the name is empty, absolute, leads out of the capture, or is none a file can have.
+    """
+    plain = name.replace("\\", "/")
+    parts = PurePosixPath(plain).parts
+    drive = bool(parts) and len(parts[0]) == 2 and parts[0][1] == ":"
+    if not _can_be_a_file(parts) or plain.startswith("/") or drive or ".." in parts:
+        raise CaptureError(
+            origin,
+            expected="image names inside the capture folder",
+            found=repr(name)[:100],
+            remedy="move the images into the capture and name them relative to it",
+        )
+    return "/".join(parts)
+
+
+def _can_be_a_file(parts: tuple[str, ...]) -> bool:
+    """Whether a file system can have such a path: no control characters, no halves of characters, not too long."""
+    lengths = [len(part.encode("utf-8", "replace")) for part in parts]
+    odd = any(unicodedata.category(letter) in ("Cc", "Cs") for part in parts for letter in part)
+    return bool(parts) and max(lengths) <= 250 and sum(lengths) < 3000 and not odd
+
+
+def checked_pose(viewmat: NDArray[np.float64], name: str, origin: Path) -> NDArray[np.float64]:
+    """A world-to-camera matrix ``[4, 4]`` whose numbers can be those of a camera.
+
+    Raises:
+        CaptureError: If a number is not finite or absurdly large.
+    """
+    if not np.isfinite(viewmat).all():
+        raise CaptureError(
+            origin,
+            expected=f"a finite pose for image {name}",
+            found="NaN or infinity",
+            remedy="remove the image from the file or estimate its pose again",
+        )
+    if np.abs(viewmat).max() > MAX_COORDINATE:
+        raise CaptureError(
+            origin,
+            expected=f"a pose for image {name} within {MAX_COORDINATE:g} units of the origin",
+            found=f"{np.abs(viewmat).max():g}",
+            remedy="remove the image from the file, or scale the scene",
+        )
+    return viewmat

@@ -1,0 +1,378 @@
+"""COLMAP models, binary and text.
+
+pycolmap knows the camera models but does not read the files here: its reader trusts every count, and on
+damaged files it runs for minutes. This one checks each count against the bytes that are left before it uses
+it. The tests compare it with pycolmap's on sound models.
+
+The format: https://colmap.github.io/format.html (cameras, images, points3D; the rigs and frames of newer
+versions add nothing here, because images still carry their full pose).
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.captures.images.undistortion import Lens
+from lexsplat.captures.readers.camera_files import (
+    MAX_COORDINATE,
+    Capture,
+    Photo,
+    checked_name,
+    checked_pose,
+)
+from lexsplat.runtime.errors import CaptureError, FileFormatError
+
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", ".")
+"""Where a capture may keep its model, in the order of preference."""
+
+IMAGE_FOLDERS = ("images", "input", "image", "rgb", "images_2", "images_4", "images_8", ".")
+"""Where a capture may keep its photos, in the order of preference."""
+
+_COPY_AGAIN = "copy the file again, or run COLMAP again"
+
+
+def find_model(root: Path) -> Path | None:
+    """The folder of a capture that holds a COLMAP model, or None."""
+    for name in MODEL_FOLDERS:
+        folder = root / name
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def read_colmap(root: Path, model: Path, images: Path | None = None) -> Capture:
+    """The capture described by a COLMAP model.
+
+    Args:
+        root: The capture folder, which holds the photos.
+        model: The folder with ``cameras``, ``images`` and (optionally) ``points3D``, ``.bin`` or ``.txt``.
+        images: The folder of the photos; None looks for it in ``root``.
+
+    Raises:
+        FileFormatError: If a file is cut off or damaged.
+        CaptureError: If a camera or pose cannot be used, or no image has a file.
+    """
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    lenses = _lenses_by_id(model / f"cameras{suffix}")
+    images_file = model / f"images{suffix}"
+    if not images_file.is_file():
+        raise FileFormatError(
+            images_file, expected="the model's images", found="no such file", remedy=_COPY_AGAIN
+        )
+    entries = list(_read_images(images_file))
+    names = [checked_name(name, images_file) for name, *_ in entries]
+    doubled = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else set()
+    if doubled:
+        raise CaptureError(
+            images_file,
+            expected="every image once",
+            found=f"{sorted(doubled)[0]} twice",
+            remedy="remove one of the two from the model",
+        )
+    folder = _image_folder(root, names) if images is None else images
+    photos, missing = [], []
+    for name, (_, camera_id, quaternion, translation) in zip(names, entries):
+        if camera_id not in lenses:
+            raise FileFormatError(
+                images_file,
+                expected=f"camera {camera_id} of image {name} in cameras{suffix}",
+                found=f"cameras {sorted(lenses)[:8]}",
+                remedy=_COPY_AGAIN,
+            )
+        viewmat = _viewmat(quaternion, translation, name, images_file)
+        if (folder / name).is_file():
+            photos.append(Photo(name, folder / name, lenses[camera_id], viewmat))
+        else:
+            missing.append(name)
+    points_file = model / f"points3D{suffix}"
+    points, colors, dropped = (
+        _read_points(points_file) if points_file.is_file() else (np.zeros((0, 3)), np.zeros((0, 3)), 0)
+    )
+    warnings = [f"{points_file}: {dropped} points that are not finite were dropped"] if dropped else []
+    return Capture(
+        root=root,
+        origin=model,
+        photos=photos,
+        source="colmap",
+        points=points.astype(np.float32),
+        point_colors=colors.astype(np.float32),
+        missing=missing,
+        warnings=warnings,
+    )
+
+
+def _lenses_by_id(file: Path) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    for camera_id, lens in _read_cameras(file):
+        if camera_id in lenses:
+            raise _damaged(file, "every camera once", f"camera {camera_id} twice")
+        lenses[camera_id] = lens
+    return lenses
+
+
+def _image_folder(root: Path, names: list[str]) -> Path:
+    """The folder in which most of the images are; the earlier one of equals."""
+    folders = [root / name for name in IMAGE_FOLDERS if (root / name).is_dir()]
+    return max(folders, key=lambda folder: sum((folder / name).is_file() for name in names))
+
+
+def _viewmat(
+    quaternion: tuple[float, ...], translation: tuple[float, ...], name: str, origin: Path
+) -> NDArray[np.float64]:
+    """World to camera ``[4, 4]`` from COLMAP's quaternion (wxyz, normalised here) and translation."""
+    q = np.array(quaternion, dtype=np.float64)
+    with np.errstate(all="ignore"):  # damaged numbers overflow here; the check below names the image
+        q = q / np.linalg.norm(q)
+    w, x, y, z = q
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = translation
+    return checked_pose(viewmat, name, origin)
+
+
+def _make_lens(file: Path, camera_id: int, model: str, width: int, height: int, params: tuple) -> Lens:
+    try:
+        return Lens(model, width, height, tuple(float(p) for p in params))
+    except ValueError as error:
+        raise CaptureError(
+            file,
+            expected=f"a perspective camera {camera_id}",
+            found=str(error),
+            remedy="correct the camera, or run COLMAP again with another camera model",
+        ) from error
+
+
+def _damaged(file: Path, expected: str, found: str) -> FileFormatError:
+    return FileFormatError(file, expected=expected, found=found, remedy=_COPY_AGAIN)
+
+
+class _Bytes:
+    """A binary file read from front to back, where every length is checked before it is used."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        try:
+            self.data = file.read_bytes()
+        except OSError as error:
+            raise _damaged(file, "a readable file", str(error.strerror)) from error
+        self.position = 0
+
+    def take(self, layout: struct.Struct, what: str) -> tuple:
+        """The next values of a fixed layout."""
+        self.need(layout.size, what)
+        values = layout.unpack_from(self.data, self.position)
+        self.position += layout.size
+        return values
+
+    def need(self, size: int, what: str) -> None:
+        """Fail unless so many bytes are left."""
+        left = len(self.data) - self.position
+        if size > left:
+            raise _damaged(self.file, f"{size} bytes of {what} at byte {self.position}", f"{left} bytes left")
+
+    def count(self, smallest: int, what: str) -> int:
+        """A number of records, each of at least ``smallest`` bytes."""
+        (count,) = self.take(_COUNT, f"number of {what}")
+        left = len(self.data) - self.position
+        if count * smallest > left:
+            raise _damaged(self.file, f"{count} {what} of at least {smallest} bytes", f"{left} bytes left")
+        return count
+
+    def skip(self, size: int, what: str) -> None:
+        """Pass over bytes that are not needed here."""
+        self.need(size, what)
+        self.position += size
+
+    def text(self, what: str) -> str:
+        """A string that ends in a zero byte."""
+        end = self.data.find(b"\0", self.position)
+        if end < 0:
+            raise _damaged(self.file, f"{what} at byte {self.position}", "the end of the file")
+        raw = self.data[self.position : end]
+        self.position = end + 1
+        try:
+            return raw.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise _damaged(self.file, f"{what} in UTF-8", repr(raw[:40])) from error
+
+    def finish(self) -> None:
+        """Fail unless the whole file was read."""
+        left = len(self.data) - self.position
+        if left:
+            raise _damaged(self.file, "the end of the file", f"{left} more bytes")
+
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I4d3dI")
+_POINT = struct.Struct("<Q3d3BdQ")
+_OBSERVATION_BYTES = 24  # x, y, point id
+_TRACK_BYTES = 8  # image id, observation index
+
+ImageEntry = tuple[str, int, tuple[float, ...], tuple[float, ...]]
+"""Name, camera id, quaternion wxyz, translation."""
+
+
+def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    if file.suffix == ".txt":
+        for line in _records(file):
+            words = line.split()
+            try:
+                values = int(words[0]), words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:]))
+            except (ValueError, IndexError) as error:
+                raise _damaged(file, "ID MODEL WIDTH HEIGHT PARAMS", repr(line[:60])) from error
+            yield values[0], _make_lens(file, *values)
+        return
+    models = {
+        int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"
+    }
+    sizes = {name: len(_example_params(name)) for name in models.values()}
+    content = _Bytes(file)
+    for _ in range(content.count(_CAMERA.size, "cameras")):
+        camera_id, model, width, height = content.take(_CAMERA, "a camera")
+        if model not in models:
+            raise _damaged(file, "a camera model of COLMAP", f"model number {model}")
+        name = models[model]
+        params = content.take(struct.Struct(f"<{sizes[name]}d"), f"{name} parameters")
+        yield camera_id, _make_lens(file, camera_id, name, width, height, params)
+    content.finish()
+
+
+def _example_params(model: str) -> list[float]:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    camera_id, focal, width, height = 1, 1.0, 2, 2
+    return list(pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height).params)
+
+
+def _read_images(file: Path) -> Iterator[ImageEntry]:
+    if file.suffix == ".txt":
+        yield from _read_images_text(file)
+        return
+    content = _Bytes(file)
+    for _ in range(content.count(_IMAGE.size + 1 + _COUNT.size, "images")):
+        _, *pose, camera_id = content.take(_IMAGE, "an image")
+        name = content.text("an image name")
+        observations = content.count(_OBSERVATION_BYTES, f"observations of {name[:60]}")
+        content.skip(observations * _OBSERVATION_BYTES, f"observations of {name[:60]}")
+        yield name, camera_id, tuple(pose[:4]), tuple(pose[4:])
+    content.finish()
+
+
+def _read_images_text(file: Path) -> Iterator[ImageEntry]:
+    lines = _lines(file)
+    found = 0
+    promised = None
+    for line in lines:
+        if line.startswith("#") or not line.strip():
+            promised = _promised_count(line, promised)
+            continue
+        words = line.strip().split(maxsplit=9)
+        try:
+            pose = tuple(float(word) for word in words[1:8])
+            camera_id, name = int(words[8]), words[9]
+        except (ValueError, IndexError) as error:
+            raise _damaged(file, "ID QW QX QY QZ TX TY TZ CAMERA NAME", repr(line[:60])) from error
+        # Every image has a second line with its observations, which may be empty but not absent.
+        observations = next(lines, None)
+        if observations is None or not _are_observations(observations):
+            instead = "the end of the file" if observations is None else repr(observations[:60])
+            raise _damaged(file, f"a line of observations after image {name}", instead)
+        found += 1
+        yield name, camera_id, pose[:4], pose[4:]
+    _check_promise(file, promised, found, "images")
+
+
+def _are_observations(line: str) -> bool:
+    """Whether a line is of ``X Y POINT`` triples, by their number and the last one; the next image's is not."""
+    words = line.split()
+    try:
+        float(words[-2]), int(words[-1])
+    except (IndexError, ValueError):
+        return not words
+    return len(words) % 3 == 0
+
+
+def _read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """Points, colours in 0..1, and how many were dropped because a number was not finite."""
+    numbers = array("d")  # eight bytes a number, where a list of tuples would take fifty
+    for row in _point_rows_text(file) if file.suffix == ".txt" else _point_rows_binary(file):
+        numbers.extend(row)
+    table = np.array(numbers, dtype=np.float64).reshape(-1, 6)
+    keep = np.isfinite(table).all(1) & (np.abs(table[:, :3]) < MAX_COORDINATE).all(1)
+    kept = table[keep]
+    return kept[:, :3], np.clip(kept[:, 3:] / 255.0, 0.0, 1.0), int((~keep).sum())
+
+
+def _point_rows_binary(file: Path) -> Iterator[tuple[float, ...]]:
+    content = _Bytes(file)
+    for _ in range(content.count(_POINT.size, "points")):
+        _, x, y, z, red, green, blue, _, track = content.take(_POINT, "a point")
+        content.skip(track * _TRACK_BYTES, "a track")
+        yield x, y, z, red, green, blue
+    content.finish()
+
+
+def _point_rows_text(file: Path) -> Iterator[tuple[float, ...]]:
+    for line in _records(file):
+        words = line.split(maxsplit=8)
+        try:
+            row = tuple(float(word) for word in words[1:7])
+            if len(row) < 6 or len(words) < 8:
+                raise ValueError("too few numbers")
+        except ValueError as error:
+            raise _damaged(file, "ID X Y Z R G B ERROR TRACK", repr(line[:60])) from error
+        yield row
+
+
+def _lines(file: Path) -> Iterator[str]:
+    try:
+        # Universal newlines only: str.splitlines would also cut names at exotic separators.
+        text = file.read_bytes().decode("utf-8")
+    except OSError as error:
+        raise _damaged(file, "a readable file", str(error.strerror)) from error
+    except UnicodeDecodeError as error:
+        raise _damaged(file, "text in UTF-8", f"byte {error.start} that is none") from error
+    if "\0" in text:
+        raise _damaged(file, "text", "zero bytes")
+    # The empty string after a last newline stays: it stands for the empty last line many writers leave out.
+    return iter(text.replace("\r\n", "\n").split("\n"))
+
+
+def _records(file: Path) -> Iterator[str]:
+    """Lines with content; fails at the end if the header promised more."""
+    promised, found = None, 0
+    for line in _lines(file):
+        if line.startswith("#") or not line.strip():
+            promised = _promised_count(line, promised)
+            continue
+        found += 1
+        yield line
+    _check_promise(file, promised, found, file.stem)
+
+
+def _promised_count(line: str, before: int | None) -> int | None:
+    """The count in a comment such as ``# Number of images: 12, mean observations ...``."""
+    head, colon, rest = line.partition(":")
+    if not (colon and head.startswith("# Number of ")):
+        return before
+    digits = rest.split(",")[0].strip()
+    return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 19 else before
+
+
+def _check_promise(file: Path, promised: int | None, found: int, what: str) -> None:
+    # Only a shortfall is damage: people remove or add lines by hand and leave the comment.
+    if promised is not None and found < promised:
+        raise _damaged(file, f"{promised} {what} as its header says", f"{found}")

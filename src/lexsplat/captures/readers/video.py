@@ -1,0 +1,300 @@
+"""Frames of a video as photos: as many as wanted, sharp ones, spread by how far the camera moved.
+
+The video is read twice and never held in memory: first small grey copies say how sharp each frame is and how much the
+picture changes to the next one, then the chosen frames are written. Needs PyAV (the extra ``video``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import BackendError, CaptureError
+from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.progress import Event, Listener, silent
+
+STAGE = "video"
+DEFAULT_FRAMES = 150
+"""How many frames a video is sampled to, unless told otherwise: a walk around a place or a thing."""
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+
+_SHARPNESS_SIDE = 480
+"""Longest side in pixels at which sharpness is judged: blur that matters to features is still seen."""
+_MOTION_SIDE = 64
+"""Longest side at which motion is judged: noise and sharpness have no say."""
+_TAPER = 0.3
+"""How much less a frame at the border of its window counts than one in its middle."""
+_WHOLE = 0.9
+"""A video from which less than this share of its frames can be read is cut off."""
+_MANIFEST = "frames.json"
+_JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class FrameMeasures:
+    """What the first reading of a video tells, by frame.
+
+    Args:
+        sharpness: Variance of the Laplacian of the grey frame, relative to its contrast ``[F]``.
+        motion: Change from the frame before, relative to its contrast ``[F]``; the first is 0.
+    """
+
+    sharpness: NDArray[np.float64]
+    motion: NDArray[np.float64]
+
+
+def is_video(path: Path) -> bool:
+    """Whether this is a file that is called like a video."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
+
+
+def sample_video(
+    video: Path,
+    folder: Path,
+    count: int = DEFAULT_FRAMES,
+    *,
+    memory: int = budget.DEFAULT_MEMORY,
+    listener: Listener = silent,
+) -> list[str]:
+    """Write frames of a video as ``frame_NUMBER.jpg``, NUMBER being the frame's place in the video.
+
+    Frames that an earlier call has written from the same video for the same count are kept.
+
+    Args:
+        video: The file.
+        folder: Where the frames go; other ``frame_*.jpg`` there are removed.
+        count: How many are wanted; a video with fewer gives all it has.
+        memory: Bytes of host memory that decoding may take: decides how many threads it has.
+        listener: Hears of stage "video": a unit a frame read.
+
+    Returns:
+        Names of the frames, in order.
+
+    Raises:
+        BackendError: If PyAV is not installed.
+        CaptureError: If the file is missing, no video, damaged, or has fewer than three frames.
+        MemoryBudgetError: If ``memory`` is too little for frames of this size.
+        ValueError: If ``count`` is below 3.
+    """
+    if count < 3:
+        raise ValueError(f"count must be at least 3, got {count}")
+    if not video.is_file():
+        raise CaptureError(video, expected="a video", found="no such file", remedy="check the path")
+    made_from = {"video": _identity(video), "count": count, "version": 1}
+    kept = _written_before(folder, made_from)
+    if kept is not None:
+        return kept
+    measures = measure_frames(video, listener, memory=memory)
+    chosen = choose_frames(measures, count)
+    names = [f"frame_{index:06d}.jpg" for index in chosen]
+    (folder / _MANIFEST).unlink(missing_ok=True)
+    for stale in folder.glob("frame_*.jpg"):
+        if stale.name not in names:
+            stale.unlink()
+    _write_frames(video, folder, dict(zip(chosen, names)), len(measures.motion), memory, listener)
+    with atomic_path(folder / _MANIFEST) as temporary:
+        temporary.write_text(json.dumps({**made_from, "names": names}, indent=1), encoding="utf-8")
+    return names
+
+
+def measure_frames(
+    video: Path, listener: Listener = silent, *, memory: int = budget.DEFAULT_MEMORY
+) -> FrameMeasures:
+    """Read a video once and measure its frames.
+
+    Raises:
+        BackendError: If PyAV is not installed.
+        CaptureError: As `sample_video`.
+    """
+    sharpness: list[float] = []
+    motion: list[float] = []
+    before: NDArray[np.float32] | None = None
+    expected = 0
+    with _open(video, memory) as (stream, frames):
+        expected = stream.frames
+        for frame in frames:
+            sharpness.append(_sharpness(_small_grey(frame, _SHARPNESS_SIDE)))
+            now = _small_grey(frame, _MOTION_SIDE)
+            motion.append(0.0 if before is None else _change(before, now))
+            before = now
+            if len(motion) % 50 == 0:
+                listener(Event(STAGE, len(motion), 2 * max(expected, len(motion))))
+    if len(motion) < _WHOLE * expected:
+        raise CaptureError(
+            video,
+            expected=f"{expected} frames, as the file promises",
+            found=f"{len(motion)} that can be read",
+            remedy="the video is cut off or damaged: copy it again",
+        )
+    if len(motion) < 3:
+        raise CaptureError(video, expected="a video of at least 3 frames", found=f"{len(motion)}")
+    return FrameMeasures(np.array(sharpness), np.array(motion))
+
+
+def choose_frames(measures: FrameMeasures, count: int) -> list[int]:
+    """Numbers of the frames to take, ascending: the sharpest of each of ``count`` stretches of equal motion.
+
+    Where a stretch holds no frame, because the camera was faster than that, the widest gaps that are left get one
+    more each, so that there are ``count`` frames in the end, or all.
+    """
+    frames = len(measures.motion)
+    if count >= frames:
+        return list(range(frames))
+    path = np.cumsum(measures.motion)
+    if path[-1] <= 0:  # nothing moves: spread by time
+        path = np.arange(frames, dtype=np.float64)
+    place = path / path[-1] * count
+    window = np.minimum(place.astype(np.int64), count - 1)
+    score = measures.sharpness * (1 - _TAPER * np.abs(2 * (place - window) - 1).clip(0, 1))
+    order = np.lexsort((-score, window))
+    first = np.unique(window[order], return_index=True)[1]
+    chosen = sorted(int(index) for index in order[first])
+    while len(chosen) < count:
+        chosen = sorted([*chosen, _fill_widest_gap(chosen, place, score)])
+    return chosen
+
+
+def _fill_widest_gap(chosen: list[int], place: NDArray, score: NDArray) -> int:
+    """The best frame near the middle of the widest stretch between two chosen frames that holds one."""
+    ends = [-1, *chosen, len(place)]
+    gaps = [(a, b) for a, b in itertools.pairwise(ends) if b - a > 1]
+    start, end = max(gaps, key=lambda gap: place[min(gap[1], len(place) - 1)] - place[max(gap[0], 0)])
+    inside = np.arange(start + 1, end)
+    quarter = len(inside) // 4
+    middle = inside[quarter : len(inside) - quarter]
+    return int(middle[score[middle].argmax()])
+
+
+@contextlib.contextmanager
+def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
+    """The picture stream of a video and its frames, decoded one after the other.
+
+    Raises:
+        BackendError: If PyAV is not installed.
+        CaptureError: If it cannot be opened or decoded; also while frames are taken.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise BackendError(
+            video,
+            expected="PyAV, which reads videos",
+            found="not installed",
+            remedy='pip install "lexsplat[video]", or give a folder of photos',
+        ) from error
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise CaptureError(video, expected="a video", found="a file without pictures")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            stream.codec_context.thread_count = _threads(video, (stream.width, stream.height), memory)
+            yield stream, container.decode(stream)
+    except av.error.FFmpegError as error:
+        raise CaptureError(
+            video,
+            expected="a whole video",
+            found=f"damaged data ({error.strerror or error})",
+            remedy="copy the file again, or convert it to an MP4",
+        ) from error
+
+
+def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
+    """How many threads decode, so that the frames they hold fit.
+
+    Raises:
+        MemoryBudgetError: If one is too many.
+    """
+    need = {
+        threads: budget.video_bytes(frame, threads) for threads in range(1, min(16, os.cpu_count() or 1) + 1)
+    }
+    what = f"frames of {frame[0]}x{frame[1]} pixels"
+    budget.require(str(video), need[1], memory, what, "scale the video down first")
+    return budget.most_within(memory, need)
+
+
+def _small_grey(frame: Any, side: int) -> NDArray[np.float32]:
+    """A frame as grey ``[h, w]`` in 0..255, no side longer than ``side``."""
+    factor = min(1.0, side / max(frame.width, frame.height))
+    size = (max(2, round(frame.width * factor)), max(2, round(frame.height * factor)))
+    small = frame.reformat(width=size[0], height=size[1], format="gray", interpolation="AREA")
+    return np.asarray(small.to_ndarray(), dtype=np.float32)
+
+
+def _sharpness(grey: NDArray[np.float32]) -> float:
+    """Variance of the Laplacian, relative to the variance of the picture, so that a plain wall is not "blurred"."""
+    inner = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    return float(laplacian.var() / (grey.var() + 1.0)) if laplacian.size else 0.0
+
+
+def _change(before: NDArray[np.float32], now: NDArray[np.float32]) -> float:
+    """Mean absolute difference of two frames without their brightness, relative to their contrast."""
+    first, second = before - before.mean(), now - now.mean()
+    contrast = (float(first.std()) + float(second.std())) / 2
+    return float(np.abs(first - second).mean()) / (contrast + 1.0)
+
+
+def _upright(frame: Any) -> NDArray[np.uint8]:
+    """The pixels of a frame ``[H, W, 3]``, turned as the video says it is to be shown."""
+    pixels = frame.to_ndarray(format="rgb24")
+    quarters = round(getattr(frame, "rotation", 0) / 90) % 4
+    return np.ascontiguousarray(np.rot90(pixels, quarters))
+
+
+def _write_frames(
+    video: Path, folder: Path, names: dict[int, str], total: int, memory: int, listener: Listener
+) -> None:
+    last = max(names)
+    written = 0
+    with _open(video, memory) as (_, frames):
+        for index, frame in enumerate(frames):
+            if index in names:
+                with atomic_path(folder / names[index]) as temporary:
+                    image = Image.fromarray(_upright(frame))
+                    image.save(temporary, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
+                written += 1
+                listener(Event(STAGE, total + index, 2 * total))
+            if index >= last:
+                break
+    if written < len(names):
+        raise CaptureError(
+            video, expected=f"{total} frames, as when it was first read", found="fewer", remedy="try again"
+        )
+    listener(Event(STAGE, 2 * total, 2 * total, {"frames": float(written)}))
+
+
+def _identity(video: Path) -> list[Any]:
+    """Name, size and a hash of the ends of a file: enough to know it again without reading it all."""
+    size = video.stat().st_size
+    with open(video, "rb") as file:
+        digest = hashlib.blake2b(file.read(1 << 20), digest_size=12)
+        file.seek(max(0, size - (1 << 20)))
+        digest.update(file.read(1 << 20))
+    return [video.name, size, digest.hexdigest()]
+
+
+def _written_before(folder: Path, made_from: dict[str, Any]) -> list[str] | None:
+    """The frames of an earlier call with the same video and count, if all are there."""
+    try:
+        content = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
+        names = content.pop("names")
+    except (OSError, ValueError, KeyError, AttributeError):
+        return None
+    whole = (
+        content == made_from and isinstance(names, list) and all((folder / str(n)).is_file() for n in names)
+    )
+    return [str(name) for name in names] if whole else None

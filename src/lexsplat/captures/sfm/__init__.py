@@ -1,0 +1,1 @@
+"""Structure from motion: photos without cameras in, a COLMAP model out."""

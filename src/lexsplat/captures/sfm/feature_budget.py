@@ -1,0 +1,100 @@
+"""Features, matches and models of pycolmap within a budget of memory: how many threads, how many photos held at once.
+
+What is chosen here decides nothing about a result: photos are numbered before, and every pair is matched and verified
+by itself, with a seed of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lexsplat.runtime import memory as budget
+
+if TYPE_CHECKING:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+HELD_AT_MOST = 1225
+"""Photos whose features are held at once, at most: pycolmap's own number."""
+
+_STAGE = "structure from motion"
+
+
+def extraction_threads(
+    photo: tuple[int, int], max_side: int, max_features: int, memory: int, *, masked: bool = False
+) -> int:
+    """In how many photos features are sought at once.
+
+    Raises:
+        MemoryBudgetError: If one is too many.
+    """
+    need = {
+        threads: budget.extraction_bytes(photo, max_side, max_features, threads, masked=masked)
+        for threads in range(1, _cores() + 1)
+    }
+    side = min(max_side, max(photo))
+    fitting = next((s for s in range(side, 63, -32) if _fits(photo, s, max_features, memory, masked)), None)
+    remedy = "scale the photos down first" if fitting is None else f"a max-side of {fitting}"
+    budget.require(_STAGE, need[1], memory, f"features of photos of {photo[0]}x{photo[1]} pixels", remedy)
+    return budget.most_within(memory, need)
+
+
+def _fits(photo: tuple[int, int], side: int, max_features: int, memory: int, masked: bool) -> bool:
+    return budget.extraction_bytes(photo, side, max_features, 1, masked=masked) <= memory
+
+
+def matching_plan(
+    database: Path, memory: int, *, least: int = 2
+) -> tuple[pycolmap.FeatureMatchingOptions, int]:
+    """How photos are compared: options with a number of threads, and how many photos are held at once.
+
+    Args:
+        database: pycolmap's, with features.
+        memory: Bytes there are.
+        least: Photos that must be held at least.
+
+    Raises:
+        MemoryBudgetError: If even so many do not fit, with one thread.
+    """
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    most, _, photos, _ = _counts(database)
+    least = min(least, max(2, photos))
+    need = budget.matching_bytes(most, least, 1)
+    fewer = max(100, most * memory // max(need, 1) // 100 * 100)
+    budget.require(_STAGE, need, memory, f"comparing photos of {most:,} features", f"max-features of {fewer}")
+    threads = budget.most_within(
+        memory, {count: budget.matching_bytes(most, least, count) for count in range(1, _cores() + 1)}
+    )
+    held = (memory - budget.matching_bytes(most, 0, threads)) // max(1, most * budget.FEATURE_BYTES)
+    return pycolmap.FeatureMatchingOptions(num_threads=threads), max(2, least, min(HELD_AT_MOST, held))
+
+
+def check_mapping(database: Path, memory: int) -> None:
+    """Refuse to place photos by more matches than fit.
+
+    Raises:
+        MemoryBudgetError: With the memory it takes.
+    """
+    _, features, photos, matches = _counts(database)
+    need = budget.mapping_bytes(features, matches)
+    what = f"{photos:,} photos with {features:,} features and {matches:,} matches"
+    budget.require(_STAGE, need, memory, what, "fewer photos, or smaller max-features")
+
+
+def _counts(database: Path) -> tuple[int, int, int, int]:
+    """Most features of a photo, features of all, photos, and verified matches, as the database has them."""
+    with closing(sqlite3.connect(database)) as connection:
+        most, features, photos = connection.execute(
+            "SELECT COALESCE(MAX(rows), 0), COALESCE(SUM(rows), 0), COUNT(*) FROM keypoints"
+        ).fetchone()
+        (matches,) = connection.execute("SELECT COALESCE(SUM(rows), 0) FROM two_view_geometries").fetchone()
+    return int(most), int(features), int(photos), int(matches)
+
+
+def _cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,416 @@
+"""Points to start from: those of the capture, triangulated under its poses, or drawn inside its views.
+
+Starting from triangulated points instead of random ones is worth several dB on real photos, so a capture that
+has poses but no points gets them here: SIFT features, matches between views that look at the same place,
+kept where they obey the epipolar geometry of the known poses, and triangulated with the poses fixed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lexsplat.captures.capture import Scene, View
+from lexsplat.captures.readers.camera_files import MAX_COORDINATE
+from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.progress import Event, Listener, silent
+
+if TYPE_CHECKING:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+STAGE = "triangulate"
+ENOUGH_POINTS = 200
+"""With fewer triangulated points than this the reconstruction starts better from random ones."""
+
+MAX_SIDE = 1000
+"""Longest side in pixels of the images in which features are sought: larger ones cost time, not points."""
+
+MAX_FEATURES = 4096
+NEIGHBOURS = 16
+"""How many other views each view is matched with."""
+
+
+@dataclass(frozen=True)
+class InitialPoints:
+    """Where Gaussians start.
+
+    Args:
+        points: Positions ``[P, 3]``, world.
+        colors: RGB in 0..1 ``[P, 3]``.
+        origin: ``"capture"``, ``"triangulated"`` or ``"random"``.
+        note: One line for people: how many points and how they were made.
+    """
+
+    points: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    origin: str
+    note: str
+
+
+def initial_points(
+    scene: Scene,
+    *,
+    count: int = 20_000,
+    seed: int = 0,
+    cache_dir: Path | None = None,
+    memory: int = budget.DEFAULT_MEMORY,
+    listener: Listener = silent,
+) -> InitialPoints:
+    """The best points to start a reconstruction from.
+
+    Points of the capture where there are enough; else points triangulated under the known poses; as the last
+    resort ``count`` random points that several cameras see.
+
+    Args:
+        scene: The capture.
+        count: How many random points.
+        seed: Seed of all that is random here.
+        cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
+        memory: Bytes of host memory that a triangulation may take.
+        listener: Hears the progress of the triangulation.
+
+    Raises:
+        CaptureError: If an image cannot be read.
+    """
+    if len(scene.points) >= ENOUGH_POINTS:
+        note = f"{len(scene.points):,} points of the capture"
+        return InitialPoints(scene.points, scene.point_colors, "capture", note)
+    points, colors = triangulate(scene, cache_dir=cache_dir, seed=seed, memory=memory, listener=listener)
+    if len(points) >= ENOUGH_POINTS:
+        return InitialPoints(points, colors, "triangulated", f"{len(points):,} points triangulated")
+    found = len(points)
+    points, colors = random_points_in_frusta(scene, count, np.random.default_rng(seed))
+    note = f"{len(points):,} random points (only {found} could be triangulated)"
+    return InitialPoints(points, colors, "random", note)
+
+
+def triangulate(
+    scene: Scene,
+    *,
+    cache_dir: Path | None = None,
+    seed: int = 0,
+    memory: int = budget.DEFAULT_MEMORY,
+    listener: Listener = silent,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points matched between training views and triangulated under their poses.
+
+    Held-out views take no part.
+
+    Args:
+        scene: The capture.
+        cache_dir: Folder for the result, keyed by photos, cameras and settings; None keeps nothing.
+        seed: Seed for pycolmap.
+        memory: Bytes of host memory that may be taken: decides how much is done at once, and no result.
+        listener: Hears of stage ``"triangulate"``: one unit an image, then matching and triangulation.
+
+    Returns:
+        Points ``[P, 3]`` float32, world, and their colours ``[P, 3]`` float32 in 0..1; P may be 0.
+
+    Raises:
+        CaptureError: If an image cannot be read.
+    """
+    views = scene.train_views
+    empty = np.zeros((0, 3), np.float32)
+    if len(views) < 2:
+        return empty, empty
+    cached = None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.npz"
+    if cached is not None and (known := _read_cache(cached)) is not None:
+        return known
+    total = len(views) + 3
+    with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
+        folder = Path(temporary)
+        sizes = []
+        masked = any(view.ignore_path is not None for view in views)
+        for done, view in enumerate(views):
+            listener(Event(STAGE, done, total))
+            sizes.append(_write_image(view, folder / "images" / _file_name(done)))
+            if masked:
+                _write_mask(view, sizes[-1], folder / "masks" / f"{_file_name(done)}.png")
+        points, colors = _run_pycolmap(views, sizes, folder, seed, memory, total, listener)
+    listener(Event(STAGE, total, total, {"points": len(points)}))
+    if cached is not None:
+        _write_cache(cached, points, colors)
+    return points, colors
+
+
+def random_points_in_frusta(
+    scene: Scene, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Random points where the cameras look, with the colours of the photos.
+
+    Every point lies on a ray through a random pixel of a random training view, at 0.2 to 2 times the distance
+    at which the cameras' optical axes meet; of ten candidates the one that most views see is kept, so that
+    points gather where the views overlap.
+
+    Args:
+        scene: The capture.
+        count: How many points.
+        rng: The source of randomness.
+
+    Returns:
+        Points ``[count, 3]`` float32, world, and colours ``[count, 3]`` float32 in 0..1.
+
+    Raises:
+        CaptureError: If an image cannot be read.
+        ValueError: If ``count`` is negative.
+    """
+    if count < 0:
+        raise ValueError(f"count must not be negative, got {count}")
+    views = scene.train_views
+    owners = np.sort(rng.integers(0, len(views), count))
+    pixels = rng.random((count, 10, 2))
+    fractions = rng.uniform(0.2, 2.0, (count, 10))
+    distance = _focus_distance(views, scene.extent)
+    points = np.zeros((count, 3))
+    colors = np.zeros((count, 3))
+    for index, view in enumerate(views):
+        mine = np.flatnonzero(owners == index)
+        if not len(mine):
+            continue
+        camera = view.camera
+        size = np.array([camera.width, camera.height])
+        rays = np.ones((len(mine), 10, 3))
+        rays[..., :2] = (pixels[mine] * size - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]
+        rays *= (fractions[mine] * distance)[..., None]
+        candidates = (rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        best = _views_that_see(views, candidates.reshape(-1, 3)).reshape(-1, 10).argmax(1)
+        rows = np.arange(len(mine))
+        points[mine] = candidates[rows, best]
+        small = view.load_image((min(camera.width, 256), min(camera.height, 256)))
+        where = (pixels[mine][rows, best] * [small.shape[1], small.shape[0]]).astype(int)
+        colors[mine] = small[where[:, 1], where[:, 0]]
+    return points.astype(np.float32), colors.astype(np.float32)
+
+
+def _focus_distance(views: tuple[View, ...], extent: float) -> float:
+    """Median distance of the cameras to the point nearest to all optical axes, in world units.
+
+    Axes that meet nowhere in front of the cameras (a corridor, a single view) give three times the extent.
+    """
+    origins = np.stack([view.camera.position for view in views])
+    axes = np.stack([view.camera.forward for view in views])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    focus = np.linalg.lstsq(across.sum(0), (across @ origins[..., None]).sum(0)[:, 0], rcond=1e-3)[0]
+    depth = ((focus - origins) * axes).sum(1)
+    in_front = np.median(depth)
+    return float(in_front) if in_front > 0.1 * extent and (depth > 0).mean() > 0.8 else 3.0 * extent
+
+
+def _views_that_see(views: tuple[View, ...], points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """In how many views each point ``[P, 3]`` falls inside the image."""
+    counts = np.zeros(len(points), dtype=np.int64)
+    for view in views:
+        camera = view.camera
+        local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        depth = np.maximum(local[:, 2:], 1e-9)
+        x, y = (local[:, :2] / depth * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]).T
+        counts += (local[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return counts
+
+
+def matching_pairs(views: tuple[View, ...], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
+    """Which views to match: each with those that look most alike, by the known poses.
+
+    The cost of a pair is the distance of the cameras over the distance of what they look at, plus twice the
+    angle between their axes in radians; pairs that look apart by more than 90 degrees are left out.
+
+    Returns:
+        Pairs of indices, the lower first, sorted.
+    """
+    origins = np.stack([view.camera.position for view in views])
+    axes = np.stack([view.camera.forward for view in views])
+    extent = float(np.linalg.norm(origins - origins.mean(0), axis=1).max()) or 1.0
+    apart = np.linalg.norm(origins[:, None] - origins[None], axis=2) / _focus_distance(views, extent)
+    angles = np.arccos(np.clip(axes @ axes.T, -1.0, 1.0))
+    cost = apart + 2.0 * angles
+    cost[angles > np.pi / 2] = np.inf
+    np.fill_diagonal(cost, np.inf)
+    pairs = set()
+    for index in range(len(views)):
+        nearest = np.argsort(cost[index], kind="stable")[:neighbours]
+        pairs |= {(min(index, int(j)), max(index, int(j))) for j in nearest if np.isfinite(cost[index, j])}
+    return sorted(pairs)
+
+
+def _file_name(index: int) -> str:
+    return f"{index:06d}.png"
+
+
+def _write_image(view: View, path: Path) -> tuple[int, int]:
+    """Write the undistorted photo where pycolmap reads it; gives its width and height."""
+    width, height = view.capture_size
+    shrink = max(1.0, max(width, height) / MAX_SIDE)
+    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = (view.load_image(size) * 255.0).round().astype(np.uint8)
+    Image.fromarray(pixels).save(path, compress_level=1)
+    return size
+
+
+def _write_mask(view: View, size: tuple[int, int], path: Path) -> None:
+    """Write what pycolmap may find features in: white where nothing is masked, else it would leave the image out."""
+    valid = view.load_valid(size)
+    pixels = np.full((size[1], size[0]), 255, np.uint8) if valid is None else valid.astype(np.uint8) * 255
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, compress_level=1)
+
+
+def _run_pycolmap(
+    views: tuple[View, ...],
+    sizes: list[tuple[int, int]],
+    folder: Path,
+    seed: int,
+    memory: int,
+    total: int,
+    listener: Listener,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Features, matches, verification under the known poses, triangulation."""
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    database, images = folder / "database.db", folder / "images"
+    done, names = len(views), [_file_name(index) for index in range(len(views))]
+    listener(Event(STAGE, done, total))
+    pycolmap.Database.open(database).close()
+    # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
+    masked = any(view.ignore_path is not None for view in views)
+    if masked:
+        reader.mask_path = folder / "masks"
+    pycolmap.import_images(database, images, pycolmap.CameraMode.PER_IMAGE, names, reader)
+    largest = max(sizes, key=lambda size: size[0] * size[1])
+    threads = extraction_threads(largest, MAX_SIDE, MAX_FEATURES, memory, masked=masked)
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
+    extraction.sift.max_num_features = MAX_FEATURES
+    pycolmap.extract_features(
+        database,
+        images,
+        names,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    known = _known_reconstruction(database, views, sizes)
+    listener(Event(STAGE, done + 1, total))
+    pairs = folder / "pairs.txt"
+    pairs.write_text("\n".join(f"{names[a]} {names[b]}" for a, b in matching_pairs(views)) + "\n")
+    matching, held = matching_plan(database, memory)
+    matching.skip_geometric_verification = True
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=pairs, block_size=held)
+    pycolmap.match_image_pairs(database, matching, pairing, device=pycolmap.Device.cpu)
+    # Matches are kept where they obey the epipolar geometry of the known poses; nothing is estimated.
+    pycolmap.guided_geometric_verification(known, database)
+    check_mapping(database, memory)
+    listener(Event(STAGE, done + 2, total))
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
+    (folder / "model").mkdir()
+    try:
+        result = pycolmap.triangulate_points(known, database, images, folder / "model", options=options)
+    except ValueError as error:
+        raise CaptureError(
+            views[0].image_path.parent,
+            expected="images that can be matched",
+            found=str(error),
+            remedy="check that the poses belong to these photos",
+        ) from error
+    return _points_of(result)
+
+
+def _known_reconstruction(
+    database_path: Path, views: tuple[View, ...], sizes: list[tuple[int, int]]
+) -> pycolmap.Reconstruction:
+    """The views' cameras and poses under the ids of the database, whose cameras are set to them."""
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    known = pycolmap.Reconstruction()
+    database = pycolmap.Database.open(database_path)
+    try:
+        entries = {entry.name: entry for entry in database.read_all_images()}
+        for index, (view, (width, height)) in enumerate(zip(views, sizes)):
+            entry = entries[_file_name(index)]
+            K = view.camera.resized(width, height).K
+            camera = pycolmap.Camera(
+                camera_id=entry.camera_id,
+                model="PINHOLE",
+                width=width,
+                height=height,
+                params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+                has_prior_focal_length=True,
+            )
+            database.update_camera(camera)
+            known.add_camera_with_trivial_rig(camera)
+            image = pycolmap.Image(name=entry.name, camera_id=entry.camera_id, image_id=entry.image_id)
+            known.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.camera.viewmat[:3]))
+    finally:
+        database.close()
+    return known
+
+
+def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Finite points of a pycolmap reconstruction, by id, and their colours."""
+    ordered = [model.points3D[key] for key in sorted(model.points3D)]
+    points = np.array([point.xyz for point in ordered], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([point.color for point in ordered], dtype=np.float64).reshape(-1, 3) / 255.0
+    keep = np.isfinite(points).all(1) & (np.abs(points) < MAX_COORDINATE).all(1)
+    return points[keep].astype(np.float32), colors[keep].astype(np.float32)
+
+
+@contextmanager
+def quiet_pycolmap(seed: int) -> Iterator[None]:
+    """pycolmap with a fixed seed and without its log: what goes wrong is told as an error of ours."""
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _cache_key(views: tuple[View, ...], seed: int) -> str:
+    """A hash of all that the points depend on; photos count by name, size and time of change."""
+    digest = hashlib.sha256(json.dumps([1, MAX_SIDE, MAX_FEATURES, NEIGHBOURS, seed]).encode())
+    for view in views:
+        status = view.image_path.stat()
+        lens = [view.lens.model, view.lens.width, view.lens.height, *view.lens.params]
+        about: list[Any] = [view.name, status.st_size, status.st_mtime_ns, lens, view.background]
+        if view.ignore_path is not None:
+            mask = view.ignore_path.stat()
+            about += [mask.st_size, mask.st_mtime_ns]
+        digest.update(json.dumps(about).encode())
+        digest.update(view.camera.viewmat.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Points kept by an earlier call; None where there are none or the file is damaged."""
+    try:
+        with np.load(file, allow_pickle=False) as content:
+            points, colors = content["points"], content["colors"]
+    except Exception:  # numpy's readers raise nearly everything on damaged archives; the points are made anew
+        return None
+    sound = points.ndim == 2 and points.shape[1:] == (3,) and points.shape == colors.shape
+    if not sound or not (np.isfinite(points).all() and np.isfinite(colors).all()):
+        return None
+    return points.astype(np.float32), colors.astype(np.float32)
+
+
+def _write_cache(file: Path, points: NDArray[np.float32], colors: NDArray[np.float32]) -> None:
+    """Keep points; the file appears whole or not at all."""
+    with atomic_path(file) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, points=points, colors=colors)

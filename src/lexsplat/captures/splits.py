@@ -1,0 +1,104 @@
+"""Which views are learned from and which are only measured on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+
+from lexsplat.captures.capture import stem_of
+from lexsplat.captures.readers.transforms_json import read_json
+from lexsplat.runtime.errors import CaptureError, FileFormatError
+
+SPLIT_FILE = "test_views.json"
+"""A list of image stems in the capture folder: the views to hold out."""
+
+
+def match_stem(stem: str, names: Iterable[str]) -> list[str]:
+    """The image names a stem can mean: those with this full stem, else those whose last part is this.
+
+    A full name with suffix counts as its own stem. More than one result means that the stem is ambiguous.
+    """
+    names = list(names)
+    exact = [name for name in names if stem in (name, stem_of(name))]
+    if exact:
+        return [stem] if stem in exact else exact
+    return [name for name in names if stem_of(name).rpartition("/")[2] == stem]
+
+
+def choose_test_names(
+    names: Sequence[str],
+    *,
+    root: Path,
+    test_names: Sequence[str] | None,
+    listed: Sequence[str] | None,
+    annotated: Collection[str],
+    test_every: int,
+) -> tuple[tuple[str, ...], list[str]]:
+    """The names of the views to hold out, sorted, and warnings.
+
+    The first of these that is there decides: ``test_names`` (given by the caller), ``test_views.json`` in the
+    capture, the split of the camera files (``listed``), views with truth (``annotated``), every
+    ``test_every``-th view counting from the first.
+
+    Raises:
+        CaptureError: If a held-out name matches no view, or nothing is left to learn from.
+        ValueError: If ``test_every`` is negative or 1.
+    """
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {test_every}")
+    file = root / SPLIT_FILE
+    warnings: list[str] = []
+    if test_names is not None:
+        chosen = _resolve(test_names, names, root)
+    elif file.is_file():
+        chosen = _resolve(_read_split(file), names, file)
+    elif listed is not None:
+        # The camera files may list images without a file; those were warned about already.
+        chosen = set(listed) & set(names)
+    else:
+        chosen = set(annotated)
+        if chosen and len(chosen) == len(names):
+            warnings.append(f"{root}: every view has masks; every {test_every}th is held out")
+            chosen = set()
+        if not chosen and test_every and len(names) > 1:
+            chosen = set(names[::test_every])
+    if len(chosen) >= len(names):
+        raise CaptureError(
+            file if file.is_file() else root,
+            expected="at least one view to learn from",
+            found=f"all {len(names)} views held out for testing",
+            remedy="hold out fewer views",
+        )
+    return tuple(sorted(chosen)), warnings
+
+
+def mask_folders(segmentations: Path) -> list[Path]:
+    """The folders below ``segmentations`` that hold masks, sorted."""
+    return sorted({path.parent for path in segmentations.rglob("*.png") if path.parent != segmentations})
+
+
+def _resolve(stems: Sequence[str], names: Collection[str], origin: Path) -> set[str]:
+    chosen = set()
+    for stem in stems:
+        matches = match_stem(stem, names)
+        if len(matches) != 1:
+            raise CaptureError(
+                origin,
+                expected="names of views to hold out",
+                found=f"{stem!r}, which is {'no view' if not matches else ' and '.join(matches[:3])}",
+                remedy="name views as in the image folder, with their subfolder",
+            )
+        chosen.add(matches[0])
+    return chosen
+
+
+def _read_split(file: Path) -> list[str]:
+    content = read_json(file)
+    if not isinstance(content, list) or not all(isinstance(stem, str) for stem in content):
+        raise FileFormatError(
+            file,
+            expected="a JSON list of image stems",
+            found=repr(content)[:60],
+            remedy='write it like ["0001", "0009"]',
+        )
+    return content

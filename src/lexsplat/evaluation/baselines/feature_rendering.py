@@ -1,0 +1,150 @@
+"""Full-dimensional features on Gaussians: averaged from views, rendered a few channels at a time.
+
+With A the blending weights of a view (pixels by Gaussians), what is rendered is A F. Its transpose spreads a feature
+map over the Gaussians, and the sum over views divided by the weights is the average of what each Gaussian shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering import PreparedView, accumulate_weights, prepare, render, spread
+
+CHANNELS = 32
+"""Feature channels rendered in one pass."""
+
+MIN_WEIGHT = 0.01
+"""A Gaussian with less weight than this over all views, in pixels, was never seen."""
+
+
+class TrainingViews:
+    """Training views at the resolution of their feature maps, with their projections kept as memory allows.
+
+    Args:
+        gaussians: The geometry.
+        cameras: The training views by name.
+        cells: Width and height of the feature maps by view name.
+        scale: Pixels rendered for each cell along a side; never more than the camera has.
+        memory_bytes: Bound for the projections that are kept.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        cameras: Mapping[str, Camera],
+        cells: Callable[[str], tuple[int, int]],
+        *,
+        scale: int = 1,
+        memory_bytes: int = 1 << 30,
+    ) -> None:
+        self.gaussians = gaussians.detach()
+        self.names = sorted(cameras)
+        self._cameras, self._cells, self._scale = cameras, cells, scale
+        self._limit, self._kept = memory_bytes, dict[str, PreparedView]()
+
+    def prepared(self, name: str) -> tuple[Camera, PreparedView]:
+        """The small camera of a view and its projection."""
+        if name in self._kept:
+            return self._kept[name].camera, self._kept[name]
+        full, (cols, rows) = self._cameras[name], self._cells(name)
+        width, height = min(full.width, cols * self._scale), min(full.height, rows * self._scale)
+        camera = full.resized(width, height)
+        view = prepare(self.gaussians, camera)
+        if sum(kept.nbytes for kept in self._kept.values()) + view.nbytes <= self._limit:
+            self._kept[name] = view
+        return camera, view
+
+    def render(self, name: str, features: Tensor) -> Tensor:
+        """Channels ``[N, C]`` rendered to ``[H, W, C]``, with gradients to the channels."""
+        camera, view = self.prepared(name)
+        return render(self.gaussians, camera, features=features, color=False, prepared=view).features
+
+    def order(self, steps: int, generator: torch.Generator) -> Iterator[str]:
+        """Names for a number of steps: all views in random order, again and again."""
+        queue: list[int] = []
+        for _ in range(steps):
+            if not queue:
+                queue = torch.randperm(len(self.names), generator=generator).tolist()
+            yield self.names[queue.pop()]
+
+
+def resized_map(values: Tensor, camera: Camera) -> Tensor:
+    """A map ``[h, w, C]`` at the size of a camera, bilinear, cell centres kept."""
+    if values.shape[:2] == (camera.height, camera.width):
+        return values
+    planes = values.permute(2, 0, 1)[None]
+    planes = F.interpolate(planes, (camera.height, camera.width), mode="bilinear", align_corners=False)
+    return planes[0].permute(1, 2, 0)
+
+
+def average_features(
+    views: TrainingViews, map_of: Callable[[str, Camera], Tensor], *, tell: Callable[[int], None]
+) -> tuple[Tensor, Tensor]:
+    """Mean of what each Gaussian shows, over all training views, weighted by how much of a pixel it is.
+
+    Args:
+        views: The training views.
+        map_of: The map ``[H, W, C]`` of a view at the size of its small camera.
+        tell: Hears how many views are done.
+
+    Returns:
+        Features ``[N, C]``, 0 where never seen, and weights ``[N]`` in pixels.
+    """
+    total: Tensor | None = None
+    weights = torch.zeros(len(views.gaussians), device=views.gaussians.device)
+    for done, name in enumerate(views.names, start=1):
+        camera, prepared = views.prepared(name)
+        found = spread(views.gaussians, camera, map_of(name, camera).to(weights.device), prepared)
+        total = found if total is None else total + found
+        weights += accumulate_weights(views.gaussians, camera, prepared=prepared)
+        tell(done)
+    if total is None:
+        raise ValueError("features need at least one training view")
+    seen = weights >= MIN_WEIGHT
+    return torch.where(seen[:, None], total / weights.clamp_min(MIN_WEIGHT)[:, None], 0.0), weights
+
+
+@torch.no_grad()
+def render_cosines(
+    gaussians: Gaussians, camera: Camera, features: Tensor, texts: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Cosines of rendered features with texts, without holding a feature map.
+
+    Args:
+        gaussians: The geometry.
+        camera: The view.
+        features: ``[N, D]``, rendered `CHANNELS` at a time.
+        texts: Unit vectors ``[T, D]``.
+
+    Returns:
+        Cosines ``[H, W, T]``, 0 where nothing is rendered, and alpha ``[H, W]``.
+    """
+    prepared = prepare(gaussians, camera)
+    device = gaussians.device
+    products = torch.zeros(camera.height, camera.width, len(texts), device=device)
+    squares = torch.zeros(camera.height, camera.width, 1, device=device)
+    alpha = torch.zeros(camera.height, camera.width, device=device)
+    texts = texts.to(device, torch.float32)
+    for start in range(0, features.shape[1], CHANNELS):
+        part = features[:, start : start + CHANNELS].contiguous()
+        found = render(gaussians, camera, features=part, color=False, prepared=prepared)
+        products += found.features @ texts[:, start : start + CHANNELS].T
+        squares += found.features.square().sum(-1, keepdim=True)
+        alpha = found.alpha
+    return (products / squares.sqrt().clamp_min(1e-12)).clamp(-1, 1), alpha
+
+
+def unit_texts(*texts: Tensor) -> list[Tensor]:
+    """Text embeddings ``[T, D]`` with unit rows."""
+    return [F.normalize(text.float(), dim=-1) for text in texts]
+
+
+def chunks(count: int, size: int = CHANNELS) -> Sequence[slice]:
+    """Ranges of at most ``size`` channels."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]

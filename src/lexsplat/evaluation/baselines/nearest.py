@@ -1,0 +1,57 @@
+"""No 3D: the 2D features of the very photo that is asked about, the sanity line.
+
+What the features of one photo can tell without any scene. It looks at the held-out photo, so it is no method for
+novel views; a 3D method that stays below it loses more by its geometry than it gains from the other views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from lexsplat.evaluation.baselines.feature_rendering import resized_map, unit_texts
+from lexsplat.features import FeatureMap
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
+
+
+class ViewFeatures:
+    """Feature maps found by their camera's pose.
+
+    Args:
+        cameras: All views by name, at any size.
+        maps: Dense features by view name.
+    """
+
+    method = "nearest"
+
+    def __init__(self, cameras: Mapping[str, Camera], maps: Mapping[str, FeatureMap]) -> None:
+        self._names = {camera.viewmat.tobytes(): name for name, camera in cameras.items()}
+        self._maps = maps
+
+    def relevancy(
+        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
+    ) -> Tensor:
+        """Maps ``[P, H, W]``: relevancy of the cells, enlarged.
+
+        Raises:
+            ValueError: If no view has this camera's pose.
+        """
+        name = self._names.get(camera.viewmat.tobytes())
+        if name is None:
+            raise ValueError("features of a view are known only from the poses of the capture")
+        positives, negatives = unit_texts(positives, negatives)
+        clip = torch.nn.functional.normalize(self._maps[name].clip.float(), dim=-1)
+        found = pairwise_relevancy(clip @ positives.T, clip @ negatives.T, config.temperature)
+        return resized_map(found, camera).permute(2, 0, 1).clamp(0, 1).contiguous()
+
+    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
+        """None: there is nothing in 3D."""
+        return None
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The maps of all views in half precision: what would have to be kept to answer."""
+        return {name: self._maps[name].clip.half() for name in self._names.values()}

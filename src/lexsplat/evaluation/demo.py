@@ -1,0 +1,59 @@
+"""``lexsplat demo``: the whole system on a scene and encoders that ship with the package."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from lexsplat.codebook import CodebookConfig
+from lexsplat.evaluation.scenes import evaluate_scene
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig, LanguageMethod
+from lexsplat.runtime.progress import Listener, silent
+from lexsplat.scenes.scene import open_scene
+
+SceneName = Literal["tabletop", "second"]
+
+SCENES = Path(__file__).resolve().parents[1] / "demo" / "scenes"
+"""Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
+
+DEMO_CONFIG = BuildConfig(clip="embedded", dino="embedded", codebook=CodebookConfig(num_codes=256))
+"""Settings of the demo; docs/results.md says on which views which setting was chosen."""
+
+
+def demo_capture(scene: SceneName = "tabletop") -> Path:
+    """The folder of an embedded capture."""
+    return SCENES / scene
+
+
+def run_demo(
+    output: Path,
+    *,
+    scene: SceneName = "tabletop",
+    method: LanguageMethod | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    seed: int = 0,
+    iterations: int | None = None,
+    listener: Listener = silent,
+) -> dict[str, Any]:
+    """Build the embedded scene and evaluate it on its held-out views.
+
+    Args:
+        output: The scene folder to make or to go on with.
+        scene: Which embedded capture.
+        method: How language gets into the Gaussians; none takes the default.
+        device: Where to compute.
+        seed: Seed of all randomness.
+        iterations: Reconstruction steps; none takes what suits the device.
+        listener: Told how far each stage is.
+
+    Returns:
+        The content of ``metrics.json``.
+    """
+    config = replace(
+        DEMO_CONFIG, method=method or DEMO_CONFIG.method, device=device, seed=seed, iterations=iterations
+    )
+    build(demo_capture(scene), output, config, listener=listener)
+    opened = open_scene(output, device=device)
+    return evaluate_scene(opened, title="lexsplat demo", listener=listener)

@@ -1,0 +1,93 @@
+"""Small pictures of an evaluation, kept while it runs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from lexsplat.evaluation import ViewPictures
+from lexsplat.queries.heatmaps import overlay_heatmap, overlay_mask
+
+
+@dataclass
+class Gallery:
+    """Collects small pictures while a scene is evaluated: pass `add` as the observer.
+
+    Args:
+        width: Width of a picture in pixels.
+        views: ``{view: {"photo" | "render": JPEG}}``.
+        cases: ``{(view, prompt): {"heatmap" | "mask" | "truth": JPEG}}``.
+    """
+
+    width: int = 300
+    views: dict[str, dict[str, bytes]] = field(default_factory=dict)
+    cases: dict[tuple[str, str], dict[str, bytes]] = field(default_factory=dict)
+
+    def add(self, pictures: ViewPictures) -> None:
+        """Keep a view and all its prompts, small."""
+        self.views[pictures.name] = {
+            "photo": self._jpeg(_to_bytes(pictures.photo)),
+            "render": self._jpeg(_to_bytes(pictures.image)),
+        }
+        for prompt, relevancy in pictures.relevancy.items():
+            image, photo = (
+                _fit(_to_bytes(side), relevancy.shape) for side in (pictures.image, pictures.photo)
+            )
+            self.cases[pictures.name, prompt] = {
+                "heatmap": self._jpeg(overlay_heatmap(image, relevancy)),
+                "mask": self._jpeg(overlay_mask(image, relevancy >= pictures.thresholds[prompt])),
+                "truth": self._jpeg(overlay_mask(photo, pictures.truth[prompt], color=(64, 200, 140))),
+            }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every JPEG by name, for safetensors."""
+        stored = {
+            f"view/{kind}/{view}": jpeg for view, kinds in self.views.items() for kind, jpeg in kinds.items()
+        }
+        for (view, prompt), kinds in self.cases.items():
+            stored |= {f"case/{kind}/{view}\n{prompt}": jpeg for kind, jpeg in kinds.items()}
+        return {name: torch.frombuffer(bytearray(jpeg), dtype=torch.uint8) for name, jpeg in stored.items()}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Gallery:
+        """The inverse of `tensors`.
+
+        Raises:
+            ValueError: If a name is not one of ours.
+        """
+        gallery = cls()
+        for name, tensor in tensors.items():
+            part, kind, place = name.split("/", 2)
+            jpeg = tensor.numpy().tobytes()
+            if part == "view":
+                gallery.views.setdefault(place, {})[kind] = jpeg
+            else:
+                view, prompt = place.split("\n", 1)
+                gallery.cases.setdefault((view, prompt), {})[kind] = jpeg
+        return gallery
+
+    def _jpeg(self, picture: NDArray[np.uint8]) -> bytes:
+        height = max(1, round(picture.shape[0] * self.width / picture.shape[1]))
+        image = Image.fromarray(picture).resize(
+            (self.width, height), Image.Resampling.LANCZOS, reducing_gap=3.0
+        )
+        buffer = io.BytesIO()
+        image.save(buffer, format="JPEG", quality=82)
+        return buffer.getvalue()
+
+
+def _to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return (np.clip(picture, 0, 1) * 255).round().astype(np.uint8)
+
+
+def _fit(picture: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    if picture.shape[:2] == shape:
+        return picture
+    return np.asarray(Image.fromarray(picture).resize((shape[1], shape[0]), Image.Resampling.BICUBIC))

@@ -1,0 +1,287 @@
+"""Numbers as text: for the terminal, as CSV and as LaTeX rows in the columns of the paper's Table 1."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lexsplat.runtime.files import atomic_path
+
+COLUMNS = ("mIoU", "mPA", "mP", "mAP")
+
+_PAPER = {
+    "psnr": ("PSNR", 2), "ssim": ("SSIM", 3), "lpips": ("LPIPS", 3), "mPA": ("mPA", 3), "mP": ("mP", 3),
+    "mIoU": ("mIoU", 3), "mAP": ("mAP", 3), "fps": ("FPS", 1), "host_bytes": ("host memory", -1),
+    "gpu_bytes": ("GPU memory", -1), "storage_bytes": ("storage", -1), "training_seconds": ("training", -2),
+}  # fmt: skip
+"""Columns of the paper's Table 1: key of a row, heading, digits (-1 bytes, -2 seconds)."""
+
+_HONEST = {
+    "mIoU_fixed": ("mIoU 0.5", 3), "mIoU_oracle": ("oracle", 3), "localization": ("localisation", 3),
+    "language_seconds": ("language", -2),
+}  # fmt: skip
+"""Columns that the paper does not have."""
+
+_OTHERS = {
+    "official_mIoU": ("official mIoU", 3), "official_mPA": ("mPA", 3), "official_mP": ("mP", 3),
+    "official_mAP": ("mAP", 3), "lerf_2d_mIoU": ("lerf-2d mIoU", 3), "lerf_2d_localization": ("localisation", 3),
+    "lerf_3d_mIoU": ("lerf-3d mIoU", 3), "lerf_3d_acc_25": ("Acc@0.25", 3), "lerf_3d_acc_50": ("Acc@0.5", 3),
+}  # fmt: skip
+
+OTHER_PROTOCOLS = tuple(_OTHERS)
+"""Columns of other people's protocols."""
+
+_HEADINGS = {**_PAPER, **_HONEST, **_OTHERS}
+
+_MEASURED_ONCE = {
+    "fps", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
+}  # fmt: skip
+"""Columns whose small differences are those of the machine: none of them is named the best."""
+
+Row = Mapping[str, Any]
+"""One line of a table: "name", and numbers by key; several runs give a list of numbers."""
+
+
+def protocol_rows(language: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """The lines of the language table: a name and its numbers in `COLUMNS`."""
+    strict = language["strict"]
+    rows = [
+        ("automatic threshold", {**strict["auto"], "mAP": strict["mAP"]}),
+        ("fixed threshold", strict["fixed"]),
+        ("oracle threshold", strict["oracle"]),
+    ]
+    names = {"official": "official protocol", "lerf_2d": "lerf-2d protocol", "lerf_3d": "lerf-3d protocol"}
+    return rows + [(name, language[key]) for key, name in names.items() if language.get(key)]
+
+
+def prompts_worst_first(prompts: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Rows of "per_prompt", the worst first."""
+    return sorted(prompts.items(), key=lambda item: (item[1]["IoU_auto"] or 0.0, item[0]))
+
+
+def format_table(result: Mapping[str, Any]) -> str:
+    """The content of ``metrics.json`` as a table for the terminal."""
+    quality, speed, size = result["quality"], result["speed"], result["size"]
+    psnr, ssim, lpips = number(quality["psnr"], 2), number(quality["ssim"]), number(quality["lpips"])
+    lines = [f"PSNR {psnr} dB   SSIM {ssim}   LPIPS {lpips}"]
+    if result["language"]:
+        lines += _language_lines(result["language"])
+    stored = f"{size_text(size['gaussian_bytes'])}; language {size_text(size['language_bytes'])}"
+    memory = size_text(size["peak_rss_bytes"])
+    lines += ["", f"{size['gaussians']:,} Gaussians, {stored}; peak memory {memory}"]
+    if speed["render_fps"]:
+        fps, query = number(speed["render_fps"], 1), number(speed["query_ms"], 1)
+        lines.append(f"{fps} frames/s with language, {query} ms a prompt and view")
+    return "\n".join(lines)
+
+
+def _language_lines(language: Mapping[str, Any]) -> list[str]:
+    strict = language["strict"]
+    lines = ["", f"{'':<22}" + "".join(f"{name:>8}" for name in COLUMNS)]
+    for name, row in protocol_rows(language):
+        lines.append(f"{name:<22}" + "".join(f"{number(row.get(key)):>8}" for key in COLUMNS))
+    lines.append(f"{'localisation':<22}{number(strict['localization']):>8}")
+    if language.get("lerf_2d"):
+        lines.append(f"{'  lerf-2d':<22}{number(language['lerf_2d']['localization']):>8}")
+    lines.append("")
+    kinds = language.get("per_kind") or {}
+    for kind, row in kinds.items():
+        numbers = (row["mIoU_auto"], row["mAP"], row["localization"])
+        cells = "".join(f"{number(value):>8}" for value in numbers)
+        lines.append(f"{kind + ' prompts':<22}{cells}{row['prompts']:>7}")
+    lines += ["(by kind: mIoU auto, mAP, localisation, prompts)", ""] if kinds else []
+    prompts = language["per_prompt"]
+    width = min(40, max(len(prompt) for prompt in prompts))
+    lines.append(f"{'prompt':<{width}}{'IoU':>8}{'AP':>8}{'loc':>8}{'views':>7}")
+    for prompt, row in prompts_worst_first(prompts):
+        numbers = (row["IoU_auto"], row["AP"], row["localization"])
+        cells = "".join(f"{number(value):>8}" for value in numbers)
+        lines.append(f"{prompt[:width]:<{width}}{cells}{row['views']:>7}")
+    return lines
+
+
+# Rows to compare
+
+
+def table_rows(
+    results: Mapping[str, Mapping[str, Any] | Sequence[Mapping[str, Any]]],
+) -> list[dict[str, Any]]:
+    """Rows for `write_rows` from contents of ``metrics.json``.
+
+    Args:
+        results: By the name of the row: one result, or one for each seed.
+
+    Returns:
+        Dictionaries with "name", "runs" and for every number the list of its values over the runs.
+    """
+    rows = []
+    for name, found in results.items():
+        runs = [found] if isinstance(found, Mapping) else list(found)
+        columns: dict[str, list[float | None]] = {}
+        for run in runs:
+            for key, value in _numbers(run).items():
+                columns.setdefault(key, []).append(value)
+        rows.append({"name": name, "runs": len(runs), **columns})
+    return rows
+
+
+def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
+    quality, speed, size = result["quality"], result["speed"], result["size"]
+    language = result["language"] or {}
+    strict = language.get("strict") or {}
+    auto = strict.get("auto") or {}
+    numbers: dict[str, float | None] = {name: quality.get(name) for name in ("psnr", "ssim", "lpips")}
+    numbers |= {name: auto.get(name) for name in ("mPA", "mP", "mIoU")}
+    numbers |= {"mAP": strict.get("mAP"), "localization": strict.get("localization")}
+    for kind in ("fixed", "oracle"):
+        numbers |= {f"{name}_{kind}": (strict.get(kind) or {}).get(name) for name in ("mPA", "mP", "mIoU")}
+    for protocol in ("official", "lerf_2d", "lerf_3d"):
+        numbers |= {f"{protocol}_{name}": v for name, v in (language.get(protocol) or {}).items()}
+    seconds = speed.get("stage_seconds") or {}
+    language_stages = [value for stage, value in seconds.items() if stage not in ("reconstruct", "features")]
+    return numbers | {
+        "fps": speed.get("render_fps"),
+        "query_ms": speed.get("query_ms"),
+        "host_bytes": size.get("peak_rss_bytes"),
+        "gpu_bytes": size.get("peak_gpu_bytes"),
+        "storage_bytes": size.get("language_bytes"),
+        "training_seconds": sum(seconds.values()) if seconds else None,
+        "language_seconds": sum(language_stages) if language_stages else None,
+    }
+
+
+def row_cells(rows: Sequence[Row], keys: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
+    """What of some rows is shown: the keys that are known, and a text for each of them in each row.
+
+    Args:
+        rows: As `table_rows` makes them.
+        keys: Which numbers; none takes the columns of the paper's Table 1 and ours.
+    """
+    shown = [key for key in keys or (*_PAPER, *_HONEST) if any(_known(row.get(key)) for row in rows)]
+    return shown, [[_cell(row.get(key), _HEADINGS[key][1]) for key in shown] for row in rows]
+
+
+def heading(key: str) -> str:
+    """What stands above a column."""
+    return _HEADINGS[key][0]
+
+
+def best_rows(rows: Sequence[Row], key: str) -> set[int]:
+    """Places of the rows with the best mean of a score; empty when all are alike, and for times and sizes."""
+    means = {place: mean_and_spread(row.get(key))[0] for place, row in enumerate(rows)}
+    known = {place: mean for place, mean in means.items() if mean is not None}
+    if len(set(known.values())) < 2 or key in _MEASURED_ONCE:
+        return set()
+    best = (min if key == "lpips" else max)(known.values())
+    return {place for place, mean in known.items() if mean == best}
+
+
+def format_rows(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
+    """Rows as a table for the terminal, mean and spread where there were several runs."""
+    shown, texts_of_rows = row_cells(rows, keys)
+    cells = [["", *map(heading, shown)]]
+    cells += [[str(row["name"]), *line] for row, line in zip(rows, texts_of_rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+    lines = []
+    for line in cells:
+        texts = [f"{line[0]:<{widths[0]}}", *(f"{text:>{w}}" for text, w in zip(line[1:], widths[1:]))]
+        lines.append("  ".join(texts))
+    return "\n".join(lines)
+
+
+def write_rows(folder: Path, stem: str, rows: Sequence[Row], keys: Sequence[str] = ()) -> None:
+    """Write rows as ``STEM.csv`` (every number, mean and spread) and ``STEM.tex`` (a table in LaTeX).
+
+    The LaTeX table has the columns of the paper's Table 1, or ``keys`` of them, and needs ``booktabs``.
+    """
+    for suffix, text in ((".csv", csv_text(rows)), (".tex", latex_text(rows, keys))):
+        with atomic_path(folder / f"{stem}{suffix}") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """Rows as CSV: for each number its mean, and its spread (standard deviation) where there were several runs."""
+    keys = list(dict.fromkeys(key for row in rows for key in row if key not in ("name", "runs")))
+    several = any(row.get("runs", 1) > 1 for row in rows)
+    columns = [name for key in keys for name in ((key, f"{key}_std") if several else (key,))]
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["name", "runs", *columns])
+    for row in rows:
+        values: list[Any] = [row["name"], row.get("runs", 1)]
+        for key in keys:
+            mean, spread = mean_and_spread(row.get(key))
+            values += ["" if v is None else f"{v:.6g}" for v in ((mean, spread) if several else (mean,))]
+        writer.writerow(values)
+    return stream.getvalue()
+
+
+def latex_text(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
+    """Rows as a LaTeX table."""
+    shown, texts_of_rows = row_cells(rows, keys or tuple(_PAPER))
+    lines = [
+        "% mPA, mP and mIoU at the automatic threshold, strict protocol",
+        rf"\begin{{tabular}}{{l{'c' * len(shown)}}}",
+        r"\toprule",
+        " & ".join(["Method", *map(heading, shown)]) + r" \\",
+        r"\midrule",
+    ]
+    for row, line in zip(rows, texts_of_rows):
+        texts = [text.replace("±", r"$\pm$") for text in line]
+        lines.append(" & ".join([_latex(str(row["name"])), *texts]) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def mean_and_spread(values: Any) -> tuple[float | None, float | None]:
+    """Mean and standard deviation (of a sample) of the numbers that are known; None where there are too few."""
+    known = _known(values)
+    if not known:
+        return None, None
+    return float(np.mean(known)), float(np.std(known, ddof=1)) if len(known) > 1 else None
+
+
+def _known(values: Any) -> list[float]:
+    listed = values if isinstance(values, (list, tuple)) else [values]
+    return [float(value) for value in listed if value is not None and math.isfinite(value)]
+
+
+def _cell(values: Any, digits: int) -> str:
+    mean, spread = mean_and_spread(values)
+    if digits == -1:
+        return size_text(None if mean is None else int(mean))
+    if digits == -2:
+        return "-" if mean is None else f"{mean:.0f} s"
+    text = number(mean, digits)
+    return text if spread is None else f"{text} ± {number(spread, digits)}"
+
+
+def _latex(text: str) -> str:
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    special |= {character: f"\\{character}" for character in "&%$#_{}"}
+    return "".join(special.get(character, character) for character in text)
+
+
+# Single values
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with a fixed count of digits, "-" where it is not known."""
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def size_text(count: int | None) -> str:
+    """A count of bytes in the largest fitting unit (powers of 1000)."""
+    if count is None:
+        return "-"
+    value, unit = float(count), "B"
+    for larger in ("KB", "MB", "GB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"

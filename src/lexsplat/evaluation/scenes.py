@@ -1,0 +1,133 @@
+"""Measure a scene folder on its held-out views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lexsplat.captures.capture import Scene
+from lexsplat.captures.ground_truth.layouts import load_annotations
+from lexsplat.captures.ground_truth.prompt_lists import PromptList
+from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
+from lexsplat.evaluation.protocols import PROTOCOLS
+from lexsplat.evaluation.report.gallery import Gallery
+from lexsplat.evaluation.report.page import write_report
+from lexsplat.evaluation.report.tables import table_rows, write_rows
+from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.runtime.environment import machine_facts
+from lexsplat.runtime.errors import CaptureError, SceneFolderError
+from lexsplat.runtime.files import atomic_path, read_json, write_json
+from lexsplat.runtime.progress import Listener, silent
+from lexsplat.scenes.answers import file_name
+from lexsplat.scenes.previous import require_current
+from lexsplat.scenes.scene import SearchableScene
+
+
+def evaluate_scene(
+    scene: SearchableScene,
+    *,
+    capture: Path | None = None,
+    masks: Path | None = None,
+    prompt_list: PromptList | None = None,
+    protocols: Sequence[str] = PROTOCOLS,
+    title: str = "lexsplat",
+    listener: Listener = silent,
+) -> dict[str, Any]:
+    """Measure a scene on its held-out views.
+
+    Writes metrics.json, metrics.csv, metrics.tex, report.html and heatmaps/ into its folder.
+
+    Args:
+        scene: An opened scene folder.
+        capture: Where the photos are, if not where the build found them.
+        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
+        protocols: Names out of `evaluation.PROTOCOLS`.
+        title: Heading of the report.
+        listener: Told how far it is.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        SceneFolderError: If the photos are not there.
+        CaptureError: If a photo or a mask cannot be used.
+    """
+    if scene.folder is None:
+        raise ValueError("only a scene opened from a folder can be evaluated")
+    folder, record = scene.folder, scene.folder.record
+    require_current(folder)
+    if folder.is_shipped:
+        raise SceneFolderError(
+            "demo",
+            expected="a scene folder of your own, for the results",
+            found="the scene that ships with lexsplat",
+            remedy="make your own copy of it with: lexsplat demo",
+        )
+    photos = load_photos(scene, capture)
+    truth = load_annotations(photos, masks, prompt_list)
+    gallery = Gallery()
+    metrics = evaluate(
+        photos,
+        scene.gaussians,
+        scene.field,
+        scene.encode_text,
+        EvaluationConfig(query=scene.query, protocols=tuple(protocols)),
+        masks=truth.masks,
+        boxes=truth.boxes,
+        observer=gallery.add,
+        listener=listener,
+        stage_seconds=folder.stage_seconds(),
+        stored_bytes={
+            "language_bytes": folder.bytes_on_disk(folder.language_path),
+            "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
+        },
+        settings={
+            **record.get("config", {}),
+            "truth": truth.origin_facts(prompt_list) if truth.masks else None,
+        },
+        machine=machine_facts(),
+        prompt_kinds=_prompt_kinds(photos.root),
+    )
+    result = metrics.to_json()
+    write_json(folder.root / "metrics.json", result)
+    write_rows(folder.root, "metrics", table_rows({title: result}))
+    write_report(folder.root / "report.html", metrics, gallery, title=title)
+    for (view, prompt), pictures in gallery.cases.items():
+        stem = Path(view).with_suffix("")
+        path = folder.root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(pictures["heatmap"])
+    return result
+
+
+def _prompt_kinds(root: Path) -> dict[str, str]:
+    """``prompts.json`` of a capture, ``{prompt: kind}``, where there is one."""
+    path = root / "prompts.json"
+    if not path.is_file():
+        return {}
+    content = read_json(path)
+    if not isinstance(content, dict) or not all(isinstance(kind, str) for kind in content.values()):
+        raise CaptureError(path, expected="an object of prompt: kind", found=type(content).__name__)
+    return content
+
+
+def load_photos(scene: SearchableScene, capture: Path | None) -> Scene:
+    """The capture of a scene, with the views, sizes and split of the build.
+
+    Raises:
+        SceneFolderError: If the photos are not where the build found them and no other place is given.
+    """
+    if scene.folder is None:
+        raise ValueError("only a scene opened from a folder knows its photos")
+    photos = reload_capture(scene.folder, capture)
+    missing = set(scene.views) - set(photos.views)
+    if missing:
+        raise SceneFolderError(
+            photos.root,
+            expected=f"the {len(scene.views)} photos of the build",
+            found=f"{len(missing)} missing, such as {min(missing)}",
+            remedy="put them back or build again",
+        )
+    return photos

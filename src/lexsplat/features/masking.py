@@ -1,0 +1,34 @@
+"""What masked pixels leave of feature maps: cells without any pixel that counts are zero.
+
+A pixel that is black in ``masks/`` is filled with the photo's mean color before anything looks at the photo
+(`lexsplat.captures.View.load_image`).
+"""
+
+from __future__ import annotations
+
+import torch
+
+from lexsplat.captures import Scene
+from lexsplat.features.cache import FeatureMap, FeatureMaps
+
+
+def without_masked_cells(maps: FeatureMaps, scene: Scene) -> FeatureMaps:
+    """Feature maps whose cells without any pixel that counts are zero, which the codebook passes over.
+
+    Args:
+        maps: Maps by view name.
+        scene: The views.
+    """
+    if all(scene.views[name].ignore_path is None for name in maps if name in scene.views):
+        return maps
+
+    def load(name: str) -> FeatureMap:
+        found = maps[name]
+        height, width = found.clip.shape[:2]
+        share = scene.views[name].valid_share((width, height))
+        if share is None:
+            return found
+        counts = torch.from_numpy(share > 0)[..., None].to(found.clip.device)
+        return FeatureMap(found.clip * counts, None if found.dino is None else found.dino * counts)
+
+    return FeatureMaps(list(maps), load, 0, source=maps)

@@ -1,0 +1,185 @@
+"""Which way is up, and upright oriented boxes around points.
+
+A box stands upright: one of its axes is gravity's, the other two are turned so that its footprint is smallest.
+Things in a room stand upright, and such a box is stable where a free one would tumble between views of a ball.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.geometry.cameras import Camera
+
+_ANGLES = np.radians(np.arange(0.0, 90.0, 2.0))
+_SAMPLE = 4096  # points that decide how a box is turned
+
+
+class Box(NamedTuple):
+    """An oriented box.
+
+    Args:
+        center: Its middle ``[3]``, world units.
+        axes: Its directions as rows ``[3, 3]``, of unit length, right-handed; the last one points up.
+        half_sizes: Half of its extent along each of the axes ``[3]``, world units.
+    """
+
+    center: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    half_sizes: NDArray[np.float64]
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """The eight corners ``[8, 3]``."""
+        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(8, 3)
+        return np.asarray(self.center + (signs * self.half_sizes) @ self.axes, dtype=np.float64)
+
+    @property
+    def volume(self) -> float:
+        """Its volume in cubed world units."""
+        return float(np.prod(2 * self.half_sizes))
+
+    def contains(self, points: NDArray, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which points ``[M, 3]`` lie in it, or at most ``margin`` outside along an axis."""
+        local = np.abs((np.asarray(points) - self.center) @ self.axes.T)
+        return np.asarray((local <= self.half_sizes + margin).all(-1))
+
+
+@dataclass(frozen=True)
+class Up:
+    """The direction away from the ground.
+
+    Args:
+        direction: World direction ``[3]`` of unit length.
+        reliable: Whether the cameras say so with one voice; photos held at odd angles do not.
+    """
+
+    direction: NDArray[np.float64]
+    reliable: bool
+
+
+def gravity_up(cameras: Iterable[Camera]) -> Up:
+    """Up from how the photos were held.
+
+    People hold cameras level: their x axes lie in the horizontal plane, whatever the pitch. Up is therefore the
+    direction that is least along all x axes; where all cameras stand side by side and look the same way (their
+    x axes agree, so that a whole plane of directions would do) it is the mean of the images' up directions.
+
+    Raises:
+        ValueError: If there is no camera.
+    """
+    rotations = [camera.viewmat[:3, :3] for camera in cameras]
+    if not rotations:
+        raise ValueError("gravity needs at least one camera")
+    rights = np.stack([r[0] / np.linalg.norm(r[0]) for r in rotations])
+    mean_up = -np.stack([r[1] / np.linalg.norm(r[1]) for r in rotations]).mean(0)
+    values, vectors = np.linalg.eigh(rights.T @ rights / len(rights))
+    length = float(np.linalg.norm(mean_up))
+    if values[1] > 4 * values[0] + 0.02:
+        direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean_up >= 0 else -1.0)
+        return Up(direction, bool(values[0] < 0.05 and abs(direction @ mean_up) > 0.1))
+    if length < 1e-6:
+        return Up(np.array([0.0, 0.0, 1.0]), False)
+    return Up(mean_up / length, bool(length > 0.8))
+
+
+def fit_box(points: NDArray, up: NDArray, weights: NDArray | None = None, *, trim: float = 0.01) -> Box:
+    """The upright box with the smallest footprint that holds all but the outermost points.
+
+    Args:
+        points: ``[M, 3]``, M > 0, world units.
+        up: World direction of one axis ``[3]``.
+        weights: How much each point counts ``[M]``; all the same when left out.
+        trim: Share of the weight that may lie beyond each end of each axis, in 0..0.5.
+
+    Raises:
+        ValueError: If there is no point.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"points must be [M, 3] with M > 0, got {list(points.shape)}")
+    shares = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
+    first, second, upwards = upright_frame(up)
+    step = max(1, len(points) // _SAMPLE)
+    flat, flat_shares = points[::step], shares[::step]
+    plane = np.stack([flat @ first, flat @ second], 1)
+    areas = []
+    for angle in _ANGLES:
+        low, high = _ends(plane @ _turn(angle).T, flat_shares, trim)
+        areas.append(float(np.prod(high - low)))
+    smallest = min(areas)
+    # A ball has no direction: the first angle that is nearly as good keeps its box from spinning.
+    angle = next(a for a, area in zip(_ANGLES, areas) if area <= smallest * 1.02 + 1e-12)
+    turn = _turn(angle)
+    axes = np.stack([*(turn @ np.stack([first, second])), upwards])
+    low, high = _ends(points @ axes.T, shares, trim)
+    return Box(((low + high) / 2) @ axes, axes, (high - low) / 2)
+
+
+def upright_frame(up: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Two horizontal directions and up ``[3]`` each: right-handed, of unit length."""
+    upwards = np.asarray(up, dtype=np.float64)
+    upwards = upwards / np.linalg.norm(upwards)
+    start = np.eye(3)[int(np.abs(upwards).argmin())]
+    first = start - (start @ upwards) * upwards
+    first /= np.linalg.norm(first)
+    return first, np.cross(upwards, first), upwards
+
+
+def box_iou(first: Box, second: Box) -> float:
+    """Volume that two boxes share divided by the volume they cover, 0..1; exact for any two orientations."""
+    from scipy.optimize import linprog
+    from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+    if min(first.volume, second.volume) <= 0:
+        return 0.0
+    faces = []
+    for box in (first, second):
+        for axis, half in zip(box.axes, box.half_sizes):
+            middle = float(axis @ box.center)
+            faces += [[*axis, -middle - half], [*(-axis), middle - half]]
+    halfspaces = np.array(faces)
+    # The middle of the largest ball inside all faces: a point that is surely inside, if any is.
+    scale = float(max(first.half_sizes.max(), second.half_sizes.max()))
+    found = linprog(
+        [0, 0, 0, -1],
+        A_ub=np.hstack([halfspaces[:, :3], np.ones((len(faces), 1))]),
+        b_ub=-halfspaces[:, 3],
+        bounds=[(None, None)] * 3 + [(0, None)],
+    )
+    if not found.success or found.x[3] <= 1e-9 * scale:
+        return 0.0
+    try:
+        inside = HalfspaceIntersection(halfspaces, found.x[:3])
+        shared = float(ConvexHull(inside.intersections).volume)
+    except QhullError:  # thinner than Qhull can tell from a plane
+        return 0.0
+    return min(1.0, shared / (first.volume + second.volume - shared))
+
+
+def rotation_about(axis: NDArray, degrees: float) -> NDArray[np.float64]:
+    """The rotation ``[3, 3]`` by an angle about an axis ``[3]``, anticlockwise for who looks against the axis."""
+    from scipy.spatial.transform import Rotation
+
+    unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    return np.asarray(Rotation.from_rotvec(unit * np.radians(degrees)).as_matrix(), dtype=np.float64)
+
+
+def _turn(angle: float) -> NDArray[np.float64]:
+    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+
+def _ends(values: NDArray, weights: NDArray, trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weighted quantiles ``trim`` and ``1 - trim`` of every column ``[M, C]``."""
+    order = np.argsort(values, axis=0)
+    ordered = np.take_along_axis(values, order, 0)
+    share = np.cumsum(weights[order], axis=0)
+    share = share / np.maximum(share[-1:], 1e-300)
+    low = (share < trim).sum(0).clip(0, len(values) - 1)
+    high = (share < 1 - trim).sum(0).clip(0, len(values) - 1)
+    columns = np.arange(values.shape[1])
+    return ordered[low, columns], ordered[high, columns]

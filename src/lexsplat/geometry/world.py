@@ -1,0 +1,144 @@
+"""What the numbers of a scene mean in the world: which way is up, and how long its unit is.
+
+Photos alone leave both open. Up is estimated from how the cameras were held and can be given; a scene has a length in
+metres once one distance in it is known (``lexsplat scale``). Both are kept in ``scene.json`` as ``world``::
+
+    {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "user"},
+     "metres_per_unit": 0.41 | null, "poses": "..."}
+
+"poses" is a fingerprint of the cameras: what a user has said holds as long as they stay where they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lexsplat.geometry.boxes import Up, gravity_up
+from lexsplat.geometry.cameras import Camera
+from lexsplat.runtime.errors import SceneFolderError
+
+Source = Literal["cameras", "user"]
+
+
+@dataclass(frozen=True)
+class World:
+    """Up and scale of a scene.
+
+    Args:
+        up: The direction away from the ground.
+        source: Who says so: the cameras, or the user.
+        metres_per_unit: Metres that one world unit is long; None where nobody has said.
+
+    Raises:
+        ValueError: If the scale is not positive and finite.
+    """
+
+    up: Up
+    source: Source = "cameras"
+    metres_per_unit: float | None = None
+
+    def __post_init__(self) -> None:
+        scale = self.metres_per_unit
+        if scale is not None and not 0 < scale < math.inf:
+            raise ValueError(f"metres_per_unit must be positive and finite, got {scale}")
+
+    @classmethod
+    def of_cameras(cls, cameras: Iterable[Camera]) -> World:
+        """Up from how the photos were held (z where there are none), no scale."""
+        cameras = list(cameras)
+        return cls(gravity_up(cameras) if cameras else Up(np.array([0.0, 0.0, 1.0]), False))
+
+    def with_up(self, direction: Iterable[float]) -> World:
+        """The same with another up, as the user says.
+
+        Raises:
+            ValueError: If the direction is not three finite numbers, or all are 0.
+        """
+        vector = np.asarray(list(direction), dtype=np.float64)
+        length = float(np.linalg.norm(vector))
+        if vector.shape != (3,) or not 0 < length < math.inf:
+            raise ValueError(f"up must be three numbers that are not all 0, got {vector.tolist()}")
+        return replace(self, up=Up(vector / length, True), source="user")
+
+    def metres(self, length: float) -> float | None:
+        """A length in world units in metres; None where the scale is not known."""
+        return None if self.metres_per_unit is None else float(length) * self.metres_per_unit
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for ``scene.json`` and for people's programs."""
+        direction = [round(float(v), 6) + 0.0 for v in self.up.direction]
+        return {
+            "up": {"direction": direction, "reliable": self.up.reliable, "from": self.source},
+            "metres_per_unit": self.metres_per_unit,
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> World:
+        """The inverse of `to_json`.
+
+        Raises:
+            SceneFolderError: If the content is not what `to_json` writes.
+        """
+        try:
+            up, scale = content["up"], content["metres_per_unit"]
+            source: Source = "user" if up["from"] == "user" else "cameras"
+            world = cls(Up(np.array([0.0, 0.0, 1.0]), False)).with_up(float(v) for v in up["direction"])
+            world = replace(world, up=replace(world.up, reliable=bool(up["reliable"])), source=source)
+            return replace(world, metres_per_unit=None if scale is None else float(scale))
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise SceneFolderError(
+                "world in scene.json",
+                expected="an up direction and metres_per_unit",
+                found=str(error),
+                remedy="take it out of the file, or run: lexsplat build again",
+            ) from error
+
+
+def world_of(record: Mapping[str, Any], cameras: Mapping[str, Camera]) -> World:
+    """What is known of the world of a scene.
+
+    Args:
+        record: The content of its ``scene.json``.
+        cameras: Its cameras by name; they say what is up where nothing is stored for just these.
+
+    Raises:
+        SceneFolderError: If what is stored is damaged.
+    """
+    stored = record.get("world")
+    if isinstance(stored, Mapping) and stored.get("poses") == _poses_of(cameras):
+        return World.from_json(stored)
+    return World.of_cameras(cameras.values())
+
+
+def stored_world(world: World, cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    """What goes into ``scene.json`` under ``world``; `world_of` reads it."""
+    return {**world.to_json(), "poses": _poses_of(cameras)}
+
+
+def _poses_of(cameras: Mapping[str, Camera]) -> str:
+    digest = hashlib.blake2b(digest_size=12)
+    for name in sorted(cameras):
+        digest.update(name.encode("utf-8", "surrogatepass"))
+        digest.update((np.round(cameras[name].viewmat, 6) + 0.0).tobytes())
+    return digest.hexdigest()
+
+
+def parse_vector(text: str) -> tuple[float, float, float]:
+    """Three finite numbers from "x,y,z".
+
+    Raises:
+        ValueError: If the text is not that.
+    """
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"three numbers like 0,0,1 are needed, got {text!r}")
+    return numbers[0], numbers[1], numbers[2]

@@ -1,0 +1,97 @@
+"""Index maps as the training reads them: a code for each pixel, also from a map coarser than the image.
+
+Cell j of w covers the pixels whose centres lie in [j W / w, (j + 1) W / w).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.captures.capture import View
+from lexsplat.codebook import MAX_CODES
+
+MASKED_CODE = MAX_CODES
+"""Index of a pixel that takes no part in any loss: above those of every codebook."""
+
+
+def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -> Tensor:
+    """Codes of the cells in which the centres of pixels lie.
+
+    Args:
+        code_map: Index map ``[h, w]``.
+        height: Of the image the pixels belong to.
+        width: Of that image.
+        pixels: Flat indices into it, row by row ``[M]``.
+
+    Returns:
+        Codes ``[M]`` int64.
+    """
+    rows, columns = code_map.shape
+    # (p + 1/2) h / H in integers, so that no rounding moves a pixel to the neighbouring cell.
+    row = (2 * (pixels // width) + 1) * rows // (2 * height)
+    column = (2 * (pixels % width) + 1) * columns // (2 * width)
+    return code_map[row, column].long()
+
+
+def check_views(names: list[str], code_maps: Mapping[str, object]) -> None:
+    """Raises ValueError if there is no view or one has no index map."""
+    if not names:
+        raise ValueError("no training view")
+    missing = [name for name in names if name not in code_maps]
+    if missing:
+        raise ValueError(
+            f"no index map for {', '.join(missing[:5])}{' and more' if len(missing) > 5 else ''}"
+        )
+
+
+class MaskedCodeMaps(Mapping[str, Any]):
+    """Index maps of training views in which masked pixels have the code `MASKED_CODE`.
+
+    Maps of views without a mask are handed out as they are, ``[h, w]`` uint8; those of masked views at the size of
+    the view's camera, ``[H, W]`` int16, made at every call from a bit a pixel.
+
+    Args:
+        code_maps: Index maps by view name.
+        views: The views, with their masks.
+
+    Raises:
+        CaptureError: If a mask cannot be read.
+    """
+
+    def __init__(self, code_maps: Mapping[str, NDArray[np.uint8]], views: Mapping[str, View]) -> None:
+        self._code_maps = code_maps
+        self._bits: dict[str, tuple[NDArray[np.uint8], tuple[int, int]]] = {}
+        for name in code_maps:
+            valid = views[name].load_valid() if name in views else None
+            if valid is not None and not valid.all():
+                self._bits[name] = (np.packbits(valid), (valid.shape[0], valid.shape[1]))
+
+    def __getitem__(self, name: str) -> NDArray[np.integer]:
+        codes = self._code_maps[name]
+        if name not in self._bits:
+            return codes
+        bits, (height, width) = self._bits[name]
+        valid = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
+        # The cell in which a pixel's centre lies, in integers so that none is moved by rounding.
+        rows = (2 * np.arange(height) + 1) * codes.shape[0] // (2 * height)
+        columns = (2 * np.arange(width) + 1) * codes.shape[1] // (2 * width)
+        return np.where(valid, codes[rows[:, None], columns].astype(np.int16), np.int16(MASKED_CODE))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._code_maps)
+
+    def __len__(self) -> int:
+        return len(self._code_maps)
+
+
+def mark_masked_cells(code_map: NDArray[np.uint8], view: View, num_codes: int) -> NDArray[np.uint8]:
+    """An index map ``[h, w]`` as it is stored: cells without any pixel that counts hold 255 where that is no code."""
+    share = view.valid_share((code_map.shape[1], code_map.shape[0]))
+    if share is None or num_codes >= MAX_CODES:
+        return code_map
+    return np.where(share > 0, code_map, np.uint8(255)).astype(np.uint8)

@@ -1,0 +1,147 @@
+"""A lifted field: a sparse distribution over codes on every Gaussian, rendered as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from lexsplat.codebook import Codebook
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields.rendering import (
+    check_table,
+    codebook_tensors,
+    render_chunks,
+    require,
+    stored_codebook,
+)
+
+
+class LiftedField:
+    """A sparse distribution over codes on every Gaussian; rendering it is linear and needs no decoder.
+
+    Where a view is not covered, the probabilities of its pixels sum to the coverage: the rest is nothing.
+
+    Args:
+        codebook: The discrete feature space S.
+        codes: Code indices ``[N, T]`` uint8, the likeliest first (T = 4 by default).
+        weights: Their probabilities ``[N, T]``; rows sum to 1, or to 0 for a Gaussian about which nothing is
+            known.
+        uncertainties: u_G ``[N]`` in 0..1.
+        method: Name under which results are reported.
+        dropped: Share of the weight of all codes that lay outside the T codes kept, 0 to 1: what their sparsity
+            costs.
+    """
+
+    def __init__(
+        self,
+        codebook: Codebook,
+        codes: Tensor,
+        weights: Tensor,
+        uncertainties: Tensor,
+        *,
+        method: str = "lifted",
+        dropped: float = 0.0,
+    ) -> None:
+        if codes.ndim != 2 or codes.dtype != torch.uint8 or weights.shape != codes.shape:
+            raise ValueError(
+                f"codes [N, T] uint8 and weights [N, T] expected, got {codes.dtype} {list(codes.shape)}, "
+                f"{list(weights.shape)}"
+            )
+        if not weights.is_floating_point() or not uncertainties.is_floating_point():
+            raise ValueError(
+                f"weights and uncertainties must be floats, got {weights.dtype}, {uncertainties.dtype}"
+            )
+        if uncertainties.shape != codes.shape[:1]:
+            raise ValueError(f"uncertainties must be [{len(codes)}], got {list(uncertainties.shape)}")
+        if codes.numel() and int(codes.max()) >= codebook.num_codes:
+            raise ValueError(f"code {int(codes.max())} is not in a codebook of {codebook.num_codes}")
+        self.codebook = codebook
+        self.codes = codes
+        self.weights = weights.float()
+        self._uncertainties = uncertainties.float()
+        self.method = method
+        self.dropped = dropped
+
+    @property
+    def uncertainties(self) -> Tensor:
+        """u_G ``[N]`` in 0..1."""
+        return self._uncertainties
+
+    def code_probabilities(self) -> Tensor:
+        """The distributions without their sparsity ``[N, K]``."""
+        return self._dense(slice(0, self.codebook.num_codes))
+
+    @torch.no_grad()
+    def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        """Blended distributions ``[H, W, K]``, rendered `RENDER_CHANNELS` codes at a time."""
+        return render_chunks(gaussians, camera, self.codebook.num_codes, self._dense)
+
+    def scores(self, table: Tensor) -> Tensor:
+        """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``."""
+        check_table(table, self.codebook)
+        table = table.to(self.weights)
+        total = self.weights.new_zeros(len(self.codes), table.shape[1])
+        for column in range(self.codes.shape[1]):
+            total.addcmul_(self.weights[:, column, None], table[self.codes[:, column].long()])
+        return total
+
+    @torch.no_grad()
+    def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
+        """The rendering of `scores`: ``[K, P]`` to ``[H, W, P]``, one channel a prompt."""
+        scores = self.scores(table)
+        return render_chunks(
+            gaussians, camera, scores.shape[1], lambda columns: scores[:, columns].contiguous()
+        )
+
+    def _dense(self, codes: slice) -> Tensor:
+        """Columns of the distribution for a range of codes ``[N, k]``."""
+        width = codes.stop - codes.start
+        dense = self.weights.new_zeros(len(self.codes), width + 1)
+        for column in range(self.codes.shape[1]):
+            index = self.codes[:, column].long() - codes.start
+            index = torch.where((index >= 0) & (index < width), index, width)
+            dense.scatter_add_(1, index[:, None], self.weights[:, column, None])
+        return dense[:, :width].contiguous()
+
+    def select(self, index: Tensor) -> LiftedField:
+        """The rows of some Gaussians; the codebook is the same."""
+        return LiftedField(
+            self.codebook,
+            self.codes[index],
+            self.weights[index],
+            self._uncertainties[index],
+            method=self.method,
+            dropped=self.dropped,
+        )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything by name, for safetensors; the codebook under ``codebook.``."""
+        own = {"codes": self.codes, "weights": self.weights, "uncertainties": self._uncertainties}
+        return {name: value.contiguous() for name, value in own.items()} | codebook_tensors(self.codebook)
+
+    def metadata(self) -> dict[str, str]:
+        """What is not a tensor."""
+        return {"kind": "lifted", "method": self.method, "dropped": f"{self.dropped:.6g}"}
+
+    @classmethod
+    def from_tensors(
+        cls, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
+    ) -> LiftedField:
+        """The inverse of `tensors` and `metadata`.
+
+        Raises:
+            ValueError: If a tensor is missing or of the wrong shape.
+        """
+        require(tensors, ("codes", "weights", "uncertainties"))
+        metadata = metadata or {}
+        return cls(
+            stored_codebook(tensors),
+            tensors["codes"],
+            tensors["weights"],
+            tensors["uncertainties"],
+            method=metadata.get("method", "lifted"),
+            dropped=float(metadata.get("dropped", "0")),
+        )

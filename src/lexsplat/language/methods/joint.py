@@ -1,0 +1,142 @@
+"""Language trained together with geometry, from the first step on, as the authors' released code does it.
+
+The paper trains language on finished geometry, which is the default here. Trained together, every step on a
+view is followed by a language step on the same view; language never reaches geometry either way, and when
+density control copies, splits or removes a Gaussian, its language goes with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.codebook import Codebook
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.code_maps import check_views
+from lexsplat.language.fields import TrainedField
+from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.trainer import EmbeddingTrainer
+from lexsplat.reconstruction import EVENT_EVERY, STAGE, Reconstructor
+from lexsplat.reconstruction.adam import below_prefix, with_prefix
+from lexsplat.runtime.checkpoints import Checkpoint
+from lexsplat.runtime.divergence import KEEP_EVERY, Guard
+from lexsplat.runtime.progress import Event, Listener, silent
+
+
+class JointTrainer:
+    """A reconstruction with its language beside it, step by step.
+
+    Args:
+        reconstructor: At its start.
+        cameras: The training views by name.
+        code_maps: Index maps by view name.
+        codebook: The discrete feature space S.
+        config: Settings of the language training; its number of steps is that of the reconstruction.
+        seed: Of the initial field and of all samples.
+
+    Raises:
+        ValueError: If there is no view, or a view has no index map.
+    """
+
+    def __init__(
+        self,
+        reconstructor: Reconstructor,
+        cameras: Mapping[str, Camera],
+        code_maps: Mapping[str, NDArray[np.uint8]],
+        codebook: Codebook,
+        config: EmbeddingConfig,
+        *,
+        seed: int = 0,
+    ) -> None:
+        check_views(sorted(cameras), code_maps)
+        self.reconstructor, self.code_maps, self.codebook, self.seed = (
+            reconstructor,
+            code_maps,
+            codebook,
+            seed,
+        )
+        self.config = replace(config, iterations=reconstructor.config.iterations)
+        self.cameras = {name: camera.downscaled(config.render_downscale) for name, camera in cameras.items()}
+        self.language = EmbeddingTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
+        self._losses = {"loss": float("nan")}
+
+    @property
+    def done(self) -> bool:
+        """Whether all iterations have run."""
+        return self.reconstructor.done
+
+    def step(self) -> dict[str, float]:
+        """One iteration of both on one view; returns the losses of the language, on a GPU those that were read last.
+
+        Raises:
+            TrainingError: If a loss is no longer finite.
+        """
+        self.reconstructor.step()
+        gaussians = self.reconstructor.gaussians()
+        if self.reconstructor.origins is not None:
+            self.language.replace_gaussians(gaussians, self.reconstructor.origins)
+        self.language.gaussians = gaussians
+        name = self.reconstructor.last_view
+        losses = self.language.step(self.cameras[name], self.code_maps[name])
+        done = self.reconstructor.steps_done
+        # Reading waits for a GPU, so there only as often as the reconstruction reads its own loss.
+        if self.reconstructor.device.type == "cpu" or done % EVENT_EVERY == 0 or self.done:
+            self._losses = {key: float(value) for key, value in losses.items()}
+            self.language.check_loss(self._losses["loss"])
+        return self._losses
+
+    @property
+    def rate_factor(self) -> float:
+        """Factor of all learning rates (`lexsplat.runtime.divergence`)."""
+        return self.reconstructor.rate_factor
+
+    @rate_factor.setter
+    def rate_factor(self, factor: float) -> None:
+        self.reconstructor.rate_factor = self.language.rate_factor = factor
+
+    def damage(self) -> str:
+        """What is wrong with the parameters; nothing where all is well."""
+        return self.reconstructor.damage() or self.language.damage()
+
+    def run(self, listener: Listener = silent, checkpoint: Checkpoint | None = None) -> None:
+        """Run the iterations that are left."""
+        total = self.reconstructor.config.iterations
+        guard = Guard(self, "joint training", every=KEEP_EVERY[self.reconstructor.device.type])
+        losses = {"loss": float("nan")}
+        with nullcontext() if checkpoint is None else checkpoint.guarding():
+            while not self.done:
+                with guard:
+                    losses = self.step()
+                    guard.after_step(self.done)
+                    if checkpoint is not None:
+                        checkpoint.after_step(self)
+                done = self.reconstructor.steps_done
+                if done % EVENT_EVERY == 0 or self.done:
+                    metrics = {**self.reconstructor.metrics, "language": losses["loss"]}
+                    listener(Event(STAGE, done, total, metrics))
+
+    def result(self) -> tuple[Gaussians, TrainedField]:
+        """The present Gaussians and their language."""
+        return self.reconstructor.gaussians(), self.language.field
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything needed to go on bit for bit."""
+        geometry = with_prefix("geometry/", self.reconstructor.state_dict())
+        return {**geometry, **with_prefix("language/", self.language.state_dict())}
+
+    def load_state_dict(self, state: dict[str, Tensor], /) -> None:
+        """The inverse of `state_dict`, for a trainer made with the same inputs.
+
+        Raises:
+            ValueError: If the state does not fit.
+        """
+        self.reconstructor.load_state_dict(below_prefix("geometry/", state))
+        gaussians = self.reconstructor.gaussians()
+        self.language = EmbeddingTrainer(gaussians, self.codebook, self.config, seed=self.seed)
+        self.language.load_state_dict(below_prefix("language/", state))

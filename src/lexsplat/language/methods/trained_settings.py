@@ -1,0 +1,112 @@
+"""Settings of the language training, with those of the paper and of the authors' code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from lexsplat.language.losses import SmoothingWeight, UncertaintyForm
+
+
+@dataclass(frozen=True)
+class EmbeddingConfig:
+    """Settings of the language training. Defaults suit a CPU; `as_in_paper` and `as_released` give the
+    others.
+
+    Args:
+        iterations: Steps, one view each (paper: 30,000).
+        pixel_sample: Pixels of a step that enter the cross-entropy, drawn at random; 0 takes the full map
+            (paper).
+        render_downscale: Views are rendered this many times smaller than their cameras.
+        semantics_lr: Learning rate of s_G (paper: 0.001).
+        uncertainty_lr: Of the logits of u (paper: 0.001; authors' code: 0.05).
+        decoder_lr: Of D_MLP (paper: 0.001).
+        smoothing_lr: Of the smoothing MLP (paper: 0.001).
+        decoder_weight_decay: Of D_MLP (paper: 0; authors' code: 1e-5).
+        final_lr_factor: Learning rates fall exponentially to this share of themselves (paper: 1, constant).
+        lambda_ce: Of Eq. 12.
+        lambda_u: Of Eq. 12.
+        lambda_s: Of Eq. 15.
+        lambda_smo: Of Eq. 15.
+        min_smoothing_weight: w_s of Eq. 14.
+        use_uncertainty: Off is the paper's ablation "w/o u_G": Eq. 9 in place of Eq. 10 to 12.
+        use_smoothing: Off is the paper's ablation "w/o MLP".
+        uncertainty_form: "linear" is Eq. 11, "log" the authors' code.
+        smoothing_weight: "max" is Eq. 14, "linear" the authors' code.
+        smoothing_squared: Squared norms in Eq. 14, as in the authors' code.
+        smoothing_every: Steps from one smoothing to the next (paper: 1; authors' code: 10).
+        smoothing_sample: Gaussians of a step that enter Eq. 14, drawn at random; 0 takes all (paper).
+        num_frequencies: Of the positional encoding in Eq. 13 (paper's table: 0).
+        normalise_rendering: Scale the rendered s to unit length before decoding (authors' code).
+        clip_decoder_grad: Largest norm of the decoder's gradient, which keeps a bad batch from ruining it;
+            None is off (paper).
+        memory_bytes: Bound for projections of views kept between steps; further views are projected anew each
+            time.
+    """
+
+    iterations: int = 1000
+    pixel_sample: int = 2048
+    render_downscale: float = 1.0
+    semantics_lr: float = 0.05
+    uncertainty_lr: float = 0.02
+    decoder_lr: float = 2e-3
+    smoothing_lr: float = 1e-3
+    decoder_weight_decay: float = 0.0
+    final_lr_factor: float = 0.1
+    lambda_ce: float = 1.0
+    lambda_u: float = 1.0
+    lambda_s: float = 1.0
+    lambda_smo: float = 1.0
+    min_smoothing_weight: float = 0.1
+    use_uncertainty: bool = True
+    use_smoothing: bool = True
+    uncertainty_form: UncertaintyForm = "linear"
+    smoothing_weight: SmoothingWeight = "max"
+    smoothing_squared: bool = False
+    smoothing_every: int = 1
+    smoothing_sample: int = 2048
+    num_frequencies: int = 0
+    normalise_rendering: bool = False
+    clip_decoder_grad: float | None = 1.0
+    memory_bytes: int = 1 << 30
+
+    def __post_init__(self) -> None:
+        if (
+            self.iterations < 0
+            or self.pixel_sample < 0
+            or self.smoothing_sample < 0
+            or self.smoothing_every < 1
+        ):
+            raise ValueError("iterations and samples must not be negative, smoothing_every must be positive")
+        if not self.render_downscale > 0 or not self.final_lr_factor > 0:
+            raise ValueError("render_downscale and final_lr_factor must be positive")
+
+    def as_in_paper(self) -> EmbeddingConfig:
+        """30,000 iterations over full maps with a constant learning rate of 0.001."""
+        return replace(
+            self,
+            iterations=30_000,
+            pixel_sample=0,
+            render_downscale=1.0,
+            semantics_lr=1e-3,
+            uncertainty_lr=1e-3,
+            decoder_lr=1e-3,
+            smoothing_lr=1e-3,
+            decoder_weight_decay=0.0,
+            final_lr_factor=1.0,
+            smoothing_every=1,
+            smoothing_sample=0,
+            clip_decoder_grad=None,
+        )
+
+    def as_released(self) -> EmbeddingConfig:
+        """What the authors' released code does where it differs from the paper."""
+        return replace(
+            self.as_in_paper(),
+            uncertainty_lr=0.05,
+            decoder_weight_decay=1e-5,
+            uncertainty_form="log",
+            smoothing_weight="linear",
+            smoothing_squared=True,
+            smoothing_every=10,
+            normalise_rendering=True,
+        )

@@ -1,0 +1,83 @@
+"""Where a scene comes from: what is recorded of it, and the fingerprints that tell when it has changed."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from lexsplat import __version__
+from lexsplat.captures import Scene
+from lexsplat.features.hub import content_hash, model_folder
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.world import parse_vector, stored_world, world_of
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.environment import versions
+from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.files import to_json
+from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.previous import keep_previous
+
+log = logging.getLogger("lexsplat")
+
+
+def write_provenance(folder: SceneFolder, scene: Scene, config: BuildConfig) -> str:
+    """Record where the scene comes from; returns a fingerprint of photos, cameras and split."""
+    views = {
+        name: (view.camera, "test" if name in scene.test_names else "train")
+        for name, view in scene.views.items()
+    }
+    sources = {name: file_hash(view.image_path) for name, view in scene.views.items()}
+    masks = {n: file_hash(v.ignore_path) for n, v in scene.views.items() if v.ignore_path is not None}
+    keep_previous(folder)
+    folder.save()
+    folder.write_cameras(views)
+    _write_world(folder, config.up, {name: camera for name, (camera, _) in views.items()})
+    if "images" not in folder.record:
+        folder.record["capture"] = str(Path(scene.root).resolve())
+    folder.record["config"] = {
+        **to_json(config),
+        "clip": model_place(config.clip),  # a scene is asked from other folders than it was built in
+        "dino": model_place(config.dino),
+    }
+    folder.record["provenance"] = {
+        "lexsplat": __version__,
+        "versions": versions(),
+        "seed": config.seed,
+        "sources": sources,
+    }
+    folder.record["warnings"] = list(scene.warnings)
+    folder.save()
+    cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
+    return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+
+
+def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
+    """Up from the cameras or the user; what was said of other cameras no longer holds."""
+    record = folder.record
+    world = world_of(record, cameras)
+    if up is not None:
+        world = world.with_up(parse_vector(up))
+    before = record.get("world")
+    if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
+        log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
+    record["world"] = stored_world(world, cameras)
+
+
+def model_place(name: str) -> str:
+    """The name of a model; of a folder its full path."""
+    folder = Path(name).expanduser()
+    return name if name in ("embedded", "none") or not folder.is_dir() else str(folder.resolve())
+
+
+def model_identity(name: str, kind: str) -> list[str]:
+    """The name of a model; for a folder also the size and time of its files, for ours the content."""
+    if name == "embedded":  # another version of lexsplat may come with others, with any time of writing
+        return [name, content_hash(model_folder(name, kind))]
+    folder = Path(name).expanduser()
+    if not folder.is_dir():
+        return [name]
+    files = sorted(file for file in folder.iterdir() if file.is_file())
+    if not files:
+        raise ModelError(name, expected="a model folder", found="an empty folder")
+    return [name, *(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)]

@@ -1,0 +1,1 @@
+"""Text in, relevancy, thresholds, presence and selections out (supplement B)."""

@@ -1,0 +1,62 @@
+"""Colour changes between photos: an affine map for each, fitted together with the scene."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lexsplat.reconstruction.adam import (
+    Adam,
+    below_prefix,
+    load_optimizer_tensors,
+    optimizer_tensors,
+    with_prefix,
+)
+
+
+class Exposures:
+    """An affine colour change ``[3, 4]`` for each training photo, the identity at the start.
+
+    Photos of one capture can differ in exposure and white balance; without this the difference becomes colour
+    that depends on the view, or haze.
+
+    Args:
+        count: Number of training photos.
+        rate: Learning rate.
+        device: Where images are rendered.
+    """
+
+    def __init__(self, count: int, rate: float, device: torch.device | str) -> None:
+        self.matrices = torch.nn.Parameter(torch.eye(3, 4, device=device).repeat(count, 1, 1))
+        self._optimizer = Adam(self.matrices, rate)
+
+    def apply(self, image: Tensor, index: int) -> Tensor:
+        """A rendered image ``[H, W, 3]`` as photo ``index`` would show it."""
+        matrix = self.matrices[index]
+        return image @ matrix[:, :3].T + matrix[:, 3]
+
+    def optimize(self) -> None:
+        """Step, then take the mean change out: the scene keeps the average exposure of all photos."""
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            identity = torch.eye(3, 4, device=self.matrices.device)
+            self.matrices.add_(identity - self.matrices.mean(0))
+
+    def state_tensors(self) -> dict[str, Tensor]:
+        """What `load_state_tensors` needs to go on bit for bit."""
+        state = with_prefix("optimizer/", optimizer_tensors(self._optimizer))
+        return {"matrices": self.matrices.detach().clone(), **state}
+
+    def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
+        """Go on where `state_tensors` was called.
+
+        Raises:
+            ValueError: If the state is of another number of photos.
+        """
+        if "matrices" not in tensors or tensors["matrices"].shape != self.matrices.shape:
+            raise ValueError("the state of the exposures does not fit")
+        with torch.no_grad():
+            self.matrices.copy_(tensors["matrices"])
+        self.matrices.grad = None
+        load_optimizer_tensors(self._optimizer, below_prefix("optimizer/", tensors))

@@ -1,0 +1,100 @@
+"""The photos a scene is trained on: loaded when first needed, kept as bytes while they fit into a budget.
+
+What fits stays, nothing is thrown out: views are visited in random order, where a cache that evicts the oldest would
+miss almost always. A photo is the same (8 bits a channel) whether it comes from the cache or from its file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.reconstruction.image_losses import SSIMTarget, ssim_target
+
+if TYPE_CHECKING:
+    from lexsplat.captures import View
+
+
+class TrainingImages:
+    """Photos and their SSIM moments by view name, for one image size at a time.
+
+    Args:
+        views: The views that may be asked for.
+        memory: Bytes of host or device memory that the cache may take. Photos and their masks go first; moments,
+            which are eight times as large and quick to recompute, take what is left.
+        shrink: Factor by which images are smaller than the views' cameras.
+        device: Where targets are needed.
+    """
+
+    def __init__(
+        self, views: Iterable[View], *, memory: int, shrink: float = 1.0, device: torch.device | str = "cpu"
+    ) -> None:
+        self._views = {view.name: view for view in views}
+        self._device = torch.device(device)
+        self._cameras = {
+            name: view.camera if shrink == 1.0 else view.camera.downscaled(shrink)
+            for name, view in self._views.items()
+        }
+        pixels = sum(camera.width * camera.height for camera in self._cameras.values())
+        self._photo_room = memory
+        self._moment_room = max(0, memory - 3 * pixels)
+        self._photos: dict[str, Tensor] = {}
+        self._valid: dict[str, Tensor | None] = {}
+        self._moments: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def camera(self, name: str) -> Camera:
+        """Camera of the view at the size of its image here."""
+        return self._cameras[name]
+
+    def target(self, name: str) -> SSIMTarget:
+        """The photo of a view with its moments.
+
+        Raises:
+            CaptureError: If the image file cannot be read.
+        """
+        image = self._photo(name).to(torch.float32).div_(255.0)
+        if name in self._moments:
+            return SSIMTarget(image, *self._moments[name])
+        target = ssim_target(image)
+        size = target.mean.nbytes + target.variance.nbytes
+        if size <= self._moment_room:
+            self._moment_room -= size
+            self._moments[name] = (target.mean, target.variance)
+        return target
+
+    def valid(self, name: str) -> Tensor | None:
+        """Which pixels of a view take part in the loss, ``[H, W]`` bool; None for all."""
+        if name not in self._valid:
+            camera = self._cameras[name]
+            mask = self._views[name].load_valid((camera.width, camera.height))
+            valid = None if mask is None else torch.from_numpy(mask).to(self._device)
+            size = 0 if valid is None else valid.nbytes
+            if size > self._photo_room:
+                return valid
+            self._photo_room -= size
+            self._moment_room = max(0, self._moment_room - size)
+            self._valid[name] = valid
+        return self._valid[name]
+
+    @property
+    def cached_bytes(self) -> int:
+        """Memory the cache takes now."""
+        moments = sum(mean.nbytes + variance.nbytes for mean, variance in self._moments.values())
+        masks = sum(valid.nbytes for valid in self._valid.values() if valid is not None)
+        return moments + masks + sum(photo.nbytes for photo in self._photos.values())
+
+    def _photo(self, name: str) -> Tensor:
+        if name in self._photos:
+            return self._photos[name]
+        view, camera = self._views[name], self._cameras[name]
+        image = view.load_image((camera.width, camera.height))
+        photo = torch.from_numpy(np.round(image * 255.0).astype(np.uint8)).to(self._device)
+        if photo.nbytes <= self._photo_room:
+            self._photo_room -= photo.nbytes
+            self._photos[name] = photo
+        return photo

@@ -1,0 +1,58 @@
+"""What results were made with: the machine and the versions of what they depend on."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lexsplat import __version__
+
+
+def machine_facts() -> dict[str, Any]:
+    """The machine, in words a reader of numbers needs."""
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "platform": platform.platform(),
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "gpu": gpu,
+        "versions": {"lexsplat": __version__, **versions()},
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that have a say in results."""
+    found = {"python": platform.python_version()}
+    for package in ("torch", "numpy", "numba", "gsplat", "pycolmap", "transformers"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+@functools.cache
+def code_identity() -> str:
+    """A hash of the program itself: measurements that are kept hold for the code that made them."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        digest.update(file.relative_to(package).as_posix().encode() + b"\0")
+        digest.update(file.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

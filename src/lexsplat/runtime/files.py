@@ -1,0 +1,199 @@
+"""Files that are written whole or not at all: the atomic rename, JSON and named tensors."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from threading import get_ident
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lexsplat.runtime.errors import FileFormatError
+
+_TEMPORARY = re.compile(r"\..*\.(\d+)\.\d+\.tmp")
+"""Names made by `atomic_path`: .NAME.PROCESS.THREAD.tmp"""
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that takes its place when the block ends without an error.
+
+    Readers see the old file or the new one, never a part. The data reach the disk before the name changes. The
+    folder is made if it is not there; threads and processes may write the same file at once, the last one wins.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove_left_overs(root: Path) -> None:
+    """Delete the temporary files below ``root`` of processes that were killed while they wrote.
+
+    Files of processes that still run stay: a query may be writing while a build begins.
+    """
+    for path in root.rglob(".*.tmp"):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match and not _is_running(int(match[1])):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it runs, for another user
+        return True
+    return True
+
+
+_MAX_JSON_BYTES = 256 << 20
+
+
+def to_json(value: Any) -> Any:
+    """Plain JSON data from dataclasses, paths, tuples and numpy numbers.
+
+    Raises:
+        TypeError: For anything that has no JSON form.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [to_json(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"no JSON form for {type(value).__name__}")
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write ``data`` as readable JSON. NaN and infinity are refused: they are not JSON."""
+    text = json.dumps(to_json(data), indent=2, allow_nan=False, ensure_ascii=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        FileFormatError: If it cannot be read, is not JSON, or is absurdly large.
+    """
+    try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise FileFormatError(path, expected="a JSON file", found=f"{path.stat().st_size} bytes")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileFormatError(path, expected="a readable JSON file", found=str(error.strerror)) from error
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(path, expected="JSON", found=str(error)) from error
+
+
+PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".ckpt")
+"""Endings of files that may hold pickles. Loading one runs whatever its author put into it: we never do."""
+
+_DIGEST = "content"
+"""Metadata entry with a hash of the tensors; files without it, of other programs, are read as they are."""
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write named tensors and string metadata as safetensors, with a hash of the tensors.
+
+    Raises:
+        OSError: If they cannot be written, as on a full disk; what was there stays.
+    """
+    contiguous = {name: tensor.detach().to("cpu").contiguous() for name, tensor in tensors.items()}
+    with atomic_path(path) as temporary:
+        save_tensors(contiguous, temporary, {**metadata, _DIGEST: _digest(contiguous)})
+
+
+def save_tensors(tensors: Mapping[str, Tensor], path: Path, metadata: Mapping[str, str]) -> None:
+    """``safetensors.torch.save_file`` that fails as every other way of writing a file does.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    try:
+        save_file(dict(tensors), path, metadata=dict(metadata))
+    except SafetensorError as error:
+        found = re.search(r"os error (\d+)", str(error))
+        code = int(found[1]) if found else errno.EIO
+        raise OSError(code, os.strerror(code), str(path)) from error
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read the tensors and the metadata of a safetensors file.
+
+    Raises:
+        FileFormatError: If it is missing, truncated, not safetensors, or not what `write_tensors` wrote.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    refuse_pickle(path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            # Copies: tensors inside the file start anywhere, and where a vector starts decides how it is summed.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            metadata = dict(file.metadata() or {})
+    except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
+        raise FileFormatError(
+            path, expected="a safetensors file", found=str(error)[:200], remedy="run the build again"
+        ) from error
+    written = metadata.pop(_DIGEST, None)
+    if written is not None and written != _digest(tensors):
+        raise FileFormatError(
+            path,
+            expected="the numbers that were written",
+            found="others: the file is damaged",
+            remedy="run the build again",
+        )
+    return tensors, metadata
+
+
+def refuse_pickle(path: Path) -> None:
+    """Refuse files that are pickles by their names, and say what to do instead.
+
+    Raises:
+        FileFormatError: If it is one.
+    """
+    if path.suffix.lower() in PICKLES:
+        raise FileFormatError(
+            path,
+            expected="safetensors, .npy, or for splats .ply",
+            found="a pickle, which can run any program when it is loaded",
+            remedy="open it where you trust it and save it with safetensors.torch.save_file, or export a .ply there",
+        )
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)};".encode("utf-8", "surrogatepass"))
+        if tensor.numel():
+            digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()

@@ -1,0 +1,399 @@
+"""Editing a scene: delete, keep, recolour, move, duplicate; undo, redo; a journal on disk.
+
+The built scene is never changed. An `Editor` holds what was done since and writes every step into a journal, a
+line of JSON each, so that an edit can be gone on with, replayed on a copy or discarded. `Editor.save` makes a new
+scene folder. Rows of the language field follow their Gaussians, and colours turn with what turns.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import logging
+import os
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.language.fields import LanguageField
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
+from lexsplat.runtime.files import atomic_path
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.transforms import moved
+
+Kind = Literal["delete", "keep", "recolour", "move", "duplicate"]
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+JOURNAL_VERSION = 1
+MAX_GROWTH = 16
+"""How many times as many Gaussians as before edits may make: a journal of copies of copies would fill any memory."""
+_DEFLATE = 1032
+"""Bytes at most that one compressed byte can stand for."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One edit.
+
+    Args:
+        kind: What is done.
+        mask: To which Gaussians ``[N]`` bool, of those there are at this point.
+        values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center".
+        phrase: What was asked for, for people.
+    """
+
+    kind: Kind
+    mask: Tensor
+    values: dict[str, Any] = field(default_factory=dict)
+    phrase: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.phrase or 'a selection'} ({int(self.mask.sum())} Gaussians)"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data; the mask as compressed bits."""
+        bits = zlib.compress(np.packbits(self.mask.cpu().numpy()).tobytes(), 6)
+        return {
+            "step": self.kind,
+            "phrase": self.phrase,
+            "gaussians": len(self.mask),
+            "mask": base64.b64encode(bits).decode("ascii"),
+            **self.values,
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Step:
+        """The inverse of `to_json`.
+
+        Raises:
+            ValueError: If the data are no step.
+        """
+        try:
+            count, kind = data["gaussians"], data["step"]
+            raw = base64.b64decode(data["mask"])
+            if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
+                raise ValueError(f"no step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100])
+            packed = zlib.decompressobj().decompress(raw, count // 8 + 1)
+            bits = np.unpackbits(np.frombuffer(packed, np.uint8))[:count]
+        except (KeyError, TypeError, binascii.Error, zlib.error) as error:
+            raise ValueError(f"no step: {error!r}") from error
+        if kind not in get_args(Kind) or len(bits) != count:
+            raise ValueError(f"no step: {kind!r}")
+        known = ("color", "strength", "rotation", "scale", "translation", "center")
+        values = {name: data[name] for name in known if name in data}
+        return cls(kind, torch.from_numpy(bits.astype(bool)), values, str(data.get("phrase", "")))
+
+
+def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Gaussians, LanguageField]:
+    """The scene after one step.
+
+    Raises:
+        ValueError: If the step is for another number of Gaussians, or its numbers make no sense.
+    """
+    if len(step.mask) != len(gaussians):
+        raise ValueError(f"a step for {len(step.mask)} Gaussians does not fit {len(gaussians)}")
+    mask = step.mask.to(gaussians.device)
+    if step.kind in ("delete", "keep"):
+        kept = mask if step.kind == "keep" else ~mask
+        return gaussians.select(kept), language.select(kept)
+    if step.kind == "duplicate":
+        everything = torch.arange(len(gaussians), device=gaussians.device)
+        index = torch.cat([everything, everything[mask]])
+        gaussians, language = gaussians.select(index), language.select(index)
+        mask = torch.arange(len(index), device=mask.device) >= len(everything)
+    changed = gaussians.select(mask)
+    if step.kind == "recolour":
+        changed = recoloured(changed, step.values["color"], step.values["strength"])
+    else:
+        numbers = {name: step.values.get(name) for name in ("rotation", "translation", "center")}
+        arrays = {name: np.array(value, float) for name, value in numbers.items() if value is not None}
+        changed = moved(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
+        if changed.damage():
+            raise ValueError(f"the move leads to {changed.damage()}")
+    tensors: dict[str, Any] = {}
+    for name, tensor in gaussians.tensors().items():
+        tensors[name] = tensor.clone()
+        tensors[name][mask] = getattr(changed, name)
+    return replace(gaussians, **tensors), language
+
+
+def recoloured(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
+    """Another colour with the old shading: brighter parts stay brighter.
+
+    Args:
+        gaussians: A thing.
+        color: RGB in 0..1 that the thing has on average afterwards (as far as it does not clip).
+        strength: 0 leaves it, 1 leaves nothing of the old hue and of view-dependent colour.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
+    target = torch.tensor([float(c) for c in color])
+    if target.shape != (3,) or not bool(((target >= 0) & (target <= 1)).all()) or not 0 <= strength <= 1:
+        raise ValueError(
+            f"a colour is three numbers in 0..1, and strength too, got {list(color)}, {strength:g}"
+        )
+    if len(gaussians) == 0:
+        return gaussians
+    target = target.to(gaussians.sh0)
+    old = gaussians.sh0[:, 0] * SH_C0 + 0.5
+    light = (old.clamp(0, 1) @ torch.tensor(_LUMINANCE).to(old)).clamp_min(0.02)
+    shares = gaussians.opacities / gaussians.opacities.sum().clamp_min(1e-12)
+    new = target * (light / (light * shares).sum())[:, None]
+    mixed = (1 - strength) * old + strength * new
+    sh0 = ((mixed - 0.5) / SH_C0)[:, None]
+    return replace(gaussians, sh0=sh0, shN=gaussians.shN * (1 - strength))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a selection moves: x -> scale R (x - center) + center + translation.
+
+    Args:
+        translation: Shift ``[3]``, world units.
+        rotation: R ``[3, 3]``, a proper rotation; none does not turn.
+        scale: Factor on sizes, positive.
+        center: Fixed point of turning and scaling ``[3]``; none takes the middle of the selection's box.
+    """
+
+    translation: Sequence[float] = (0.0, 0.0, 0.0)
+    rotation: NDArray[np.float64] | None = None
+    scale: float = 1.0
+    center: Sequence[float] | None = None
+
+    def values(self, chosen: Selection) -> dict[str, Any]:
+        """The numbers of a `Step` that moves ``chosen``; they are tried out first.
+
+        Raises:
+            ValueError: If the rotation is none or the scale is not positive.
+        """
+        middle = np.zeros(3)
+        if self.center is not None:
+            middle = np.asarray(self.center, float)
+        elif chosen:
+            middle = chosen.center
+        turn = np.eye(3) if self.rotation is None else np.asarray(self.rotation, float)
+        shift = np.asarray(self.translation, float)
+        moved(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
+        return {
+            "rotation": turn.tolist(),
+            "scale": float(self.scale),
+            "translation": shift.tolist(),
+            "center": middle.tolist(),
+        }
+
+
+class Editor:
+    """A scene under edit.
+
+    Args:
+        scene: The scene as it was built.
+        journal: Where the steps are kept; none keeps them in memory only. Steps that are there are done again.
+
+    Raises:
+        FileFormatError: If the journal is damaged.
+        SceneFolderError: If it belongs to another reconstruction.
+    """
+
+    def __init__(self, scene: SearchableScene, journal: Path | None = None) -> None:
+        self.original, self.journal = scene, journal
+        self.steps: list[Step] = []
+        self.undone: list[Step] = []
+        self.scene = scene
+        if journal is not None and journal.exists():
+            self._read(journal)
+            try:
+                self._replay()
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
+                raise FileFormatError(
+                    journal,
+                    expected="steps that can be done",
+                    found=repr(error)[:200],
+                    remedy="discard the edit",
+                ) from error
+
+    # -- steps
+
+    def select(self, phrase: str, threshold: float | None = None) -> Selection:
+        """What answers to a phrase in the scene as it is now."""
+        return self.scene.select(phrase, threshold)
+
+    def delete(self, chosen: Selection) -> None:
+        """Remove a selection."""
+        self._do("delete", chosen)
+
+    def keep(self, chosen: Selection) -> None:
+        """Remove everything but a selection."""
+        self._do("keep", chosen)
+
+    def recolour(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
+        """Give a selection another colour, RGB in 0..1; its shading stays (`recoloured`)."""
+        recoloured(chosen.selected, color, strength)  # raises before the journal knows
+        self._do("recolour", chosen, color=[float(c) for c in color], strength=float(strength))
+
+    def move(self, chosen: Selection, motion: Motion) -> None:
+        """Shift, turn and scale a selection.
+
+        Raises:
+            ValueError: If the motion is none (see `lexsplat.scenes.transforms.moved`).
+        """
+        self._do("move", chosen, **motion.values(chosen))
+
+    def duplicate(self, chosen: Selection, motion: Motion) -> None:
+        """Add a copy of a selection, moved as `move` does.
+
+        Raises:
+            ValueError: If the motion is none (see `lexsplat.scenes.transforms.moved`).
+        """
+        self._do("duplicate", chosen, **motion.values(chosen))
+
+    def undo(self) -> bool:
+        """Take the last step back; False if there is none."""
+        if not self.steps:
+            return False
+        self.undone.append(self.steps.pop())
+        self._replay()
+        self._write({"undo": True})
+        return True
+
+    def redo(self) -> bool:
+        """Do the last undone step again; False if there is none."""
+        if not self.undone:
+            return False
+        self._advance(self.undone.pop())
+        self._write({"redo": True})
+        return True
+
+    def discard(self) -> None:
+        """Forget all steps and delete the journal."""
+        self.steps, self.undone, self.scene = [], [], self.original
+        if self.journal is not None:
+            self.journal.unlink(missing_ok=True)
+
+    def save(self, output: Path) -> SceneFolder:
+        """Write the scene as it is now into a new folder; the steps are in its ``scene.json``.
+
+        Raises:
+            SceneFolderError: If the folder exists, or the scene was not opened from one.
+        """
+        source = self.original.folder
+        if source is None or output.exists():
+            raise SceneFolderError(
+                output,
+                expected="a new folder and a scene that was opened from one",
+                found="a scene in memory" if source is None else "a folder that exists",
+                remedy="give another --output",
+            )
+        folder = SceneFolder(output)
+        record = json.loads(json.dumps(source.record))
+        record["edits"] = [str(step) for step in self.steps]
+        record["stages"].get("reconstruct", {})["gaussians"] = len(self.scene.gaussians)
+        stages, record["stages"] = record["stages"], {}
+        folder.record = record
+        output.mkdir(parents=True)
+        folder.write_cameras({name: (view.camera, view.split) for name, view in self.scene.views.items()})
+        folder.write_gaussians(self.scene.gaussians)
+        reconstruction = stages.get("reconstruct", {}).get("fingerprint")
+        with atomic_path(folder.language_path) as temporary:
+            write_field(self.scene.field, {"reconstruction": str(reconstruction)}, temporary)
+        folder.record["stages"] = stages
+        folder.save()  # last: a folder without finished stages is no scene
+        return folder
+
+    # -- inside
+
+    def _do(self, kind: Kind, chosen: Selection, **values: Any) -> None:
+        if len(chosen.mask) != len(self.scene.gaussians):
+            raise ValueError("the selection is of the scene before an edit: select again")
+        if not chosen:
+            raise QueryError(
+                chosen.phrase or "selection",
+                expected="something to edit",
+                found="nothing",
+                remedy="try other words or a lower threshold",
+            )
+        step = Step(kind, chosen.mask.clone().cpu(), values, chosen.phrase)
+        self._advance(step)
+        self.undone.clear()
+        self._write(step.to_json())
+
+    def _advance(self, step: Step) -> None:
+        if len(self.scene.gaussians) > MAX_GROWTH * max(len(self.original.gaussians), 1):
+            raise ValueError(f"edits may make at most {MAX_GROWTH} times as many Gaussians")
+        self.scene = self.scene.with_content(*apply(step, self.scene.gaussians, self.scene.field))
+        self.steps.append(step)
+
+    def _replay(self) -> None:
+        steps, self.steps, self.scene = self.steps, [], self.original
+        for step in steps:
+            self._advance(step)
+
+    def _header(self) -> dict[str, Any]:
+        folder = self.original.folder
+        made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint") if folder else None
+        return {
+            "journal": JOURNAL_VERSION,
+            "gaussians": len(self.original.gaussians),
+            "reconstruction": made_from,
+        }
+
+    def _write(self, entry: dict[str, Any]) -> None:
+        """Append a line and wait until it is on the disk: a crash later loses nothing of it."""
+        if self.journal is None:
+            return
+        self.journal.parent.mkdir(parents=True, exist_ok=True)
+        lines = [entry] if self.journal.exists() else [self._header(), entry]
+        with open(self.journal, "a", encoding="utf-8") as file:
+            file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _read(self, path: Path) -> None:
+        try:
+            lines = path.read_text(encoding="utf-8").split("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileFormatError(
+                path, expected="a readable journal", found=str(error), remedy="discard the edit"
+            ) from error
+        if lines[-1]:
+            logging.getLogger("lexsplat").warning("%s: the last line is cut off and left out", path)
+            path.write_text("\n".join([*lines[:-1], ""]), encoding="utf-8")
+        for number, line in enumerate(lines[:-1], start=1):
+            try:
+                entry = json.loads(line)
+                if number == 1:
+                    self._check(entry, path)
+                elif entry.get("undo"):
+                    self.undone.append(self.steps.pop())
+                elif entry.get("redo"):
+                    self.steps.append(self.undone.pop())
+                else:
+                    self.steps.append(Step.from_json(entry))
+                    self.undone.clear()
+            except (ValueError, IndexError, AttributeError, RecursionError) as error:
+                raise FileFormatError(
+                    path,
+                    expected="steps of an edit",
+                    found=f"line {number}: {error}"[:200],
+                    remedy="discard the edit",
+                ) from error
+
+    def _check(self, header: dict[str, Any], path: Path) -> None:
+        if header != self._header():
+            raise SceneFolderError(
+                path,
+                expected="edits of this reconstruction",
+                found="edits of another one",
+                remedy="the scene was built again: discard the edits",
+            )

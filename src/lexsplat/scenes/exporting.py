@@ -1,0 +1,204 @@
+"""A scene, or what was found in it, as a file for other programs. The ending of the name says which format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.world import World
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.runtime.files import atomic_path, write_json
+from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
+from lexsplat.scenes.formats.gltf import write_glb
+from lexsplat.scenes.formats.language import (
+    StoredLanguage,
+    codebook_path,
+    ply_columns,
+    stored_language,
+    write_codebook,
+)
+from lexsplat.scenes.formats.ply import write_ply
+from lexsplat.scenes.formats.splat import write_splat
+from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
+from lexsplat.scenes.scene import SearchableScene
+
+SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".glb")
+"""Endings of files that hold Gaussians or their points."""
+LABEL_ENDINGS = (".csv", ".json")
+"""Endings of files that hold labels."""
+
+
+def ending_of(path: Path) -> str:
+    """Which of the known endings a name has.
+
+    Raises:
+        SceneFolderError: If none.
+    """
+    name = path.name.lower()
+    for ending in (*SPLAT_ENDINGS, *LABEL_ENDINGS):
+        if name.endswith(ending):
+            return ending
+    raise SceneFolderError(
+        path,
+        expected="a name that ends in " + ", ".join((*SPLAT_ENDINGS, *LABEL_ENDINGS)),
+        found=repr(path.suffix),
+    )
+
+
+def export_gaussians(
+    gaussians: Gaussians,
+    path: Path,
+    *,
+    language: StoredLanguage | None = None,
+    world: World | None = None,
+) -> list[Path]:
+    """Write Gaussians in the format of the name's ending.
+
+    Args:
+        gaussians: What to write.
+        path: ``.ply``, ``.points.ply``, ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat`` or ``.glb``.
+        language: Codes to write along, where the format has room: in ``.ply`` (the codebook goes into a file
+            beside it) and ``.glb``.
+        world: Up and scale of the scene, for ``.glb``: it has y up, and metres where the scale is known. The other
+            formats keep the scene's axes and units, so that they go with its cameras.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        SceneFolderError: If the ending is unknown, or the format has no room for language.
+        QueryError: If there is nothing to write.
+        BackendError: If the format needs a library that is not installed.
+    """
+    ending = ending_of(path)
+    _check_language_fits(path, language is not None)
+    if len(gaussians) == 0:
+        raise QueryError(path, expected="something to write", found="no Gaussian")
+    if ending in LABEL_ENDINGS:
+        raise SceneFolderError(
+            path, expected="phrases to label by", found="none", remedy='--select "red mug"'
+        )
+    writers: dict[str, Callable[[Path], object]] = {
+        ".ply": lambda file: write_ply(gaussians, file, further=ply_columns(language) if language else None),
+        ".points.ply": lambda file: write_points_ply(gaussians, file),
+        ".splat": lambda file: write_splat(gaussians, file),
+        ".glb": lambda file: write_glb(gaussians, file, language=language, world=world),
+    }
+    writers |= {
+        name: lambda file, kind=kind: write_compressed(gaussians, file, kind)  # type: ignore[misc]
+        for name, kind in COMPRESSED.items()
+    }
+    written = [path]
+    if language is not None and ending == ".ply":
+        written.append(codebook_path(path))
+        with atomic_path(written[-1]) as temporary:
+            write_codebook(language, temporary)
+    with atomic_path(path) as temporary:
+        writers[ending](temporary)
+    return written
+
+
+def found_by(
+    scene: SearchableScene,
+    phrases: Sequence[str],
+    view: str | None = None,
+    threshold: float | None = None,
+) -> list[Selection]:
+    """What answers to each phrase, relations and all, under the phrase as it was written.
+
+    Args:
+        scene: The scene.
+        phrases: What to look for (`lexsplat.queries.phrases`).
+        view: Whose left and right are meant; none takes one for each relation.
+        threshold: Score from which a Gaussian was found; none chooses one for each phrase.
+
+    Raises:
+        QueryError: If a phrase is empty or the view is unknown.
+    """
+    return [replace(scene.find(phrase, view, threshold=threshold), phrase=phrase) for phrase in phrases]
+
+
+def export_scene(
+    scene: SearchableScene, path: Path, *, found: Sequence[Selection] = (), language: bool = False
+) -> list[Path]:
+    """Write a scene, or selections of it, or which Gaussian belongs to which selection.
+
+    Args:
+        scene: The scene.
+        path: A splat format (see `export_gaussians`); ``.csv`` for a line for each Gaussian; ``.json`` for what
+            was found, with boxes and indices.
+        found: Selections, from `found_by`; splat formats then hold only them.
+        language: Write codes and codebook along.
+
+    Raises:
+        QueryError: If nothing is selected.
+        SceneFolderError: See `export_gaussians`; also for labels without selections.
+    """
+    ending = ending_of(path)
+    _check_language_fits(path, language)
+    if ending in LABEL_ENDINGS and found:
+        with atomic_path(path) as temporary:
+            if ending == ".csv":
+                labels, scores = best_labels(found)
+                names = [selection.phrase for selection in found]
+                write_labels_csv(scene.gaussians, labels, scores, names, temporary)
+            else:
+                write_json(temporary, labels_as_json(found))
+        return [path]
+    stored = stored_language(scene.field, scene.encoder_identity()) if language else None
+    gaussians = scene.gaussians
+    if found:
+        mask = torch.stack([selection.mask for selection in found]).any(0)
+        if not mask.any():
+            raise QueryError(
+                ", ".join(selection.phrase for selection in found),
+                expected="something to write",
+                found="nothing",
+                remedy="try other words or a lower threshold",
+            )
+        gaussians = gaussians.select(mask)
+        stored = stored.select(mask.cpu()) if stored else None
+    return export_gaussians(gaussians, path, language=stored, world=scene.world)
+
+
+def _check_language_fits(path: Path, language: bool) -> None:
+    """Refuse language for a format that cannot hold it.
+
+    Raises:
+        SceneFolderError: If the ending of the name is another than ``.ply`` or ``.glb``.
+    """
+    if language and ending_of(path) not in (".ply", ".glb"):
+        raise SceneFolderError(
+            path, expected="a name that ends in .ply or .glb", found="a format without room for language"
+        )
+
+
+def best_labels(found: Sequence[Selection]) -> tuple[Tensor, Tensor]:
+    """The phrase that claims each Gaussian: its number or -1, and its score, both ``[N]``.
+
+    Where several do, the one that is furthest above its own threshold, relative to what is left above it.
+    """
+    scores = torch.stack([selection.scores for selection in found])
+    limits = scores.new_tensor([selection.threshold for selection in found])[:, None]
+    claimed = torch.stack([selection.mask for selection in found])
+    margin = torch.where(claimed, (scores - limits) / (1 - limits).clamp_min(1e-6), -torch.inf)
+    best = margin.argmax(0)
+    labels = torch.where(claimed.any(0), best, -1)
+    return labels.cpu(), scores.gather(0, best[None])[0].cpu()
+
+
+def labels_as_json(found: Sequence[Selection]) -> dict[str, object]:
+    """What was found, with the indices of the Gaussians of every instance."""
+    entries = []
+    for selection in found:
+        entry = selection.to_json()
+        for place, instance in zip(entry["instances"], selection.instances):
+            place["indices"] = instance.indices.tolist()
+        entries.append(entry)
+    return {"gaussians": len(found[0].mask), "labels": entries}

@@ -1,0 +1,181 @@
+"""The PLY of 3D Gaussian Splatting: binary little endian, one float32 property per number.
+
+One schema (`_properties`) serves writing and reading. Reading goes by property *names*, so files whose
+columns stand in another order, or that carry further properties, are read rightly.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.errors import FileFormatError
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_MAX_HEADER_BYTES = 1 << 16
+_REQUIRED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+
+
+def _properties(num_rest: int) -> list[str]:
+    """Names of the columns in the order of the original 3DGS writer; ``num_rest`` counts ``f_rest_*``."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(num_rest)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def write_ply(gaussians: Gaussians, path: Path, *, further: Mapping[str, torch.Tensor] | None = None) -> None:
+    """Write the standard 3DGS PLY, readable by every splat viewer.
+
+    Stored (not activated) values go out: log scales and opacity logits. ``f_rest`` is channel-major as in the
+    original files: all red coefficients, then green, then blue.
+
+    Args:
+        gaussians: What to write; on any device.
+        path: The file; overwritten. Writing it whole or not at all is the caller's affair
+            (`lexsplat.runtime.files.atomic_path`).
+        further: Properties of our own by name, ``[N]`` each, uint8 or float, after the standard ones: readers go by
+            name and pass over them.
+
+    Raises:
+        ValueError: If a value is not finite: such a file would fail in other programs without a word.
+    """
+    g = gaussians.detach().to("cpu")
+    rest = g.shN.transpose(1, 2).flatten(1)
+    columns = [
+        g.means, torch.zeros(len(g), 3), g.sh0[:, 0], rest,
+        g.opacity_logits[:, None], g.log_scales, g.quats,
+    ]  # fmt: skip
+    table = torch.cat(columns, dim=1).numpy().astype("<f4")
+    bad = ~np.isfinite(table).all(axis=1)
+    if bad.any():
+        raise ValueError(f"{int(bad.sum())} of {len(g)} Gaussians have a value that is not finite")
+    names = _properties(rest.shape[1])
+    header = ["ply", "format binary_little_endian 1.0"]
+    if g.antialiased:
+        header.append("comment antialiased 1")
+    header += [f"element vertex {len(g)}", *(f"property float {name}" for name in names)]
+    rows: np.ndarray = table
+    if further:
+        layout: list[tuple] = [("standard", "<f4", table.shape[1])]
+        layout += [(name, "u1" if t.dtype == torch.uint8 else "<f4") for name, t in further.items()]
+        rows = np.zeros(len(g), dtype=layout)
+        rows["standard"] = table
+        for name, values in further.items():
+            rows[name] = values.cpu().numpy()
+        header += [
+            f"property {'uchar' if t.dtype == torch.uint8 else 'float'} {name}" for name, t in further.items()
+        ]
+    with open(path, "wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        file.write(rows.tobytes())
+
+
+def read_ply(path: Path, *, certain_opacities: bool = False) -> Gaussians:
+    """Read a 3DGS PLY written by any program.
+
+    Args:
+        path: A binary little-endian PLY with the properties of 3DGS.
+        certain_opacities: Take an infinite opacity logit as opacity 0 or 1 instead of refusing it: some programs
+            write that.
+
+    Raises:
+        FileFormatError: If it is not such a file, is truncated, or holds numbers that are not finite.
+    """
+    try:
+        with open(path, "rb") as file:
+            count, dtype, antialiased = _read_header(file, path)
+            available = os.path.getsize(path) - file.tell()
+            if available < count * dtype.itemsize:
+                raise FileFormatError(
+                    path,
+                    expected=f"{count} Gaussians of {dtype.itemsize} bytes",
+                    found=f"{available} bytes of data",
+                    remedy="the file is truncated: copy or make it again",
+                )
+            table = np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype)
+    except OSError as error:
+        raise FileFormatError(path, expected="a readable PLY file", found=str(error.strerror)) from error
+    return _gaussians_from_table(table, antialiased, path, certain_opacities)
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype, bool]:
+    lines: list[str] = []
+    consumed = 0
+    while not lines or lines[-1] != "end_header":
+        raw = file.readline(1024)
+        consumed += len(raw)
+        if not raw.endswith(b"\n") or consumed > _MAX_HEADER_BYTES or (not lines and raw.strip() != b"ply"):
+            raise FileFormatError(
+                path, expected="a PLY header", found=repr(raw[:20]), remedy="give a .ply of 3D Gaussians"
+            )
+        lines.append(raw.decode("ascii", "replace").strip())
+    if "format binary_little_endian 1.0" not in lines:
+        found = next((line for line in lines if line.startswith("format")), "no format line")
+        raise FileFormatError(path, expected="format binary_little_endian 1.0", found=found)
+    elements = [line.split() for line in lines if line.startswith("element ")]
+    if not elements or len(elements[0]) != 3 or elements[0][1] != "vertex" or not elements[0][2].isdigit():
+        raise FileFormatError(
+            path, expected="'element vertex COUNT' as the first element", found=str(elements)
+        )
+    start = next(i for i, line in enumerate(lines) if line.startswith("element "))
+    columns = []
+    for line in lines[start + 1 :]:
+        if not line.startswith("property "):
+            break
+        parts = line.split()
+        if len(parts) != 3 or parts[1] not in _TYPES:
+            raise FileFormatError(path, expected="scalar properties", found=repr(line))
+        columns.append((parts[2], "<" + _TYPES[parts[1]]))
+    names = [name for name, _ in columns]
+    missing = [name for name in (*_REQUIRED, "f_dc_0", "f_dc_1", "f_dc_2") if name not in names]
+    if missing or len(set(names)) != len(names):
+        found = f"no {', '.join(missing)}" if missing else "a property twice"
+        raise FileFormatError(path, expected="the properties of 3D Gaussians", found=found)
+    return int(elements[0][2]), np.dtype(columns), "comment antialiased 1" in lines
+
+
+def _gaussians_from_table(
+    table: np.ndarray, antialiased: bool, path: Path, certain_opacities: bool
+) -> Gaussians:
+    def columns(*names: str) -> torch.Tensor:
+        stacked = [table[name].astype(np.float32) for name in names]
+        return torch.from_numpy(
+            np.stack(stacked, axis=1) if len(table) else np.zeros((0, len(names)), np.float32)
+        )
+
+    num_rest = sum(1 for name in table.dtype.names or () if name.startswith("f_rest_"))
+    complete = all(f"f_rest_{i}" in (table.dtype.names or ()) for i in range(num_rest))
+    if num_rest not in (0, 9, 24, 45, 72) or not complete:
+        found = str(num_rest) if complete else "gaps in their numbers"
+        raise FileFormatError(path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found)
+    rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
+    gaussians = Gaussians(
+        means=columns("x", "y", "z"),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        log_scales=columns("scale_0", "scale_1", "scale_2"),
+        opacity_logits=columns("opacity")[:, 0],
+        sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
+        shN=rest.reshape(len(table), 3, num_rest // 3).transpose(1, 2).contiguous(),
+        antialiased=antialiased,
+    )
+    if certain_opacities:
+        gaussians.opacity_logits.clamp_(-20.0, 20.0)  # keeps NaN, which the check below finds
+    damage = gaussians.damage()
+    if damage:
+        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="make it again")
+    return gaussians

@@ -1,0 +1,64 @@
+"""Labels and point clouds: tables that spreadsheets, CloudCompare and scripts read."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
+
+
+def colors_of(gaussians: Gaussians) -> Tensor:
+    """Colour of every Gaussian seen from nowhere in particular: ``[N, 3]`` uint8."""
+    rgb = gaussians.sh0[:, 0].detach() * SH_C0 + 0.5
+    return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def write_labels_csv(
+    gaussians: Gaussians, labels: Tensor, scores: Tensor, names: Sequence[str], path: Path
+) -> None:
+    """One line for each Gaussian: index, x, y, z, red, green, blue, opacity, label, score.
+
+    Args:
+        gaussians: The scene.
+        labels: Number of its label in ``names``, -1 for none ``[N]``.
+        scores: Score of its best label ``[N]``.
+        names: What the labels are called.
+        path: The file.
+    """
+    means = gaussians.means.detach().cpu().numpy()
+    opacities = gaussians.opacities.detach().cpu().numpy()
+    rgb = colors_of(gaussians).numpy()
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["index", "x", "y", "z", "red", "green", "blue", "opacity", "label", "score"])
+        for index, (label, score) in enumerate(zip(labels.tolist(), scores.tolist())):
+            place = [f"{v:.6g}" for v in means[index]]
+            name = names[label] if label >= 0 else ""
+            writer.writerow(
+                [index, *place, *rgb[index].tolist(), f"{opacities[index]:.4f}", name, f"{score:.4f}"]
+            )
+
+
+def write_points_ply(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.1) -> int:
+    """A plain coloured point cloud (x, y, z, red, green, blue): one point for each Gaussian that shows.
+
+    Returns:
+        Number of points.
+    """
+    shown = gaussians.select((gaussians.opacities >= min_opacity).detach())
+    layout = [("place", "<f4", 3), ("color", "u1", 3)]
+    table = np.zeros(len(shown), dtype=layout)
+    table["place"], table["color"] = shown.means.detach().cpu().numpy(), colors_of(shown).numpy()
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(shown)}"]
+    header += [f"property float {name}" for name in "xyz"]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    with open(path, "wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        file.write(table.tobytes())
+    return len(shown)

@@ -1,0 +1,98 @@
+"""Moving Gaussians as a body: rotate, scale, shift. Their colours turn with them.
+
+Spherical harmonics are a function of the viewing direction in the world, so a body that turns needs its
+coefficients turned: within a degree they mix among themselves, by a matrix that depends on the rotation alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering.kernels.spherical_harmonics import basis_at
+from lexsplat.rendering.posing import multiplied
+
+_DIRECTIONS = 64
+
+
+def moved(
+    gaussians: Gaussians,
+    *,
+    rotation: NDArray[np.float64] | None = None,
+    scale: float = 1.0,
+    translation: NDArray[np.float64] | None = None,
+    center: NDArray[np.float64] | None = None,
+) -> Gaussians:
+    """The Gaussians after x -> scale R (x - center) + center + translation.
+
+    Args:
+        gaussians: What moves.
+        rotation: R ``[3, 3]``, a proper rotation; none when left out.
+        scale: Factor on sizes and distances, positive.
+        translation: Shift ``[3]``, world units.
+        center: Fixed point of rotation and scaling ``[3]``; the origin when left out.
+
+    Raises:
+        ValueError: If R is no rotation or the scale is not positive.
+    """
+    if not (math.isfinite(scale) and scale > 0):
+        raise ValueError(f"scale must be positive, got {scale:g}")
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    if (
+        turn.shape != (3, 3)
+        or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5)
+        or np.linalg.det(turn) < 0
+    ):
+        raise ValueError("rotation must be a [3, 3] matrix of a proper rotation")
+    place = np.zeros(3) if center is None else np.asarray(center, dtype=np.float64)
+    shift = np.zeros(3) if translation is None else np.asarray(translation, dtype=np.float64)
+    if not all(vector.shape == (3,) and np.isfinite(vector).all() for vector in (place, shift)):
+        raise ValueError("center and translation must be three finite numbers")
+    matrix, offset = scale * turn, place + shift - scale * turn @ place
+    means = gaussians.means.double() @ _like(matrix.T, gaussians) + _like(offset, gaussians)
+    changed = replace(gaussians, means=means.float(), log_scales=gaussians.log_scales + math.log(scale))
+    if np.allclose(turn, np.eye(3), atol=1e-12):
+        return changed
+    quats = multiplied(_like(quaternion_of(turn), gaussians), gaussians.quats.double()).float()
+    return replace(changed, quats=quats, shN=rotated_harmonics(gaussians.shN, turn))
+
+
+def rotated_harmonics(shN: Tensor, rotation: NDArray[np.float64]) -> Tensor:
+    """Coefficients ``[N, (degree + 1)^2 - 1, 3]`` of a body that was turned by ``rotation [3, 3]``.
+
+    What the turned body shows in direction d is what the body showed in direction R^T d. The matrix of each degree is
+    the least-squares solution over many directions, which is exact, as the harmonics of a degree are closed under
+    rotation.
+    """
+    degree = round((shN.shape[1] + 1) ** 0.5) - 1
+    if degree == 0:
+        return shN
+    turn = np.asarray(rotation, dtype=np.float64)
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    after, before = basis_at(directions, degree), basis_at(directions @ turn, degree)
+    blocks = []
+    for order in range(1, degree + 1):
+        columns = slice(order * order, (order + 1) ** 2)
+        matrix = np.linalg.lstsq(after[:, columns], before[:, columns], rcond=None)[0]
+        rows = shN[:, columns.start - 1 : columns.stop - 1].double()
+        blocks.append(torch.einsum("ij,njc->nic", torch.from_numpy(matrix).to(rows), rows))
+    return torch.cat(blocks, dim=1).float()
+
+
+def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """wxyz of a rotation matrix ``[3, 3]``, of unit length, w not negative."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return np.array([w, x, y, z])
+
+
+def _like(array: NDArray[np.float64], gaussians: Gaussians) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array)).to(gaussians.device)

@@ -1,0 +1,270 @@
+"""A colour for every Gaussian: photo colours, relevancy of prompts, language, codes, uncertainty, depth.
+
+Everything here is arithmetic on arrays, done in milliseconds, and knows no browser. N Gaussians, K codes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.language.fields import LanguageField, LiftedField
+from lexsplat.queries.heatmaps import PEAK_FLOOR, colorize
+from lexsplat.queries.picking import field_scores
+from lexsplat.queries.thresholds import automatic_threshold
+
+Mode = Literal["photo", "relevancy", "language", "codes", "uncertainty", "depth"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+
+PROMPT_COLORS: tuple[tuple[int, int, int], ...] = (
+    (230, 57, 70),
+    (0, 119, 182),
+    (42, 157, 80),
+    (244, 140, 6),
+    (131, 56, 180),
+    (0, 150, 150),
+    (214, 51, 132),
+    (120, 90, 40),
+)
+"""Colours of prompts when several are shown, told apart on light ground."""
+
+_FADED = 236.0
+_SAMPLE = 65_536
+_ROWS = 16_384
+_PLAIN = (150, 150, 158)
+"""Colour of Gaussians about which nothing is known."""
+
+
+@dataclass
+class Layer:
+    """One prompt as it is drawn.
+
+    Args:
+        text: The prompt.
+        scores: Relevancy of every Gaussian ``[N]`` float32 in 0..1.
+        threshold: Relevancy from which a Gaussian is marked.
+        color: RGB bytes, used when several prompts are shown.
+        mask: Which Gaussians are marked ``[N]`` bool; none takes those with at least the threshold.
+        shown: Whether it is drawn at all.
+    """
+
+    text: str
+    scores: NDArray[np.float32]
+    threshold: float
+    color: tuple[int, int, int] = PROMPT_COLORS[0]
+    mask: NDArray[np.bool_] | None = None
+    shown: bool = True
+    peak: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.peak = peak_of(self.scores)
+
+    def set_scores(self, scores: NDArray[np.float32]) -> None:
+        """Replace the relevancies, as when a phrase turns out to have several parts."""
+        self.scores, self.peak = scores, peak_of(scores)
+
+    @property
+    def high(self) -> float:
+        """Relevancy that is drawn in full colour."""
+        return max(self.peak, self.threshold + PEAK_FLOOR)
+
+    def marked(self) -> NDArray[np.int64]:
+        """Indices of the Gaussians that are marked."""
+        mask = self.scores >= self.threshold if self.mask is None else self.mask
+        return np.flatnonzero(mask)
+
+    def amount(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """How relevant the Gaussians ``index`` are, 0 at the threshold and 1 at `high`."""
+        span = self.high - self.threshold
+        return np.clip((self.scores[index] - self.threshold) / span, 0, 1).astype(np.float32)
+
+
+def peak_of(scores: NDArray[np.float32]) -> float:
+    """The relevancy that all but a few stray Gaussians stay under: the 99.9th percentile."""
+    if len(scores) == 0:
+        return 0.0
+    position = min(len(scores) - 1, int(0.999 * len(scores)))
+    return float(np.partition(scores, position)[position])
+
+
+def quick_threshold(scores: NDArray[np.float32], opacities: NDArray[np.float32]) -> float:
+    """A threshold from the scores of the Gaussians alone, in milliseconds.
+
+    It is drawn for the moment it takes to compute the scene's own, which looks at rendered views.
+    """
+    step = max(1, len(scores) // _SAMPLE)
+    values, weights = torch.from_numpy(scores[::step].copy()), torch.from_numpy(opacities[::step].copy())
+    return float(automatic_threshold(values[None], weights)[0])
+
+
+def photo_colors(gaussians: Gaussians) -> NDArray[np.uint8]:
+    """The view-independent colour of every Gaussian ``[N, 3]``."""
+    rgb = (gaussians.sh0[:, 0] * SH_C0 + 0.5).clamp(0, 1)
+    return (rgb * 255).round().to(torch.uint8).cpu().numpy()
+
+
+class Colouring:
+    """Colours of all Gaussians of a scene in every mode.
+
+    Args:
+        gaussians: The scene.
+        language: What its Gaussians say.
+    """
+
+    def __init__(self, gaussians: Gaussians, language: LanguageField) -> None:
+        self.photo = photo_colors(gaussians)
+        self._means = gaussians.means.detach().cpu().numpy()
+        self._language = language
+        self._fixed: dict[str, NDArray[np.uint8]] = {}
+        self._scale = (0.0, 1.0)
+
+    def colors(
+        self,
+        mode: Mode,
+        layers: Sequence[Layer] = (),
+        *,
+        opacity: float = 0.9,
+        fade: float = 0.0,
+        eye: NDArray | None = None,
+    ) -> NDArray[np.uint8]:
+        """RGB bytes ``[N, 3]``; a new array.
+
+        Args:
+            mode: What the colours mean.
+            layers: The prompts, for ``"relevancy"``.
+            opacity: Of the marks over the photo colours, 0..1.
+            fade: How far what is not marked recedes to light grey, 0..1.
+            eye: Position of the camera ``[3]``, for ``"depth"``.
+
+        Raises:
+            ValueError: If the mode is unknown.
+        """
+        if mode == "photo":
+            return self.photo.copy()
+        if mode == "relevancy":
+            return self._relevancy(layers, opacity, fade)
+        if mode == "depth":
+            return self._depth(eye)
+        if mode not in MODES:
+            raise ValueError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
+        if mode not in self._fixed:
+            make = {"language": self._pca, "codes": self._codes, "uncertainty": self._uncertainty}[mode]
+            self._fixed[mode] = make()
+        return self._fixed[mode].copy()
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """What the darkest and the brightest colour stood for when depth or uncertainty was last drawn."""
+        return self._scale
+
+    def _relevancy(self, layers: Sequence[Layer], opacity: float, fade: float) -> NDArray[np.uint8]:
+        result = _faded(self.photo, fade)
+        shown = [layer for layer in layers if layer.shown]
+        best = np.zeros(len(result), dtype=np.float32) if len(shown) > 1 else None
+        for layer in shown:
+            index = layer.marked()
+            amount = layer.amount(index)
+            if best is None:
+                marks = colorize(0.3 + 0.7 * amount)
+            else:
+                # Where two prompts mark the same Gaussian, the one that is surer of it is drawn.
+                wins = amount + 1e-3 > best[index]
+                index, amount = index[wins], amount[wins]
+                best[index] = amount + 1e-3
+                marks = np.broadcast_to(np.array(layer.color, dtype=np.uint8), (len(index), 3))
+            weight = (opacity * (0.55 + 0.45 * amount))[:, None]
+            result[index] = np.round((1 - weight) * self.photo[index] + weight * marks).astype(np.uint8)
+        return result
+
+    def _pca(self) -> NDArray[np.uint8]:
+        return language_colors(self._language)
+
+    def _codes(self) -> NDArray[np.uint8]:
+        codes, known = likeliest_codes(self._language)
+        colors = code_palette(self._language.codebook.num_codes)[codes]
+        colors[~known] = _PLAIN
+        return colors
+
+    def _uncertainty(self) -> NDArray[np.uint8]:
+        values = self._language.uncertainties.detach().cpu().numpy()
+        high = max(float(np.percentile(values, 98)) if len(values) else 0.0, 1e-3)
+        self._scale = (0.0, high)
+        return colorize(values, 0.0, high)
+
+    def _depth(self, eye: NDArray | None) -> NDArray[np.uint8]:
+        centre = self._means.mean(0) if eye is None else np.asarray(eye, dtype=np.float32)
+        distances = np.linalg.norm(self._means - centre, axis=1)
+        low, high = (float(v) for v in np.percentile(distances, [1, 95])) if len(distances) else (0.0, 1.0)
+        self._scale = (low, max(high, low + 1e-6))
+        return colorize(-distances, -self._scale[1], -self._scale[0])
+
+
+def _faded(colors: NDArray[np.uint8], fade: float) -> NDArray[np.uint8]:
+    if fade <= 0:
+        return colors.copy()
+    grey = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    target = 0.75 * _FADED + 0.25 * grey
+    return np.round((1 - fade) * colors + fade * target[:, None]).astype(np.uint8)
+
+
+# Language
+
+
+def likeliest_codes(language: LanguageField) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The likeliest code of every Gaussian ``[N]``, and whether anything is known about it ``[N]``."""
+    if isinstance(language, LiftedField):
+        weights, place = language.weights.max(1)
+        codes = language.codes.gather(1, place[:, None])[:, 0].long()
+        return codes.cpu().numpy(), (weights > 0).cpu().numpy()
+    count = len(language.uncertainties)
+    index = torch.arange(count, device=language.uncertainties.device)
+    parts = [language.select(rows).code_probabilities().max(1) for rows in index.split(_ROWS)]
+    likeliest = torch.cat([part.indices for part in parts]).cpu().numpy()
+    return likeliest, (torch.cat([part.values for part in parts]) > 0).cpu().numpy()
+
+
+def code_palette(count: int) -> NDArray[np.uint8]:
+    """Colours ``[count, 3]`` for codes: hues a golden angle apart, in three lightnesses."""
+    import colorsys
+
+    colors = [
+        colorsys.hls_to_rgb((0.61803398875 * i) % 1.0, (0.45, 0.6, 0.72)[i % 3], 0.65) for i in range(count)
+    ]
+    return np.round(np.array(colors, dtype=np.float64).reshape(count, 3) * 255).astype(np.uint8)
+
+
+def language_colors(language: LanguageField) -> NDArray[np.uint8]:
+    """The three main directions of the Gaussians' language features as red, green and blue ``[N, 3]``.
+
+    The feature of a Gaussian is linear in its codes, F = p S, so its coordinates along the main directions V are
+    p (S V): the directions come from a sample of the Gaussians, the projection of all of them is sparse.
+    Gaussians about which nothing is known are grey.
+    """
+    codewords = language.codebook.clip.double().cpu()
+    count = len(language.uncertainties)
+    colors = np.tile(np.array(_PLAIN, dtype=np.uint8), (count, 1))
+    ones = torch.ones(len(codewords), 1, device=language.uncertainties.device)
+    known = field_scores(language, ones)[:, 0].cpu().numpy() > 0.5
+    places = np.flatnonzero(known)
+    if len(places) < 2:
+        return colors
+    sample = torch.from_numpy(places[:: max(1, len(places) // _SAMPLE)])
+    shares = language.select(sample.to(ones.device)).code_probabilities().double().cpu()
+    centred = shares - shares.mean(0)
+    # The covariance of F is S^T cov(p) S; cov(p) is only K x K.
+    covariance = codewords.T @ (centred.T @ centred) @ codewords
+    directions = torch.linalg.eigh(covariance).eigenvectors[:, -3:].flip(-1)
+    signs = directions.gather(0, directions.abs().argmax(0, keepdim=True)).sign()
+    table = (codewords @ (directions * signs)).float().to(ones.device)
+    coordinates = field_scores(language, table).cpu().numpy()[known]
+    low, high = np.percentile(coordinates, [2, 98], axis=0)
+    spread = np.where(high - low > 1e-9, high - low, np.inf)
+    unit = np.clip((coordinates - low) / spread, 0, 1)
+    colors[known] = np.round(unit * 255).astype(np.uint8)
+    return colors
