@@ -6,10 +6,10 @@
 
 Synthetic scenes are three shells of Gaussians (`render.three_shells`) with four random codes each. Printed for each:
 
-    rgb         frames per second of colour alone
-    prompt      of colour and the relevancy of one prompt in the same pass: each Gaussian's score is blended
+    rgb         frames per second of color alone
+    prompt      of color and the relevancy of one prompt in the same pass: each Gaussian's score is blended
                 (`code` form), scored anew for every frame as if every frame asked another prompt
-    paper       of colour, s and u in one pass, then the paper's decoder and relevancy at every pixel
+    paper       of color, s and u in one pass, then the paper's decoder and relevancy at every pixel
     training    iterations per second: render, L1 + D-SSIM, gradients, Adam on all parameters; no density control
     memory      largest amount allocated, MiB (of the device; of the process on a CPU)
 
@@ -89,7 +89,7 @@ def frames_per_second(draw: Callable[[Camera], object], cameras: Sequence[Camera
 
 
 def draw_prompt(gaussians: Gaussians, field: LanguageField, camera: Camera, texts: Sequence[torch.Tensor]):
-    """Colour and relevancy of one prompt, in one pass ``[H, W, 4]``."""
+    """Color and relevancy of one prompt, in one pass ``[H, W, 4]``."""
     table = code_relevancy(field.codebook.clip, *texts)
     return render(gaussians, camera, features=field.scores(table)).channels
 
@@ -97,7 +97,7 @@ def draw_prompt(gaussians: Gaussians, field: LanguageField, camera: Camera, text
 def draw_as_the_paper(
     gaussians: Gaussians, field: TrainedField, camera: Camera, texts: Sequence[torch.Tensor]
 ):
-    """Colour, s and u in one pass, then decoder and relevancy of the blended feature at every pixel."""
+    """Color, s and u in one pass, then decoder and relevancy of the blended feature at every pixel."""
     carried = torch.cat([field.semantics, field.uncertainties[:, None]], 1)
     rendering = render(gaussians, camera, features=carried)
     probabilities = field.decoder(rendering.features[..., :8]).softmax(-1)

@@ -3,7 +3,7 @@
     python benchmarks/memory.py [--views 300] [--size 1297x840] [--memory 1GB 4GB] [--json FILE]
 
 The views are photographs of noise (the count and size of crops do not depend on what is seen) with cameras around
-nothing; the encoders are the embedded ones, whose maps are as large as any of their width. `photos` is what all
+nothing; the encoders are the bundled ones, whose maps are as large as any of their width. `photos` is what all
 photos would take together, `maps` what all maps take on disk: neither may be held. `peak` counts everything, Python,
 torch and weights included, of which `bare` is what a process takes that has only loaded the encoders.
 """
@@ -75,16 +75,16 @@ def make_capture(folder: Path, views: int, width: int, height: int) -> None:
 
 def extract(capture: Path, memory: str) -> dict[str, float]:
     """The feature stage at full size; GiB and seconds."""
-    from lexsplat.captures import load_scene
+    from lexsplat.captures import load_capture
     from lexsplat.features.encoders import load_clip, load_dino
     from lexsplat.pipeline.build import feature_maps
     from lexsplat.pipeline.config import BuildConfig
 
-    load_clip("embedded"), load_dino("embedded")
+    load_clip("bundled"), load_dino("bundled")
     bare = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    scene = load_scene(capture)
+    scene = load_capture(capture)
     view = next(iter(scene.views.values()))
-    config = BuildConfig(clip="embedded", dino="embedded", memory=memory, downscale=1.0)
+    config = BuildConfig(clip="bundled", dino="bundled", memory=memory, downscale=1.0)
     config = config.resolved("cpu", view.capture_size).within_memory()
     with tempfile.TemporaryDirectory() as cache:
         start = time.perf_counter()

@@ -1,7 +1,7 @@
 """What a prompt costs in a view once the language is rendered: ours against the published algorithm.
 
 The published algorithm (LERF's relevancy on the paper's feature map) builds F = p S for every pixel,
-normalises it, compares it with the prompt and each canonical phrase, takes a softmax for each of the pairs and
+normalizes it, compares it with the prompt and each canonical phrase, takes a softmax for each of the pairs and
 keeps the least. Ours answers the same without F (``feature``: equal to 1e-5) or blends the answers of the codes
 (``code``); ``gaussians`` scores 200,000 Gaussians with four codes each. All get the same code probabilities p,
 codebook and texts. Memory is the largest growth of the process beyond p.

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lexsplat.captures import InitialPoints, Scene, View, initial_points, load_scene
+from lexsplat.captures import Capture, InitialPoints, View, initial_points, load_capture
 from lexsplat.cli.progress import ProgressBars
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.evaluation.metrics import psnr, ssim
@@ -39,7 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no-warm-up": {"warm_up": 0.0},
     "classic": {"antialiased": False},
     "half-cap": {"max_gaussians": 20_000},
-    "regularised": {"opacity_weight": 0.01, "scale_weight": 0.01},
+    "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01},
     "exposure": {"exposure": True},
 }
 """Names of settings and what they change of `ReconstructionConfig`."""
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("captures", nargs="+", metavar="CAPTURE[=DOWNSCALE]")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["default", "mcmc"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--iterations", type=int, help="of the optimisation; none: 3,000, on CUDA 30,000")
+    parser.add_argument("--iterations", type=int, help="of the optimization; none: 3,000, on CUDA 30,000")
     parser.add_argument("--on", choices=("validation", "test"), default="validation")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path)
@@ -83,10 +83,10 @@ def main() -> None:
 
 def prepared(
     name: str, downscale: float | None, options: argparse.Namespace
-) -> tuple[Scene, ReconstructionConfig]:
+) -> tuple[Capture, ReconstructionConfig]:
     """A capture at its working size, split as asked, and the settings that `lexsplat build` would take."""
     capture = demo_capture("tabletop" if name == "demo" else "second") if name in ("demo", "second") else name
-    scene = load_scene(capture)
+    scene = load_capture(capture)
     largest = max((view.capture_size for view in scene.views.values()), key=lambda size: size[0] * size[1])
     wished = BuildConfig(downscale=downscale, iterations=options.iterations)
     config = wished.resolved(options.device, largest)
@@ -99,7 +99,7 @@ def prepared(
 
 
 def measured(
-    scene: Scene, config: ReconstructionConfig, points: InitialPoints, seed: int, device: str
+    scene: Capture, config: ReconstructionConfig, points: InitialPoints, seed: int, device: str
 ) -> dict[str, Any]:
     """Train once; numbers of the held-out views at the working size."""
     trainer = Reconstructor(scene, config, points, device=device, seed=seed)
@@ -117,7 +117,7 @@ def measured(
 
 
 @torch.no_grad()
-def view_scores(trainer: Reconstructor, scene: Scene, view: View) -> Sequence[float]:
+def view_scores(trainer: Reconstructor, scene: Capture, view: View) -> Sequence[float]:
     """PSNR in dB and SSIM of one view."""
     background = torch.tensor(scene.background, device=trainer.device)
     image = render(trainer.gaussians(), view.camera, background=background).image

@@ -1,11 +1,11 @@
-"""3D selections against exact truth, and the calibration of "not in this scene".
+"""3D selections against exact ground truth, and the calibration of "not in this scene".
 
 Truth comes from index maps and depth of every view (``TRUTH/truth/VIEW.npz``, ``TRUTH/cameras.json``, as
 tools/demo_scene writes them), lifted to Gaussians and to boxes (`lexsplat.truth`). Which indices a prompt means is
 read off the masks of the capture.
 
-    python benchmarks/selection.py --calibrate SECOND_SCENE --truth-of SECOND_SCENE=RENDERS/second \\
-        --scene output/demo --truth-of output/demo=RENDERS/tabletop
+    python benchmarks/selection.py --calibrate SECOND_SCENE --ground truth-of SECOND_SCENE=RENDERS/second \\
+        --scene output/demo --ground truth-of output/demo=RENDERS/tabletop
 
 Presence is calibrated on ``--calibrate`` only and reported on the scenes of ``--scene``. Prints JSON; ``calibration``
 is what goes into ``CALIBRATION`` in src/lexsplat/presence.py.
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from PIL import Image
 from selection_ground_truth import (
-    TruthView,
+    GroundTruthView,
     lift_labels,
     selection_f1,
     surface_points,
@@ -47,7 +47,7 @@ NEVER = (
     "giraffe", "bicycle", "airplane", "computer keyboard", "swimming pool", "guitar", "elephant", "traffic light",
     "bed", "shoe", "pizza", "dog",
 )  # fmt: skip
-COLOURS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", "orange")
+COLORS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", "orange")
 
 
 def main() -> None:
@@ -56,7 +56,7 @@ def main() -> None:
     )
     parser.add_argument("--calibrate", type=Path)
     parser.add_argument("--scene", type=Path, action="append", default=[])
-    parser.add_argument("--truth-of", action="append", default=[], metavar="SCENE=FOLDER")
+    parser.add_argument("--ground truth-of", action="append", default=[], metavar="SCENE=FOLDER")
     parser.add_argument("--stride", type=int, default=1, help="take every n-th view of the truth")
     parser.add_argument("--only", choices=("presence", "accuracy"), help="measure only one of the two")
     options = parser.parse_args()
@@ -76,34 +76,34 @@ def main() -> None:
     print(json.dumps(result, indent=1))
 
 
-def capture_folder(scene: lexsplat.SearchableScene) -> Path:
+def capture_folder(scene: lexsplat.Scene) -> Path:
     """Where the photos, prompts and masks of a scene are."""
     return Path(scene.folder.record["capture"])
 
 
-def evidence(folder: Path, truth: Path) -> tuple[dict, dict, dict]:
-    """Evidence of prompts that are there, that are not, and that are but for their colour."""
+def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
+    """Evidence of prompts that are there, that are not, and that are but for their color."""
     scene = lexsplat.open_scene(folder)
     prompts = list(json.loads((capture_folder(scene) / "prompts.json").read_text()))
-    things = list(json.loads((truth / "things.json").read_text()).values())
+    things = list(json.loads((ground_truth / "things.json").read_text()).values())
     kinds = {thing["kind"] for thing in things}
     known = kinds | {ALIASES.get(kind, kind) for kind in kinds}
     absent = [kind for kind in KINDS if kind not in known and kind.split()[-1] not in kinds] + list(NEVER)
-    recoloured = []
+    recolored = []
     for number, kind in enumerate(sorted(kinds - {"table", "wall", "floor", "cloth"})):
-        taken = {thing["colour"] for thing in things if thing["kind"] == kind}
-        free = [colour for colour in COLOURS if colour not in taken]
-        recoloured.append(f"{free[number % len(free)]} {kind}")
-    judge = scene.presence_judge
+        taken = {thing["color"] for thing in things if thing["kind"] == kind}
+        free = [color for color in COLORS if color not in taken]
+        recolored.append(f"{free[number % len(free)]} {kind}")
+    judge = scene.presence_classifier
 
     def of(phrases: list[str]) -> dict:
         return {phrase: judge.evidence(scores) for phrase, scores in zip(phrases, scene.scores(phrases))}
 
-    return of(prompts), of(absent), of(recoloured)
+    return of(prompts), of(absent), of(recolored)
 
 
-def presence(folder: Path, truth: Path, calibration) -> dict:
-    groups = zip(("present", "absent", "wrong colour"), evidence(folder, truth))
+def presence(folder: Path, ground_truth: Path, calibration) -> dict:
+    groups = zip(("present", "absent", "wrong color"), evidence(folder, ground_truth))
     answer = {}
     for name, found in groups:
         judged = {phrase: calibration.judge(e) for phrase, e in found.items()}
@@ -128,11 +128,11 @@ def evidence_values(group: dict):
     return [Evidence(*numbers) for _, *numbers in group["each"].values()]
 
 
-def accuracy(folder: Path, truth: Path, stride: int) -> dict:
+def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:
     """F1 of Gaussians and IoU of boxes for every prompt that masks of the capture tell the meaning of."""
     scene = lexsplat.open_scene(folder)
-    views = load_truth(truth, stride)
-    meanings = meaning_of_prompts(capture_folder(scene) / "segmentations", truth)
+    views = load_ground_truth(ground_truth, stride)
+    meanings = meaning_of_prompts(capture_folder(scene) / "segmentations", ground_truth)
     lifted = lift_labels(scene.gaussians, views, 256)
     up = gravity_up(scene.cameras.values()).direction
     rows = {}
@@ -179,23 +179,25 @@ def things_of(indices: list[int]) -> list[list[int]]:
     return [[i for i in indices if i // 10 == thing] for thing in sorted({i // 10 for i in indices})]
 
 
-def load_truth(folder: Path, stride: int) -> list[TruthView]:
+def load_ground_truth(folder: Path, stride: int) -> list[GroundTruthView]:
     record = json.loads((folder / "cameras.json").read_text())
     views = []
     for name in sorted(record["camera_to_world"])[::stride]:
         pose = np.array(record["camera_to_world"][name], float)
         camera = camera_from_opengl(record["width"], record["height"], np.array(record["K"], float), pose)
-        with np.load(folder / "truth" / f"{name}.npz", allow_pickle=False) as content:
-            views.append(TruthView(camera, content["index"], content["depth"].astype(np.float64)))
+        with np.load(folder / "ground_truth" / f"{name}.npz", allow_pickle=False) as content:
+            views.append(GroundTruthView(camera, content["index"], content["depth"].astype(np.float64)))
     return views
 
 
-def meaning_of_prompts(masks: Path, truth: Path) -> dict[str, list[int]]:
+def meaning_of_prompts(masks: Path, ground_truth: Path) -> dict[str, list[int]]:
     """Which indices lie in a prompt's masks for the most part, over all views that have masks."""
     inside: dict[str, np.ndarray] = {}
     total: dict[str, np.ndarray] = {}
     for path in sorted(masks.glob("*/*.png")):
-        with np.load(truth / "truth" / f"{path.parent.name}.npz", allow_pickle=False) as content:
+        with np.load(
+            ground_truth / "ground_truth" / f"{path.parent.name}.npz", allow_pickle=False
+        ) as content:
             index = content["index"]
         size = (index.shape[1], index.shape[0])
         mask = np.array(Image.open(path).convert("L").resize(size, Image.Resampling.NEAREST)) > 127

@@ -1,4 +1,4 @@
-"""Exact truth in 3D: labels of pixels, known for every view, lifted to labels of Gaussians and to boxes.
+"""Exact ground truth in 3D: labels of pixels, known for every view, lifted to labels of Gaussians and to boxes.
 
 A Gaussian belongs to the thing that most of its visible weight (alpha T over all pixels of all views) falls on,
 where the exact depth agrees with its own: weight that a Gaussian gets through a hole in something nearer, or
@@ -22,7 +22,7 @@ from lexsplat.rendering import accumulate_codes, prepare
 
 
 @dataclass(frozen=True)
-class TruthView:
+class GroundTruthView:
     """What a view shows, exactly.
 
     Args:
@@ -38,7 +38,7 @@ class TruthView:
 
 @dataclass(frozen=True)
 class GaussianLabels:
-    """The truth about Gaussians.
+    """The ground truth about Gaussians.
 
     Args:
         labels: The thing each belongs to ``[N]`` int64, 0 for none.
@@ -53,7 +53,7 @@ class GaussianLabels:
 
 @torch.no_grad()
 def lift_labels(
-    gaussians: Gaussians, views: Iterable[TruthView], num_labels: int, *, tolerance: float = 0.02
+    gaussians: Gaussians, views: Iterable[GroundTruthView], num_labels: int, *, tolerance: float = 0.02
 ) -> GaussianLabels:
     """Labels of Gaussians from labels of pixels.
 
@@ -80,7 +80,7 @@ def lift_labels(
     return GaussianLabels(labels, weights, torch.where(weights > 0, purity, 0.0))
 
 
-def surface_points(views: Iterable[TruthView], label: int, *, stride: int = 2) -> NDArray[np.float64]:
+def surface_points(views: Iterable[GroundTruthView], label: int, *, stride: int = 2) -> NDArray[np.float64]:
     """Exact points of a thing in the world ``[M, 3]``, from the depth of every ``stride``-th pixel."""
     found = []
     for view in views:
@@ -98,23 +98,23 @@ def true_box(points: NDArray[np.float64], up: NDArray[np.float64]) -> Box:
     return fit_box(points, up, trim=0.001)
 
 
-def selection_f1(mask: Tensor, truth: Tensor, weights: Tensor) -> tuple[float, float, float]:
+def selection_f1(mask: Tensor, ground_truth: Tensor, weights: Tensor) -> tuple[float, float, float]:
     """F1, precision and recall of a selection, every Gaussian counted by how much of the views it makes up.
 
     Args:
         mask: What was selected ``[N]`` bool.
-        truth: What belongs to the thing ``[N]`` bool.
+        ground truth: What belongs to the thing ``[N]`` bool.
         weights: ``[N]``, not negative.
     """
-    mask, truth, weights = mask.cpu(), truth.cpu(), weights.cpu().double()
-    hit = float(weights[mask & truth].sum())
+    mask, ground_truth, weights = mask.cpu(), ground_truth.cpu(), weights.cpu().double()
+    hit = float(weights[mask & ground_truth].sum())
     precision = hit / max(float(weights[mask].sum()), 1e-12)
-    recall = hit / max(float(weights[truth].sum()), 1e-12)
+    recall = hit / max(float(weights[ground_truth].sum()), 1e-12)
     return 2 * precision * recall / max(precision + recall, 1e-12), precision, recall
 
 
-def _near_surface(gaussians: Gaussians, view: TruthView, tolerance: float) -> Tensor:
-    """Which Gaussians lie at the exact surface where their centre is seen ``[N]`` as 0 or 1."""
+def _near_surface(gaussians: Gaussians, view: GroundTruthView, tolerance: float) -> Tensor:
+    """Which Gaussians lie at the exact surface where their center is seen ``[N]`` as 0 or 1."""
     means = gaussians.means.detach().cpu().double().numpy()
     local = means @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
     depth = np.maximum(local[:, 2], 1e-9)
@@ -124,6 +124,6 @@ def _near_surface(gaussians: Gaussians, view: TruthView, tolerance: float) -> Te
     inside = (local[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
     exact = view.depth[row.clip(0, height - 1), column.clip(0, width - 1)]
     reach = tolerance * depth + 3 * gaussians.scales.detach().cpu().double().numpy().min(1)
-    # Just outside a silhouette the centre's own pixel shows something far behind: that is no contradiction
+    # Just outside a silhouette the center's own pixel shows something far behind: that is no contradiction
     # to the front, so only what lies clearly behind the exact surface is left out.
     return torch.from_numpy(inside & (exact > 0) & (depth <= exact + reach)).float()

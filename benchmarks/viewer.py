@@ -25,7 +25,7 @@ from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LiftedField
 from lexsplat.scenes.folder import StoredView
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
 from lexsplat.viewer.splats import BYTES_PER_SPLAT
 
@@ -41,7 +41,7 @@ PROMPTS = (
 )
 
 
-class Synthetic(SearchableScene):
+class Synthetic(Scene):
     """Random Gaussians on the walls of a room; every word is a fixed random direction."""
 
     def encode_text(self, texts: list[str]) -> torch.Tensor:
@@ -52,7 +52,7 @@ class Synthetic(SearchableScene):
         pass
 
 
-def synthetic(count: int) -> SearchableScene:
+def synthetic(count: int) -> Scene:
     g = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=g) * 10 - 5
     wall = torch.randint(0, 3, (count,), generator=g)
@@ -96,7 +96,7 @@ def browser_seconds(viewer: ViewerServer) -> dict[str, float]:
         while not viewer.viser.get_clients():
             time.sleep(0.1)
         (client,) = viewer.viser.get_clients().values()
-        while True:  # an empty page answers too: wait for a picture that is not one colour
+        while True:  # an empty page answers too: wait for a picture that is not one color
             picture = viewer.display.picture(client, 240)
             if np.ptp(picture.reshape(-1, picture.shape[-1]), axis=0).max() > 30:
                 break
@@ -145,10 +145,10 @@ def main() -> None:
             viewer.panels.wait()
             refined.append(viewer.panels.seconds["refine"])
     result |= {
-        "recolour_median_ms": round(1e3 * statistics.median(asked), 1),
-        "recolour_max_ms": round(1e3 * max(asked), 1),
-        "recolour_cpu_median_ms": round(1e3 * statistics.median(spent), 1),
-        "recolour_bytes_max": max(sent),
+        "recolor_median_ms": round(1e3 * statistics.median(asked), 1),
+        "recolor_max_ms": round(1e3 * max(asked), 1),
+        "recolor_cpu_median_ms": round(1e3 * statistics.median(spent), 1),
+        "recolor_bytes_max": max(sent),
         "threshold_and_selection_median_ms": round(1e3 * statistics.median(refined), 1) if refined else None,
         "load_average": round(os.getloadavg()[0], 1),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,

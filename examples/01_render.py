@@ -16,14 +16,14 @@ from lexsplat.rendering import render
 
 rng = np.random.default_rng(0)
 
-# Points on a ball, coloured by where they are.
+# Points on a ball, colored by where they are.
 directions = rng.normal(size=(2000, 3))
 points = directions / np.linalg.norm(directions, axis=1, keepdims=True)
 gaussians = gaussians_from_points(points, 0.5 + 0.5 * points, sh_degree=0, opacity=0.8)
 
 camera = look_at([0.0, -3.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], width=320, height=240, fov_y=0.8)
 
-# Everything is differentiable: here, how must the colours change to make the picture greener?
+# Everything is differentiable: here, how must the colors change to make the picture greener?
 gaussians.sh0.requires_grad_()
 rendering = render(gaussians, camera)
 rendering.image[..., 1].mean().backward()

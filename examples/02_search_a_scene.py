@@ -18,7 +18,7 @@ scene = lexsplat.open_scene(folder)
 view = next((name for name, view in scene.views.items() if view.split == "test"), next(iter(scene.views)))
 picture = scene.render(view).image.clamp(0, 1).cpu().numpy()
 relevancy = scene.relevancy(prompts, view).cpu().numpy()  # [P, H, W] in 0..1
-thresholds = scene.thresholds(prompts).tolist()  # chosen from the scene alone, never from the truth
+thresholds = scene.thresholds(prompts).tolist()  # chosen from the scene alone, never from the ground truth
 
 for prompt, heat, threshold in zip(prompts, relevancy, thresholds):
     share = (heat >= threshold).mean()

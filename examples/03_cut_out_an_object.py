@@ -19,6 +19,6 @@ if len(chosen) == 0:
     sys.exit(f"no Gaussian answers to {prompt!r} above {threshold:.2f}")
 
 # The median is where the thing is, even if a few floaters answer too.
-centre = chosen.means.median(dim=0).values.tolist()
-print(f"{prompt}: {len(chosen)} of {len(scene.gaussians)} Gaussians around {[round(c, 2) for c in centre]}")
+center = chosen.means.median(dim=0).values.tolist()
+print(f"{prompt}: {len(chosen)} of {len(scene.gaussians)} Gaussians around {[round(c, 2) for c in center]}")
 write_ply(chosen, output)

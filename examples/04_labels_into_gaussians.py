@@ -1,6 +1,6 @@
 """Put per-pixel labels of your own onto Gaussians, without training.
 
-Whatever tool labelled your images, if the labels are small integers per pixel, one pass over the views tells
+Whatever tool labeled your images, if the labels are small integers per pixel, one pass over the views tells
 for every Gaussian how much of each label it carries.
 
     python examples/04_labels_into_gaussians.py

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-from tiny_capture import write_capture
+from support.tiny_capture import write_capture
 
 import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
 from lexsplat.runtime import device as threads
@@ -37,8 +37,8 @@ def tiny_capture(tmp_path_factory) -> Path:
 
 
 QUICK_BUILD = [
-    "--clip", "embedded", "--dino", "embedded", "--device", "cpu", "--iterations", "120",
-    "--codebook.num-codes", "16", "--embedding.iterations", "60",
+    "--clip", "bundled", "--dino", "bundled", "--device", "cpu", "--iterations", "120",
+    "--codebook.num-codes", "16", "--trained.iterations", "60",
 ]  # fmt: skip
 """Options of ``lexsplat build`` that make a small scene in seconds."""
 
@@ -56,8 +56,7 @@ def built(tiny_capture, tmp_path_factory) -> Path:
 @pytest.fixture
 def pretended_gpu(monkeypatch):
     """A GPU that is none, with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts what is waited for."""
-    import gsplat_kernels
-    import pretended_gpu
+    from support import gsplat_kernels, pretended_gpu
 
     gsplat_kernels.install(monkeypatch)
     with pretended_gpu.pretending(monkeypatch) as waits:

@@ -122,14 +122,14 @@ def validate(node: Path, file: Path, count: int) -> list[str]:
 
 
 def babylon(node: Path, file: Path, gaussians: Gaussians) -> list[str]:
-    """What Babylon.js reads differently: floats must be equal, 8-bit colours and rotations within a step."""
+    """What Babylon.js reads differently: floats must be equal, 8-bit colors and rotations within a step."""
     output = file.with_name(f"{file.name}.babylon").resolve()
     subprocess.run(["node", "babylon.js", str(file.resolve()), str(output)], cwd=node, check=True)
     found = np.fromfile(output, BABYLON_SPLAT)
     if len(found) != len(gaussians):
         return [f"{len(found)} Gaussians instead of {len(gaussians)}"]
-    colours = (0.5 + SH_C0 * gaussians.sh0[:, 0]).clamp(0, 1)
-    rgba = torch.cat([colours, gaussians.opacities[:, None]], 1) * 255
+    colors = (0.5 + SH_C0 * gaussians.sh0[:, 0]).clamp(0, 1)
+    rgba = torch.cat([colors, gaussians.opacities[:, None]], 1) * 255
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1) * 127.5 + 127.5
     pairs = {
         "mean": (gaussians.means, 1e-6), "scale": (gaussians.scales, 1e-6), "rgba": (rgba, 1.0), "quat": (quats, 1.0),

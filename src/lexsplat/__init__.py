@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
-    from lexsplat.scenes.scene import SearchableScene, open_scene
+    from lexsplat.scenes.scene import Scene, open_scene
 
 __version__ = "0.1.0"
 
-__all__ = ["SearchableScene", "__version__", "open_scene"]
+__all__ = ["Scene", "__version__", "open_scene"]
 
 
 def __getattr__(name: str) -> Any:
     # Loaded when first used, so that `import lexsplat` and `lexsplat --help` stay quick.
-    if name in ("open_scene", "SearchableScene"):
-        from lexsplat.scenes import scene as search
+    if name in ("open_scene", "Scene"):
+        from lexsplat.scenes import scene
 
-        return getattr(search, name)
+        return getattr(scene, name)
     raise AttributeError(f"module 'lexsplat' has no attribute {name!r}")

@@ -17,7 +17,7 @@ from lexsplat.cli.progress import ProgressBars
 from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
 from lexsplat.evaluation.scenes import evaluate_scene
 from lexsplat.pipeline.build import build
-from lexsplat.scenes.folder import SHIPPED_SCENE
+from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
 
 KEPT = ("cameras.json", "gaussians.ply", "language.safetensors")
@@ -37,15 +37,15 @@ def main() -> None:
         with ProgressBars() as bars:
             folder = build(demo_capture(), work, config, listener=bars)
             quality = evaluate_scene(open_scene(work, device="cpu"), listener=bars)
-        SHIPPED_SCENE.mkdir(parents=True, exist_ok=True)
+        BUNDLED_SCENE.mkdir(parents=True, exist_ok=True)
         for name in KEPT:
-            shutil.copyfile(work / name, SHIPPED_SCENE / name)
+            shutil.copyfile(work / name, BUNDLED_SCENE / name)
         record = json.loads(json.dumps(folder.record))
         record["capture"] = None  # where the photos were on the machine that built it is nobody's business
-        (SHIPPED_SCENE / "scene.json").write_text(json.dumps(record, indent=1))
-        size = sum(file.stat().st_size for file in SHIPPED_SCENE.iterdir())
+        (BUNDLED_SCENE / "scene.json").write_text(json.dumps(record, indent=1))
+        size = sum(file.stat().st_size for file in BUNDLED_SCENE.iterdir())
         strict = quality["language"]["strict"]
-        print(f"{SHIPPED_SCENE}: {size / 1e6:.2f} MB, PSNR {quality['quality']['psnr']:.2f} dB, "
+        print(f"{BUNDLED_SCENE}: {size / 1e6:.2f} MB, PSNR {quality['quality']['psnr']:.2f} dB, "
               f"mIoU {strict['auto']['mIoU']:.3f}, mAP {strict['mAP']:.3f}")  # fmt: skip
 
 

@@ -1,10 +1,10 @@
 """Captures: photos with cameras in, views with pinhole cameras out, everything keyed by image name."""
 
-from lexsplat.captures.capture import Scene, View, stem_of
-from lexsplat.captures.ground_truth.layouts import Annotations, check_truth_wishes, load_annotations
+from lexsplat.captures.capture import Capture, View, stem_of
+from lexsplat.captures.ground_truth.layouts import Annotations, check_ground_truth_options, load_annotations
 from lexsplat.captures.ground_truth.masks import load_mask, load_masks
 from lexsplat.captures.images.undistortion import Lens
-from lexsplat.captures.loading import is_photo_folder, load_scene
+from lexsplat.captures.loading import is_photo_folder, load_capture
 from lexsplat.captures.sfm.photos import PhotoPoses, PoseConfig, poses_from_photos
 from lexsplat.captures.sfm.triangulation import (
     InitialPoints,
@@ -19,15 +19,15 @@ __all__ = [
     "Lens",
     "PhotoPoses",
     "PoseConfig",
-    "Scene",
+    "Capture",
     "View",
-    "check_truth_wishes",
+    "check_ground_truth_options",
     "initial_points",
     "is_photo_folder",
     "load_annotations",
     "load_mask",
     "load_masks",
-    "load_scene",
+    "load_capture",
     "poses_from_photos",
     "random_points_in_frusta",
     "stem_of",

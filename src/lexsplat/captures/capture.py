@@ -41,7 +41,7 @@ class View:
         camera: Pinhole camera at the working resolution.
         capture_size: Width and height of the undistorted photo at full resolution, in pixels.
         lens: The lens the photo was taken through, for photos of the size on disk.
-        background: Colour behind transparent pixels, RGB in 0..1.
+        background: Color behind transparent pixels, RGB in 0..1.
         ignore_path: A picture that is black where pixels take no part in any loss (``masks/`` of a
             capture); None where all pixels count.
     """
@@ -62,7 +62,7 @@ class View:
     def load_image(self, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
         """The undistorted photo ``[H, W, 3]`` in 0..1, read from disk at every call.
 
-        Masked pixels have the mean colour of the others, so that nothing depends on what was there: not the pixels
+        Masked pixels have the mean color of the others, so that nothing depends on what was there: not the pixels
         beside them in a smaller picture, not the window of a loss, not the crop of an encoder.
 
         Args:
@@ -242,7 +242,7 @@ def _no_points() -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Capture:
     """A capture: views, their split, and what else lies beside them.
 
     Args:
@@ -251,11 +251,11 @@ class Scene:
         train_names: Names of the views that may be learned from, sorted.
         test_names: Names of the views that are only measured on, sorted.
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
-        point_colors: Their colours ``[P, 3]``, RGB in 0..1.
+        point_colors: Their colors ``[P, 3]``, RGB in 0..1.
         segmentations: Folder with ``STEM/PROMPT.png``, or None.
         warnings: What was left out and why, one line each.
         source: Where the cameras came from: ``"colmap"`` or ``"transforms"``.
-        background: Colour behind transparent pixels, RGB in 0..1.
+        background: Color behind transparent pixels, RGB in 0..1.
     """
 
     root: Path
@@ -279,7 +279,7 @@ class Scene:
         """The views that are only measured on, by name."""
         return tuple(self.views[name] for name in self.test_names)
 
-    def downscaled(self, factor: float) -> Scene:
+    def downscaled(self, factor: float) -> Capture:
         """The same capture to be worked on ``factor`` times smaller than the undistorted photos."""
         views = {
             name: replace(view, camera=view.camera.resized(*view.capture_size).downscaled(factor))

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from lexsplat.captures.capture import Scene, View, stem_of
+from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
 from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree
 from lexsplat.captures.images.undistortion import pinhole_of
-from lexsplat.captures.readers.camera_files import Capture, Photo
+from lexsplat.captures.readers.camera_files import CameraFiles, Photo
 from lexsplat.captures.readers.colmap import find_model, read_colmap
 from lexsplat.captures.readers.transforms_json import find_transforms, read_transforms
 from lexsplat.captures.readers.video import is_video
@@ -23,7 +23,7 @@ SEGMENTATIONS = "segmentations"
 """Folder of a capture with ``STEM/PROMPT.png``: masks to measure against."""
 
 
-def load_scene(
+def load_capture(
     path: str | Path,
     *,
     downscale: float = 1.0,
@@ -31,7 +31,7 @@ def load_scene(
     test_names: Sequence[str] | None = None,
     images: str | Path | None = None,
     beside: str | Path | None = None,
-) -> Scene:
+) -> Capture:
     """Load a capture: COLMAP (binary or text), ``transforms.json`` (nerfstudio, instant-ngp, NeRF-synthetic).
 
     Photos are not read beyond their headers. Where a capture has both a COLMAP model and a
@@ -78,7 +78,7 @@ def load_scene(
     warnings += split_warnings
     for warning in warnings:
         logging.getLogger("lexsplat").warning(warning)
-    return Scene(
+    return Capture(
         root=root,
         views=views,
         train_names=tuple(name for name in views if name not in set(chosen)),
@@ -92,7 +92,7 @@ def load_scene(
     )
 
 
-def _told_missing(capture: Capture) -> list[str]:
+def _told_missing(capture: CameraFiles) -> list[str]:
     """A warning that lists the images without a file, if there are any.
 
     Raises:
@@ -142,12 +142,12 @@ def _check_names(names: list[str], origin: Path) -> None:
 
 
 def _annotated(root: Path, names: list[str]) -> set[str]:
-    """Names of the views with truth beside them, in any layout."""
+    """Names of the views with ground truth beside them, in any layout."""
     found = find_annotations(root)
     return set() if found is None else annotated_names(*found, names, root / "images")
 
 
-def _read_capture(path: Path, images: Path | None) -> Capture:
+def _read_capture(path: Path, images: Path | None) -> CameraFiles:
     if path.is_file() and path.suffix == ".json":
         return read_transforms(path)
     if not path.is_dir():
@@ -193,7 +193,7 @@ def _photos_of(path: Path) -> list[Path]:
     return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
 
 
-def _make_view(photo: Photo, capture: Capture, downscale: float, mask: Path | None) -> View:
+def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path | None) -> View:
     """Fit the lens to the photo's real size and replace it by a pinhole camera; ``mask`` says which pixels count."""
     found = image_size(photo.path)
     stated = (photo.lens.width, photo.lens.height)

@@ -37,7 +37,7 @@ def choose_test_names(
     """The names of the views to hold out, sorted, and warnings.
 
     The first of these that is there decides: ``test_names`` (given by the caller), ``test_views.json`` in the
-    capture, the split of the camera files (``listed``), views with truth (``annotated``), every
+    capture, the split of the camera files (``listed``), views with ground truth (``annotated``), every
     ``test_every``-th view counting from the first.
 
     Raises:

@@ -15,7 +15,7 @@ import tyro
 
 from lexsplat import __version__
 from lexsplat.cli.ablate import Ablate
-from lexsplat.cli.build import Build, Embed, Reconstruct
+from lexsplat.cli.build import Build, Language, Reconstruct
 from lexsplat.cli.compare import Compare
 from lexsplat.cli.demo import Demo
 from lexsplat.cli.edit import Edit
@@ -34,7 +34,7 @@ Command = (
     | Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
-    | Annotated[Embed, tyro.conf.subcommand("embed")]
+    | Annotated[Language, tyro.conf.subcommand("language")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Find, tyro.conf.subcommand("find")]
     | Annotated[Scale, tyro.conf.subcommand("scale")]
@@ -52,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr)
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == ["embed"]:  # the name of the command before "language"
+        arguments[0] = "language"
     if arguments[:1] in (["--version"], ["-V"]):
         print(f"lexsplat {__version__}")
         return 0

@@ -1,4 +1,4 @@
-"""``lexsplat build``, ``reconstruct`` and ``embed``: photos in, a searchable scene out."""
+"""``lexsplat build``, ``reconstruct`` and ``language``: photos in, a searchable scene out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lexsplat.pipeline.config import BuildConfig
 class Build:
     """Make a searchable scene from photos, with or without cameras, or from a video.
 
-    All stages: reconstruct, features, codebook, embed. Run it again with the same output to go on where it
+    All stages: reconstruct, features, codebook, language. Run it again with the same output to go on where it
     stopped; only what a changed setting touches is done again.
 
     Args:
@@ -32,7 +32,7 @@ class Build:
     test_views: tuple[str, ...] = ()
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
-    until = "embed"
+    until = "language"
 
     def run(self) -> None:
         """Build up to the last stage of this command."""
@@ -50,7 +50,7 @@ class Build:
                 listener=bars,
             )
         print(f"{folder.root}: {', '.join(folder.record['stages'])} finished")
-        if self.until == "embed":
+        if self.until == "language":
             print(f'next: lexsplat query {folder.root} "something you see"')
 
 
@@ -62,7 +62,7 @@ class Reconstruct(Build):
 
 
 @dataclasses.dataclass
-class Embed(Build):
+class Language(Build):
     """Give a scene its language: the stages after reconstruct (which is run first where it is missing).
 
     With --splats, Gaussians made by another program are taken as they are; photos and poses must be those they were

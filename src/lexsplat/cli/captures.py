@@ -8,14 +8,14 @@ from typing import Any
 
 from lexsplat.pipeline.config import BuildConfig
 
-EMBEDDED = ("demo", "second")
+BUNDLED = ("demo", "second")
 """Captures that ship with the package, by name."""
 
 
 def capture_and_settings(capture: str, settings: BuildConfig) -> tuple[Path, BuildConfig]:
-    """The folder of a capture; the words of `EMBEDDED` stand for the embedded ones, with the demo's settings."""
+    """The folder of a capture; the words of `BUNDLED` stand for the bundled ones, with the demo's settings."""
     path = Path(capture)
-    if capture not in EMBEDDED or path.exists():
+    if capture not in BUNDLED or path.exists():
         return path, settings
     from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
 

@@ -14,13 +14,13 @@ from lexsplat.pipeline.config import BuildConfig, LanguageMethod
 class Demo:
     """Run the whole system on the scene that ships with lexsplat, and show what it can do.
 
-    Reconstructs the scene, extracts language features with the embedded encoders, fits the codebook, makes the
+    Reconstructs the scene, extracts language features with the bundled encoders, fits the codebook, makes the
     language field, answers queries on held-out views, and evaluates them against exact masks. Needs no network
     and no GPU. Run it again to go on where it stopped.
 
     Args:
         output: Folder for everything that is written.
-        scene: Which embedded scene: the table top of the pictures, or the second, smaller one.
+        scene: Which bundled scene: the table top of the pictures, or the second, smaller one.
         method: How language gets into the Gaussians (see ``lexsplat build --help``).
         device: Where to compute.
         seed: Seed of all randomness.

@@ -14,12 +14,12 @@ from lexsplat.runtime.errors import QueryError
 
 if TYPE_CHECKING:
     from lexsplat.scenes.editing import Editor
-    from lexsplat.scenes.scene import SearchableScene
+    from lexsplat.scenes.scene import Scene
 
 
 @dataclasses.dataclass
 class Edit:
-    """Change a scene by words: delete, keep, recolour, move or duplicate what is found; undo, redo; save as another.
+    """Change a scene by words: delete, keep, recolor, move or duplicate what is found; undo, redo; save as another.
 
     The scene itself stays as it was built. Steps are kept in SCENE/edits.jsonl until they are discarded (those of
     ``demo`` in demo_edits.jsonl here); other commands see them in what "save" writes:
@@ -38,8 +38,8 @@ class Edit:
         grow: Widen the selection by this distance, world units.
         shrink: Narrow the selection by this distance, world units.
         largest: Only the largest thing found.
-        color: Red, green and blue in 0..1, for recolour.
-        strength: How much of the new colour, in 0..1.
+        color: Red, green and blue in 0..1, for recolor.
+        strength: How much of the new color, in 0..1.
         by: Shift in world units, for move and duplicate.
         turn: Degrees about the up direction, anticlockwise from above.
         scale: Factor on its size.
@@ -50,7 +50,7 @@ class Edit:
 
     scene: tyro.conf.Positional[str]
     action: tyro.conf.Positional[
-        Literal["delete", "keep", "recolour", "move", "duplicate", "undo", "redo", "list", "discard", "save"]
+        Literal["delete", "keep", "recolor", "move", "duplicate", "undo", "redo", "list", "discard", "save"]
     ]
     select: str | None = None
     view: str | None = None
@@ -68,8 +68,8 @@ class Edit:
     device: Device = "auto"
 
     def __post_init__(self) -> None:
-        needs = {"delete": "select", "keep": "select", "recolour": "color", "save": "output"}
-        if self.action in ("delete", "keep", "recolour", "move", "duplicate") and not self.select:
+        needs = {"delete": "select", "keep": "select", "recolor": "color", "save": "output"}
+        if self.action in ("delete", "keep", "recolor", "move", "duplicate") and not self.select:
             raise ValueError(f'{self.action} needs --select "what"')
         if self.action in needs and getattr(self, needs[self.action]) is None:
             raise ValueError(f"{self.action} needs --{needs[self.action]}")
@@ -107,7 +107,7 @@ class Edit:
             print(
                 f"{editor.save(self.output).root}: written; the steps stay in {journal} until you discard them"
             )
-        elif self.action in ("delete", "keep", "recolour", "move", "duplicate"):
+        elif self.action in ("delete", "keep", "recolor", "move", "duplicate"):
             self._change(editor)
         for number, step in enumerate(editor.steps, start=1):
             print(f"{number}. {step}")
@@ -122,8 +122,8 @@ class Edit:
         chosen = chosen.grow(self.grow) if self.grow is not None else chosen
         chosen = chosen.shrink(self.shrink) if self.shrink is not None else chosen
         try:
-            if self.action == "recolour" and self.color:
-                editor.recolour(chosen, self.color, self.strength)
+            if self.action == "recolor" and self.color:
+                editor.recolor(chosen, self.color, self.strength)
             elif self.action in ("move", "duplicate"):
                 turn = rotation_about(chosen.up.direction, self.turn)
                 getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
@@ -135,8 +135,8 @@ class Edit:
             ) from error
 
 
-def _journal_of(scene: SearchableScene) -> Path:
+def _journal_of(scene: Scene) -> Path:
     """Where the steps are kept; the scene that ships is never written to."""
-    if scene.folder is None or scene.folder.is_shipped:
+    if scene.folder is None or scene.folder.is_bundled:
         return Path("demo_edits.jsonl")
     return scene.folder.root / "edits.jsonl"

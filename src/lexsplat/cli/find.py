@@ -16,7 +16,7 @@ class Find:
     Phrases may relate things: "mug on the cloth", "largest book", "fruit but not the banana", "how many apples",
     "chair next to the table" (left of, right of, in front of, behind, on, under, above, below, inside, next to,
     nearest to). Put words into quotation marks inside the phrase to keep them together. Places are in the scene's
-    units; sizes are in metres once the scale is known (see `lexsplat scale`).
+    units; sizes are in meters once the scale is known (see `lexsplat scale`).
 
     Args:
         scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
@@ -54,9 +54,9 @@ class Find:
             print(f"{answer['phrase']}: present: {answer['present']}, {count} found{weak}")
             for number, thing in enumerate(answer["instances"], start=1):
                 center = ", ".join(f"{v:.2f}" for v in thing["center"])
-                metres = thing.get("size_metres")
+                meters = thing.get("size_meters")
                 size = " x ".join(f"{v:.2f}" for v in thing["size"])
-                if metres is not None:
-                    size = " x ".join(f"{v:.3f}" for v in metres) + " m"
+                if meters is not None:
+                    size = " x ".join(f"{v:.3f}" for v in meters) + " m"
                 print(f"  {number}. at ({center}), size {size}, score {thing['score']:.2f}, "
                       f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}")  # fmt: skip

@@ -12,7 +12,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.device import check_seed
 
 if TYPE_CHECKING:
-    from lexsplat.scenes.scene import SearchableScene
+    from lexsplat.scenes.scene import Scene
 
 Settings = Annotated[BuildConfig, tyro.conf.arg(name="")]
 Device = Literal["auto", "cpu", "cuda"]
@@ -24,7 +24,7 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 """What is said behind an answer, for each verdict on whether the thing is in the scene at all."""
 
 
-def open_scene(path: str, device: str, clip: str | None) -> SearchableScene:
+def open_scene(path: str, device: str, clip: str | None) -> Scene:
     """The scene a command was given, ready to be asked."""
     from lexsplat.scenes import scene as search
 

@@ -12,7 +12,7 @@ from lexsplat.cli.options import PRESENCE, Device, check_relevancy, open_scene, 
 from lexsplat.queries.relevancy import QueryConfig
 
 if TYPE_CHECKING:
-    from lexsplat.scenes.scene import SearchableScene
+    from lexsplat.scenes.scene import Scene
 
 
 @dataclasses.dataclass
@@ -83,8 +83,8 @@ class Query:
         print(f"pictures in {folder}")
 
 
-def _pictures_folder(scene: SearchableScene) -> Path:
+def _pictures_folder(scene: Scene) -> Path:
     """Where answers go unless told otherwise; the scene that ships is never written to."""
-    if scene.folder is None or scene.folder.is_shipped:
+    if scene.folder is None or scene.folder.is_bundled:
         return Path("demo_heatmaps")
     return scene.folder.root / "heatmaps"

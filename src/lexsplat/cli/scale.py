@@ -1,4 +1,4 @@
-"""``lexsplat scale``: what a scene's unit is in metres, and which way is up."""
+"""``lexsplat scale``: what a scene's unit is in meters, and which way is up."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lexsplat.geometry.world import World, parse_vector, world_of
 
 @dataclasses.dataclass
 class Scale:
-    """Tell a scene how long something in it is, so that sizes are in metres from then on.
+    """Tell a scene how long something in it is, so that sizes are in meters from then on.
 
     Photos alone do not say how large things are; one distance that you know does:
 
@@ -22,12 +22,12 @@ class Scale:
         lexsplat scale SCENE --distance 1.2 --points 0.1,0.2,0 0.9,0.2,0.4    # as `lexsplat find` prints places
         lexsplat scale SCENE --up 0,0,1                                       # where the cameras misled
 
-    Without options it says what is known. `find`, `info` and glTF exports then are in metres; what is stored keeps
+    Without options it says what is known. `find`, `info` and glTF exports then are in meters; what is stored keeps
     its units. Nothing is built again.
 
     Args:
         scene: A scene folder.
-        distance: The distance in metres.
+        distance: The distance in meters.
         between: Two phrases: it is that between the middles of these things.
         height_of: A phrase: it is the height of this thing.
         points: Two places as x,y,z: it is that between them.
@@ -51,7 +51,7 @@ class Scale:
         ways = sum(way is not None for way in (self.between, self.height_of, self.points))
         if (self.distance is None) != (ways == 0) or ways > 1:
             raise ValueError(
-                "--distance METRES goes with one of --between A B, --height-of A, --points X,Y,Z X,Y,Z"
+                "--distance METERS goes with one of --between A B, --height-of A, --points X,Y,Z X,Y,Z"
             )
         if self.distance is not None and not 0 < self.distance < float("inf"):
             raise ValueError(f"distance must be positive, got {self.distance:g}")
@@ -75,7 +75,7 @@ class Scale:
         up = parse_vector(self.up) if self.up else None
         changes = up is not None or scale is not None
         if changes:
-            world = store_world(folder, up=up, metres_per_unit=scale)
+            world = store_world(folder, up=up, meters_per_unit=scale)
         else:
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
             world = world_of(folder.record, cameras)
@@ -83,7 +83,7 @@ class Scale:
             print_json(world.to_json())
             return
         direction = ", ".join(f"{v:.3f}" for v in world.up.direction)
-        known = world.metres_per_unit
+        known = world.meters_per_unit
         print("scale: not known" if known is None else f"scale: one unit is {known:.4g} m")
         print(f"up: ({direction}) from the {world.source}{'' if world.up.reliable else ', unsure'}")
 

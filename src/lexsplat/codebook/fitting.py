@@ -194,7 +194,7 @@ def spherical_kmeans(
 ) -> tuple[Tensor, Tensor | None]:
     """k-means for the similarity of Eq. 4, with k-means++ seeds.
 
-    The normalised sum of a cluster's unit vectors, half by half, minimises Eq. 5 for a given assignment, so
+    The normalized sum of a cluster's unit vectors, half by half, minimizes Eq. 5 for a given assignment, so
     every iteration lowers L_cos. A cluster left without features restarts at the feature that is served
     worst.
 
@@ -203,10 +203,10 @@ def spherical_kmeans(
     """
     joint = clip if dino is None else torch.cat([clip, lambda_dino**0.5 * dino], dim=-1)
     split = clip.shape[1]
-    centres = joint[_kmeans_seeds(joint, num_codes, generator)]
+    centers = joint[_kmeans_seeds(joint, num_codes, generator)]
     for _ in range(iterations):
-        best, chosen = _nearest(joint, centres)
-        sums = torch.zeros_like(centres).index_add_(0, chosen, joint)
+        best, chosen = _nearest(joint, centers)
+        sums = torch.zeros_like(centers).index_add_(0, chosen, joint)
         counts = torch.bincount(chosen, minlength=num_codes)
         empty = (counts == 0).nonzero()[:, 0]
         if len(empty):
@@ -216,11 +216,11 @@ def spherical_kmeans(
         if dino is not None:
             halves.append(lambda_dino**0.5 * functional.normalize(sums[:, split:], dim=-1))
         updated = torch.cat(halves, dim=-1)
-        if torch.equal(updated, centres):
+        if torch.equal(updated, centers):
             break
-        centres = updated
-    code_dino = None if dino is None else functional.normalize(centres[:, split:], dim=-1)
-    return functional.normalize(centres[:, :split], dim=-1), code_dino
+        centers = updated
+    code_dino = None if dino is None else functional.normalize(centers[:, split:], dim=-1)
+    return functional.normalize(centers[:, :split], dim=-1), code_dino
 
 
 def _uniform_codes(features: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
@@ -246,9 +246,9 @@ def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> 
     return torch.tensor(seeds, device=joint.device)
 
 
-def _nearest(joint: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+def _nearest(joint: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
     """Best similarity and its index for every row, in blocks."""
-    parts = [(joint[i : i + BLOCK_ROWS] @ centres.T).max(-1) for i in range(0, len(joint), BLOCK_ROWS)]
+    parts = [(joint[i : i + BLOCK_ROWS] @ centers.T).max(-1) for i in range(0, len(joint), BLOCK_ROWS)]
     return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
 
 

@@ -30,11 +30,11 @@ from lexsplat.runtime.progress import Listener, silent
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "w/o DINO": {"codebook": {"use_dino": False}},
     "w/o L_lb": {"codebook": {"load_balancing": False}},
-    "w/o u_G": {"embedding": {"use_uncertainty": False}},
-    "w/o MLP": {"embedding": {"use_smoothing": False}},
-    "w/o u_G & MLP": {"embedding": {"use_uncertainty": False, "use_smoothing": False}},
-    "with neighbours": {"lifting": {"use_smoothing": True}},
-    "one code": {"lifting": {"top": 1}},
+    "w/o u_G": {"trained": {"use_uncertainty": False}},
+    "w/o MLP": {"trained": {"use_smoothing": False}},
+    "w/o u_G & MLP": {"trained": {"use_uncertainty": False, "use_smoothing": False}},
+    "with neighbors": {"lifted": {"use_smoothing": True}},
+    "one code": {"lifted": {"top": 1}},
     "full": {},
 }
 """What each row changes: those of the paper's Table 2 in its order, and what a lifted field can have otherwise."""
@@ -50,9 +50,9 @@ def variants_of(method: str) -> tuple[str, ...]:
     features are quantized by k-means alone.
     """
     without = {
-        "averaged": {"codebook", "embedding", "lifting"},
-        "lifted": {"embedding"},
-        "trained": {"lifting"},
+        "averaged": {"codebook", "trained", "lifted"},
+        "lifted": {"trained"},
+        "trained": {"lifted"},
     }
     return tuple(name for name, changes in VARIANTS.items() if not without.get(method, set()) & set(changes))
 
@@ -95,7 +95,7 @@ def changed(config: BuildConfig, variant: str) -> BuildConfig:
 
 def as_in_paper(config: BuildConfig) -> BuildConfig:
     """The fit and the training of the paper in place of our short ones."""
-    return replace(config, codebook=config.codebook.as_in_paper(), embedding=config.embedding.as_in_paper())
+    return replace(config, codebook=config.codebook.as_in_paper(), trained=config.trained.as_in_paper())
 
 
 def ablate(
@@ -129,7 +129,7 @@ def ablate(
         forms: How codes and text are compared, each beside the others: "feature" as in the paper, "code". Names of
             rows end in the form where there are several.
         evaluation: How to measure; by default as `paper_evaluation`.
-        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        masks: Folder with the ground truth in any layout of `scenes.annotations`, if not the capture's own.
         prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
         listener: Told how far each stage is.
 
@@ -138,7 +138,7 @@ def ablate(
 
     Raises:
         ValueError: If a variant is unknown, or there is no seed.
-        CaptureError: If there is no truth of held-out views, or no prompt list for the capture.
+        CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
     plan = _plan(config, list(methods) or [config.method], variants)
     if not seeds or not forms:
@@ -211,11 +211,11 @@ def make_language(
     else:
         cameras = {name: view.camera for name, view in views.items()}
         field = make_field(bench.gaussians, cameras, code_maps, codebook, bounded, bench.listener)
-    return field, {**seconds, "embed": time.perf_counter() - start}
+    return field, {**seconds, "language": time.perf_counter() - start}
 
 
 def language_settings(config: BuildConfig) -> list[Any]:
     """Everything a language depends on beside Gaussians, features and seed."""
     return [
-        config.method, config.codebook, config.averaging, config.embedding, config.lifting, config.tuning,
+        config.method, config.codebook, config.averaged, config.trained, config.lifted, config.tuning,
     ]  # fmt: skip

@@ -55,7 +55,7 @@ def compare(
         methods: Names out of `METHODS`.
         seeds: Seeds of codebook and language; one is enough for methods without chance.
         lpips: Measure LPIPS if it is installed.
-        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        masks: Folder with the ground truth in any layout of `scenes.annotations`, if not the capture's own.
         prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
         protocols: Names out of `evaluation.PROTOCOLS`; "strict" is always measured.
         listener: Told how far each stage is.
@@ -65,7 +65,7 @@ def compare(
 
     Raises:
         ValueError: If a method or protocol is unknown, or there is no method or seed.
-        CaptureError: If there is no truth of held-out views, or no prompt list for the capture.
+        CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
     unknown = [name for name in methods if name not in METHODS]
     if unknown or not methods or not seeds:
@@ -94,14 +94,14 @@ def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[],
         "3dovs": baselines.Ovs3dConfig(),
         "nearest": None,
     }[name]
-    prompts = list(bench.truth.prompts()) if name == "3dovs" else []
+    prompts = list(bench.ground_truth.prompts()) if name == "3dovs" else []
     return [name, settings, prompts], lambda: _baseline(bench, name, settings, seed)
 
 
 def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
     scene, maps = bench.scene, bench.maps
     training: Mapping[str, Any] = {view: scene.views[view].camera for view in scene.train_names}
-    memory = bench.config.within_memory().embedding.memory_bytes
+    memory = bench.config.within_memory().trained.memory_bytes
     start = time.perf_counter()
     found: Method
     if name == "dff":
@@ -114,7 +114,9 @@ def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
             memory_bytes=memory, listener=bench.listener,
         )  # fmt: skip
     elif name == "3dovs":
-        classes = embed_prompts(bench.truth.prompts(), bench.encode_text, bench.evaluation.query.templates)
+        classes = embed_prompts(
+            bench.ground_truth.prompts(), bench.encode_text, bench.evaluation.query.templates
+        )
         found = baselines.fit_3dovs(
             bench.gaussians, training, maps, bench.level_maps, classes, settings, seed=seed,
             memory_bytes=memory, listener=bench.listener,

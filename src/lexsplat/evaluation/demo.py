@@ -18,12 +18,12 @@ SceneName = Literal["tabletop", "second"]
 SCENES = Path(__file__).resolve().parents[1] / "demo" / "scenes"
 """Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
 
-DEMO_CONFIG = BuildConfig(clip="embedded", dino="embedded", codebook=CodebookConfig(num_codes=256))
+DEMO_CONFIG = BuildConfig(clip="bundled", dino="bundled", codebook=CodebookConfig(num_codes=256))
 """Settings of the demo; docs/results.md says on which views which setting was chosen."""
 
 
 def demo_capture(scene: SceneName = "tabletop") -> Path:
-    """The folder of an embedded capture."""
+    """The folder of a bundled capture."""
     return SCENES / scene
 
 
@@ -37,11 +37,11 @@ def run_demo(
     iterations: int | None = None,
     listener: Listener = silent,
 ) -> dict[str, Any]:
-    """Build the embedded scene and evaluate it on its held-out views.
+    """Build the bundled scene and evaluate it on its held-out views.
 
     Args:
         output: The scene folder to make or to go on with.
-        scene: Which embedded capture.
+        scene: Which bundled capture.
         method: How language gets into the Gaussians; none takes the default.
         device: Where to compute.
         seed: Seed of all randomness.

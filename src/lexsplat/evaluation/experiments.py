@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from lexsplat.captures import Annotations, Scene, check_truth_wishes, load_annotations
+from lexsplat.captures import Annotations, Capture, check_ground_truth_options, load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
@@ -93,11 +93,11 @@ class Bench:
         config: Settings; ``config.seed`` is the seed of the Gaussians.
         evaluation: How runs are measured.
         listener: Told how far each stage is.
-        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        masks: Folder with the ground truth in any layout of `scenes.annotations`, if not the capture's own.
         prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
 
     Raises:
-        CaptureError: If there is no truth to measure against.
+        CaptureError: If there is no ground truth to measure against.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Bench:
         masks: Path | None = None,
         prompt_list: PromptList | None = None,
     ) -> None:
-        check_truth_wishes(capture, masks, prompt_list)
+        check_ground_truth_options(capture, masks, prompt_list)
         self.output, self.listener = output, listener
         # Other methods than the settings' may be measured: features are made with everything that any of them uses.
         everything = replace(config, method="trained") if config.method == "averaged" else config
@@ -123,9 +123,9 @@ class Bench:
         self.config = resolved
         self.evaluation = evaluation
         self.prompt_list = prompt_list
-        self.truth: Annotations = load_annotations(self.scene, masks, prompt_list)
+        self.ground_truth: Annotations = load_annotations(self.scene, masks, prompt_list)
         held_out = set(self.scene.test_names)
-        if not any(prompts for view, prompts in self.truth.masks.items() if view in held_out):
+        if not any(prompts for view, prompts in self.ground_truth.masks.items() if view in held_out):
             remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
             if masks is not None:
                 remedy = "hold out the views that have masks: list them in test_views.json of the capture"
@@ -144,7 +144,7 @@ class Bench:
         self._last: tuple[str, Made] | None = None
         self._codebook_peaks: Peaks = {}
 
-    def _load_scene(self, config: BuildConfig) -> tuple[Scene, BuildConfig]:
+    def _load_scene(self, config: BuildConfig) -> tuple[Capture, BuildConfig]:
         scene = reload_capture(self.folder)
         sizes = [view.capture_size for view in scene.views.values()]
         return scene, config.resolved(self.device, max(sizes, key=lambda size: size[0] * size[1]))
@@ -298,8 +298,8 @@ class Bench:
             language,
             self.encode_text,
             self.evaluation,
-            masks=self.truth.masks,
-            boxes=self.truth.boxes,
+            masks=self.ground_truth.masks,
+            boxes=self.ground_truth.boxes,
             observer=observer,
             listener=self.listener,
             stage_seconds={**stages, **seconds},
@@ -309,11 +309,12 @@ class Bench:
 
     @cached_property
     def _truth_identity(self) -> list[Any]:
-        """Words and truth as they are measured, by content: wherever it lies, and whatever its files are called."""
+        """Words and ground truth as they are measured, by content: wherever it lies, and whatever its files are called."""
         masks = {
-            view: {p: _digest(m) for p, m in prompts.items()} for view, prompts in self.truth.masks.items()
+            view: {p: _digest(m) for p, m in prompts.items()}
+            for view, prompts in self.ground_truth.masks.items()
         }
-        return [masks, self.truth.boxes]
+        return [masks, self.ground_truth.boxes]
 
 
 class Results:
@@ -352,7 +353,7 @@ class Results:
                 **to_json(self.bench.config),
                 "seeds": self.seeds,
                 "evaluation": to_json(self.evaluation),
-                "truth": self._truth(),
+                "ground_truth": self._truth(),
             },
             machine=machine_facts(),
         )
@@ -369,7 +370,7 @@ class Results:
             "seeds": self.seeds,
             "config": to_json(self.bench.config),
             "evaluation": to_json(self.evaluation),
-            "truth": self._truth(),
+            "ground_truth": self._truth(),
             "machine": machine_facts(),
             "runs": {name: [language["strict"] for language in found] for name, found in words.items()},
             "per_prompt": {
@@ -378,7 +379,7 @@ class Results:
         }
 
     def _truth(self) -> dict[str, Any]:
-        return self.bench.truth.origin_facts(self.bench.prompt_list)
+        return self.bench.ground_truth.origin_facts(self.bench.prompt_list)
 
     def _measured(self, name: str) -> MeasuredMethod:
         runs = self.runs[name]

@@ -2,11 +2,11 @@
 
 Nothing is chosen on the views it is reported on. Three thresholds stand side by side: ``fixed`` (0.5, the
 paper), ``auto`` (per prompt, from renderings of training views, `presence.found_thresholds`) and ``oracle``
-(per prompt, the best one for the truth: an upper bound, never a result).
+(per prompt, the best one for the ground truth: an upper bound, never a result).
 
-Relevancy is rendered at the size of the truth, so that neither has to be resized; only masks larger than
+Relevancy is rendered at the size of the ground truth, so that neither has to be resized; only masks larger than
 ``max_pixels`` are met by a map rendered at the working size and enlarged. The official protocol renders at
-the working size and resizes the truth, as the authors do.
+the working size and resizes the ground truth, as the authors do.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from lexsplat.queries.relevancy import QueryConfig, TextEncoder, embed_prompts
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.captures import Scene, View
+    from lexsplat.captures import Capture, View
     from lexsplat.language.fields import LanguageField
 
 
@@ -78,7 +78,7 @@ class EvaluationConfig:
 
 
 def evaluate(
-    scene: Scene,
+    scene: Capture,
     gaussians: Gaussians,
     language: LanguageField | Method | None,
     encode_text: TextEncoder | None,
@@ -104,14 +104,14 @@ def evaluate(
         config: What is measured.
         masks: Truth by view and prompt; None takes what the capture has (`scenes.load_annotations`). Views of the
             training split are left out.
-        boxes: Boxes by view and prompt for LangSplat's localisation; where there are none, those of the masks.
+        boxes: Boxes by view and prompt for LangSplat's localization; where there are none, those of the masks.
         observer: Called once for each held-out view, for reports.
         listener: Told how far it is.
         stage_seconds: Time of each stage of the build, passed through.
         stored_bytes: "language_bytes" and "gaussian_bytes" on disk; else the size of the tensors.
         settings: Settings of the build, passed through.
         machine: Passed through.
-        prompt_kinds: What kind of question a prompt is ("name", "colour", "part", ...); the numbers are then also
+        prompt_kinds: What kind of question a prompt is ("name", "color", "part", ...); the numbers are then also
             given for each kind.
 
     Raises:
@@ -150,7 +150,7 @@ class _Evaluation:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Capture,
         gaussians: Gaussians,
         method: Method | None,
         config: EvaluationConfig,
@@ -209,10 +209,10 @@ class _Evaluation:
                 "lpips": perceptual(image, photo) if perceptual else None,
             }
             self.pictures[view.name] = scores
-            relevancy, truth = self._score_language(view)
+            relevancy, ground_truth = self._score_language(view)
             if observer is not None:
-                automatic = {prompt: self.thresholds[prompt]["auto"] for prompt in truth}
-                observer(ViewPictures(view.name, photo, image, relevancy, truth, automatic))
+                automatic = {prompt: self.thresholds[prompt]["auto"] for prompt in ground_truth}
+                observer(ViewPictures(view.name, photo, image, relevancy, ground_truth, automatic))
             listener(Event("evaluate", done, len(self.views), {"psnr": scores["psnr"] or 0.0}))
         for prompt in self.prompts:
             curves = [prompts[prompt].counts.iou for prompts in self.pairs.values() if prompt in prompts]
@@ -243,19 +243,19 @@ class _Evaluation:
         self, view: View
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.bool_]]]:
         sources = sorted(self.masks.get(view.name, {}).items())
-        truth = {prompt: _mask(view, source) for prompt, source in sources}
-        if not truth:
+        ground_truth = {prompt: _mask(view, source) for prompt, source in sources}
+        if not ground_truth:
             return {}, {}
-        working = self._relevancy(view.camera, list(truth))
+        working = self._relevancy(view.camera, list(ground_truth))
         relevancy: dict[str, NDArray[np.float32]] = {}
-        for size in sorted({mask.shape for mask in truth.values()}):
-            prompts = [prompt for prompt, mask in truth.items() if mask.shape == size]
+        for size in sorted({mask.shape for mask in ground_truth.values()}):
+            prompts = [prompt for prompt, mask in ground_truth.items() if mask.shape == size]
             relevancy |= self._at_size(view.camera, size, {prompt: working[prompt] for prompt in prompts})
         self.pairs[view.name] = {
             prompt: self._pair(view, prompt, relevancy[prompt], working[prompt], mask)
-            for prompt, mask in truth.items()
+            for prompt, mask in ground_truth.items()
         }
-        return relevancy, truth
+        return relevancy, ground_truth
 
     def _pair(
         self,
@@ -265,7 +265,7 @@ class _Evaluation:
         working: NDArray[np.float32],
         mask: NDArray[np.bool_],
     ) -> PairResult:
-        """One prompt in one view under every protocol: maps at the size of the truth and at the working size."""
+        """One prompt in one view under every protocol: maps at the size of the ground truth and at the working size."""
         asked = self.config.protocols
         boxes = self.boxes.get(view.name, {}).get(prompt)
         return PairResult(

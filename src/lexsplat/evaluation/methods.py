@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.presence import PresenceJudge, found_thresholds
+from lexsplat.queries.presence import PresenceClassifier, found_thresholds
 from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
 from lexsplat.queries.thresholds import automatic_threshold
 
@@ -73,7 +73,7 @@ class FieldMethod:
         config: QueryConfig,
     ) -> Tensor:
         """See `presence.found_thresholds`: what a user of the scene gets."""
-        judge = PresenceJudge(gaussians, self.field, references, negatives, config.temperature)
+        judge = PresenceClassifier(gaussians, self.field, references, negatives, config.temperature)
         return found_thresholds(judge, gaussians, cameras, positives, negatives, config)
 
     def tensors(self) -> dict[str, Tensor]:

@@ -1,6 +1,6 @@
 """Numbers: how good the pictures are and how well words are found. Arrays in, floats out, never a disk.
 
-What is here is strict: truth is binary and never resized; where sizes differ, the relevancy is
+What is here is strict: ground truth is binary and never resized; where sizes differ, the relevancy is
 (`resize_scores`). Average precision takes every distinct score as a threshold and is the mean over the recalls
 0, 0.01, ..., 1 of the interpolated precision (COCO's), so it lies in 0..1. Prompts are averaged within an
 image, then images (`mean_over_images`). Other people's protocols stand in `evaluation.protocols`.
@@ -94,29 +94,29 @@ def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
 # Masks, strict
 
 
-def iou(prediction: ArrayLike, truth: ArrayLike) -> float:
+def iou(prediction: ArrayLike, ground_truth: ArrayLike) -> float:
     """Intersection over union of two boolean masks; 1 when both are empty."""
-    first, second = _masks(prediction, truth)
+    first, second = _masks(prediction, ground_truth)
     union = np.count_nonzero(first | second)
     return np.count_nonzero(first & second) / union if union else 1.0
 
 
-def pixel_accuracy(prediction: ArrayLike, truth: ArrayLike) -> float:
+def pixel_accuracy(prediction: ArrayLike, ground_truth: ArrayLike) -> float:
     """Share of pixels on which two boolean masks agree."""
-    first, second = _masks(prediction, truth)
+    first, second = _masks(prediction, ground_truth)
     return float(np.mean(first == second))
 
 
-def precision(prediction: ArrayLike, truth: ArrayLike) -> float:
-    """Share of predicted pixels that are true; for an empty prediction 0, or 1 if the truth is empty too."""
-    first, second = _masks(prediction, truth)
+def precision(prediction: ArrayLike, ground_truth: ArrayLike) -> float:
+    """Share of predicted pixels that are true; for an empty prediction 0, or 1 if the ground truth is empty too."""
+    first, second = _masks(prediction, ground_truth)
     found = np.count_nonzero(first)
     if not found:
         return 0.0 if second.any() else 1.0
     return np.count_nonzero(first & second) / found
 
 
-def precision_recall(scores: ArrayLike, truth: ArrayLike) -> tuple[NDArray, NDArray, NDArray]:
+def precision_recall(scores: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray, NDArray, NDArray]:
     """Precision and recall at every distinct score, from the highest threshold to the lowest.
 
     Returns:
@@ -126,7 +126,7 @@ def precision_recall(scores: ArrayLike, truth: ArrayLike) -> tuple[NDArray, NDAr
     Raises:
         ValueError: If shapes differ, a score is not a number, or nothing is true.
     """
-    values, mask = _scores(scores, truth)
+    values, mask = _scores(scores, ground_truth)
     positives = np.count_nonzero(mask)
     if not positives:
         raise ValueError("precision and recall need at least one true pixel")
@@ -137,15 +137,15 @@ def precision_recall(scores: ArrayLike, truth: ArrayLike) -> tuple[NDArray, NDAr
     return hits / (last + 1), hits / positives, ranked[last]
 
 
-def average_precision(scores: ArrayLike, truth: ArrayLike) -> float:
+def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
     """Strict average precision: mean over 101 recalls of the best precision at that recall or a higher one.
 
     Returns:
         A number in 0..1; NaN when nothing is true, for such an image cannot be ranked.
     """
-    if not np.asarray(truth).any():
+    if not np.asarray(ground_truth).any():
         return math.nan
-    precisions, recalls, _ = precision_recall(scores, truth)
+    precisions, recalls, _ = precision_recall(scores, ground_truth)
     return float(interpolated_precision(precisions, recalls).mean())
 
 
@@ -155,18 +155,18 @@ def interpolated_precision(precisions: NDArray, recalls: NDArray) -> NDArray:
     return best[np.searchsorted(recalls, RECALLS, side="left")]
 
 
-def localization(scores: ArrayLike, truth: ArrayLike) -> float:
+def localization(scores: ArrayLike, ground_truth: ArrayLike) -> float:
     """Whether the highest score lies on the object: 1 or 0; NaN when nothing is true.
 
     Where several pixels share the highest score, the share of them that lies on the object, which is what
     picking one at random hits on average: a flat map is worth no more than the object's area.
     """
-    values, mask = _scores(scores, truth)
+    values, mask = _scores(scores, ground_truth)
     return float(mask[values == values.max()].mean()) if mask.any() else math.nan
 
 
 def resize_scores(scores: ArrayLike, width: int, height: int) -> NDArray[np.float32]:
-    """A relevancy map ``[H, W]`` at another size, bilinear, centres kept; unchanged when sizes agree."""
+    """A relevancy map ``[H, W]`` at another size, bilinear, centers kept; unchanged when sizes agree."""
     values = np.asarray(scores, dtype=np.float32)
     if values.shape == (height, width):
         return values
@@ -224,9 +224,9 @@ class ThresholdCounts:
         return self.hits[keep] / found[keep], self.hits[keep] / max(int(self.hits[0]), 1)
 
 
-def threshold_counts(scores: ArrayLike, truth: ArrayLike) -> ThresholdCounts:
+def threshold_counts(scores: ArrayLike, ground_truth: ArrayLike) -> ThresholdCounts:
     """Counts at 1001 thresholds in 0..1; scores outside are clipped."""
-    values, mask = _scores(scores, truth)
+    values, mask = _scores(scores, ground_truth)
     bins = np.searchsorted(THRESHOLDS, np.clip(values, 0, 1), side="right") - 1
     counts = [np.bincount(bins[side], minlength=1001)[::-1].cumsum()[::-1] for side in (mask, ~mask)]
     return ThresholdCounts(*counts)
@@ -259,8 +259,8 @@ def _same_shape(image: ArrayLike, target: ArrayLike) -> tuple[NDArray[np.float64
     return first, second
 
 
-def _masks(prediction: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    first, second = np.asarray(prediction), np.asarray(truth)
+def _masks(prediction: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    first, second = np.asarray(prediction), np.asarray(ground_truth)
     if first.dtype != bool or second.dtype != bool:
         raise ValueError(f"masks must be boolean, got {first.dtype} and {second.dtype}")
     if first.shape != second.shape or not first.size:
@@ -268,8 +268,8 @@ def _masks(prediction: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.bool_], 
     return first, second
 
 
-def _scores(scores: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    values, mask = np.asarray(scores), np.asarray(truth)
+def _scores(scores: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    values, mask = np.asarray(scores), np.asarray(ground_truth)
     if mask.dtype != bool or values.shape != mask.shape or not values.size:
         raise ValueError(
             f"scores {list(values.shape)} need a boolean mask as large, got {mask.dtype} {list(mask.shape)}"

@@ -1,7 +1,7 @@
 """Other people's protocols, by name, to be comparable with numbers made by them.
 
 - **official**: the authors' released evaluation of LEGaussians, quirks included (`official_scores`).
-- **lerf-2d**: LangSplat's evaluation on LERF-OVS: localisation by the peak of a blurred map, IoU of a mask cut
+- **lerf-2d**: LangSplat's evaluation on LERF-OVS: localization by the peak of a blurred map, IoU of a mask cut
   from the map stretched to its own range (`lerf_2d_scores`).
 - **lerf-3d**: Gaussians are selected in 3D, then rendered alone (OpenGaussian's evaluation on LERF-OVS); the two
   LERF-OVS protocols cannot be compared (`silhouette_iou`).
@@ -72,17 +72,17 @@ def official_scores(relevancy: ArrayLike, mask: ArrayLike, threshold: float = 0.
 
     Args:
         relevancy: ``[H, W]`` in 0..1, at the size of the rendered image.
-        mask: Boolean truth at its own size.
+        mask: Boolean ground truth at its own size.
         threshold: For everything but the average precision.
     """
     values = np.asarray(relevancy, dtype=np.float32)
-    truth = official_truth(mask, values.shape[1], values.shape[0])
+    ground_truth = official_truth(mask, values.shape[1], values.shape[0])
     predicted = values >= np.float32(threshold)
-    thing, ground = truth != 0, truth != 1
+    thing, ground = ground_truth != 0, ground_truth != 1
     hits, alarms = _count(predicted & thing), _count(predicted & ground)
     return OfficialScores(
         iou=float(hits / (_count(predicted | thing) + _EPSILON)),
-        accuracy=float(_count(predicted.astype(np.float32) == truth) / np.float32(truth.size)),
+        accuracy=float(_count(predicted.astype(np.float32) == ground_truth) / np.float32(ground_truth.size)),
         precision=float(hits / (hits + alarms + _EPSILON)),
         average_precision=_official_average_precision(values, thing, ground),
     )
@@ -129,13 +129,13 @@ class Lerf2dScores:
 
 def lerf_2d_scores(
     relevancy: ArrayLike,
-    truth: ArrayLike,
+    ground_truth: ArrayLike,
     boxes: ArrayLike | None = None,
     threshold: float = LERF_2D_THRESHOLD,
 ) -> Lerf2dScores:
-    """LangSplat's evaluation of one map: localisation and IoU.
+    """LangSplat's evaluation of one map: localization and IoU.
 
-    The map is blurred by a box of 30 pixels, borders mirrored. Localisation: does a highest pixel of the blurred
+    The map is blurred by a box of 30 pixels, borders mirrored. Localization: does a highest pixel of the blurred
     map lie in a box, edges included? IoU: the mean of map and blurred map is stretched to its own range, to -1..1,
     cut above ``threshold`` and smoothed by a majority of 7x7 pixels. A map is thus always cut somewhere,
     whatever its absolute values.
@@ -144,16 +144,18 @@ def lerf_2d_scores(
 
     Args:
         relevancy: ``[H, W]`` at the size of the truth.
-        truth: Boolean mask ``[H, W]``.
+        ground truth: Boolean mask ``[H, W]``.
         boxes: Boxes ``[B, 4]`` as x0, y0, x1, y1 in pixels; None takes those of the mask's parts (`mask_boxes`).
         threshold: In -1..1.
 
     Raises:
         ValueError: If shapes differ.
     """
-    values, mask = np.asarray(relevancy, dtype=np.float32), np.asarray(truth, dtype=bool)
+    values, mask = np.asarray(relevancy, dtype=np.float32), np.asarray(ground_truth, dtype=bool)
     if values.ndim != 2 or values.shape != mask.shape or not values.size:
-        raise ValueError(f"map {list(values.shape)} and truth {list(mask.shape)} must be [H, W] of one size")
+        raise ValueError(
+            f"map {list(values.shape)} and ground truth {list(mask.shape)} must be [H, W] of one size"
+        )
     areas = mask_boxes(mask) if boxes is None else np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
     blurred = ndimage.uniform_filter(values, LERF_2D_WINDOW, mode="mirror")
     rows, columns = np.nonzero(blurred == blurred.max())
@@ -193,22 +195,22 @@ def _majority(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 # LERF-OVS in 3D
 
 
-def silhouette_iou(alpha: ArrayLike, truth: ArrayLike, threshold: float = SILHOUETTE_ALPHA) -> float:
-    """IoU of the silhouette of selected Gaussians, rendered alone, with the truth; 0 when both are empty.
+def silhouette_iou(alpha: ArrayLike, ground_truth: ArrayLike, threshold: float = SILHOUETTE_ALPHA) -> float:
+    """IoU of the silhouette of selected Gaussians, rendered alone, with the ground truth; 0 when both are empty.
 
     Rendered alone means that nothing hides them: an object behind another one is seen through it.
 
     Args:
         alpha: Opacity of the selected Gaussians ``[H, W]`` in 0..1.
-        truth: Boolean mask ``[H, W]``.
+        ground truth: Boolean mask ``[H, W]``.
         threshold: Opacity beyond which a pixel belongs to the silhouette.
 
     Raises:
         ValueError: If shapes differ.
     """
-    found, mask = np.asarray(alpha) > threshold, np.asarray(truth, dtype=bool)
+    found, mask = np.asarray(alpha) > threshold, np.asarray(ground_truth, dtype=bool)
     if found.shape != mask.shape:
-        raise ValueError(f"alpha {list(found.shape)} and truth {list(mask.shape)} must be of one size")
+        raise ValueError(f"alpha {list(found.shape)} and ground truth {list(mask.shape)} must be of one size")
     union = np.count_nonzero(found | mask)
     return np.count_nonzero(found & mask) / union if union else 0.0
 

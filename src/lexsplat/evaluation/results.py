@@ -29,8 +29,8 @@ class PairResult:
 
     Args:
         counts: What the map finds at every threshold; ``counts.at(threshold)`` has IoU, accuracy, precision.
-        average_precision: Strict, in 0..1; NaN when the truth is empty.
-        localization: 1 if the highest relevancy lies on the object; NaN when the truth is empty.
+        average_precision: Strict, in 0..1; NaN when the ground truth is empty.
+        localization: 1 if the highest relevancy lies on the object; NaN when the ground truth is empty.
         official: The authors' protocol, if asked for.
         lerf_2d: LangSplat's, if asked for.
         lerf_3d: IoU of the selected Gaussians' silhouette, if asked for and the method has scores in 3D.
@@ -57,7 +57,7 @@ class ViewPictures:
         photo: ``[H, W, 3]`` in 0..1, at the working size.
         image: The rendering, same shape.
         relevancy: ``[h, w]`` in 0..1 by prompt, at the size of the truth.
-        truth: Boolean ``[h, w]`` by prompt.
+        ground truth: Boolean ``[h, w]`` by prompt.
         thresholds: The automatic threshold by prompt.
     """
 
@@ -65,7 +65,7 @@ class ViewPictures:
     photo: NDArray[np.float32]
     image: NDArray[np.float32]
     relevancy: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    truth: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    ground_truth: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     thresholds: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -77,7 +77,7 @@ class Metrics:
         quality: "psnr", "ssim", "lpips" (or None with "lpips_reason"), "per_view".
         language: "strict", "official", "lerf_2d", "lerf_3d", "per_prompt", "per_view", "form"; None for a scene
             without masks.
-        speed: "render_fps" (a view in colour with one prompt's map), "rgb_fps", "query_ms" (a prompt's map in
+        speed: "render_fps" (a view in color with one prompt's map), "rgb_fps", "query_ms" (a prompt's map in
             a view, language rendered anew), "stage_seconds".
         size: "gaussians", "language_bytes", "gaussian_bytes", "peak_rss_bytes", "peak_gpu_bytes".
         config: Settings.

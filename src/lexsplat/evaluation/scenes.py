@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lexsplat.captures.capture import Scene
+from lexsplat.captures.capture import Capture
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
@@ -21,11 +21,11 @@ from lexsplat.runtime.files import atomic_path, read_json, write_json
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.previous import require_current
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 
 
 def evaluate_scene(
-    scene: SearchableScene,
+    scene: Scene,
     *,
     capture: Path | None = None,
     masks: Path | None = None,
@@ -41,7 +41,7 @@ def evaluate_scene(
     Args:
         scene: An opened scene folder.
         capture: Where the photos are, if not where the build found them.
-        masks: Folder with the truth in any layout of `scenes.annotations`, if not the capture's own.
+        masks: Folder with the ground truth in any layout of `scenes.annotations`, if not the capture's own.
         prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
         protocols: Names out of `evaluation.PROTOCOLS`.
         title: Heading of the report.
@@ -58,7 +58,7 @@ def evaluate_scene(
         raise ValueError("only a scene opened from a folder can be evaluated")
     folder, record = scene.folder, scene.folder.record
     require_current(folder)
-    if folder.is_shipped:
+    if folder.is_bundled:
         raise SceneFolderError(
             "demo",
             expected="a scene folder of your own, for the results",
@@ -66,7 +66,7 @@ def evaluate_scene(
             remedy="make your own copy of it with: lexsplat demo",
         )
     photos = load_photos(scene, capture)
-    truth = load_annotations(photos, masks, prompt_list)
+    ground_truth = load_annotations(photos, masks, prompt_list)
     gallery = Gallery()
     metrics = evaluate(
         photos,
@@ -74,8 +74,8 @@ def evaluate_scene(
         scene.field,
         scene.encode_text,
         EvaluationConfig(query=scene.query, protocols=tuple(protocols)),
-        masks=truth.masks,
-        boxes=truth.boxes,
+        masks=ground_truth.masks,
+        boxes=ground_truth.boxes,
         observer=gallery.add,
         listener=listener,
         stage_seconds=folder.stage_seconds(),
@@ -85,7 +85,7 @@ def evaluate_scene(
         },
         settings={
             **record.get("config", {}),
-            "truth": truth.origin_facts(prompt_list) if truth.masks else None,
+            "ground_truth": ground_truth.origin_facts(prompt_list) if ground_truth.masks else None,
         },
         machine=machine_facts(),
         prompt_kinds=_prompt_kinds(photos.root),
@@ -113,7 +113,7 @@ def _prompt_kinds(root: Path) -> dict[str, str]:
     return content
 
 
-def load_photos(scene: SearchableScene, capture: Path | None) -> Scene:
+def load_photos(scene: Scene, capture: Path | None) -> Capture:
     """The capture of a scene, with the views, sizes and split of the build.
 
     Raises:

@@ -236,7 +236,7 @@ def read_grid(path: Path, cols: int, rows: int) -> Tensor:
 
 
 def resize_grid(features: Tensor, cols: int, rows: int) -> Tensor:
-    """Features ``[h, w, D]`` at the centres of ``rows`` x ``cols`` cells, unit length."""
+    """Features ``[h, w, D]`` at the centers of ``rows`` x ``cols`` cells, unit length."""
     if features.shape[:2] != (rows, cols):
         planes = features.permute(2, 0, 1)[None]
         planes = F.interpolate(planes, (rows, cols), mode="bilinear", antialias=True, align_corners=False)

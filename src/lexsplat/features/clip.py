@@ -18,7 +18,7 @@ from torch import Tensor
 from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
-    normalisation,
+    normalization,
     precision,
     resize_images,
 )
@@ -47,7 +47,7 @@ class ClipEncoder(PretrainedModel):
         config = self._model.config
         if not (hasattr(self._model, "get_image_features") and hasattr(config, "vision_config")):
             raise self._refusal(
-                "a CLIP-like model with an image and a text tower", f"try {DEFAULT_CLIP} or `--clip embedded`"
+                "a CLIP-like model with an image and a text tower", f"try {DEFAULT_CLIP} or `--clip bundled`"
             )
         self._siglip = config.model_type.startswith("siglip")
         self.image_size = _image_size(config.vision_config)
@@ -55,7 +55,7 @@ class ClipEncoder(PretrainedModel):
             _plain_attention(self._model, config.vision_config, self.image_size)
         self._text_length = int(config.text_config.max_position_embeddings)
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
-        self._mean, self._std = normalisation(folder, default, self.device)
+        self._mean, self._std = normalization(folder, default, self.device)
         self._patches = _PatchReader(self._model) if config.model_type == "clip" else None
         try:
             self._tokenizer = AutoTokenizer.from_pretrained(

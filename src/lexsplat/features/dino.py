@@ -15,7 +15,7 @@ from torch import Tensor
 from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
-    normalisation,
+    normalization,
     precision,
     resize_images,
 )
@@ -38,12 +38,12 @@ class DinoEncoder(PretrainedModel):
         if not self._keys or not isinstance(getattr(config, "patch_size", None), int):
             raise self._refusal(
                 "a vision transformer such as DINO, DINOv2 or DINOv3 (ViT)",
-                f"try {DEFAULT_DINO}, `--dino embedded` or `--dino none`",
+                f"try {DEFAULT_DINO}, `--dino bundled` or `--dino none`",
             )
         self.patch_size = int(config.patch_size)
         self.dim = int(config.hidden_size)
         self.num_layers = len(self._keys)
-        self._mean, self._std = normalisation(folder, (_IMAGENET_MEAN, _IMAGENET_STD), self.device)
+        self._mean, self._std = normalization(folder, (_IMAGENET_MEAN, _IMAGENET_STD), self.device)
         self._caught = threading.local()  # several threads may evaluate the model, each wants its own keys
         for projection in self._keys:
             projection.register_forward_hook(self._catch)
@@ -65,7 +65,7 @@ class DinoEncoder(PretrainedModel):
         """Dense features on a regular grid of cells that tiles the image.
 
         A stride below the patch size is reached by evaluating shifted copies of the image, each on the
-        model's own patch grid, and interleaving the results: patch centres lie exactly on cell centres, and
+        model's own patch grid, and interleaving the results: patch centers lie exactly on cell centers, and
         attention sees ``(patch / stride)**2`` times fewer tokens at once than with a changed convolution
         stride.
 
@@ -95,7 +95,7 @@ class DinoEncoder(PretrainedModel):
         image = resize_images(image[None].to(self.device, torch.float32), rows * patch, cols * patch)
         pixels = (image - self._mean) / self._std
         phases = -(-patch // min(stride or patch, patch))
-        # Cell centres of the fine grid; the shift of a phase brings its patch centres onto them.
+        # Cell centers of the fine grid; the shift of a phase brings its patch centers onto them.
         shifts = [round((phase + 0.5) * patch / phases - patch / 2) for phase in range(phases)]
         margin = max(abs(shift) for shift in shifts)
         padded = F.pad(pixels, (margin, margin, margin, margin), mode="replicate")

@@ -82,7 +82,7 @@ class DenseEncoder(Protocol):
 
 
 def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> ClipEncoder:
-    """A CLIP-like encoder by name, folder, or "embedded".
+    """A CLIP-like encoder by name, folder, or "bundled".
 
     Raises:
         ModelError: If it is not here and cannot be fetched, or is not a CLIP-like model.
@@ -91,7 +91,7 @@ def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> C
 
 
 def load_dino(name: str = DEFAULT_DINO, device: torch.device | str = "cpu") -> DinoEncoder:
-    """A DINO-like encoder by name, folder, or "embedded".
+    """A DINO-like encoder by name, folder, or "bundled".
 
     Raises:
         ModelError: If it is not here and cannot be fetched, or is not a vision transformer.

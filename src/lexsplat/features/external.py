@@ -17,14 +17,14 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import PICKLES, refuse_pickle
 
 if TYPE_CHECKING:
-    from lexsplat.captures import Scene, View
+    from lexsplat.captures import Capture, View
 
 _FLOATS = ("F64", "F32", "F16", "BF16")
 
 
 def load_external_features(
     folder: Path,
-    scene: Scene,
+    scene: Capture,
     *,
     memory: int = budget.DEFAULT_MEMORY,
     dimension: int | None = None,
@@ -41,7 +41,7 @@ def load_external_features(
       them; levels are averaged, and pixels in no segment have the feature zero.
 
     An array has the photo's shape at any size. What is finer than the pictures that language is learned from is
-    read at their pixels' centres only.
+    read at their pixels' centers only.
 
     Args:
         folder: Where the arrays are.
@@ -90,7 +90,7 @@ def load_external_features(
     return FeatureMaps(list(sources), load, memory // 4)
 
 
-def external_sources(folder: Path, scene: Scene) -> dict[str, Path]:
+def external_sources(folder: Path, scene: Capture) -> dict[str, Path]:
     """The file of each view by its name; of a pair, the features.
 
     Raises:
@@ -99,7 +99,7 @@ def external_sources(folder: Path, scene: Scene) -> dict[str, Path]:
     return {name: _source(folder, view.stem) for name, view in scene.views.items()}
 
 
-def external_identity(folder: Path, scene: Scene) -> list[str]:
+def external_identity(folder: Path, scene: Capture) -> list[str]:
     """Name, size and time of every file that is read: what tells that features have changed."""
     files = []
     for path in external_sources(folder, scene).values():
@@ -226,11 +226,11 @@ class _Reading:
         need = rows * columns * (depth * (4 + itemsize) + 16) + (16 << 20)
         what = f"features of {columns}x{rows}x{depth} of a view"
         budget.require("features", need, self.memory, what, "a larger --downscale")
-        return _centres(rows, height), _centres(columns, width)
+        return _centers(rows, height), _centers(columns, width)
 
 
-def _centres(count: int, length: int) -> NDArray[np.intp]:
-    """The cells out of ``length`` in which the centres of ``count`` cells lie."""
+def _centers(count: int, length: int) -> NDArray[np.intp]:
+    """The cells out of ``length`` in which the centers of ``count`` cells lie."""
     return ((2 * np.arange(count) + 1) * length) // (2 * count)
 
 

@@ -44,7 +44,7 @@ from lexsplat.runtime import memory as budget
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.captures import Scene, View
+    from lexsplat.captures import Capture, View
 
 _CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15 % slower at 256
 _LONGEST = 16  # in short sides: longer strips get coarser maps, or the memory of a map would know no bound
@@ -134,7 +134,7 @@ class FeatureConfig:
         return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=4)
 
     @classmethod
-    def embedded(cls) -> FeatureConfig:
+    def bundled(cls) -> FeatureConfig:
         """Settings for the small encoders that ship with the package, chosen by measurement."""
         return cls(
             crop_sizes=(18 / 240, 44 / 240),
@@ -171,7 +171,7 @@ class FeatureConfig:
 
 
 def extract_features(
-    scene: Scene,
+    scene: Capture,
     clip: ImageTextEncoder,
     dino: DenseEncoder | None,
     config: FeatureConfig | None = None,
@@ -250,7 +250,7 @@ def _patch_bytes(entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig) -
 
 
 def load_level_maps(
-    scene: Scene, clip: ImageTextEncoder, config: FeatureConfig, cache_dir: Path, name: str
+    scene: Capture, clip: ImageTextEncoder, config: FeatureConfig, cache_dir: Path, name: str
 ) -> tuple[Tensor, list[float]]:
     """The CLIP map of each crop size of one view, from features that `extract_features` has stored.
 

@@ -17,7 +17,7 @@ from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 
-EMBEDDED_ENCODERS = Path(__file__).resolve().parent.parent / "demo" / "encoders"
+BUNDLED_ENCODERS = Path(__file__).resolve().parent.parent / "demo" / "encoders"
 """Folder of the encoders that ship with the package."""
 
 _WANTED_FILES = ["*.json", "*.txt", "*.model", "model*.safetensors"]
@@ -25,12 +25,12 @@ _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first answer; without a netw
 _CONVERSION_BOT = "SFconvertbot"  # opens a pull request with safetensors on repositories that lack them
 
 
-def model_folder(name: str, embedded: str) -> Path:
+def model_folder(name: str, tower: str) -> Path:
     """The local folder of a model, downloaded if need be.
 
     Args:
-        name: A folder, a name on the Hugging Face Hub, or "embedded".
-        embedded: Subfolder of the package's own encoders that "embedded" stands for: "clip" or "dino".
+        name: A folder, a name on the Hugging Face Hub, or "bundled".
+        tower: Subfolder of the package's own encoders that "bundled" stands for: "clip" or "dino".
 
     Returns:
         A folder with ``config.json`` and safetensors.
@@ -38,8 +38,8 @@ def model_folder(name: str, embedded: str) -> Path:
     Raises:
         ModelError: If there is no such model here and none can be fetched.
     """
-    if name == "embedded":
-        return EMBEDDED_ENCODERS / embedded
+    if name in ("bundled", "embedded"):  # the second is the word before the first
+        return BUNDLED_ENCODERS / tower
     folder = Path(name).expanduser()
     if folder.is_dir():
         if not is_model_folder(folder):
@@ -47,11 +47,11 @@ def model_folder(name: str, embedded: str) -> Path:
                 name,
                 expected="a Hugging Face model folder (config.json and model.safetensors)",
                 found=_contents(folder),
-                remedy=f"give a folder saved with save_pretrained, a model name, or `--{embedded} embedded`",
+                remedy=f"give a folder saved with save_pretrained, a model name, or `--{tower} bundled`",
             )
         return folder
     cached = _cached_folder(name)
-    return cached if cached is not None else _download(name, embedded)
+    return cached if cached is not None else _download(name, tower)
 
 
 def is_model_folder(folder: Path) -> bool:
@@ -124,7 +124,7 @@ def _cached_folder(name: str) -> Path | None:
     return None
 
 
-def _download(name: str, embedded: str) -> Path:
+def _download(name: str, tower: str) -> Path:
     """Fetch a model from the hub; safetensors from the conversion bot's pull request where main has none."""
     from huggingface_hub import HfApi, snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
@@ -142,23 +142,23 @@ def _download(name: str, embedded: str) -> Path:
                 log.info("%s: safetensors taken from %s", name, discussion.git_reference)
                 return folder
     except HFValidationError as error:
-        raise _missing(name, embedded, "neither a folder nor a valid model name") from error
+        raise _missing(name, tower, "neither a folder nor a valid model name") from error
     except HfHubHTTPError as error:
         status = getattr(getattr(error, "response", None), "status_code", None)
-        raise _missing(name, embedded, f"the hub answered {status or 'with an error'}") from error
+        raise _missing(name, tower, f"the hub answered {status or 'with an error'}") from error
     except Exception as error:  # no network shows as many types, depending on the HTTP library and the proxy
         raise _missing(
-            name, embedded, f"no copy here and the hub cannot be reached ({type(error).__name__})"
+            name, tower, f"no copy here and the hub cannot be reached ({type(error).__name__})"
         ) from error
-    raise _missing(name, embedded, "no safetensors in its repository")
+    raise _missing(name, tower, "no safetensors in its repository")
 
 
-def _missing(name: str, embedded: str, found: str) -> ModelError:
+def _missing(name: str, tower: str, found: str) -> ModelError:
     return ModelError(
         f"model {name}",
         expected="a downloaded model",
         found=found,
         remedy=f"either connect to the internet and run again (it is downloaded once), or give a folder "
-        f"that holds it (`--{embedded} FOLDER`), or use the small encoder that ships with lexsplat "
-        f"(`--{embedded} embedded`)",
+        f"that holds it (`--{tower} FOLDER`), or use the small encoder that ships with lexsplat "
+        f"(`--{tower} bundled`)",
     )

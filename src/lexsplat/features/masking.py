@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import torch
 
-from lexsplat.captures import Scene
+from lexsplat.captures import Capture
 from lexsplat.features.cache import FeatureMap, FeatureMaps
 
 
-def without_masked_cells(maps: FeatureMaps, scene: Scene) -> FeatureMaps:
+def without_masked_cells(maps: FeatureMaps, scene: Capture) -> FeatureMaps:
     """Feature maps whose cells without any pixel that counts are zero, which the codebook passes over.
 
     Args:

@@ -9,14 +9,14 @@ from torch import Tensor
 
 
 def pca_image(features: Tensor) -> NDArray[np.uint8]:
-    """Colour features by their first three principal components.
+    """Color features by their first three principal components.
 
     Args:
         features: ``[h, w, D]``.
 
     Returns:
         Picture ``[h, w, 3]``; each component runs from its 2nd to its 98th percentile. Without variation it
-        is grey.
+        is gray.
 
     Raises:
         ValueError: If the features are not ``[h, w, D]`` with D at least 1.

@@ -1,6 +1,6 @@
 """What the encoders share: a model of transformers from a folder, its precision, and images as it wants them.
 
-Resizing and normalisation are done here in torch, so no image library is needed for them.
+Resizing and normalization are done here in torch, so no image library is needed for them.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _computes_in_bfloat16() -> bool:
     return any(getattr(torch.cpu, name, bool)() for name in names)
 
 
-def normalisation(folder: Path, default: tuple, device: torch.device) -> tuple[Tensor, Tensor]:
+def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[Tensor, Tensor]:
     """Mean and deviation ``[3, 1, 1]`` from the model's preprocessing file, or its family's usual ones."""
     mean, std = default
     for file in ("preprocessor_config.json", "processor_config.json"):
@@ -101,7 +101,7 @@ def normalisation(folder: Path, default: tuple, device: torch.device) -> tuple[T
             break
     else:
         log.warning(
-            "%s: no preprocessing file; the usual image normalisation of its family is used", folder.name
+            "%s: no preprocessing file; the usual image normalization of its family is used", folder.name
         )
     return tuple(torch.tensor(v, dtype=torch.float32, device=device).reshape(3, 1, 1) for v in (mean, std))  # type: ignore[return-value]
 

@@ -4,11 +4,11 @@ CLIP gives one vector for a whole image. Cropping the image at many places and s
 gives vectors for places; averaging the crops that speak for a place gives a dense map. Two ways to choose the
 crops:
 
-- a regular grid for each size (as in LERF), whose embeddings are interpolated between the crops' centres;
-- random crops for each size, averaged over the crops that cover a place, nearer centres counting more.
+- a regular grid for each size (as in LERF), whose embeddings are interpolated between the crops' centers;
+- random crops for each size, averaged over the crops that cover a place, nearer centers counting more.
 
-Both put each embedding where its crop really is: crop centres are pixel positions, never cells of a resized
-grid. Crops keep inside the image; beyond the outermost centres the nearest ones count.
+Both put each embedding where its crop really is: crop centers are pixel positions, never cells of a resized
+grid. Crops keep inside the image; beyond the outermost centers the nearest ones count.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def grid_levels(
         width: Image width in pixels.
         height: Image height in pixels.
         sizes: Sides as fractions of the image's short side.
-        strides: Largest distance between neighbours for each size, as a fraction of the crop's side.
+        strides: Largest distance between neighbors for each size, as a fraction of the crop's side.
 
     Raises:
         ValueError: If there is no size, the numbers of sizes and strides differ, or one is not positive.
@@ -235,30 +235,30 @@ def _axis_weights(level: CropLevel, starts: NDArray, positions: NDArray) -> Tens
         return _linear_weights(positions, starts + level.size / 2)
     side = level.size / level.patches
     places = (np.arange(level.patches) + 0.5) * side
-    centres = (starts[:, None] + places).ravel()
-    inside = np.clip(positions, centres.min(), centres.max())  # beyond the outermost ones the nearest count
-    tents = np.maximum(0, 1 - np.abs(inside[:, None] - centres) / side)
+    centers = (starts[:, None] + places).ravel()
+    inside = np.clip(positions, centers.min(), centers.max())  # beyond the outermost ones the nearest count
+    tents = np.maximum(0, 1 - np.abs(inside[:, None] - centers) / side)
     weights = tents * np.tile(np.minimum(places, level.size - places), len(starts))
     return torch.from_numpy((weights / weights.sum(1, keepdims=True)).astype(np.float32))
 
 
-def _linear_weights(positions: NDArray, centres: NDArray) -> Tensor:
-    """Weights ``[m, n]`` of linear interpolation between sorted centres, clamped at the ends."""
-    weights = np.zeros((len(positions), len(centres)), dtype=np.float32)
-    upper = np.clip(np.searchsorted(centres, positions), 1, max(1, len(centres) - 1))
+def _linear_weights(positions: NDArray, centers: NDArray) -> Tensor:
+    """Weights ``[m, n]`` of linear interpolation between sorted centers, clamped at the ends."""
+    weights = np.zeros((len(positions), len(centers)), dtype=np.float32)
+    upper = np.clip(np.searchsorted(centers, positions), 1, max(1, len(centers) - 1))
     lower = upper - 1
     row = np.arange(len(positions))
-    if len(centres) == 1:
+    if len(centers) == 1:
         weights[:, 0] = 1
     else:
-        part = np.clip((positions - centres[lower]) / (centres[upper] - centres[lower]), 0, 1)
+        part = np.clip((positions - centers[lower]) / (centers[upper] - centers[lower]), 0, 1)
         weights[row, lower] = 1 - part
         weights[row, upper] = part
     return torch.from_numpy(weights)
 
 
 def _tent_weights(level: CropLevel, xs: NDArray, ys: NDArray) -> Tensor:
-    """Weights ``[rows * cols, n]``: 1 at a crop's centre, falling to 0 at its edges."""
+    """Weights ``[rows * cols, n]``: 1 at a crop's center, falling to 0 at its edges."""
     half = level.size / 2
     across = np.maximum(0, 1 - np.abs(xs[:, None] - (level.lefts + half)) / half)
     down = np.maximum(0, 1 - np.abs(ys[:, None] - (level.tops + half)) / half)
@@ -267,11 +267,11 @@ def _tent_weights(level: CropLevel, xs: NDArray, ys: NDArray) -> Tensor:
 
 
 def _nearest_crops(levels: Sequence[CropLevel], xs: NDArray, ys: NDArray) -> Tensor:
-    """Index of the crop with the nearest centre for every cell ``[rows, cols]``."""
+    """Index of the crop with the nearest center for every cell ``[rows, cols]``."""
     boxes = np.concatenate([level.boxes for level in levels])
-    centres = torch.from_numpy((boxes[:, :2] + boxes[:, 2:] / 2).astype(np.float32))
+    centers = torch.from_numpy((boxes[:, :2] + boxes[:, 2:] / 2).astype(np.float32))
     grid = torch.stack(torch.meshgrid(torch.from_numpy(ys), torch.from_numpy(xs), indexing="ij"), -1).flip(-1)
-    return torch.cdist(grid.reshape(-1, 2).float(), centres).argmin(1).reshape(len(ys), len(xs))
+    return torch.cdist(grid.reshape(-1, 2).float(), centers).argmin(1).reshape(len(ys), len(xs))
 
 
 def unique_boxes(levels: Sequence[CropLevel]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:

@@ -1,7 +1,7 @@
 """Pinhole cameras, and the only place where camera conventions are converted.
 
 Convention everywhere else: OpenCV axes (x right, y down, z forward), ``viewmat`` maps world to camera,
-``K`` is in pixels, and the centre of the top-left pixel is at (0.5, 0.5).
+``K`` is in pixels, and the center of the top-left pixel is at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """Centre of projection in world coordinates ``[3]``."""
+        """Center of projection in world coordinates ``[3]``."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     @property
@@ -86,7 +86,7 @@ def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height:
     """A camera at ``position`` that looks at ``target``.
 
     Args:
-        position: Centre of projection ``[3]``, world.
+        position: Center of projection ``[3]``, world.
         target: Point in the middle of the image ``[3]``, world.
         up: World direction that appears upwards ``[3]``; not parallel to the view.
         width: Image width in pixels.

@@ -29,11 +29,11 @@ class Gaussians:
     """Geometry and appearance of a scene. All tensors are float32 on one device.
 
     Args:
-        means: Centres ``[N, 3]``, world units.
+        means: Centers ``[N, 3]``, world units.
         quats: Rotations ``[N, 4]``, wxyz, not necessarily of unit length.
         log_scales: Natural logarithm of the standard deviations along the axes ``[N, 3]``.
         opacity_logits: Inverse sigmoid of the opacities ``[N]``.
-        sh0: Constant colour coefficient ``[N, 1, 3]``.
+        sh0: Constant color coefficient ``[N, 1, 3]``.
         shN: Higher spherical-harmonic coefficients ``[N, (degree + 1)^2 - 1, 3]``.
         antialiased: Whether they were trained with the mip filter and must be rendered with it.
     """
@@ -138,7 +138,7 @@ def gaussians_from_points(
     antialiased: bool = False,
     device: torch.device | str = "cpu",
 ) -> Gaussians:
-    """One round Gaussian per point, as large as the mean distance to its three nearest neighbours (3DGS).
+    """One round Gaussian per point, as large as the mean distance to its three nearest neighbors (3DGS).
 
     Args:
         points: Positions ``[N, 3]``, world units.
@@ -149,7 +149,7 @@ def gaussians_from_points(
         device: Where the tensors go.
 
     Raises:
-        ValueError: If there are no points, a coordinate is not finite, colours do not match, or the opacity
+        ValueError: If there are no points, a coordinate is not finite, colors do not match, or the opacity
             is not between 0 and 1.
     """
     points = np.asarray(points, dtype=np.float32)
@@ -163,8 +163,8 @@ def gaussians_from_points(
         raise ValueError(f"opacity must be between 0 and 1, got {opacity:g}")
     count = len(points)
     if count > 1:
-        neighbours = min(4, count)
-        distances, _ = cKDTree(points).query(points, k=neighbours, workers=-1)
+        neighbors = min(4, count)
+        distances, _ = cKDTree(points).query(points, k=neighbors, workers=-1)
         spacing = distances[:, 1:].mean(1)
         typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
         spacing = np.clip(spacing, 1e-3 * typical, 1e2 * typical)

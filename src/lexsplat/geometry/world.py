@@ -1,10 +1,10 @@
 """What the numbers of a scene mean in the world: which way is up, and how long its unit is.
 
 Photos alone leave both open. Up is estimated from how the cameras were held and can be given; a scene has a length in
-metres once one distance in it is known (``lexsplat scale``). Both are kept in ``scene.json`` as ``world``::
+meters once one distance in it is known (``lexsplat scale``). Both are kept in ``scene.json`` as ``world``::
 
     {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "user"},
-     "metres_per_unit": 0.41 | null, "poses": "..."}
+     "meters_per_unit": 0.41 | null, "poses": "..."}
 
 "poses" is a fingerprint of the cameras: what a user has said holds as long as they stay where they are.
 """
@@ -33,7 +33,7 @@ class World:
     Args:
         up: The direction away from the ground.
         source: Who says so: the cameras, or the user.
-        metres_per_unit: Metres that one world unit is long; None where nobody has said.
+        meters_per_unit: Meters that one world unit is long; None where nobody has said.
 
     Raises:
         ValueError: If the scale is not positive and finite.
@@ -41,12 +41,12 @@ class World:
 
     up: Up
     source: Source = "cameras"
-    metres_per_unit: float | None = None
+    meters_per_unit: float | None = None
 
     def __post_init__(self) -> None:
-        scale = self.metres_per_unit
+        scale = self.meters_per_unit
         if scale is not None and not 0 < scale < math.inf:
-            raise ValueError(f"metres_per_unit must be positive and finite, got {scale}")
+            raise ValueError(f"meters_per_unit must be positive and finite, got {scale}")
 
     @classmethod
     def of_cameras(cls, cameras: Iterable[Camera]) -> World:
@@ -66,16 +66,16 @@ class World:
             raise ValueError(f"up must be three numbers that are not all 0, got {vector.tolist()}")
         return replace(self, up=Up(vector / length, True), source="user")
 
-    def metres(self, length: float) -> float | None:
-        """A length in world units in metres; None where the scale is not known."""
-        return None if self.metres_per_unit is None else float(length) * self.metres_per_unit
+    def meters(self, length: float) -> float | None:
+        """A length in world units in meters; None where the scale is not known."""
+        return None if self.meters_per_unit is None else float(length) * self.meters_per_unit
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for ``scene.json`` and for people's programs."""
         direction = [round(float(v), 6) + 0.0 for v in self.up.direction]
         return {
             "up": {"direction": direction, "reliable": self.up.reliable, "from": self.source},
-            "metres_per_unit": self.metres_per_unit,
+            "meters_per_unit": self.meters_per_unit,
         }
 
     @classmethod
@@ -86,15 +86,15 @@ class World:
             SceneFolderError: If the content is not what `to_json` writes.
         """
         try:
-            up, scale = content["up"], content["metres_per_unit"]
+            up, scale = content["up"], content["meters_per_unit"]
             source: Source = "user" if up["from"] == "user" else "cameras"
             world = cls(Up(np.array([0.0, 0.0, 1.0]), False)).with_up(float(v) for v in up["direction"])
             world = replace(world, up=replace(world.up, reliable=bool(up["reliable"])), source=source)
-            return replace(world, metres_per_unit=None if scale is None else float(scale))
+            return replace(world, meters_per_unit=None if scale is None else float(scale))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise SceneFolderError(
                 "world in scene.json",
-                expected="an up direction and metres_per_unit",
+                expected="an up direction and meters_per_unit",
                 found=str(error),
                 remedy="take it out of the file, or run: lexsplat build again",
             ) from error

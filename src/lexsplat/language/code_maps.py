@@ -1,6 +1,6 @@
 """Index maps as the training reads them: a code for each pixel, also from a map coarser than the image.
 
-Cell j of w covers the pixels whose centres lie in [j W / w, (j + 1) W / w).
+Cell j of w covers the pixels whose centers lie in [j W / w, (j + 1) W / w).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MASKED_CODE = MAX_CODES
 
 
 def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -> Tensor:
-    """Codes of the cells in which the centres of pixels lie.
+    """Codes of the cells in which the centers of pixels lie.
 
     Args:
         code_map: Index map ``[h, w]``.
@@ -32,7 +32,7 @@ def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -
         Codes ``[M]`` int64.
     """
     rows, columns = code_map.shape
-    # (p + 1/2) h / H in integers, so that no rounding moves a pixel to the neighbouring cell.
+    # (p + 1/2) h / H in integers, so that no rounding moves a pixel to the neighboring cell.
     row = (2 * (pixels // width) + 1) * rows // (2 * height)
     column = (2 * (pixels % width) + 1) * columns // (2 * width)
     return code_map[row, column].long()
@@ -77,7 +77,7 @@ class MaskedCodeMaps(Mapping[str, Any]):
             return codes
         bits, (height, width) = self._bits[name]
         valid = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
-        # The cell in which a pixel's centre lies, in integers so that none is moved by rounding.
+        # The cell in which a pixel's center lies, in integers so that none is moved by rounding.
         rows = (2 * np.arange(height) + 1) * codes.shape[0] // (2 * height)
         columns = (2 * np.arange(width) + 1) * codes.shape[1] // (2 * width)
         return np.where(valid, codes[rows[:, None], columns].astype(np.int16), np.int16(MASKED_CODE))

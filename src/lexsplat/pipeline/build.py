@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lexsplat.captures import Scene, View, load_annotations
+from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.captures.sfm.triangulation import initial_points
 from lexsplat.codebook import MAX_CODES, Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.features import (
@@ -38,7 +38,7 @@ from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.language.methods.lifted import lift, tune
 from lexsplat.language.methods.trained import train_field
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.inputs import load_capture
+from lexsplat.pipeline.inputs import prepare_capture
 from lexsplat.pipeline.provenance import model_identity, write_provenance
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
@@ -56,7 +56,7 @@ from lexsplat.scenes.previous import drop_previous
 
 log = logging.getLogger("lexsplat")
 
-STAGES = ("reconstruct", "features", "codebook", "embed")
+STAGES = ("reconstruct", "features", "codebook", "language")
 """Names of the stages in the order in which they run."""
 
 
@@ -65,7 +65,7 @@ def build(
     output: Path,
     config: BuildConfig,
     *,
-    until: str = "embed",
+    until: str = "language",
     test_names: list[str] | None = None,
     splats: Path | None = None,
     listener: Listener = silent,
@@ -94,7 +94,7 @@ def build(
     is_new = not folder.root.exists()
     with folder.locked():
         try:
-            scene = load_capture(capture, folder, config, test_names, listener)
+            scene = prepare_capture(capture, folder, config, test_names, listener)
             load_annotations(scene)  # a mask that belongs to no view is told now, not after the training
             sizes = [view.capture_size for view in scene.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
@@ -114,7 +114,7 @@ class _Builder:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Capture,
         folder: SceneFolder,
         config: BuildConfig,
         device: str,
@@ -137,7 +137,7 @@ class _Builder:
         features: list[Any] = [capture_hash, config.features, models]
         if config.features_from is not None:
             features = [capture_hash, external_identity(config.features_from, self.scene), models[0]]
-        language = [config.method, config.averaging, config.embedding, config.lifting, config.tuning]
+        language = [config.method, config.averaged, config.trained, config.lifted, config.tuning]
         # What each stage is made from (a stage's name stands for all of its inputs), what it does, what it writes.
         stages: dict[str, tuple[list[Any], Callable[[], dict[str, Any]], list[Path]]] = {
             "reconstruct": (
@@ -151,7 +151,7 @@ class _Builder:
                 [] if config.features_from is not None else [folder.features_path],
             ),
             "codebook": (["features", config.codebook, config.seed], self._fit_codebook, self._code_paths()),
-            "embed": (
+            "language": (
                 ["reconstruct", "codebook", language, config.seed],
                 self._embed,
                 [folder.language_path],
@@ -163,16 +163,20 @@ class _Builder:
         order: tuple[str, ...] = STAGES
         if config.method == "averaged":  # finds its codes among the Gaussians, not in the views
             inputs = ["reconstruct", "features", config.codebook, language, config.seed]
-            stages["embed"] = (inputs, self._average, [folder.language_path])
-            order = ("reconstruct", "features", "embed")
+            stages["language"] = (inputs, self._average, [folder.language_path])
+            order = ("reconstruct", "features", "language")
         if config.joint:  # language needs its codes before geometry is trained
             if self.splats is not None:
                 raise ValueError("joint training makes its own Gaussians: leave --splats out")
             inputs, _, outputs = stages["reconstruct"]
-            inputs = [*inputs, "codebook", config.embedding]
+            inputs = [*inputs, "codebook", config.trained]
             stages["reconstruct"] = (inputs, self._train_jointly, [*outputs, self._joint_path])
-            stages["embed"] = (["reconstruct", language], self._take_joint_language, [folder.language_path])
-            order = ("features", "codebook", "reconstruct", "embed")
+            stages["language"] = (
+                ["reconstruct", language],
+                self._take_joint_language,
+                [folder.language_path],
+            )
+            order = ("features", "codebook", "reconstruct", "language")
         until = until if until in order else "features"  # without a stage for the codes, what comes before it
         wanted = order[: order.index(until) + 1]
         if "features" in wanted and not folder.is_finished("features", fingerprint(stages["features"][0])):
@@ -185,7 +189,7 @@ class _Builder:
         for name in wanted:
             inputs, work, outputs = stages[name]
             self._run_stage(name, inputs, work, outputs)
-        if until == "embed":
+        if until == "language":
             self.folder.record.pop("building", None)
             self.folder.save()
             drop_previous(self.folder)
@@ -237,9 +241,7 @@ class _Builder:
             scene, config.reconstruction, points, device=self.device, seed=config.seed
         )
         cameras, code_maps, codebook = self._lessons()
-        trainer = JointTrainer(
-            reconstructor, cameras, code_maps, codebook, config.embedding, seed=config.seed
-        )
+        trainer = JointTrainer(reconstructor, cameras, code_maps, codebook, config.trained, seed=config.seed)
         if self.checkpoint is not None:
             self.checkpoint.resume(trainer)
         trainer.run(self.listener, self.checkpoint)
@@ -346,7 +348,7 @@ class _Builder:
         return [self.folder.codebook_path, *(self.folder.code_map_path(n) for n in self.scene.train_names)]
 
 
-def _check_photos(scene: Scene, memory: int) -> None:
+def _check_photos(scene: Capture, memory: int) -> None:
     """Refuse photos that are too small, or do not fit into the budget one by one, before anything is done."""
     from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
@@ -395,7 +397,7 @@ def check_in_view(gaussians: Gaussians, cameras: list[Camera], subject: Path) ->
 
 
 def feature_maps(
-    scene: Scene, config: BuildConfig, cache_dir: Path, device: str, listener: Listener = silent
+    scene: Capture, config: BuildConfig, cache_dir: Path, device: str, listener: Listener = silent
 ) -> tuple[FeatureMaps, str]:
     """Features of every view, extracted where they are not in the cache, and the hash of the CLIP that made them.
 
@@ -436,10 +438,10 @@ def make_averaged_field(
         return views[name].load_valid(size)
 
     found = average_features(
-        gaussians, cameras, maps, config.averaging, valid=valid, scratch=scratch, listener=listener
+        gaussians, cameras, maps, config.averaged, valid=valid, scratch=scratch, listener=listener
     )
     memory = parse_bytes(config.memory)
-    return field_from_means(found, config.codebook, config.averaging, seed=config.seed, memory=memory)
+    return field_from_means(found, config.codebook, config.averaged, seed=config.seed, memory=memory)
 
 
 def make_field(
@@ -454,13 +456,13 @@ def make_field(
     """The language field by the method the settings name, one that learns from the codes of the views."""
     if config.method == "trained":
         return train_field(
-            gaussians, cameras, code_maps, codebook, config.embedding,
+            gaussians, cameras, code_maps, codebook, config.trained,
             seed=config.seed, checkpoint=checkpoint, listener=listener,
         )  # fmt: skip
-    lifted = lift(gaussians, cameras, code_maps, codebook, config.lifting, listener=listener)
+    lifted = lift(gaussians, cameras, code_maps, codebook, config.lifted, listener=listener)
     if config.method == "lifted":
         return lifted
     return tune(
-        lifted, gaussians, cameras, code_maps, config.tuning, config.embedding,
+        lifted, gaussians, cameras, code_maps, config.tuning, config.trained,
         seed=config.seed, checkpoint=checkpoint, listener=listener,
     )  # fmt: skip

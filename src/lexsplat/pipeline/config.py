@@ -13,9 +13,9 @@ from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureConfig
 from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.geometry.world import World, parse_vector
-from lexsplat.language.methods.averaged import AveragingConfig
-from lexsplat.language.methods.lifted import LiftingConfig, TuningConfig
-from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.averaged import AveragedConfig
+from lexsplat.language.methods.lifted import LiftedConfig, TuningConfig
+from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction import ReconstructionConfig
 from lexsplat.runtime.device import check_seed
 from lexsplat.runtime.memory import parse_bytes
@@ -39,7 +39,7 @@ class BuildConfig:
     """Everything that decides what a build makes.
 
     Args:
-        clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "embedded" (small, made by us,
+        clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled" (small, made by us,
             knows only scenes like the demo).
         dino: Dense encoder, in the same way, or "none" (the paper's ablation without DINO).
         device: "auto" takes CUDA where there is a GPU.
@@ -58,7 +58,7 @@ class BuildConfig:
             held.
         method: "averaged" puts the features of all views on each Gaussian and quantizes them there: the best by our
             measurements (docs/results.md). "lifted" computes each Gaussian's codes from those of the views, as fast.
-            "trained" is the paper's optimisation, "lifted+tuned" starts the paper's field from the lifted one.
+            "trained" is the paper's optimization, "lifted+tuned" starts the paper's field from the lifted one.
         joint: Train language together with geometry from the first step, as the authors' code does (with
             method "trained"; its steps are then those of the reconstruction).
         poses: Structure from motion, for photos without cameras and videos.
@@ -66,9 +66,9 @@ class BuildConfig:
         features: Dense CLIP and DINO features. What is left at its default takes the value that suits the encoder and
             the device; `scene.json` has the values that were taken.
         codebook: Quantization.
-        averaging: Features of all views on the Gaussians, and codes for them.
-        embedding: Training of the language field.
-        lifting: Computing the language field from the codes of the views.
+        averaged: Features of all views on the Gaussians, and codes for them.
+        trained: Training of the language field.
+        lifted: Computing the language field from the codes of the views.
         tuning: From the lifted field to the paper's form.
 
     Raises:
@@ -93,12 +93,15 @@ class BuildConfig:
     reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     codebook: CodebookConfig = field(default_factory=CodebookConfig)
-    averaging: AveragingConfig = field(default_factory=AveragingConfig)
-    embedding: EmbeddingConfig = field(default_factory=EmbeddingConfig)
-    lifting: LiftingConfig = field(default_factory=LiftingConfig)
+    averaged: AveragedConfig = field(default_factory=AveragedConfig)
+    trained: TrainedConfig = field(default_factory=TrainedConfig)
+    lifted: LiftedConfig = field(default_factory=LiftedConfig)
     tuning: TuningConfig = field(default_factory=TuningConfig)
 
     def __post_init__(self) -> None:
+        for encoder in ("clip", "dino"):
+            if getattr(self, encoder) == "embedded":  # the word before "bundled"
+                object.__setattr__(self, encoder, "bundled")
         parse_bytes(self.memory)
         check_seed(self.seed)
         if self.downscale is not None and not 0 < self.downscale < 1e6:
@@ -123,17 +126,15 @@ class BuildConfig:
         """
         whole = parse_bytes(self.memory)
         photos = min(self.reconstruction.image_memory, whole // 4)
-        projections = min(self.embedding.memory_bytes, whole // 4)
-        histogram = max(1, min(self.lifting.memory_bytes, whole // 4))
+        projections = min(self.trained.memory_bytes, whole // 4)
+        histogram = max(1, min(self.lifted.memory_bytes, whole // 4))
         return replace(
             self,
             reconstruction=replace(self.reconstruction, image_memory=photos),
             features=replace(self.features, memory=whole),
-            embedding=replace(self.embedding, memory_bytes=projections),
-            averaging=replace(
-                self.averaging, memory_bytes=max(1, min(self.averaging.memory_bytes, whole // 4))
-            ),
-            lifting=replace(self.lifting, memory_bytes=histogram),
+            trained=replace(self.trained, memory_bytes=projections),
+            averaged=replace(self.averaged, memory_bytes=max(1, min(self.averaged.memory_bytes, whole // 4))),
+            lifted=replace(self.lifted, memory_bytes=histogram),
         )
 
     def decisive(self) -> BuildConfig:
@@ -143,24 +144,24 @@ class BuildConfig:
         """
         kept = {
             "reconstruction": {"image_memory": ReconstructionConfig.image_memory},
-            "embedding": {"memory_bytes": EmbeddingConfig.memory_bytes},
-            "averaging": {"memory_bytes": AveragingConfig.memory_bytes},
-            "lifting": {"memory_bytes": LiftingConfig.memory_bytes},
+            "trained": {"memory_bytes": TrainedConfig.memory_bytes},
+            "averaged": {"memory_bytes": AveragedConfig.memory_bytes},
+            "lifted": {"memory_bytes": LiftedConfig.memory_bytes},
         }
         parts = {name: replace(getattr(self, name), **fields) for name, fields in kept.items()}
         unused: dict[str, dict[str, Any]] = {
             "averaged": {
-                "embedding": EmbeddingConfig(),
-                "lifting": LiftingConfig(),
+                "trained": TrainedConfig(),
+                "lifted": LiftedConfig(),
                 "tuning": TuningConfig(),
             },
             "lifted": {
-                "averaging": AveragingConfig(),
-                "embedding": EmbeddingConfig(),
+                "averaged": AveragedConfig(),
+                "trained": TrainedConfig(),
                 "tuning": TuningConfig(),
             },
-            "trained": {"averaging": AveragingConfig(), "lifting": LiftingConfig(), "tuning": TuningConfig()},
-            "lifted+tuned": {"averaging": AveragingConfig()},
+            "trained": {"averaged": AveragedConfig(), "lifted": LiftedConfig(), "tuning": TuningConfig()},
+            "lifted+tuned": {"averaged": AveragedConfig()},
         }
         parts |= unused[self.method]
         return replace(self, features=self.features.decisive(use_dino=self.uses_dino), **parts)
@@ -184,8 +185,8 @@ class BuildConfig:
             # Halves keep the numbers readable; never enlarge.
             downscale = max(1.0, round(factor * 2) / 2)
         features = self.features
-        if self.clip == "embedded" or device == "cpu":
-            suited = FeatureConfig.embedded() if self.clip == "embedded" else FeatureConfig.sparse()
+        if self.clip == "bundled" or device == "cpu":
+            suited = FeatureConfig.bundled() if self.clip == "bundled" else FeatureConfig.sparse()
             features = features.where_open(suited)
         iterations = self.iterations
         if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lexsplat.captures import Scene, is_photo_folder, load_scene, poses_from_photos
+from lexsplat.captures import Capture, is_photo_folder, load_capture, poses_from_photos
 from lexsplat.captures.readers.video import is_video, sample_video
 from lexsplat.captures.sfm.preparation import find_photos, mask_places, photo_folder
 from lexsplat.pipeline.config import BuildConfig
@@ -22,17 +22,17 @@ from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
 
 
-def load_capture(
+def prepare_capture(
     capture: Path,
     folder: SceneFolder,
     config: BuildConfig,
     test_names: list[str] | None,
     listener: Listener,
-) -> Scene:
+) -> Capture:
     """The capture; photos without cameras, or a video, get them by structure from motion, kept in ``poses/``."""
     if not is_photo_folder(capture):
         folder.record.pop("images", None)
-        return load_scene(capture, test_every=config.test_every, test_names=test_names)
+        return load_capture(capture, test_every=config.test_every, test_names=test_names)
     poses = folder.root / "poses"
     photos = poses / "images" if is_video(capture) else photo_folder(capture)
     if folder.root.resolve() in (photos.resolve(), capture.resolve()):
@@ -62,11 +62,15 @@ def load_capture(
             logging.getLogger("lexsplat").warning(note)
         inside = found.images.resolve().is_relative_to(folder.root.resolve())
         images = "poses/images" if inside else str(found.images.resolve())
-        facts = {"placed": len(found.placed), "left_out": list(found.left_out), "images": images}
+        facts = {
+            "registered": len(found.registered),
+            "unregistered": list(found.unregistered),
+            "images": images,
+        }
         folder.finish("poses", made_from, time.perf_counter() - start, **facts)
     folder.record["images"] = images
     folder.record["capture"] = str(capture.resolve())
-    return load_scene(
+    return load_capture(
         poses,
         images=folder.root / images,
         beside=capture if capture.is_dir() else poses,
@@ -91,7 +95,7 @@ def _photos_fingerprint(capture: Path, photos: Path, output: Path, config: Build
     )
 
 
-def reload_capture(folder: SceneFolder, capture: Path | None = None) -> Scene:
+def reload_capture(folder: SceneFolder, capture: Path | None = None) -> Capture:
     """The capture of a scene that was built, with the views, sizes and split of the build.
 
     Args:
@@ -119,9 +123,9 @@ def reload_capture(folder: SceneFolder, capture: Path | None = None) -> Scene:
             remedy="say where they are with --capture",
         )
     if images is None or place is None:
-        return load_scene(place or folder.root / "poses", downscale=downscale, test_names=held_out)
+        return load_capture(place or folder.root / "poses", downscale=downscale, test_names=held_out)
     poses = folder.root / "poses"
-    return load_scene(
+    return load_capture(
         poses,
         images=photo_folder(capture) if capture is not None and not owned else folder.root / images,
         beside=place if place.is_dir() else poses,

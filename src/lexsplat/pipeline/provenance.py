@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
+from importlib.metadata import version
 from pathlib import Path
 
-from lexsplat import __version__
-from lexsplat.captures import Scene
+from lexsplat.captures import Capture
 from lexsplat.features.hub import content_hash, model_folder
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.world import parse_vector, stored_world, world_of
@@ -21,7 +21,7 @@ from lexsplat.scenes.previous import keep_previous
 log = logging.getLogger("lexsplat")
 
 
-def write_provenance(folder: SceneFolder, scene: Scene, config: BuildConfig) -> str:
+def write_provenance(folder: SceneFolder, scene: Capture, config: BuildConfig) -> str:
     """Record where the scene comes from; returns a fingerprint of photos, cameras and split."""
     views = {
         name: (view.camera, "test" if name in scene.test_names else "train")
@@ -41,7 +41,7 @@ def write_provenance(folder: SceneFolder, scene: Scene, config: BuildConfig) -> 
         "dino": model_place(config.dino),
     }
     folder.record["provenance"] = {
-        "lexsplat": __version__,
+        "lexsplat": version("lexsplat"),
         "versions": versions(),
         "seed": config.seed,
         "sources": sources,
@@ -59,7 +59,7 @@ def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]
     if up is not None:
         world = world.with_up(parse_vector(up))
     before = record.get("world")
-    if isinstance(before, dict) and before.get("metres_per_unit") and world.metres_per_unit is None:
+    if isinstance(before, dict) and before.get("meters_per_unit") and world.meters_per_unit is None:
         log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
     record["world"] = stored_world(world, cameras)
 
@@ -67,12 +67,12 @@ def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]
 def model_place(name: str) -> str:
     """The name of a model; of a folder its full path."""
     folder = Path(name).expanduser()
-    return name if name in ("embedded", "none") or not folder.is_dir() else str(folder.resolve())
+    return name if name in ("bundled", "none") or not folder.is_dir() else str(folder.resolve())
 
 
 def model_identity(name: str, kind: str) -> list[str]:
     """The name of a model; for a folder also the size and time of its files, for ours the content."""
-    if name == "embedded":  # another version of lexsplat may come with others, with any time of writing
+    if name == "bundled":  # another version of lexsplat may come with others, with any time of writing
         return [name, content_hash(model_folder(name, kind))]
     folder = Path(name).expanduser()
     if not folder.is_dir():

@@ -1,8 +1,8 @@
-"""Relevancy in colour: a perceptually uniform scale, overlays on pictures, and a legend.
+"""Relevancy in color: a perceptually uniform scale, overlays on pictures, and a legend.
 
 The scale is computed, not copied: a path through the Oklab space whose lightness rises in equal steps from
 near black over violet and orange to pale yellow, as saturated as the screen allows. Equal differences in
-relevancy look about equally large, and the order survives grey printing and colour blindness.
+relevancy look about equally large, and the order survives gray printing and color blindness.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def color_scale() -> NDArray[np.uint8]:
     lightness = _LIGHTNESS[0] + (_LIGHTNESS[1] - _LIGHTNESS[0]) * steps
     hue = np.radians(_HUES[0] + (_HUES[1] - _HUES[0]) * steps)
     direction = np.stack([np.cos(hue), np.sin(hue)], axis=1)
-    # The largest chroma inside the screen's gamut, by bisection; then smoothed, so that colour has no kinks.
+    # The largest chroma inside the screen's gamut, by bisection; then smoothed, so that color has no kinks.
     low, high = np.zeros(256), np.full(256, 0.4)
     for _ in range(30):
         middle = (low + high) / 2
@@ -57,7 +57,7 @@ def color_scale() -> NDArray[np.uint8]:
 
 
 def colorize(values: ArrayLike, low: float = 0.0, high: float = 1.0) -> NDArray[np.uint8]:
-    """Numbers ``[...]`` as colours ``[..., 3]``; ``low`` and below is darkest, ``high`` and above brightest.
+    """Numbers ``[...]`` as colors ``[..., 3]``; ``low`` and below is darkest, ``high`` and above brightest.
 
     Raises:
         ValueError: If ``low`` is not below ``high``.
@@ -72,15 +72,15 @@ def overlay_heatmap(
     high: float | None = None,
     strength: float = 0.85,
 ) -> NDArray[np.uint8]:
-    """A picture that recedes into grey, with relevancy glowing over it.
+    """A picture that recedes into gray, with relevancy glowing over it.
 
     Args:
         image: ``[H, W, 3]``, bytes or floats in 0..1.
         relevancy: ``[H, W]`` in 0..1.
         low: Relevancy that is not marked at all.
-        high: Relevancy in full colour. None takes the map's own peak, but at least `PEAK_FLOOR` above
+        high: Relevancy in full color. None takes the map's own peak, but at least `PEAK_FLOOR` above
             ``low``, so that a map in which nothing is relevant stays dark.
-        strength: Opacity of the full colour in 0..1.
+        strength: Opacity of the full color in 0..1.
 
     Returns:
         ``[H, W, 3]`` bytes.
@@ -96,15 +96,15 @@ def overlay_heatmap(
     if high is None:
         high = max(float(values.max()), low + PEAK_FLOOR)
     amount = _unit(values, low, high)
-    grey = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
-    backdrop = 0.55 * (0.65 * grey[..., None] + 0.35 * colors) + 0.06
+    gray = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    backdrop = 0.55 * (0.65 * gray[..., None] + 0.35 * colors) + 0.06
     weight = (strength * amount**0.8)[..., None]
     blended = (1 - weight) * backdrop + weight * (colorize(amount).astype(np.float32) / 255)
     return (np.clip(blended, 0, 1) * 255).round().astype(np.uint8)
 
 
 PEAK_FLOOR = 0.1
-"""Least span of relevancy that an overlay stretches over its colours."""
+"""Least span of relevancy that an overlay stretches over its colors."""
 
 
 def overlay_mask(

@@ -105,7 +105,7 @@ def select_hit(
     gaussians: Gaussians,
     field: LanguageField,
     cameras: Mapping[str, Camera],
-    likeness: float | None = None,
+    similarity: float | None = None,
     world: World | None = None,
 ) -> Selection:
     """What is joined to a hit and means the same.
@@ -119,12 +119,12 @@ def select_hit(
         world: Up and scale of the scene; none takes up from the cameras.
     """
     scores = likeness_to(hit, field)
-    if likeness is None:
+    if similarity is None:
         own = float((scores[hit.indices] * hit.weights).sum() / hit.weights.sum().clamp_min(1e-12))
         two_classes = float(automatic_threshold(scores[None], gaussians.opacities.detach())[0])
-        likeness = max(two_classes, _ALIKE * own)
+        similarity = max(two_classes, _ALIKE * own)
     chosen = Selection(
-        gaussians, cameras, scores >= likeness, scores, likeness, "yes", "what was clicked", world
+        gaussians, cameras, scores >= similarity, scores, similarity, "yes", "what was clicked", world
     )
     if not chosen:
         return chosen

@@ -99,7 +99,7 @@ class Calibration:
 CALIBRATION = Calibration(bias=-1.869, height=0.0, rank=0.353, yes=0.457, no=0.457, peak=3.32)
 
 
-class PresenceJudge:
+class PresenceClassifier:
     """Compares phrases with the reference phrases in one scene.
 
     Args:
@@ -158,7 +158,7 @@ class PresenceJudge:
 
 
 def found_thresholds(
-    judge: PresenceJudge,
+    judge: PresenceClassifier,
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     positives: Tensor,

@@ -4,7 +4,7 @@ Nothing here needs an encoder: text comes in as embeddings. Dimension letters: P
 M negatives, T texts, K codes, D feature dimensions, N Gaussians, H and W image size.
 
 Relevancy is LERF's: a prompt is compared with each canonical phrase by a softmax of two, and the least
-favourable phrase counts. 0.5 means "as near to the prompt as to a canonical phrase". Two forms, by name:
+favorable phrase counts. 0.5 means "as near to the prompt as to a canonical phrase". Two forms, by name:
 
 - ``"feature"`` (the paper): code probabilities p become a feature, F = p S, which is compared with the text.
 - ``"code"``: each code is compared with the text once (a table r of K numbers for a prompt), and the answers

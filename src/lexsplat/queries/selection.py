@@ -30,9 +30,9 @@ Presence = Literal["yes", "no", "unsure"]
 PRESENCES: tuple[Presence, ...] = ("no", "unsure", "yes")
 """The answers, the least sure first."""
 
-_NEIGHBOURS = 8
+_NEIGHBORS = 8
 _LINK = 2.5
-"""Gaussians of one instance are at most this many times the usual distance to the sixth neighbour apart."""
+"""Gaussians of one instance are at most this many times the usual distance to the sixth neighbor apart."""
 _SMALLEST_SHARE = 0.1
 """A cluster with less than this share of the largest one's opacity is not an instance."""
 _CONVINCING = 0.65
@@ -113,7 +113,7 @@ class Selection:
 
     @cached_property
     def box(self) -> Box:
-        """The upright box around it: centre, axes (rows), half sizes, in world units.
+        """The upright box around it: center, axes (rows), half sizes, in world units.
 
         Raises:
             QueryError: If nothing is selected.
@@ -134,9 +134,9 @@ class Selection:
         return 2 * self.box.half_sizes
 
     @property
-    def size_metres(self) -> NDArray[np.float64] | None:
-        """`size` in metres; None where nobody has said how long a unit is (``lexsplat scale``)."""
-        scale = self.world.metres_per_unit if self.world else None
+    def size_meters(self) -> NDArray[np.float64] | None:
+        """`size` in meters; None where nobody has said how long a unit is (``lexsplat scale``)."""
+        scale = self.world.meters_per_unit if self.world else None
         return None if scale is None else self.size * scale
 
     def distance_to(self, other: Selection) -> float:
@@ -248,9 +248,9 @@ class Selection:
         }
 
     def geometry(self) -> dict[str, Any]:
-        """Count, score, place and size as plain numbers, in world units; the size in metres too where known."""
-        box, metres = self.box, self.size_metres
-        known = {} if metres is None else {"size_metres": [round(float(v), 5) for v in metres]}
+        """Count, score, place and size as plain numbers, in world units; the size in meters too where known."""
+        box, meters = self.box, self.size_meters
+        known = {} if meters is None else {"size_meters": [round(float(v), 5) for v in meters]}
         return {
             "gaussians": self.count,
             "score": round(self.score, 4),
@@ -287,7 +287,7 @@ class Selection:
         return torch.from_numpy(array).to(self.mask.device)
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centres ``[M, 3]`` and opacities ``[M]`` of its Gaussians."""
+        """Centers ``[M, 3]`` and opacities ``[M]`` of its Gaussians."""
         means = self.gaussians.means[self.mask].detach().cpu().double().numpy()
         return means, self.gaussians.opacities[self.mask].detach().cpu().double().numpy()
 
@@ -302,10 +302,10 @@ class Selection:
         """Usual distance from one of its Gaussians to the sixth nearest."""
         points, _ = self._points()
         sample = points[:: max(1, len(points) // 4096)]
-        neighbours = min(7, len(points))
-        if neighbours < 2:
+        neighbors = min(7, len(points))
+        if neighbors < 2:
             return float(self.gaussians.scales[self.mask].max())
-        apart, _ = cKDTree(points).query(sample, k=neighbours)
+        apart, _ = cKDTree(points).query(sample, k=neighbors)
         return float(np.median(apart[:, -1]))
 
     def _clusters(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -317,11 +317,11 @@ class Selection:
         firm = firm if len(firm) else np.arange(len(points))
         link = self._spacing() * _LINK
         tree = cKDTree(points[firm])
-        k = min(_NEIGHBOURS + 1, len(firm))
-        apart, neighbours = tree.query(points[firm], k=k, distance_upper_bound=link)
-        apart, neighbours = apart.reshape(len(firm), k), neighbours.reshape(len(firm), k)
+        k = min(_NEIGHBORS + 1, len(firm))
+        apart, neighbors = tree.query(points[firm], k=k, distance_upper_bound=link)
+        apart, neighbors = apart.reshape(len(firm), k), neighbors.reshape(len(firm), k)
         rows, columns = np.nonzero(np.isfinite(apart))
-        edges = (np.ones(len(rows)), (rows, neighbours[rows, columns]))
+        edges = (np.ones(len(rows)), (rows, neighbors[rows, columns]))
         _, found = connected_components(coo_array(edges, shape=(len(firm), len(firm))), directed=False)
         _, nearest = tree.query(points)  # the faint ones go with the firm one nearest to them
         labels = found[nearest].astype(np.intp)

@@ -149,12 +149,12 @@ def _best_cut(
     median, top = (int(torch.searchsorted(share, torch.tensor(q, dtype=share.dtype))) for q in (0.5, 0.998))
     if (top - median) * width < min_contrast:
         return None
-    centres = low + width * (torch.arange(bins, dtype=torch.float64) + 0.5)
+    centers = low + width * (torch.arange(bins, dtype=torch.float64) + 0.5)
     heights = counts**tempering * (counts > 0)
     below = heights.cumsum(0)[:-1]
     above = heights.sum() - below
-    first = (heights * centres).cumsum(0)[:-1]
-    lower, upper = first / below, ((heights * centres).sum() - first) / above
+    first = (heights * centers).cumsum(0)[:-1]
+    lower, upper = first / below, ((heights * centers).sum() - first) / above
     between = below * above * (lower - upper) ** 2
     # All cuts inside a gap are equally good: take the middle of the best run.
     best = torch.nonzero(between >= between.max() * (1 - 1e-12)).flatten()

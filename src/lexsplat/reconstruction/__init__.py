@@ -15,7 +15,7 @@ from lexsplat.runtime import memory as budget
 from lexsplat.runtime.progress import Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.captures import Scene
+    from lexsplat.captures import Capture
     from lexsplat.runtime.checkpoints import Checkpoint
 
 __all__ = [
@@ -30,7 +30,7 @@ __all__ = [
 
 
 def reconstruct(
-    scene: Scene,
+    scene: Capture,
     config: ReconstructionConfig,
     *,
     device: torch.device | str = "cpu",
@@ -54,7 +54,7 @@ def reconstruct(
             views) and "gaussians".
 
     Raises:
-        TrainingError: If there is nothing to train on or the optimisation diverges.
+        TrainingError: If there is nothing to train on or the optimization diverges.
         CaptureError: If a photo cannot be read.
         MemoryBudgetError: If the Gaussians, or the photos while they are triangulated, do not fit into ``memory``.
     """

@@ -1,4 +1,4 @@
-"""The optimisers of the reconstruction: one Adam for each parameter, and their state as named tensors."""
+"""The optimizers of the reconstruction: one Adam for each parameter, and their state as named tensors."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torch import Tensor
 class Adam(torch.optim.Adam):
     """Adam with the epsilon of 3DGS, all its arithmetic in one pass over memory.
 
-    On CUDA it is torch's fused Adam. On a CPU it is our kernel: torch's synchronises its OpenMP threads by
+    On CUDA it is torch's fused Adam. On a CPU it is our kernel: torch's synchronizes its OpenMP threads by
     spinning, which takes ten times as long as the arithmetic when another process wants the cores.
 
     Every number is stepped, also of Gaussians that the view does not show: their moments decay and move them on, so
-    leaving them out would be another optimiser.
+    leaving them out would be another optimizer.
 
     Args:
         parameter: The one parameter it changes, float32.
@@ -67,13 +67,13 @@ def _adam_on_cpu(
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Copies of the state of an optimiser of one parameter; empty before its first step."""
+    """Copies of the state of an optimizer of one parameter; empty before its first step."""
     (parameter,) = optimizer.param_groups[0]["params"]
     return {name: value.clone() for name, value in optimizer.state[parameter].items()}
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Give an optimiser of one parameter the state that `optimizer_tensors` returned.
+    """Give an optimizer of one parameter the state that `optimizer_tensors` returned.
 
     Raises:
         ValueError: If the state is of another parameter.
@@ -90,16 +90,16 @@ def check_moments(tensors: Mapping[str, Tensor], parameter: Tensor) -> None:
     if not tensors:
         return
     if not {"step", "exp_avg", "exp_avg_sq"} <= tensors.keys() or tensors["step"].numel() != 1:
-        raise ValueError("the state of an optimiser lacks something")
+        raise ValueError("the state of an optimizer lacks something")
     if not 0 <= float(tensors["step"]) < 1e9:
-        raise ValueError(f"the state of an optimiser is of step {float(tensors['step']):g}")
+        raise ValueError(f"the state of an optimizer is of step {float(tensors['step']):g}")
     for name in ("exp_avg", "exp_avg_sq"):
         if tensors[name].shape != parameter.shape or tensors[name].dtype != parameter.dtype:
             raise ValueError(
-                f"the state of an optimiser is of {list(tensors[name].shape)}, not {list(parameter.shape)}"
+                f"the state of an optimizer is of {list(tensors[name].shape)}, not {list(parameter.shape)}"
             )
         if not bool(torch.isfinite(tensors[name]).all()):
-            raise ValueError("the state of an optimiser has a number that is not finite")
+            raise ValueError("the state of an optimizer has a number that is not finite")
 
 
 def with_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

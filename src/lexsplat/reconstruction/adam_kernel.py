@@ -24,7 +24,7 @@ def adam_step(
     """Update moments and values ``[n]`` float32 in place.
 
     Args:
-        values: What is optimised.
+        values: What is optimized.
         gradient: Its gradient.
         first: Running mean of the gradient.
         second: Running mean of its square.

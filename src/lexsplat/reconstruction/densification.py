@@ -80,7 +80,7 @@ class DensityControl:
         schedule: When it acts.
         extent: Radius of the scene; sizes are judged relative to it.
         max_gaussians: Never more than this many.
-        grow_gradient: Mean gradient of the projected centres, in halves of the image, above which "default"
+        grow_gradient: Mean gradient of the projected centers, in halves of the image, above which "default"
             adds.
         min_opacity: Gaussians fainter than this are removed ("default") or moved ("mcmc").
         reset_opacities: Whether "default" resets the opacities to twice ``min_opacity`` now and then, and
@@ -151,13 +151,13 @@ class DensityControl:
         image_size: tuple[int, int],
         means_learning_rate: float,
     ) -> bool:
-        """Act after the optimisers' step; entries of ``parameters`` may be replaced.
+        """Act after the optimizers' step; entries of ``parameters`` may be replaced.
 
         Args:
             parameters: By gsplat's names.
             optimizers: One for each parameter, each with one group.
             step: Steps done before this one.
-            means2d: Projected centres ``[N, 2]`` in pixels whose ``grad`` is filled.
+            means2d: Projected centers ``[N, 2]`` in pixels whose ``grad`` is filled.
             radii: Size on screen ``[N]`` in pixels; 0 where not drawn.
             image_size: Width and height of the image behind ``means2d``.
             means_learning_rate: Present learning rate of the means; scales the noise of "mcmc".

@@ -1,4 +1,4 @@
-"""Colour changes between photos: an affine map for each, fitted together with the scene."""
+"""Color changes between photos: an affine map for each, fitted together with the scene."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lexsplat.reconstruction.adam import (
 
 
 class Exposures:
-    """An affine colour change ``[3, 4]`` for each training photo, the identity at the start.
+    """An affine color change ``[3, 4]`` for each training photo, the identity at the start.
 
-    Photos of one capture can differ in exposure and white balance; without this the difference becomes colour
+    Photos of one capture can differ in exposure and white balance; without this the difference becomes color
     that depends on the view, or haze.
 
     Args:

@@ -1,6 +1,6 @@
 """The photometric loss and its gradient in three sweeps over the rows of an image (Numba, CPU).
 
-Images are handled as ``[H, W3]`` with ``W3 = 3 W``: as the colours are interleaved, a horizontal tap is a
+Images are handled as ``[H, W3]`` with ``W3 = 3 W``: as the colors are interleaved, a horizontal tap is a
 shift by three and every inner loop runs over contiguous memory. Kept apart from `image_losses` so that Numba
 is imported only when a loss is computed on a CPU.
 """
@@ -32,7 +32,7 @@ def photometric(
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[float, float, np.ndarray]:
-    """Sums of absolute differences and of SSIM over all pixels and colours, and the gradient of the loss.
+    """Sums of absolute differences and of SSIM over all pixels and colors, and the gradient of the loss.
 
     Args:
         image: ``[H, W3]`` float32, as is every array here.

@@ -20,7 +20,7 @@ class ReconstructionConfig:
     """Settings of the reconstruction; numbers of steps refer to a training of 30,000.
 
     Args:
-        iterations: Optimisation steps, one view each; on the command line ``--iterations`` sets it.
+        iterations: Optimization steps, one view each; on the command line ``--iterations`` sets it.
         ssim_weight: Weight of 1 - SSIM against L1, in 0..1.
         sh_degree: Highest degree of spherical harmonics, 0..3 (4 where the backend can).
         sh_degree_every: Steps after which the next degree joins.
@@ -28,7 +28,7 @@ class ReconstructionConfig:
         max_gaussians: Never more than this many; None is 3,000,000 on CUDA and 40,000 on a CPU.
         densify_every: Steps between two rounds of density control.
         densify_min_every: Rounds of "default" are never closer than this many actual steps.
-        grow_gradient: Mean gradient of projected centres above which "default" adds Gaussians.
+        grow_gradient: Mean gradient of projected centers above which "default" adds Gaussians.
         min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
         reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None does so in trainings of at
             least 15,000, which have the time to recover.
@@ -40,17 +40,17 @@ class ReconstructionConfig:
         initial_opacity: Opacity of the first Gaussians.
         warm_up: Share of the iterations that run at half resolution, at the start; None is 0.3 in trainings
             shorter than 15,000, else 0.
-        exposure: Fit an affine colour change per training photo, for captures whose exposure varies.
+        exposure: Fit an affine color change per training photo, for captures whose exposure varies.
         rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
             30,000 / iterations, between 1 and 3: a short training takes longer strides.
-        means_rate: Learning rate of the centres at the start, relative to the extent of the scene.
+        means_rate: Learning rate of the centers at the start, relative to the extent of the scene.
         means_rate_final: The same at the end; it decays exponentially.
         scales_rate: Learning rate of the logarithms of the scales.
         quats_rate: Learning rate of the rotations.
         opacities_rate: Learning rate of the opacity logits.
-        sh0_rate: Learning rate of the constant colour.
-        shN_rate: Learning rate of the other colour coefficients.
-        exposure_rate: Learning rate of the colour change.
+        sh0_rate: Learning rate of the constant color.
+        shN_rate: Learning rate of the other color coefficients.
+        exposure_rate: Learning rate of the color change.
         image_memory: Bytes for photos kept in memory.
     """
 
@@ -115,7 +115,7 @@ class ReconstructionConfig:
         return round(share * self.iterations)
 
     @property
-    def regularisers(self) -> tuple[float, float]:
+    def regularizers(self) -> tuple[float, float]:
         """Weights of opacity and scale in the loss."""
         default = 0.01 if self.strategy == "mcmc" else 0.0
         given = (self.opacity_weight, self.scale_weight)

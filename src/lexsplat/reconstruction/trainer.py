@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,7 @@ from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.captures import Scene, View
+    from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.runtime.checkpoints import Checkpoint
 
@@ -61,7 +60,7 @@ class Reconstructor:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Capture,
         config: ReconstructionConfig,
         points: InitialPoints,
         *,
@@ -178,7 +177,7 @@ class Reconstructor:
         valid = images.valid(self._names[index])
         if valid is not None:
             image = torch.where(valid[..., None], image, target.image)
-        loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularisation()
+        loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularization()
         loss.backward()
         value = loss.item() if self._checks_now() else 0.0
         if not math.isfinite(value):
@@ -222,29 +221,6 @@ class Reconstructor:
         del self._optimizers["origins"]
         origins = self._parameters.pop("origins").detach().long()
         self.origins = origins if changed else None
-
-    @torch.no_grad()
-    def evaluate(self, views: Iterable[View]) -> float:
-        """Mean PSNR in dB over views, at the size of their cameras.
-
-        Raises:
-            ValueError: If there is no view.
-        """
-        from lexsplat.evaluation.metrics import psnr
-        from lexsplat.rendering import render
-
-        scores = []
-        gaussians = self.gaussians()
-        for view in views:
-            image = render(gaussians, view.camera, background=self._background).image
-            photo = torch.from_numpy(view.load_image()).to(self.device)
-            valid = view.load_valid()
-            if valid is not None:
-                image, photo = image[valid], photo[valid]
-            scores.append(psnr(image.clamp(0, 1).cpu().numpy(), photo.cpu().numpy()))
-        if not scores:
-            raise ValueError("no views to evaluate on")
-        return sum(scores) / len(scores)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything needed to go on bit for bit, as named tensors."""
@@ -354,8 +330,8 @@ class Reconstructor:
             self._images_shrink = shrink
         return self._images
 
-    def _regularisation(self) -> Tensor | float:
-        opacity_weight, scale_weight = self.config.regularisers
+    def _regularization(self) -> Tensor | float:
+        opacity_weight, scale_weight = self.config.regularizers
         total: Tensor | float = 0.0
         if opacity_weight > 0:
             total = total + opacity_weight * self._parameters["opacities"].sigmoid().mean()

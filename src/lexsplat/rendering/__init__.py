@@ -1,6 +1,6 @@
 """Rendering Gaussians to images with any number of channels, and the one choice of backend.
 
-`render` composites colour, features and alpha of one view; gradients of colour and alpha reach the geometry,
+`render` composites color, features and alpha of one view; gradients of color and alpha reach the geometry,
 gradients of features reach the features only. `prepare` does what depends on geometry and camera alone, for
 those who render many features over geometry that does not move. `accumulate_codes` goes the other way: from
 codes on pixels to weights on Gaussians.
@@ -37,7 +37,7 @@ __all__ = [
 Backend = Literal["auto", "cpu", "gsplat"]
 NEAR = 0.01
 """Gaussians nearer than this are not drawn, world units."""
-SPREAD_CHANNELS = 64
+BACK_PROJECTED_CHANNELS = 64
 """Channels that `spread` takes at a time."""
 IGNORED_CODE = 255
 """In code maps with at most 255 codes: a pixel without a code."""
@@ -48,11 +48,11 @@ class Rendering:
     """One rendered view.
 
     Args:
-        channels: Colour, then features ``[H, W, C]``.
+        channels: Color, then features ``[H, W, C]``.
         alpha: 1 - transmittance behind the last Gaussian ``[H, W]`` in 0..1.
-        means2d: Centres on the image ``[N, 2]`` in pixels; keeps its gradient when it has one.
+        means2d: Centers on the image ``[N, 2]`` in pixels; keeps its gradient when it has one.
         radii: Radius in pixels ``[N]``, 0 for Gaussians that are not drawn.
-        color_channels: How many of the channels are colour: 3 or 0.
+        color_channels: How many of the channels are color: 3 or 0.
         depth: Mean depth of what is seen ``[H, W]``, world units along the view axis, 0 where nothing is; only
             if asked for. It has no gradient.
     """
@@ -150,7 +150,7 @@ def render(
 ) -> Rendering:
     """Render one view by front-to-back blending.
 
-    Gradients of the feature channels reach ``features`` only: geometry, opacity and colour are deaf to them, bit
+    Gradients of the feature channels reach ``features`` only: geometry, opacity and color are deaf to them, bit
     for bit. Gradients of RGB and alpha reach everything else.
 
     Args:
@@ -282,7 +282,7 @@ def accumulate_codes(
     return out
 
 
-def spread(gaussians: Gaussians, camera: Camera, values: Tensor, prepared: PreparedView) -> Tensor:
+def back_project(gaussians: Gaussians, camera: Camera, values: Tensor, prepared: PreparedView) -> Tensor:
     """A map spread over the Gaussians by their blending weights, the transpose of rendering: sum of alpha T values.
 
     Rendering is linear in what the Gaussians carry, so this is its gradient; `SPREAD_CHANNELS` are taken at a time.
@@ -298,7 +298,7 @@ def spread(gaussians: Gaussians, camera: Camera, values: Tensor, prepared: Prepa
     """
     parts = []
     with torch.enable_grad():
-        for part in values.split(SPREAD_CHANNELS, dim=-1):
+        for part in values.split(BACK_PROJECTED_CHANNELS, dim=-1):
             carried = torch.zeros(len(gaussians), part.shape[-1], device=gaussians.device, requires_grad=True)
             image = render(gaussians, camera, features=carried, color=False, prepared=prepared).features
             (gradient,) = torch.autograd.grad(image, carried, part.contiguous())

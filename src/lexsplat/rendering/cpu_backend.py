@@ -77,7 +77,7 @@ class _Project(torch.autograd.Function):
 
 
 class _Shade(torch.autograd.Function):
-    """(means, sh0, shN) -> colours of the visible Gaussians."""
+    """(means, sh0, shN) -> colors of the visible Gaussians."""
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, sh0: Tensor, shN: Tensor, *constants: Any) -> Tensor:
@@ -105,7 +105,7 @@ class _Blend(torch.autograd.Function):
     """(means2d, conics, opacities, colors, features, background) -> (channels [H, W, C], alpha [H, W]).
 
     The geometry is read from the pairs; the first three tensors only tell autograd where its gradients go.
-    Colours and alpha have a say in the geometry, features do not.
+    Colors and alpha have a say in the geometry, features do not.
     """
 
     @staticmethod

@@ -1,7 +1,7 @@
 """The CUDA rasterizer: gsplat's kernels behind the same functions as `cpu_backend`.
 
 gsplat's parts are called one by one instead of its `rasterization`, so that projection and sorting are shared by
-the pass for colour and the pass for features. The second one sees the geometry detached.
+the pass for color and the pass for features. The second one sees the geometry detached.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lexsplat.runtime.errors import BackendError
 TILE = 16
 CHANNELS = 32
 """Channels blended, and codes accumulated, at a time. Bounds memory to [N, 32] and [H, W, 32]; for gradients gsplat
-keeps the colours of 256 Gaussians in a block's shared memory, where 64 channels are too many for small cards."""
+keeps the colors of 256 Gaussians in a block's shared memory, where 64 channels are too many for small cards."""
 CAMERAS = 4096
 """Matrices kept on the device, so that rendering a view again waits for no copy."""
 
@@ -153,7 +153,7 @@ def blend(
     features: Tensor | None,
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Channels ``[H, W, C]`` and alpha ``[H, W]``; colours (or alpha alone) first, features over deaf geometry."""
+    """Channels ``[H, W, C]`` and alpha ``[H, W]``; colors (or alpha alone) first, features over deaf geometry."""
     geometry = projected[:3]
     deaf = tuple(t.detach() for t in geometry)
     alone = not any(t.requires_grad for t in geometry)

@@ -25,7 +25,7 @@ class TilePairs:
         height: Image height in pixels.
         count: Number of all Gaussians N.
         order: Index of each visible Gaussian, nearest first ``[V]``.
-        ellipses: Centre, half conic and opacity in that order ``[V, 8]``.
+        ellipses: Center, half conic and opacity in that order ``[V, 8]``.
         boxes: Tile columns and pixel rows ``[V, 4]``, half open.
         pair_offsets: First pair of each Gaussian in the list by Gaussian ``[V + 1]``.
         tile_offsets: First pair of each tile in the list by tile ``[T + 1]``.
@@ -73,7 +73,7 @@ def find_pairs(
     """Sort by depth once, then count and list the pairs tile by tile.
 
     Args:
-        means2d: Centres ``[N, 2]`` in pixels.
+        means2d: Centers ``[N, 2]`` in pixels.
         conics: Inverse covariances ``[N, 3]`` (xx, xy, yy) in 1 / square pixels.
         opacities: Effective opacities ``[N]``.
         extents: Half sizes of the box outside of which alpha is below its threshold ``[N, 2]`` in pixels.

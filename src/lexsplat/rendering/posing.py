@@ -2,7 +2,7 @@
 
 Rendering from world-to-camera (R, t) equals rendering the Gaussians moved by (R, t) from a camera at the origin.
 Means and rotations move differentiably here, so whatever gradient a backend gives them reaches the pose, and no
-backend needs to know of poses. Colours depend on directions in the world; they are shaded there.
+backend needs to know of poses. Colors depend on directions in the world; they are shaded there.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def in_camera_frame(gaussians: Gaussians, viewmat: Tensor) -> Gaussians:
 
 
 def around_the_camera(gaussians: Gaussians, viewmat: Tensor) -> Gaussians:
-    """The Gaussians shifted so that the camera's centre is the origin, in world axes: what shading looks at."""
-    centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    return replace(gaussians, means=gaussians.means - centre)
+    """The Gaussians shifted so that the camera's center is the origin, in world axes: what shading looks at."""
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return replace(gaussians, means=gaussians.means - center)
 
 
 def at_the_origin(camera: Camera) -> Camera:

@@ -12,8 +12,6 @@ from typing import Any
 
 import torch
 
-from lexsplat import __version__
-
 
 def machine_facts() -> dict[str, Any]:
     """The machine, in words a reader of numbers needs."""
@@ -23,7 +21,7 @@ def machine_facts() -> dict[str, Any]:
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
         "gpu": gpu,
-        "versions": {"lexsplat": __version__, **versions()},
+        "versions": {"lexsplat": version("lexsplat"), **versions()},
     }
 
 

@@ -76,4 +76,4 @@ class QueryError(LexsplatError):
 
 
 class TrainingError(LexsplatError):
-    """Optimisation that diverged or has nothing to optimise."""
+    """Optimization that diverged or has nothing to optimize."""

@@ -46,7 +46,7 @@ SEQUENTIAL_BLOCKS = 5
 """And so many times the overlap while it compares each photo with the next ones."""
 
 GAUSSIAN_BYTES = 1_700
-"""A Gaussian in training, with gradient, two moments of the optimiser and the last good state."""
+"""A Gaussian in training, with gradient, two moments of the optimizer and the last good state."""
 
 
 def photo_bytes(photo: tuple[int, int], made: tuple[int, int] = (0, 0)) -> int:

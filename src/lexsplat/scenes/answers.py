@@ -17,14 +17,14 @@ from lexsplat.queries.phrases import parse
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 
 MAX_DEFAULT_VIEWS = 6
 """How many held-out views a query without ``--view`` draws."""
 
 
 def answer_queries(
-    scene: SearchableScene,
+    scene: Scene,
     prompts: Sequence[str],
     views: Sequence[str],
     threshold: float | None,
@@ -60,7 +60,7 @@ def answer_queries(
             "peak": 0.0,
             "best_view": names[0],
             "gaussians": int((score >= limit).sum()),
-            "present": scene.presence_judge.judge(score),
+            "present": scene.presence_classifier.judge(score),
             "views": {},
         }
         for prompt, limit, score in zip(prompts, thresholds, scores)
@@ -80,7 +80,7 @@ def answer_queries(
 
 
 def find_phrases(
-    scene: SearchableScene,
+    scene: Scene,
     phrases: Sequence[str],
     view: str | None = None,
     threshold: float | None = None,
@@ -94,9 +94,9 @@ def find_phrases(
         threshold: Relevancy from which a Gaussian belongs to a thing; none chooses one for each.
 
     Returns:
-        ``{"scene", "up", "metres_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
-        "count", "threshold", "best_view" and "instances" with centre, size and axes in world units, and
-        "size_metres" where the scale is known.
+        ``{"scene", "up", "meters_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
+        "count", "threshold", "best_view" and "instances" with center, size and axes in world units, and
+        "size_meters" where the scale is known.
 
     Raises:
         QueryError: If a phrase is empty or the view is unknown.
@@ -114,7 +114,7 @@ def find_phrases(
     }
 
 
-def _default_views(scene: SearchableScene) -> list[str]:
+def _default_views(scene: Scene) -> list[str]:
     held_out = [name for name, view in scene.views.items() if view.split == "test"]
     names = held_out or list(scene.views)
     return names[:: max(1, len(names) // MAX_DEFAULT_VIEWS)][:MAX_DEFAULT_VIEWS]
@@ -160,8 +160,8 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
     config = record.get("config", {})
     stages = record["stages"]
-    averaged = stages.get("embed", {}).get("method") == "averaged"
-    codes = stages.get("embed" if averaged else "codebook", {})  # where they were found
+    averaged = stages.get("language", {}).get("method") == "averaged"
+    codes = stages.get("language" if averaged else "codebook", {})  # where they were found
     facts: dict[str, Any] = {
         "scene": str(folder.root),
         "capture": record.get("capture"),
@@ -173,8 +173,8 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussians": stages.get("reconstruct", {}).get("gaussians"),
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
-        "method": stages.get("embed", {}).get("method"),
-        **({} if averaged else {"weight_dropped": stages.get("embed", {}).get("dropped")}),
+        "method": stages.get("language", {}).get("method"),
+        **({} if averaged else {"weight_dropped": stages.get("language", {}).get("dropped")}),
         "clip": config.get("clip"),
         "dino": "not used" if averaged else config.get("dino"),
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),

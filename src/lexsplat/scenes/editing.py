@@ -1,8 +1,8 @@
-"""Editing a scene: delete, keep, recolour, move, duplicate; undo, redo; a journal on disk.
+"""Editing a scene: delete, keep, recolor, move, duplicate; undo, redo; a journal on disk.
 
 The built scene is never changed. An `Editor` holds what was done since and writes every step into a journal, a
 line of JSON each, so that an edit can be gone on with, replayed on a copy or discarded. `Editor.save` makes a new
-scene folder. Rows of the language field follow their Gaussians, and colours turn with what turns.
+scene folder. Rows of the language field follow their Gaussians, and colors turn with what turns.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderErro
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import moved
 
-Kind = Literal["delete", "keep", "recolour", "move", "duplicate"]
+Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 JOURNAL_VERSION = 1
 MAX_GROWTH = 16
@@ -113,8 +113,8 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
         gaussians, language = gaussians.select(index), language.select(index)
         mask = torch.arange(len(index), device=mask.device) >= len(everything)
     changed = gaussians.select(mask)
-    if step.kind == "recolour":
-        changed = recoloured(changed, step.values["color"], step.values["strength"])
+    if step.kind == "recolor":
+        changed = recolored(changed, step.values["color"], step.values["strength"])
     else:
         numbers = {name: step.values.get(name) for name in ("rotation", "translation", "center")}
         arrays = {name: np.array(value, float) for name, value in numbers.items() if value is not None}
@@ -128,13 +128,13 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     return replace(gaussians, **tensors), language
 
 
-def recoloured(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
-    """Another colour with the old shading: brighter parts stay brighter.
+def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
+    """Another color with the old shading: brighter parts stay brighter.
 
     Args:
         gaussians: A thing.
         color: RGB in 0..1 that the thing has on average afterwards (as far as it does not clip).
-        strength: 0 leaves it, 1 leaves nothing of the old hue and of view-dependent colour.
+        strength: 0 leaves it, 1 leaves nothing of the old hue and of view-dependent color.
 
     Raises:
         ValueError: If a number is out of range.
@@ -142,7 +142,7 @@ def recoloured(gaussians: Gaussians, color: Sequence[float], strength: float) ->
     target = torch.tensor([float(c) for c in color])
     if target.shape != (3,) or not bool(((target >= 0) & (target <= 1)).all()) or not 0 <= strength <= 1:
         raise ValueError(
-            f"a colour is three numbers in 0..1, and strength too, got {list(color)}, {strength:g}"
+            f"a color is three numbers in 0..1, and strength too, got {list(color)}, {strength:g}"
         )
     if len(gaussians) == 0:
         return gaussians
@@ -206,7 +206,7 @@ class Editor:
         SceneFolderError: If it belongs to another reconstruction.
     """
 
-    def __init__(self, scene: SearchableScene, journal: Path | None = None) -> None:
+    def __init__(self, scene: Scene, journal: Path | None = None) -> None:
         self.original, self.journal = scene, journal
         self.steps: list[Step] = []
         self.undone: list[Step] = []
@@ -237,10 +237,10 @@ class Editor:
         """Remove everything but a selection."""
         self._do("keep", chosen)
 
-    def recolour(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
-        """Give a selection another colour, RGB in 0..1; its shading stays (`recoloured`)."""
-        recoloured(chosen.selected, color, strength)  # raises before the journal knows
-        self._do("recolour", chosen, color=[float(c) for c in color], strength=float(strength))
+    def recolor(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
+        """Give a selection another color, RGB in 0..1; its shading stays (`recolored`)."""
+        recolored(chosen.selected, color, strength)  # raises before the journal knows
+        self._do("recolor", chosen, color=[float(c) for c in color], strength=float(strength))
 
     def move(self, chosen: Selection, motion: Motion) -> None:
         """Shift, turn and scale a selection.

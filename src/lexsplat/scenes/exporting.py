@@ -26,7 +26,7 @@ from lexsplat.scenes.formats.language import (
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.splat import write_splat
 from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 
 SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".glb")
 """Endings of files that hold Gaussians or their points."""
@@ -65,7 +65,7 @@ def export_gaussians(
         path: ``.ply``, ``.points.ply``, ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat`` or ``.glb``.
         language: Codes to write along, where the format has room: in ``.ply`` (the codebook goes into a file
             beside it) and ``.glb``.
-        world: Up and scale of the scene, for ``.glb``: it has y up, and metres where the scale is known. The other
+        world: Up and scale of the scene, for ``.glb``: it has y up, and meters where the scale is known. The other
             formats keep the scene's axes and units, so that they go with its cameras.
 
     Returns:
@@ -105,7 +105,7 @@ def export_gaussians(
 
 
 def found_by(
-    scene: SearchableScene,
+    scene: Scene,
     phrases: Sequence[str],
     view: str | None = None,
     threshold: float | None = None,
@@ -125,7 +125,7 @@ def found_by(
 
 
 def export_scene(
-    scene: SearchableScene, path: Path, *, found: Sequence[Selection] = (), language: bool = False
+    scene: Scene, path: Path, *, found: Sequence[Selection] = (), language: bool = False
 ) -> list[Path]:
     """Write a scene, or selections of it, or which Gaussian belongs to which selection.
 

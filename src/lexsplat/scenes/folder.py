@@ -42,7 +42,7 @@ SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetens
 """What a scene is made of."""
 
 
-SHIPPED_SCENE = Path(__file__).resolve().parents[1] / "demo" / "scene"
+BUNDLED_SCENE = Path(__file__).resolve().parents[1] / "demo" / "scene"
 """The finished demo scene: what the word ``demo`` means where a scene folder is asked for."""
 
 
@@ -93,6 +93,29 @@ def _checked_record(record: Any, path: Path) -> dict[str, Any]:
     return record
 
 
+_RENAMED_SETTINGS = {"averaging": "averaged", "embedding": "trained", "lifting": "lifted"}
+
+
+def _in_todays_words(record: dict[str, Any]) -> dict[str, Any]:
+    """A checked record whose stage, encoders, settings and scale have the names of today.
+
+    Scene folders of format version 1 that were written before the renames say ``embed``, ``embedded`` and
+    ``metres_per_unit``.
+    """
+    stages = {("language" if name == "embed" else name): facts for name, facts in record["stages"].items()}
+    config = {_RENAMED_SETTINGS.get(name, name): value for name, value in record.get("config", {}).items()}
+    for encoder in ("clip", "dino"):
+        if config.get(encoder) == "embedded":
+            config[encoder] = "bundled"
+    renamed = {**record, "stages": stages, **({"config": config} if config else {})}
+    world = record.get("world")
+    if isinstance(world, dict) and "metres_per_unit" in world:
+        renamed["world"] = {
+            ("meters_per_unit" if name == "metres_per_unit" else name): value for name, value in world.items()
+        }
+    return renamed
+
+
 def _stored_view(entry: Any, path: Path) -> StoredView:
     """A view of ``cameras.json``.
 
@@ -130,7 +153,7 @@ class SceneFolder:
         self.content = self.root if content is None else content
         self.record: dict[str, Any] = {"format_version": FORMAT_VERSION, "stages": {}}
         if self._record_path.exists():
-            self.record = _checked_record(read_json(self._record_path), self._record_path)
+            self.record = _in_todays_words(_checked_record(read_json(self._record_path), self._record_path))
 
     @classmethod
     def open(cls, root: Path) -> SceneFolder:
@@ -140,7 +163,7 @@ class SceneFolder:
             SceneFolderError: If it is not a scene folder.
         """
         if str(root) == "demo" and not Path(root).exists():
-            root = SHIPPED_SCENE
+            root = BUNDLED_SCENE
         if not (Path(root) / "scene.json").is_file():
             found = "no such folder" if not Path(root).is_dir() else "no scene.json in it"
             raise SceneFolderError(
@@ -152,9 +175,9 @@ class SceneFolder:
         return cls(root)
 
     @property
-    def is_shipped(self) -> bool:
+    def is_bundled(self) -> bool:
         """Whether this is the scene that ships with the package: it is read, never written."""
-        return self.root.resolve() == SHIPPED_SCENE
+        return self.root.resolve() == BUNDLED_SCENE
 
     @property
     def _record_path(self) -> Path:
@@ -346,14 +369,14 @@ class SceneFolder:
         """Read one code index map, uint8 ``[h, w]``.
 
         Raises:
-            FileFormatError: If it is missing, damaged or not an 8-bit grey PNG.
+            FileFormatError: If it is missing, damaged or not an 8-bit gray PNG.
         """
         path = self.code_map_path(name)
         try:
             content = path.read_bytes()
             with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
                 if image.mode != "L":
-                    raise FileFormatError(path, expected="an 8-bit grey PNG", found=f"mode {image.mode}")
+                    raise FileFormatError(path, expected="an 8-bit gray PNG", found=f"mode {image.mode}")
                 if len(_pixel_data(content, image.size)) != image.height * (image.width + 1):
                     raise FileFormatError(
                         path, expected=f"{image.width}x{image.height} codes", found="others"
@@ -372,7 +395,7 @@ class SceneFolder:
 
 
 def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:
-    """The unpacked pixels of an 8-bit grey PNG with the filter byte of each row; at most one byte too many.
+    """The unpacked pixels of an 8-bit gray PNG with the filter byte of each row; at most one byte too many.
 
     Pillow fills up with zeros what a PNG promises and does not hold, and zero is a code.
     """

@@ -26,7 +26,7 @@ def keep_previous(folder: SceneFolder) -> None:
     The caller holds the lock of the folder and saves the record.
     """
     stages = folder.record["stages"]
-    whole = {"reconstruct", "embed"} <= stages.keys() and all(
+    whole = {"reconstruct", "language"} <= stages.keys() and all(
         (folder.root / name).is_file() for name in SCENE_FILES
     )
     if whole and not folder.record.get("building"):

@@ -12,12 +12,12 @@ from lexsplat.geometry.world import World, stored_world, world_of
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 
 log = logging.getLogger("lexsplat")
 
 
-def length_between(scene: SearchableScene, first: str, second: str) -> float:
+def length_between(scene: Scene, first: str, second: str) -> float:
     """Distance in world units between the middles of two things, found by phrases.
 
     Raises:
@@ -27,7 +27,7 @@ def length_between(scene: SearchableScene, first: str, second: str) -> float:
     return _positive(things[0].distance_to(things[1]), f"{first} and {second}")
 
 
-def height_of(scene: SearchableScene, phrase: str) -> float:
+def height_of(scene: Scene, phrase: str) -> float:
     """How high a thing is, found by a phrase, in world units.
 
     Raises:
@@ -45,7 +45,7 @@ def length_of_points(first: Sequence[float], second: Sequence[float]) -> float:
     return _positive(float(np.linalg.norm(np.subtract(first, second))), "the two points")
 
 
-def the_thing(scene: SearchableScene, phrase: str) -> Selection:
+def the_thing(scene: Scene, phrase: str) -> Selection:
     """The largest thing that answers to a phrase; a warning tells where there are several or perhaps none.
 
     Raises:
@@ -65,20 +65,20 @@ def store_world(
     root: SceneFolder,
     *,
     up: Sequence[float] | None = None,
-    metres_per_unit: float | None = None,
+    meters_per_unit: float | None = None,
 ) -> World:
     """Write a new up direction or scale into ``scene.json``; what is left out stays.
 
     Args:
         root: The scene folder.
         up: World direction ``[3]`` away from the ground.
-        metres_per_unit: Metres that one world unit is long.
+        meters_per_unit: Meters that one world unit is long.
 
     Raises:
         SceneFolderError: If the scene is the one that ships, or another process builds there.
         ValueError: If a number makes no sense.
     """
-    if root.is_shipped:
+    if root.is_bundled:
         raise SceneFolderError(
             "demo",
             expected="a scene folder of your own",
@@ -91,8 +91,8 @@ def store_world(
         world = world_of(folder.record, cameras)
         if up is not None:
             world = world.with_up(up)
-        if metres_per_unit is not None:
-            world = replace(world, metres_per_unit=metres_per_unit)
+        if meters_per_unit is not None:
+            world = replace(world, meters_per_unit=meters_per_unit)
         folder.record["world"] = stored_world(world, cameras)
         folder.save()
     return world

@@ -22,7 +22,7 @@ from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField, field_from_tensors
 from lexsplat.queries.phrases import parse
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceJudge, found_thresholds
+from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier, found_thresholds
 from lexsplat.queries.relations import answer
 from lexsplat.queries.relevancy import (
     CANONICAL_PHRASES,
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from lexsplat.features.encoders import ImageTextEncoder
 
 
-class SearchableScene:
+class Scene:
     """Gaussians, their language and the views they were made from.
 
     Args:
@@ -69,12 +69,12 @@ class SearchableScene:
         self._encoder: ImageTextEncoder | None = None
         self._cache: TextCache | None = None
         self._texts: dict[str, Tensor] = {}
-        self._judge: PresenceJudge | None = None
+        self._judge: PresenceClassifier | None = None
         self._world: World | None = None
 
-    def with_content(self, gaussians: Gaussians, field: LanguageField) -> SearchableScene:
+    def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
-        other = SearchableScene(gaussians, field, self.views, self.clip, self.query, self.folder)
+        other = Scene(gaussians, field, self.views, self.clip, self.query, self.folder)
         other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
         return other
 
@@ -105,7 +105,7 @@ class SearchableScene:
             ModelError: If the encoder cannot be loaded, or is not the one the language was made with.
         """
         known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
-        writable = self.folder and not self.folder.is_shipped and os.access(self.folder.root, os.W_OK)
+        writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
         if self.folder is None or known is None or not writable:
             return encode_each(self._load_encoder(known), texts)
         if self._cache is None:
@@ -156,7 +156,7 @@ class SearchableScene:
 
     def thresholds(self, prompts: Sequence[str]) -> Tensor:
         """An automatic threshold ``[P]`` for each prompt, from the scene alone; 0.5 for what is not there."""
-        return found_thresholds(self.presence_judge, self.gaussians, self._threshold_cameras(),
+        return found_thresholds(self.presence_classifier, self.gaussians, self._threshold_cameras(),
                                 self.embed(prompts), self._negatives(), self.query)  # fmt: skip
 
     def select(self, phrase: str, threshold: float | None = None) -> Selection:
@@ -173,7 +173,7 @@ class SearchableScene:
         (phrase,) = check_prompts([phrase])
         scores = self.scores([phrase])[0]
         limit = float(self.thresholds([phrase])[0]) if threshold is None else float(threshold)
-        present = self.presence_judge.judge(scores)
+        present = self.presence_classifier.judge(scores)
         chosen = Selection(
             self.gaussians, self.cameras, scores >= limit, scores, limit, present, phrase, self.world
         )
@@ -181,11 +181,11 @@ class SearchableScene:
         return chosen.convincing() if threshold is None else chosen
 
     @property
-    def presence_judge(self) -> PresenceJudge:
+    def presence_classifier(self) -> PresenceClassifier:
         """What decides whether a phrase is in the scene at all; made when it is first needed."""
         if self._judge is None:
             references = self.embed(list(REFERENCE_PHRASES))
-            self._judge = PresenceJudge(
+            self._judge = PresenceClassifier(
                 self.gaussians, self.field, references, self._negatives(), self.query.temperature
             )
         return self._judge
@@ -210,7 +210,7 @@ class SearchableScene:
 
         return answer(parse(phrase), lambda text: self.select(text, threshold), viewer)
 
-    def click(self, view: str | Camera, x: float, y: float, *, likeness: float | None = None) -> Selection:
+    def click(self, view: str | Camera, x: float, y: float, *, similarity: float | None = None) -> Selection:
         """What a click on a picture hits: the surface there and what is joined to it and says the same.
 
         Args:
@@ -224,11 +224,11 @@ class SearchableScene:
         """
         camera = view if isinstance(view, Camera) else self.view(view).camera
         hit = surface_at(self.gaussians, camera, x, y)
-        return select_hit(hit, self.gaussians, self.field, self.cameras, likeness, self.world)
+        return select_hit(hit, self.gaussians, self.field, self.cameras, similarity, self.world)
 
     @property
     def world(self) -> World:
-        """Which way is up, and what a unit is in metres, where that is known (``lexsplat scale``)."""
+        """Which way is up, and what a unit is in meters, where that is known (``lexsplat scale``)."""
         if self._world is None:
             self._world = world_of(self.folder.record if self.folder else {}, self.cameras)
         return self._world
@@ -239,7 +239,7 @@ class SearchableScene:
         return {name: view.camera for name, view in self.views.items()}
 
     def render(self, view: str | Camera) -> Rendering:
-        """The scene in colour."""
+        """The scene in color."""
         import torch
 
         camera = view if isinstance(view, Camera) else self.view(view).camera
@@ -272,7 +272,7 @@ class SearchableScene:
         return cameras[::step][:8]
 
 
-def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> SearchableScene:
+def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> Scene:
     """Open a scene folder for questions.
 
     Args:
@@ -289,8 +289,8 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
 
     place = choose_device(device)
     folder, cameras, gaussians, field = _read_whole(Path(path), place)
-    clip = clip or folder.record.get("config", {}).get("clip", "embedded")
-    return SearchableScene(gaussians, field, cameras, clip, folder=folder)
+    clip = clip or folder.record.get("config", {}).get("clip", "bundled")
+    return Scene(gaussians, field, cameras, clip, folder=folder)
 
 
 _Content = tuple[SceneFolder, dict[str, StoredView], Gaussians, LanguageField]
@@ -329,7 +329,7 @@ def _read_content(folder: SceneFolder, device: str) -> _Content:
         SceneFolderError: If it is not whole.
         FileFormatError: If a file is damaged.
     """
-    if "embed" not in folder.record["stages"] or not folder.language_path.exists():
+    if "language" not in folder.record["stages"] or not folder.language_path.exists():
         finished = ", ".join(folder.record["stages"]) or "none"
         raise SceneFolderError(
             folder.root,

@@ -1,4 +1,4 @@
-"""Moving Gaussians as a body: rotate, scale, shift. Their colours turn with them.
+"""Moving Gaussians as a body: rotate, scale, shift. Their colors turn with them.
 
 Spherical harmonics are a function of the viewing direction in the world, so a body that turns needs its
 coefficients turned: within a degree they mix among themselves, by a matrix that depends on the rotation alone.

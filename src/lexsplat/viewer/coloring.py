@@ -1,4 +1,4 @@
-"""A colour for every Gaussian: photo colours, relevancy of prompts, language, codes, uncertainty, depth.
+"""A color for every Gaussian: photo colors, relevancy of prompts, language, codes, uncertainty, depth.
 
 Everything here is arithmetic on arrays, done in milliseconds, and knows no browser. N Gaussians, K codes.
 """
@@ -32,13 +32,13 @@ PROMPT_COLORS: tuple[tuple[int, int, int], ...] = (
     (214, 51, 132),
     (120, 90, 40),
 )
-"""Colours of prompts when several are shown, told apart on light ground."""
+"""Colors of prompts when several are shown, told apart on light ground."""
 
 _FADED = 236.0
 _SAMPLE = 65_536
 _ROWS = 16_384
 _PLAIN = (150, 150, 158)
-"""Colour of Gaussians about which nothing is known."""
+"""Color of Gaussians about which nothing is known."""
 
 
 @dataclass
@@ -71,7 +71,7 @@ class Layer:
 
     @property
     def high(self) -> float:
-        """Relevancy that is drawn in full colour."""
+        """Relevancy that is drawn in full color."""
         return max(self.peak, self.threshold + PEAK_FLOOR)
 
     def marked(self) -> NDArray[np.int64]:
@@ -104,13 +104,13 @@ def quick_threshold(scores: NDArray[np.float32], opacities: NDArray[np.float32])
 
 
 def photo_colors(gaussians: Gaussians) -> NDArray[np.uint8]:
-    """The view-independent colour of every Gaussian ``[N, 3]``."""
+    """The view-independent color of every Gaussian ``[N, 3]``."""
     rgb = (gaussians.sh0[:, 0] * SH_C0 + 0.5).clamp(0, 1)
     return (rgb * 255).round().to(torch.uint8).cpu().numpy()
 
 
-class Colouring:
-    """Colours of all Gaussians of a scene in every mode.
+class Coloring:
+    """Colors of all Gaussians of a scene in every mode.
 
     Args:
         gaussians: The scene.
@@ -136,10 +136,10 @@ class Colouring:
         """RGB bytes ``[N, 3]``; a new array.
 
         Args:
-            mode: What the colours mean.
+            mode: What the colors mean.
             layers: The prompts, for ``"relevancy"``.
-            opacity: Of the marks over the photo colours, 0..1.
-            fade: How far what is not marked recedes to light grey, 0..1.
+            opacity: Of the marks over the photo colors, 0..1.
+            fade: How far what is not marked recedes to light gray, 0..1.
             eye: Position of the camera ``[3]``, for ``"depth"``.
 
         Raises:
@@ -160,7 +160,7 @@ class Colouring:
 
     @property
     def scale(self) -> tuple[float, float]:
-        """What the darkest and the brightest colour stood for when depth or uncertainty was last drawn."""
+        """What the darkest and the brightest color stood for when depth or uncertainty was last drawn."""
         return self._scale
 
     def _relevancy(self, layers: Sequence[Layer], opacity: float, fade: float) -> NDArray[np.uint8]:
@@ -198,8 +198,8 @@ class Colouring:
         return colorize(values, 0.0, high)
 
     def _depth(self, eye: NDArray | None) -> NDArray[np.uint8]:
-        centre = self._means.mean(0) if eye is None else np.asarray(eye, dtype=np.float32)
-        distances = np.linalg.norm(self._means - centre, axis=1)
+        center = self._means.mean(0) if eye is None else np.asarray(eye, dtype=np.float32)
+        distances = np.linalg.norm(self._means - center, axis=1)
         low, high = (float(v) for v in np.percentile(distances, [1, 95])) if len(distances) else (0.0, 1.0)
         self._scale = (low, max(high, low + 1e-6))
         return colorize(-distances, -self._scale[1], -self._scale[0])
@@ -208,8 +208,8 @@ class Colouring:
 def _faded(colors: NDArray[np.uint8], fade: float) -> NDArray[np.uint8]:
     if fade <= 0:
         return colors.copy()
-    grey = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
-    target = 0.75 * _FADED + 0.25 * grey
+    gray = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    target = 0.75 * _FADED + 0.25 * gray
     return np.round((1 - fade) * colors + fade * target[:, None]).astype(np.uint8)
 
 
@@ -230,7 +230,7 @@ def likeliest_codes(language: LanguageField) -> tuple[NDArray[np.int64], NDArray
 
 
 def code_palette(count: int) -> NDArray[np.uint8]:
-    """Colours ``[count, 3]`` for codes: hues a golden angle apart, in three lightnesses."""
+    """Colors ``[count, 3]`` for codes: hues a golden angle apart, in three lightnesses."""
     import colorsys
 
     colors = [
@@ -244,7 +244,7 @@ def language_colors(language: LanguageField) -> NDArray[np.uint8]:
 
     The feature of a Gaussian is linear in its codes, F = p S, so its coordinates along the main directions V are
     p (S V): the directions come from a sample of the Gaussians, the projection of all of them is sparse.
-    Gaussians about which nothing is known are grey.
+    Gaussians about which nothing is known are gray.
     """
     codewords = language.codebook.clip.double().cpu()
     count = len(language.uncertainties)
@@ -256,9 +256,9 @@ def language_colors(language: LanguageField) -> NDArray[np.uint8]:
         return colors
     sample = torch.from_numpy(places[:: max(1, len(places) // _SAMPLE)])
     shares = language.select(sample.to(ones.device)).code_probabilities().double().cpu()
-    centred = shares - shares.mean(0)
+    centered = shares - shares.mean(0)
     # The covariance of F is S^T cov(p) S; cov(p) is only K x K.
-    covariance = codewords.T @ (centred.T @ centred) @ codewords
+    covariance = codewords.T @ (centered.T @ centered) @ codewords
     directions = torch.linalg.eigh(covariance).eigenvectors[:, -3:].flip(-1)
     signs = directions.gather(0, directions.abs().argmax(0, keepdim=True)).sign()
     table = (codewords @ (directions * signs)).float().to(ones.device)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.scenes.folder import StoredView
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.recording import looking_at, orbit
 from lexsplat.viewer.splats import SplatBlocks
 
@@ -33,7 +33,7 @@ class Display:
         budget: How many Gaussians are drawn at most.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: SearchableScene, budget: int) -> None:
+    def __init__(self, server: viser.ViserServer, scene: Scene, budget: int) -> None:
         self.server, self.scene = server, scene
         self.splats = SplatBlocks(scene.gaussians, budget)
         self._handles: list[Any] = []
@@ -47,7 +47,7 @@ class Display:
     # -- splats
 
     def draw(self, colors: NDArray[np.uint8]) -> int:
-        """Show the Gaussians in these colours ``[N, 3]``; returns how many bytes were queued for each page."""
+        """Show the Gaussians in these colors ``[N, 3]``; returns how many bytes were queued for each page."""
         from lexsplat.viewer.splats import BYTES_PER_SPLAT
 
         sent = 0

@@ -36,7 +36,7 @@ def warning(text: str) -> str:
 
 
 def legend(questions: Sequence[Question], mode: Mode, scale: tuple[float, float], hint: str) -> str:
-    """What the colours mean."""
+    """What the colors mean."""
     if mode == "relevancy":
         shown = [question for question in questions if question.layer.shown]
         if not shown:
@@ -51,9 +51,9 @@ def legend(questions: Sequence[Question], mode: Mode, scale: tuple[float, float]
     if mode == "depth":
         return box(_bar(f"{scale[1]:.2f}", "distance, world units", f"{scale[0]:.2f}"))
     words = {
-        "photo": "Colours of the photos.",
-        "language": "Alike colours mean alike things: the three main directions of the language as red, green, blue.",
-        "codes": "One colour for each code of the codebook; grey where nothing is known.",
+        "photo": "Colors of the photos.",
+        "language": "Alike colors mean alike things: the three main directions of the language as red, green, blue.",
+        "codes": "One color for each code of the codebook; gray where nothing is known.",
     }
     return note(words[mode])
 
@@ -119,5 +119,5 @@ def selection_facts(question: Question | None) -> str:
     return box(
         f"<b>{escape(question.text)}</b><br>{selection.count:,} splats in {parts} "
         f"{'piece' if parts == 1 else 'pieces'}<br>"
-        f'<span style="{_MUTED}">size {size}, centre ({center}), world units</span>'
+        f'<span style="{_MUTED}">size {size}, center ({center}), world units</span>'
     )

@@ -115,7 +115,7 @@ class Panels:
             self._when(self._prompt.on_update, lambda _: self._choose_prompt())
             self._shown = gui.add_checkbox("Shown", True)
             self._when(self._shown.on_update, lambda _: self._change_prompt())
-            self._color = gui.add_rgb("Colour", (230, 57, 70), hint="Used when several prompts are shown.")
+            self._color = gui.add_rgb("Color", (230, 57, 70), hint="Used when several prompts are shown.")
             self._when(self._color.on_update, lambda _: self._change_prompt())
             self._automatic = gui.add_checkbox("Automatic", True, hint="A threshold found from the scene.")
             self._when(self._automatic.on_update, self._change_threshold)
@@ -184,7 +184,7 @@ class Panels:
     # -- asking
 
     def ask(self, text: str, client: Any = None) -> None:
-        """Ask for something: colours at once, threshold and selection when they are known.
+        """Ask for something: colors at once, threshold and selection when they are known.
 
         Args:
             text: The prompt.
@@ -386,7 +386,7 @@ class Panels:
     def _tell(self) -> None:
         session = self.session
         self._legend.content = pages.legend(
-            session.all_questions(), session.mode, session.colouring.scale, HINT
+            session.all_questions(), session.mode, session.coloring.scale, HINT
         )
 
     def _show_prompt(self) -> None:

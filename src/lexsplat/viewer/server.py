@@ -9,7 +9,7 @@ import socket
 from dataclasses import dataclass
 
 from lexsplat.runtime.errors import BackendError
-from lexsplat.scenes.scene import SearchableScene
+from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.guard import Guard, Limits
 from lexsplat.viewer.history import Memory
 from lexsplat.viewer.session import Session
@@ -53,7 +53,7 @@ class ViewerServer:
     """
 
     def __init__(
-        self, scene: SearchableScene, config: ViewerConfig | None = None, limits: Limits | None = None
+        self, scene: Scene, config: ViewerConfig | None = None, limits: Limits | None = None
     ) -> None:
         self.config = config or ViewerConfig()
         _check_address(self.config.host)
@@ -79,7 +79,7 @@ class ViewerServer:
                 remedy="install the version of viser that constraints.txt names",
             )
         try:
-            folder = scene.folder.root if scene.folder and not scene.folder.is_shipped else None
+            folder = scene.folder.root if scene.folder and not scene.folder.is_bundled else None
             self.session = Session(scene, Memory.load(folder, scene.clip))
             self.display = Display(self.viser, scene, self.config.splats)
             self.panels = Panels(self.viser, self.session, self.display)

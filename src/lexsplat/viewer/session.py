@@ -19,7 +19,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.heatmaps import overlay_mask
 from lexsplat.queries.phrases import Thing, parse
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceJudge
+from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
 from lexsplat.queries.relevancy import check_prompts, probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
@@ -27,8 +27,8 @@ from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.exporting import export_gaussians
-from lexsplat.scenes.scene import SearchableScene
-from lexsplat.viewer.coloring import PROMPT_COLORS, Colouring, Layer, Mode, quick_threshold
+from lexsplat.scenes.scene import Scene
+from lexsplat.viewer.coloring import PROMPT_COLORS, Coloring, Layer, Mode, quick_threshold
 from lexsplat.viewer.history import Memory
 from lexsplat.viewer.vocabulary import MAX_LENGTH
 
@@ -85,16 +85,16 @@ class Session:
         memory: History and vocabulary.
     """
 
-    def __init__(self, scene: SearchableScene, memory: Memory | None = None) -> None:
+    def __init__(self, scene: Scene, memory: Memory | None = None) -> None:
         self.scene, self.memory = scene, memory or Memory()
-        self.colouring = Colouring(scene.gaussians, scene.field)
+        self.coloring = Coloring(scene.gaussians, scene.field)
         self.mode: Mode = "photo"
         self.opacity, self.fade = 0.9, 0.0
         self.questions: list[Question] = []
         self.clicked: Question | None = None
         self.current: Question | None = None
         self._encoding = threading.Lock()
-        self._judge: PresenceJudge | None = None
+        self._judge: PresenceClassifier | None = None
         self._opacities = scene.gaussians.opacities.detach().cpu().numpy()
 
     def warm_up(self) -> None:
@@ -111,7 +111,7 @@ class Session:
         for phrase in REFERENCE_PHRASES:
             with self._encoding:
                 self.scene.embed([phrase])
-        self._judge = self.scene.presence_judge
+        self._judge = self.scene.presence_classifier
 
     # -- questions
 
@@ -245,9 +245,9 @@ class Session:
     # -- pictures
 
     def colors(self, eye: NDArray | None = None) -> NDArray[np.uint8]:
-        """A colour for every Gaussian ``[N, 3]`` as things stand; ``eye`` is the camera, for depth."""
+        """A color for every Gaussian ``[N, 3]`` as things stand; ``eye`` is the camera, for depth."""
         layers = [question.layer for question in self.all_questions()]
-        return self.colouring.colors(self.mode, layers, opacity=self.opacity, fade=self.fade, eye=eye)
+        return self.coloring.colors(self.mode, layers, opacity=self.opacity, fade=self.fade, eye=eye)
 
     @property
     def selection(self) -> Selection | None:

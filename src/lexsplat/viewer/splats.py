@@ -1,4 +1,4 @@
-"""What the browser is sent: Gaussians within a budget, in blocks of neighbours, and only the blocks that change."""
+"""What the browser is sent: Gaussians within a budget, in blocks of neighbors, and only the blocks that change."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lexsplat.geometry.gaussians import Gaussians
 
 BYTES_PER_SPLAT = 32
-"""What one Gaussian costs on the wire, whatever changed of it (position, covariance, colour and opacity)."""
+"""What one Gaussian costs on the wire, whatever changed of it (position, covariance, color and opacity)."""
 
 _LARGEST_VARIANCE = 1e4
 _HALF_MAX = 6e4
@@ -20,11 +20,11 @@ _MAX_GROWTH = 1.5
 
 @dataclass(frozen=True)
 class Block:
-    """Neighbouring Gaussians that are sent together.
+    """Neighboring Gaussians that are sent together.
 
     Args:
         index: Which Gaussians of the scene they are ``[M]``.
-        centers: Their centres ``[M, 3]``, in drawing units (world units times `SplatBlocks.unit`).
+        centers: Their centers ``[M, 3]``, in drawing units (world units times `SplatBlocks.unit`).
         covariances: ``[M, 3, 3]``, in drawing units squared.
         opacities: ``[M, 1]`` in 0..1.
     """
@@ -73,7 +73,7 @@ class SplatBlocks:
         return sum(len(block.index) for block in self.blocks)
 
     def changes(self, colors: NDArray[np.uint8]) -> list[tuple[int, NDArray[np.uint8]]]:
-        """The blocks whose colours differ from what this returned last: ``(block, colours [M, 3])``."""
+        """The blocks whose colors differ from what this returned last: ``(block, colors [M, 3])``."""
         changed = []
         for number, block in enumerate(self.blocks):
             own = colors[block.index]
@@ -127,7 +127,7 @@ def covariances_of(gaussians: Gaussians) -> NDArray[np.float32]:
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """An order of points ``[N, 3]`` in which neighbours in space are near each other (the Z curve, 2^10 cells)."""
+    """An order of points ``[N, 3]`` in which neighbors in space are near each other (the Z curve, 2^10 cells)."""
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     low, high = np.percentile(points, [0.5, 99.5], axis=0)

@@ -21,15 +21,15 @@ _EVERYDAY = """
 """
 
 
-_EMBEDDED = """
+_BUNDLED = """
     apple, rubber duck, mug, stack of books, vase, ring, traffic cone, potted plant, table lamp, banana, teddy bear,
     striped ball, bowl, candle, bottle, pumpkin, toy car, wooden crate, table, tablecloth, wall, floor
 """
 
 
 def default_vocabulary(clip: str = "") -> list[str]:
-    """The phrases a scene starts with: everyday things, or those that the embedded encoder knows."""
-    return clean_phrases((_EMBEDDED if clip == "embedded" else _EVERYDAY).split(","))
+    """The phrases a scene starts with: everyday things, or those that the bundled encoder knows."""
+    return clean_phrases((_BUNDLED if clip == "bundled" else _EVERYDAY).split(","))
 
 
 def clean_phrases(phrases: Iterable[str]) -> list[str]:

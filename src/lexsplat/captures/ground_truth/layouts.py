@@ -5,7 +5,7 @@
 - **3d-ovs**: ``segmentations/NN/CLASS.png`` and ``segmentations/classes.txt``; NN counts the images in order.
 - **lerf-ovs**: LangSplat's ``label/SCENE/frame_*.json`` beside the capture ``SCENE``: polygons and boxes.
 
-A test holds each reader to small fixtures in its layout. Views with truth are the views to hold out.
+A test holds each reader to small fixtures in its layout. Views with ground truth are the views to hold out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from lexsplat.captures.capture import Scene, View, stem_of
+from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.masks import load_masks
 from lexsplat.captures.ground_truth.prompt_lists import PromptList, capture_prompt_names
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, MAX_PIXELS
@@ -60,15 +60,15 @@ class Annotations:
     classes: tuple[str, ...] = ()
 
     def prompts(self) -> tuple[str, ...]:
-        """All prompts that have truth somewhere, sorted."""
+        """All prompts that have ground truth somewhere, sorted."""
         return tuple(sorted({prompt for prompts in self.masks.values() for prompt in prompts}))
 
     def origin_facts(self, prompt_list: PromptList | None) -> dict[str, str | None]:
-        """Where the truth lay and which list was asked, as results record it."""
+        """Where the ground truth lay and which list was asked, as results record it."""
         return {"folder": str(self.origin), "layout": self.layout, "prompt_list": prompt_list}
 
     def renamed(self, names: Mapping[str, str]) -> Annotations:
-        """The same truth under other words; prompts that ``names`` does not list are left out."""
+        """The same ground truth under other words; prompts that ``names`` does not list are left out."""
 
         def change(table: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             kept = {
@@ -82,7 +82,7 @@ class Annotations:
 
 
 def find_annotations(root: Path) -> tuple[str, Path] | None:
-    """Layout and folder of the truth that belongs to a capture, or None.
+    """Layout and folder of the ground truth that belongs to a capture, or None.
 
     Masks in ``segmentations/`` of the capture come first; else LERF-OVS labels in ``label/`` beside the capture.
     """
@@ -97,7 +97,7 @@ def find_annotations(root: Path) -> tuple[str, Path] | None:
 
 
 def layout_of(folder: Path) -> str:
-    """The layout of a folder with truth: one of `LAYOUTS`."""
+    """The layout of a folder with ground truth: one of `LAYOUTS`."""
     if any(folder.glob("frame_*.json")):
         return "lerf-ovs"
     return "3d-ovs" if (folder / CLASSES_FILE).is_file() else "segmentations"
@@ -113,12 +113,12 @@ def annotated_names(layout: str, folder: Path, names: Collection[str], image_fol
     return {matches[0] for matches in found if len(matches) == 1}
 
 
-def check_truth_wishes(root: Path, folder: Path | None, prompt_list: PromptList | None) -> None:
+def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: PromptList | None) -> None:
     """Refuse what `load_annotations` could not use, before hours are spent on a scene.
 
     Args:
         root: The folder of the capture.
-        folder: Where the truth is said to be, if not in or beside the capture.
+        folder: Where the ground truth is said to be, if not in or beside the capture.
         prompt_list: Whose words are to be asked, if not what the masks are called.
 
     Raises:
@@ -131,13 +131,13 @@ def check_truth_wishes(root: Path, folder: Path | None, prompt_list: PromptList 
 
 
 def load_annotations(
-    scene: Scene, folder: Path | None = None, prompt_list: PromptList | None = None
+    scene: Capture, folder: Path | None = None, prompt_list: PromptList | None = None
 ) -> Annotations:
-    """The truth of a capture, in whichever layout it is.
+    """The ground truth of a capture, in whichever layout it is.
 
     Args:
         scene: The capture.
-        folder: Where the truth is; None looks in and beside the capture (`find_annotations`).
+        folder: Where the ground truth is; None looks in and beside the capture (`find_annotations`).
         prompt_list: Ask the words of the paper or of the released code, for captures called like its scenes;
             None asks what the masks are called. Masks may be called in the words of either; others are left out.
 
@@ -149,30 +149,30 @@ def load_annotations(
             folder is none, the capture has no prompt lists, or no mask is called like one of their prompts.
         FileFormatError: If a label file is not what LangSplat's reader expects.
     """
-    check_truth_wishes(scene.root, folder, prompt_list)
-    truth = _read_truth(scene, folder)
-    return _in_words_of(truth, scene.root, prompt_list) if prompt_list else truth
+    check_ground_truth_options(scene.root, folder, prompt_list)
+    ground_truth = _read_truth(scene, folder)
+    return _in_words_of(ground_truth, scene.root, prompt_list) if prompt_list else ground_truth
 
 
-def _in_words_of(truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
-    """The truth that a list asks for, in its words; what is left out is told."""
+def _in_words_of(ground_truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
+    """The ground truth that a list asks for, in its words; what is left out is told."""
     names = capture_prompt_names(root, prompt_list)
-    left_out = [prompt for prompt in truth.prompts() if prompt not in names]
-    found = truth.renamed(names)
+    left_out = [prompt for prompt in ground_truth.prompts() if prompt not in names]
+    found = ground_truth.renamed(names)
     if left_out and not found.masks:
         raise CaptureError(
-            truth.origin,
+            ground_truth.origin,
             expected="masks called like prompts of the paper",
             found=f"none in the words of the list {prompt_list!r}, but {', '.join(left_out[:3])}",
             remedy="leave the prompt list out: prompts are then what the masks are called",
         )
     if left_out:
         some = ", ".join(left_out[:5]) + (" and more" if len(left_out) > 5 else "")
-        log.warning("%s: not in the prompt list %r and not asked: %s", truth.origin, prompt_list, some)
+        log.warning("%s: not in the prompt list %r and not asked: %s", ground_truth.origin, prompt_list, some)
     return found
 
 
-def _read_truth(scene: Scene, folder: Path | None) -> Annotations:
+def _read_truth(scene: Capture, folder: Path | None) -> Annotations:
     if folder is None:
         found = find_annotations(scene.root)
         if scene.segmentations is not None:
@@ -194,7 +194,7 @@ def _read_truth(scene: Scene, folder: Path | None) -> Annotations:
 # 3D-OVS
 
 
-def _read_3d_ovs(scene: Scene, folder: Path) -> Annotations:
+def _read_3d_ovs(scene: Capture, folder: Path) -> Annotations:
     classes = _read_classes(folder / CLASSES_FILE)
     masks: dict[str, dict[str, Path]] = {}
     for view_folder in mask_folders(folder):
@@ -234,7 +234,7 @@ def _read_classes(path: Path) -> tuple[str, ...]:
 
 
 def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: Path) -> list[str]:
-    """The images a folder or file of the truth can mean; in 3D-OVS a number counts the images in order."""
+    """The images a folder or file of the ground truth can mean; in 3D-OVS a number counts the images in order."""
     matches = match_stem(stem, names)
     if layout != "3d-ovs" or not stem.isdigit() or not image_folder.is_dir():
         return matches
@@ -245,7 +245,7 @@ def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: 
     return matches if counted == matches else sorted({*matches, *counted})
 
 
-def _the_image(stem: str, layout: str, scene: Scene, subject: Path) -> str:
+def _the_image(stem: str, layout: str, scene: Capture, subject: Path) -> str:
     matches = _images_meant(stem, layout, scene.views, scene.root / "images")
     if len(matches) != 1:
         found = "no view of that name" if not matches else f"views {' and '.join(matches[:3])}"
@@ -261,7 +261,7 @@ def _the_image(stem: str, layout: str, scene: Scene, subject: Path) -> str:
 # LERF-OVS
 
 
-def _read_lerf_ovs(scene: Scene, folder: Path) -> Annotations:
+def _read_lerf_ovs(scene: Capture, folder: Path) -> Annotations:
     masks: dict[str, dict[str, NDArray[np.bool_]]] = {}
     boxes: dict[str, dict[str, NDArray[np.float64]]] = {}
     for path in sorted(folder.glob("frame_*.json")):
@@ -353,6 +353,6 @@ def _box_around(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.array([columns.min(), rows.min(), columns.max(), rows.max()], dtype=np.float64)
 
 
-def load_truth(view: View, mask: Path | NDArray[np.bool_]) -> NDArray[np.bool_]:
+def load_ground_truth(view: View, mask: Path | NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A mask of `Annotations` as an array ``[H, W]`` on the undistorted image."""
     return mask.astype(bool) if isinstance(mask, np.ndarray) else view.load_mask(mask)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.captures.capture import Scene
+from lexsplat.captures.capture import Capture
 from lexsplat.captures.images.reading import read_mask
 from lexsplat.captures.splits import mask_folders, match_stem
 from lexsplat.runtime.errors import CaptureError
@@ -22,7 +22,7 @@ def load_mask(path: Path) -> NDArray[np.bool_]:
     return read_mask(path)
 
 
-def load_masks(scene: Scene) -> dict[str, dict[str, Path]]:
+def load_masks(scene: Capture) -> dict[str, dict[str, Path]]:
     """Where the masks of each view are: view name to prompt to file, both sorted.
 
     "_" in a file name means a space: ``plastic_box.png`` answers "plastic box". Sizes are checked from

@@ -142,7 +142,7 @@ def read_image(
 
     Args:
         path: The file.
-        background: Colour behind transparent pixels.
+        background: Color behind transparent pixels.
         size: Width and height of the result, as by :func:`resize_image`; a large photo never is in memory as
             floats then (`lexsplat.captures.images.bands`). None keeps the picture's.
 
@@ -198,10 +198,10 @@ def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> ND
     image.load()
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, dtype=np.float32)
-        # Pillow hands out 16-bit grey as I or I;16; float pictures hold 0..1 by convention.
-        grey = values if image.mode == "F" else values / 65535.0
-        grey = np.clip(np.nan_to_num(grey, nan=0.0), 0.0, 1.0)
-        return np.repeat(grey[..., None], 3, axis=2)
+        # Pillow hands out 16-bit gray as I or I;16; float pictures hold 0..1 by convention.
+        gray = values if image.mode == "F" else values / 65535.0
+        gray = np.clip(np.nan_to_num(gray, nan=0.0), 0.0, 1.0)
+        return np.repeat(gray[..., None], 3, axis=2)
     if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
         alpha = rgba[..., 3:]
@@ -240,7 +240,7 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     if highest <= 1:
         return values > 0.5
     half = 127 if highest <= 255 else 32767
-    # A little over black is the noise of a JPEG. More of it is a mask in colours, such as labels in a palette.
+    # A little over black is the noise of a JPEG. More of it is a mask in colors, such as labels in a palette.
     if half / 4 < highest <= half:
         raise CaptureError(
             path,

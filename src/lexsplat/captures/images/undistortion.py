@@ -31,7 +31,7 @@ class Lens:
         model: Name of the model in COLMAP, such as ``"OPENCV"``.
         width: Image width in pixels.
         height: Image height in pixels.
-        params: The model's parameters in COLMAP's order; lengths in pixels, pixel centres at +0.5.
+        params: The model's parameters in COLMAP's order; lengths in pixels, pixel centers at +0.5.
 
     Raises:
         ValueError: If the numbers cannot belong to a perspective camera of this model.
@@ -212,7 +212,7 @@ def _remap(image: NDArray[Any], grid: NDArray[np.float32], nearest: bool) -> NDA
     import torch
 
     source = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
-    # Its convention without align_corners, -1 and 1 at the outer edges, is that of pixel centres at +0.5.
+    # Its convention without align_corners, -1 and 1 at the outer edges, is that of pixel centers at +0.5.
     sampled = torch.nn.functional.grid_sample(
         source,
         torch.from_numpy(grid)[None],

@@ -36,7 +36,7 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Capture:
+class CameraFiles:
     """The content of a capture's camera files.
 
     Args:
@@ -45,10 +45,10 @@ class Capture:
         photos: The photos that have a file.
         source: ``"colmap"`` or ``"transforms"``.
         points: Points ``[P, 3]`` float32, world.
-        point_colors: Their colours ``[P, 3]`` float32 in 0..1.
+        point_colors: Their colors ``[P, 3]`` float32 in 0..1.
         missing: Names of images that have a camera but no file.
         test_names: The split the files themselves prescribe, or None.
-        background: Colour behind transparent pixels.
+        background: Color behind transparent pixels.
         warnings: What was left out and why.
     """
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lexsplat.captures.images.undistortion import Lens
 from lexsplat.captures.readers.camera_files import (
     MAX_COORDINATE,
-    Capture,
+    CameraFiles,
     Photo,
     checked_name,
     checked_pose,
@@ -46,7 +46,7 @@ def find_model(root: Path) -> Path | None:
     return None
 
 
-def read_colmap(root: Path, model: Path, images: Path | None = None) -> Capture:
+def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFiles:
     """The capture described by a COLMAP model.
 
     Args:
@@ -95,7 +95,7 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> Capture:
         _read_points(points_file) if points_file.is_file() else (np.zeros((0, 3)), np.zeros((0, 3)), 0)
     )
     warnings = [f"{points_file}: {dropped} points that are not finite were dropped"] if dropped else []
-    return Capture(
+    return CameraFiles(
         root=root,
         origin=model,
         photos=photos,
@@ -125,7 +125,7 @@ def _image_folder(root: Path, names: list[str]) -> Path:
 def _viewmat(
     quaternion: tuple[float, ...], translation: tuple[float, ...], name: str, origin: Path
 ) -> NDArray[np.float64]:
-    """World to camera ``[4, 4]`` from COLMAP's quaternion (wxyz, normalised here) and translation."""
+    """World to camera ``[4, 4]`` from COLMAP's quaternion (wxyz, normalized here) and translation."""
     q = np.array(quaternion, dtype=np.float64)
     with np.errstate(all="ignore"):  # damaged numbers overflow here; the check below names the image
         q = q / np.linalg.norm(q)
@@ -306,7 +306,7 @@ def _are_observations(line: str) -> bool:
 
 
 def _read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Points, colours in 0..1, and how many were dropped because a number was not finite."""
+    """Points, colors in 0..1, and how many were dropped because a number was not finite."""
     numbers = array("d")  # eight bytes a number, where a list of tuples would take fifty
     for row in _point_rows_text(file) if file.suffix == ".txt" else _point_rows_binary(file):
         numbers.extend(row)

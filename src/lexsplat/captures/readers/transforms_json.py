@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size
 from lexsplat.captures.images.undistortion import Lens
-from lexsplat.captures.readers.camera_files import Capture, Photo, checked_name, checked_pose
+from lexsplat.captures.readers.camera_files import CameraFiles, Photo, checked_name, checked_pose
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, invert_pose
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
@@ -50,7 +50,7 @@ def find_transforms(root: Path) -> Path | None:
     return None
 
 
-def read_transforms(file: Path) -> Capture:
+def read_transforms(file: Path) -> CameraFiles:
     """The capture described by a ``transforms.json``, or by NeRF-synthetic's files for train and test.
 
     Raises:
@@ -82,7 +82,7 @@ def read_transforms(file: Path) -> Capture:
         photos = [Photo(p.name[len(shared) :], p.path, p.lens, p.viewmat, p.ignore_path) for p in photos]
         missing = [name[len(shared) :] for name in missing]
         test_names = None if test_names is None else [name.removeprefix(shared) for name in test_names]
-    return Capture(
+    return CameraFiles(
         root=root,
         origin=file,
         photos=photos,

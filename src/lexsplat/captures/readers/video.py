@@ -1,6 +1,6 @@
 """Frames of a video as photos: as many as wanted, sharp ones, spread by how far the camera moved.
 
-The video is read twice and never held in memory: first small grey copies say how sharp each frame is and how much the
+The video is read twice and never held in memory: first small gray copies say how sharp each frame is and how much the
 picture changes to the next one, then the chosen frames are written. Needs PyAV (the extra ``video``).
 """
 
@@ -48,7 +48,7 @@ class FrameMeasures:
     """What the first reading of a video tells, by frame.
 
     Args:
-        sharpness: Variance of the Laplacian of the grey frame, relative to its contrast ``[F]``.
+        sharpness: Variance of the Laplacian of the gray frame, relative to its contrast ``[F]``.
         motion: Change from the frame before, relative to its contrast ``[F]``; the first is 0.
     """
 
@@ -126,8 +126,8 @@ def measure_frames(
     with _open(video, memory) as (stream, frames):
         expected = stream.frames
         for frame in frames:
-            sharpness.append(_sharpness(_small_grey(frame, _SHARPNESS_SIDE)))
-            now = _small_grey(frame, _MOTION_SIDE)
+            sharpness.append(_sharpness(_small_gray(frame, _SHARPNESS_SIDE)))
+            now = _small_gray(frame, _MOTION_SIDE)
             motion.append(0.0 if before is None else _change(before, now))
             before = now
             if len(motion) % 50 == 0:
@@ -226,19 +226,19 @@ def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
     return budget.most_within(memory, need)
 
 
-def _small_grey(frame: Any, side: int) -> NDArray[np.float32]:
-    """A frame as grey ``[h, w]`` in 0..255, no side longer than ``side``."""
+def _small_gray(frame: Any, side: int) -> NDArray[np.float32]:
+    """A frame as gray ``[h, w]`` in 0..255, no side longer than ``side``."""
     factor = min(1.0, side / max(frame.width, frame.height))
     size = (max(2, round(frame.width * factor)), max(2, round(frame.height * factor)))
     small = frame.reformat(width=size[0], height=size[1], format="gray", interpolation="AREA")
     return np.asarray(small.to_ndarray(), dtype=np.float32)
 
 
-def _sharpness(grey: NDArray[np.float32]) -> float:
+def _sharpness(gray: NDArray[np.float32]) -> float:
     """Variance of the Laplacian, relative to the variance of the picture, so that a plain wall is not "blurred"."""
-    inner = grey[1:-1, 1:-1]
-    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
-    return float(laplacian.var() / (grey.var() + 1.0)) if laplacian.size else 0.0
+    inner = gray[1:-1, 1:-1]
+    laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner
+    return float(laplacian.var() / (gray.var() + 1.0)) if laplacian.size else 0.0
 
 
 def _change(before: NDArray[np.float32], now: NDArray[np.float32]) -> float:

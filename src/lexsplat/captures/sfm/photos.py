@@ -22,7 +22,7 @@ from PIL import Image
 
 from lexsplat.captures.images.reading import image_size
 from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
-from lexsplat.captures.sfm.pose_agreement import misplaced, place_again
+from lexsplat.captures.sfm.pose_agreement import misregistered, place_again
 from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
 from lexsplat.captures.sfm.triangulation import quiet_pycolmap
 from lexsplat.runtime import memory as budget
@@ -89,7 +89,7 @@ class PhotoPoses:
 
     Args:
         root: Folder whose ``sparse/0`` holds the COLMAP model; load it with
-            ``load_scene(root, images=images)``.
+            ``load_capture(root, images=images)``.
         images: Folder of the photos the model speaks of: the given one, or upright copies in ``root/images``.
         placed: Names of the photos that have a camera, sorted; relative to ``images``.
         left_out: Names of the photos that could not be placed, sorted.
@@ -100,8 +100,8 @@ class PhotoPoses:
 
     root: Path
     images: Path
-    placed: tuple[str, ...]
-    left_out: tuple[str, ...]
+    registered: tuple[str, ...]
+    unregistered: tuple[str, ...]
     points: int
     models: int
     notes: tuple[str, ...] = ()
@@ -109,11 +109,11 @@ class PhotoPoses:
     @property
     def note(self) -> str:
         """One line for people."""
-        total = len(self.placed) + len(self.left_out)
-        line = f"{len(self.placed)} of {total} photos placed, {self.points:,} points"
+        total = len(self.registered) + len(self.unregistered)
+        line = f"{len(self.registered)} of {total} photos placed, {self.points:,} points"
         if self.models > 1:
             line = f"{line}, the largest of {self.models} models"
-        return line if not self.left_out else f"{line}; left out: {', '.join(self.left_out)}"
+        return line if not self.unregistered else f"{line}; left out: {', '.join(self.unregistered)}"
 
 
 def poses_from_photos(
@@ -170,12 +170,14 @@ def poses_from_photos(
                 remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
             )
         best = _without_misplaced(best, database, photos, work / "again", seed)
-        left_out = _not_placed(names, best)
+        unregistered = _not_placed(names, best)
         _write_model(best, output)
     _discard(work, output)
-    placed = tuple(sorted(set(names) - set(left_out)))
-    listener(Event(STAGE, total, total, {"placed": len(placed), "photos": len(names)}))
-    return PhotoPoses(output, photos.images, placed, left_out, best.num_points3D(), len(models), photos.notes)
+    registered = tuple(sorted(set(names) - set(unregistered)))
+    listener(Event(STAGE, total, total, {"registered": len(registered), "photos": len(names)}))
+    return PhotoPoses(
+        output, photos.images, registered, unregistered, best.num_points3D(), len(models), photos.notes
+    )
 
 
 def _check_mapper(config: PoseConfig) -> None:
@@ -196,8 +198,8 @@ def _best(models: list[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | No
 
 
 def _not_placed(names: tuple[str, ...] | list[str], model: pycolmap.Reconstruction | None) -> tuple[str, ...]:
-    placed = set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
-    return tuple(sorted(set(names) - placed))
+    registered = set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
+    return tuple(sorted(set(names) - registered))
 
 
 def _work_folder(output: Path, photos: PreparedPhotos, config: PoseConfig, seed: int) -> Path:
@@ -346,12 +348,12 @@ def _map(
         options = pycolmap.GlobalPipelineOptions(random_seed=seed, min_model_size=3)
         found = pycolmap.global_mapping(database, photos.images, models, options)
         return [found[key] for key in sorted(found)]
-    placed, total = len(photos.names) + 1, 2 * len(photos.names) + 1
+    registered, total = len(photos.names) + 1, 2 * len(photos.names) + 1
 
     def another() -> None:
-        nonlocal placed
-        placed = min(placed + 1, total - 1)
-        listener(Event(STAGE, placed, total))
+        nonlocal registered
+        registered = min(registered + 1, total - 1)
+        listener(Event(STAGE, registered, total))
 
     found = pycolmap.incremental_mapping(
         database,
@@ -377,7 +379,7 @@ def _without_misplaced(
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        wrong = misplaced(model, opened)
+        wrong = misregistered(model, opened)
     if not wrong:
         return model
     return place_again(model, wrong, database, photos.images, folder, _mapper_options(seed))

@@ -2,7 +2,7 @@
 
 An incremental mapper places a photo by the few points that it has at that moment, and does not come back to it: a
 photo that was placed wrongly stays, with hardly a point, and teaches a reconstruction something that nobody saw.
-The matches with its neighbours, verified pair by pair before any photo was placed, tell: they contradict its place.
+The matches with its neighbors, verified pair by pair before any photo was placed, tell: they contradict its place.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MAX_ERROR = 4.0
 """Pixels (Sampson distance) within which a match agrees with two cameras; what pycolmap verifies pairs with."""
 
 MIN_AGREEMENT = 0.5
-"""A photo that most of its matches contradict is misplaced. Its neighbours each have many others that agree."""
+"""A photo that most of its matches contradict is misplaced. Its neighbors each have many others that agree."""
 
 
 def agreements(model: pycolmap.Reconstruction, database: pycolmap.Database) -> dict[int, float]:
@@ -35,13 +35,13 @@ def agreements(model: pycolmap.Reconstruction, database: pycolmap.Database) -> d
     Returns:
         The share for each image, 0 to 1, by its number; without those that match no placed photo.
     """
-    placed = set(model.reg_image_ids())
-    rays = {number: _rays(_camera(model, number), database.read_keypoints(number)) for number in placed}
-    agreeing, compared = dict.fromkeys(placed, 0), dict.fromkeys(placed, 0)
+    registered = set(model.reg_image_ids())
+    rays = {number: _rays(_camera(model, number), database.read_keypoints(number)) for number in registered}
+    agreeing, compared = dict.fromkeys(registered, 0), dict.fromkeys(registered, 0)
     for pair, geometry in zip(*database.read_two_view_geometries()):
         first, second = _images_of(pair)
         matches = geometry.inlier_matches
-        if first not in placed or second not in placed or not len(matches):
+        if first not in registered or second not in registered or not len(matches):
             continue
         errors = sampson_errors(model, first, second, rays, matches)
         for number in (first, second):
@@ -63,7 +63,7 @@ def sampson_errors(
         model: The cameras.
         first: Number of one photo.
         second: Number of the other.
-        rays: Keypoints of each photo in its normalised image plane ``[n, 2]``, by its number.
+        rays: Keypoints of each photo in its normalized image plane ``[n, 2]``, by its number.
         matches: Indices of keypoints in the first and in the second ``[m, 2]``.
 
     Returns:
@@ -83,7 +83,7 @@ def sampson_errors(
     return np.nan_to_num(distances * focal, nan=np.inf)
 
 
-def misplaced(model: pycolmap.Reconstruction, database: pycolmap.Database) -> list[int]:
+def misregistered(model: pycolmap.Reconstruction, database: pycolmap.Database) -> list[int]:
     """Numbers of the placed photos that most of their matches contradict."""
     shares = agreements(model, database)
     return sorted(number for number, share in shares.items() if share < MIN_AGREEMENT)
@@ -130,7 +130,7 @@ def place_again(
     if again.num_reg_images() < model.num_reg_images():
         return model
     with pycolmap.Database.open(database) as opened:
-        take_out(again, misplaced(again, opened))
+        take_out(again, misregistered(again, opened))
     return again
 
 
@@ -139,7 +139,7 @@ def _camera(model: pycolmap.Reconstruction, image: int) -> pycolmap.Camera:
 
 
 def _rays(camera: pycolmap.Camera, keypoints: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Keypoints ``[n, 2+]`` in pixels to the normalised image plane ``[n, 2]``, without the lens's distortion."""
+    """Keypoints ``[n, 2+]`` in pixels to the normalized image plane ``[n, 2]``, without the lens's distortion."""
     if not len(keypoints):
         return np.empty((0, 2))
     return np.asarray(camera.cam_from_img(np.asarray(keypoints[:, :2], np.float64)))

@@ -2,7 +2,7 @@
 
 pycolmap takes pixels as they are stored: it does not turn a photo by its EXIF orientation, and it does not read
 every kind of picture. Photos that are stored turned, or in a kind that it does not read alike (anything but 8-bit
-grey or RGB in JPEG or PNG), are therefore copied, upright and with the focal length of their EXIF data; the others
+gray or RGB in JPEG or PNG), are therefore copied, upright and with the focal length of their EXIF data; the others
 are linked beside them. Where no photo needs it, nothing is copied.
 """
 
@@ -38,7 +38,7 @@ STAGE = "photos"
 
 _ORIENTATION, _EXIF, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
 _FOCAL = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
-"""EXIF tags a focal length is worked out from: in millimetres, for 35 mm film, and pixels a unit of the sensor."""
+"""EXIF tags a focal length is worked out from: in millimeters, for 35 mm film, and pixels a unit of the sensor."""
 _APART = (IGNORE_FOLDER, "segmentations")
 _JPEG_QUALITY = 95
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lexsplat.captures.capture import Scene, View
+from lexsplat.captures.capture import Capture, View
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
 from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
 from lexsplat.runtime import memory as budget
@@ -39,7 +39,7 @@ MAX_SIDE = 1000
 """Longest side in pixels of the images in which features are sought: larger ones cost time, not points."""
 
 MAX_FEATURES = 4096
-NEIGHBOURS = 16
+NEIGHBORS = 16
 """How many other views each view is matched with."""
 
 
@@ -61,7 +61,7 @@ class InitialPoints:
 
 
 def initial_points(
-    scene: Scene,
+    scene: Capture,
     *,
     count: int = 20_000,
     seed: int = 0,
@@ -98,7 +98,7 @@ def initial_points(
 
 
 def triangulate(
-    scene: Scene,
+    scene: Capture,
     *,
     cache_dir: Path | None = None,
     seed: int = 0,
@@ -117,7 +117,7 @@ def triangulate(
         listener: Hears of stage ``"triangulate"``: one unit an image, then matching and triangulation.
 
     Returns:
-        Points ``[P, 3]`` float32, world, and their colours ``[P, 3]`` float32 in 0..1; P may be 0.
+        Points ``[P, 3]`` float32, world, and their colors ``[P, 3]`` float32 in 0..1; P may be 0.
 
     Raises:
         CaptureError: If an image cannot be read.
@@ -147,9 +147,9 @@ def triangulate(
 
 
 def random_points_in_frusta(
-    scene: Scene, count: int, rng: np.random.Generator
+    scene: Capture, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Random points where the cameras look, with the colours of the photos.
+    """Random points where the cameras look, with the colors of the photos.
 
     Every point lies on a ray through a random pixel of a random training view, at 0.2 to 2 times the distance
     at which the cameras' optical axes meet; of ten candidates the one that most views see is kept, so that
@@ -161,7 +161,7 @@ def random_points_in_frusta(
         rng: The source of randomness.
 
     Returns:
-        Points ``[count, 3]`` float32, world, and colours ``[count, 3]`` float32 in 0..1.
+        Points ``[count, 3]`` float32, world, and colors ``[count, 3]`` float32 in 0..1.
 
     Raises:
         CaptureError: If an image cannot be read.
@@ -221,7 +221,7 @@ def _views_that_see(views: tuple[View, ...], points: NDArray[np.float64]) -> NDA
     return counts
 
 
-def matching_pairs(views: tuple[View, ...], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
+def matching_pairs(views: tuple[View, ...], neighbors: int = NEIGHBORS) -> list[tuple[int, int]]:
     """Which views to match: each with those that look most alike, by the known poses.
 
     The cost of a pair is the distance of the cameras over the distance of what they look at, plus twice the
@@ -240,7 +240,7 @@ def matching_pairs(views: tuple[View, ...], neighbours: int = NEIGHBOURS) -> lis
     np.fill_diagonal(cost, np.inf)
     pairs = set()
     for index in range(len(views)):
-        nearest = np.argsort(cost[index], kind="stable")[:neighbours]
+        nearest = np.argsort(cost[index], kind="stable")[:neighbors]
         pairs |= {(min(index, int(j)), max(index, int(j))) for j in nearest if np.isfinite(cost[index, j])}
     return sorted(pairs)
 
@@ -360,7 +360,7 @@ def _known_reconstruction(
 
 
 def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Finite points of a pycolmap reconstruction, by id, and their colours."""
+    """Finite points of a pycolmap reconstruction, by id, and their colors."""
     ordered = [model.points3D[key] for key in sorted(model.points3D)]
     points = np.array([point.xyz for point in ordered], dtype=np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in ordered], dtype=np.float64).reshape(-1, 3) / 255.0
@@ -384,7 +384,7 @@ def quiet_pycolmap(seed: int) -> Iterator[None]:
 
 def _cache_key(views: tuple[View, ...], seed: int) -> str:
     """A hash of all that the points depend on; photos count by name, size and time of change."""
-    digest = hashlib.sha256(json.dumps([1, MAX_SIDE, MAX_FEATURES, NEIGHBOURS, seed]).encode())
+    digest = hashlib.sha256(json.dumps([1, MAX_SIDE, MAX_FEATURES, NEIGHBORS, seed]).encode())
     for view in views:
         status = view.image_path.stat()
         lens = [view.lens.model, view.lens.width, view.lens.height, *view.lens.params]

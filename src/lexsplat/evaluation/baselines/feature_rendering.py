@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering import PreparedView, accumulate_weights, prepare, render, spread
+from lexsplat.rendering import PreparedView, accumulate_weights, back_project, prepare, render
 
 CHANNELS = 32
 """Feature channels rendered in one pass."""
@@ -75,7 +75,7 @@ class TrainingViews:
 
 
 def resized_map(values: Tensor, camera: Camera) -> Tensor:
-    """A map ``[h, w, C]`` at the size of a camera, bilinear, cell centres kept."""
+    """A map ``[h, w, C]`` at the size of a camera, bilinear, cell centers kept."""
     if values.shape[:2] == (camera.height, camera.width):
         return values
     planes = values.permute(2, 0, 1)[None]
@@ -100,7 +100,7 @@ def average_features(
     weights = torch.zeros(len(views.gaussians), device=views.gaussians.device)
     for done, name in enumerate(views.names, start=1):
         camera, prepared = views.prepared(name)
-        found = spread(views.gaussians, camera, map_of(name, camera).to(weights.device), prepared)
+        found = back_project(views.gaussians, camera, map_of(name, camera).to(weights.device), prepared)
         total = found if total is None else total + found
         weights += accumulate_weights(views.gaussians, camera, prepared=prepared)
         tell(done)

@@ -1,10 +1,10 @@
-"""LERF: CLIP at several physical scales, the scale chosen for each question, DINO as a regulariser.
+"""LERF: CLIP at several physical scales, the scale chosen for each question, DINO as a regularizer.
 
 Kerr et al. 2023 train a field F(x, s) whose target at a pixel is the embedding of the crop that is s wide at the
 depth of the surface. Here every Gaussian carries one vector for each of a few scales s: the average of what the
 training views show of it at that scale, where depth is rendered and the crop size that is s wide there is
-interpolated between the crop sizes at hand. LERF's DINO branch makes neighbours that look alike agree through a
-shared grid; here a Gaussian takes the mean of its nearest neighbours, weighted by how alike their DINO features are.
+interpolated between the crop sizes at hand. LERF's DINO branch makes neighbors that look alike agree through a
+shared grid; here a Gaussian takes the mean of its nearest neighbors, weighted by how alike their DINO features are.
 
 A question is asked at every scale; the scale with the highest relevancy answers (LERF's rule, for each view).
 """
@@ -45,17 +45,17 @@ class LerfConfig:
 
     Args:
         scales: Number of physical scales.
-        neighbours: Neighbours a Gaussian is averaged with; 0 leaves DINO out.
-        sharpness: How fast a neighbour's weight falls with the DINO cosine: exp(sharpness (cos - 1)).
+        neighbors: Neighbors a Gaussian is averaged with; 0 leaves DINO out.
+        sharpness: How fast a neighbor's weight falls with the DINO cosine: exp(sharpness (cos - 1)).
     """
 
     scales: int = 4
-    neighbours: int = 8
+    neighbors: int = 8
     sharpness: float = 10.0
 
     def __post_init__(self) -> None:
-        if self.scales < 1 or self.neighbours < 0:
-            raise ValueError("scales must be positive, neighbours not negative")
+        if self.scales < 1 or self.neighbors < 0:
+            raise ValueError("scales must be positive, neighbors not negative")
 
 
 class ScaledFeatures:
@@ -112,12 +112,12 @@ def fit_lerf(
     memory_bytes: int = 1 << 30,
     listener: Listener = silent,
 ) -> ScaledFeatures:
-    """Average CLIP at each scale over the training views, then over neighbours that look alike.
+    """Average CLIP at each scale over the training views, then over neighbors that look alike.
 
     Args:
         gaussians: The geometry.
         cameras: The training views by name, and only these.
-        maps: Dense features by view name; their DINO part regularises.
+        maps: Dense features by view name; their DINO part regularizes.
         level_maps: Features of each crop size.
         config: Settings.
         memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
@@ -144,7 +144,7 @@ def fit_lerf(
     stacked = torch.stack(found)
     del found, features
     with_dino = maps[views.names[0]].dino is not None
-    if config.neighbours and with_dino and len(gaussians) > 1:
+    if config.neighbors and with_dino and len(gaussians) > 1:
         dino, _ = average_features(
             views,
             lambda name, camera: resized_map(_dino(maps[name]), camera),
@@ -220,26 +220,26 @@ def level_weights(wanted: Tensor, sides: list[float]) -> Tensor:
 
 
 def smooth_alike(means: Tensor, dino: Tensor, features: Tensor, config: LerfConfig) -> Tensor:
-    """Every Gaussian's mean with its nearest neighbours, weighted by how alike their DINO features are.
+    """Every Gaussian's mean with its nearest neighbors, weighted by how alike their DINO features are.
 
     Args:
-        means: Centres ``[N, 3]``.
-        dino: DINO features ``[N, E]``; a zero row (never seen) has no say and is filled in by its neighbours.
+        means: Centers ``[N, 3]``.
+        dino: DINO features ``[N, E]``; a zero row (never seen) has no say and is filled in by its neighbors.
         features: ``[S, N, D]``.
         config: Settings.
     """
     points = means.detach().cpu().numpy()
-    near = min(config.neighbours + 1, len(points))
+    near = min(config.neighbors + 1, len(points))
     _, index = cKDTree(points).query(points, k=near, workers=-1)
-    neighbours = torch.as_tensor(index.reshape(len(points), near), device=features.device)
+    neighbors = torch.as_tensor(index.reshape(len(points), near), device=features.device)
     unit = F.normalize(dino, dim=-1)
     seen = (dino.norm(dim=1) > 0).float()
     total = torch.zeros_like(features)
     weights = torch.zeros(len(points), device=features.device)
     for column in range(near):
-        other = neighbours[:, column]
+        other = neighbors[:, column]
         alike = torch.exp(config.sharpness * ((unit * unit[other]).sum(-1) - 1))
-        # Nothing is known of what was never seen, so its neighbours count alike.
+        # Nothing is known of what was never seen, so its neighbors count alike.
         weight = torch.where(seen > 0, alike, torch.ones_like(alike)) * seen[other]
         for scale, values in enumerate(features):  # one scale at a time: what is gathered is a copy
             total[scale] += weight[:, None] * values[other]

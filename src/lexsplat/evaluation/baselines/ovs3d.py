@@ -44,7 +44,7 @@ class Ovs3dConfig:
         learning_rate: Of Adam on features and choices.
         relevancy_weight: Of the relevancy-distribution alignment.
         alike_weight: Of pairs that DINO finds alike. How much is right depends on how many those are: to the
-            embedded DINO it is a quarter of all pairs, and with 200 every class became the same (second scene:
+            bundled DINO it is a quarter of all pairs, and with 200 every class became the same (second scene:
             mIoU .20, with 0.67 .63).
         unlike_weight: Of pairs that DINO finds unlike.
         shift: DINO cosine that separates alike from unlike.

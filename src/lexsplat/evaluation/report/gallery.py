@@ -43,7 +43,9 @@ class Gallery:
             self.cases[pictures.name, prompt] = {
                 "heatmap": self._jpeg(overlay_heatmap(image, relevancy)),
                 "mask": self._jpeg(overlay_mask(image, relevancy >= pictures.thresholds[prompt])),
-                "truth": self._jpeg(overlay_mask(photo, pictures.truth[prompt], color=(64, 200, 140))),
+                "ground_truth": self._jpeg(
+                    overlay_mask(photo, pictures.ground_truth[prompt], color=(64, 200, 140))
+                ),
             }
 
     def tensors(self) -> dict[str, Tensor]:

@@ -109,7 +109,7 @@ def _header(title: str, subtitle: str, data: Mapping[str, Any]) -> str:
         facts += [
             ("mIoU", number(strict["auto"]["mIoU"]), "automatic threshold"),
             ("mAP", number(strict["mAP"]), ""),
-            ("localisation", number(strict["localization"]), ""),
+            ("localization", number(strict["localization"]), ""),
         ]
     return header(title, subtitle, cards(facts))
 
@@ -146,12 +146,12 @@ def _language_table(data: Mapping[str, Any]) -> str:
     )
     form, method = (escape(str(data["language"].get(key))) for key in ("form", "method"))
     kind = f"<p>Relevancy: form <code>{form}</code>; language field: <code>{method}</code>.</p>"
-    names = ["", *COLUMNS, "localisation", "Acc@0.25", "Acc@0.5"]
+    names = ["", *COLUMNS, "localization", "Acc@0.25", "Acc@0.5"]
     return table(names, rows) + _kind_table(data["language"].get("per_kind") or {}) + kind + note
 
 
 def _with_localization(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The strict numbers with the localisation beside the automatic threshold, where a reader looks for it."""
+    """The strict numbers with the localization beside the automatic threshold, where a reader looks for it."""
     strict = data["language"]["strict"]
     return {**strict, "auto": {**strict["auto"], "localization": strict["localization"]}}
 
@@ -165,7 +165,7 @@ def _kind_table(kinds: Mapping[str, Mapping[str, Any]]) -> str:
         [f"{escape(kind)} ({row['prompts']})", *(number(row[name]) for name in names)]
         for kind, row in kinds.items()
     ]
-    return table(["kind of prompt", "mIoU auto", "oracle", "mAP", "localisation"], rows)
+    return table(["kind of prompt", "mIoU auto", "oracle", "mAP", "localization"], rows)
 
 
 def _prompt_table(data: Mapping[str, Any]) -> str:
@@ -186,7 +186,7 @@ def _prompt_table(data: Mapping[str, Any]) -> str:
                 str(row["views"]),
             ]
         )
-    names = "prompt,IoU,fixed,oracle,PA,P,AP,localisation,threshold,best threshold,lerf-2d,lerf-3d,views"
+    names = "prompt,IoU,fixed,oracle,PA,P,AP,localization,threshold,best threshold,lerf-2d,lerf-3d,views"
     return table(names.split(","), rows)
 
 
@@ -208,7 +208,9 @@ def _plot(name: str, curve: NDArray[np.float64], kind: str) -> str:
 def _cases(cases: Sequence[_Case], gallery: Gallery, limit: int) -> str:
     if not cases:
         return ""
-    heads = "".join(f"<span>{name}</span>" for name in ("photo", "rendering", "relevancy", "mask", "truth"))
+    heads = "".join(
+        f"<span>{name}</span>" for name in ("photo", "rendering", "relevancy", "mask", "ground_truth")
+    )
     rows = [f'<div class="cases"><div class="case head">{heads}</div>']
     index = {view: place for place, view in enumerate(gallery.views)}
     for case in cases[:limit]:
@@ -218,7 +220,9 @@ def _cases(cases: Sequence[_Case], gallery: Gallery, limit: int) -> str:
             f'aria-label="{kind} of {escape(case.view)}"></div>'
             for kind in ("photo", "render")
         ]
-        tiles += [image(pictures[kind], f"{kind} of {case.prompt}") for kind in ("heatmap", "mask", "truth")]
+        tiles += [
+            image(pictures[kind], f"{kind} of {case.prompt}") for kind in ("heatmap", "mask", "ground_truth")
+        ]
         words = f"<b>{escape(case.prompt)}</b> in {escape(case.view)}"
         numbers = f"IoU {number(case.iou)} · AP {number(case.average_precision)}"
         rows.append(f'<div class="case"><p>{words}<span>{numbers}</span></p>{"".join(tiles)}</div>')
@@ -244,11 +248,11 @@ def _quality_table(data: Mapping[str, Any]) -> str:
 def _resources(data: Mapping[str, Any]) -> str:
     speed, size = data["speed"], data["size"]
     rows = [
-        ("frames a second, colour and one prompt", number(speed["render_fps"], 1)),
-        ("frames a second, colour", number(speed["rgb_fps"], 1)),
+        ("frames a second, color and one prompt", number(speed["render_fps"], 1)),
+        ("frames a second, color", number(speed["rgb_fps"], 1)),
         ("milliseconds for a prompt in a view", number(speed["query_ms"], 1)),
         ("Gaussians", f"{size['gaussians']:,}"),
-        ("geometry and colour", size_text(size["gaussian_bytes"])),
+        ("geometry and color", size_text(size["gaussian_bytes"])),
         ("language", size_text(size["language_bytes"])),
         ("peak memory", size_text(size["peak_rss_bytes"])),
         ("peak memory of the GPU", size_text(size["peak_gpu_bytes"])),

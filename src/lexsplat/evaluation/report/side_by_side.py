@@ -43,8 +43,8 @@ from lexsplat.evaluation.report.tables import (
 MAX_CASES = 40
 """Prompts in a view that are shown with the pictures of all methods."""
 
-COLOURS = 10
-"""Colours of lines in the style sheet."""
+COLORS = 10
+"""Colors of lines in the style sheet."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _reading(rows: Sequence[Row]) -> str:
     spread = f" Mean ± standard deviation over {seeds} seeds." if seeds > 1 else ""
     return (
         "<p>Strict protocol: mIoU, mPA and mP at the automatic threshold, which is chosen for each prompt from "
-        "training views and never sees the truth; beside it mIoU at the fixed threshold of 0.5 and at the "
+        "training views and never sees the ground truth; beside it mIoU at the fixed threshold of 0.5 and at the "
         "oracle's, which sees it: an upper bound, not a result. The best of a column is bold."
         f"{spread}</p>"
     )
@@ -184,7 +184,7 @@ def _curves(methods: Sequence[MeasuredMethod]) -> str:
     prompts = sorted({prompt for method in drawn for prompt in method.curves})
     average = {p: float(np.mean([np.mean(m.curves[p]) for m in drawn if p in m.curves])) for p in prompts}
     legend = "".join(
-        f'<span class="s{place % COLOURS}"><i></i>{escape(m.name)}</span>'
+        f'<span class="s{place % COLORS}"><i></i>{escape(m.name)}</span>'
         for place, m in enumerate(methods)
         if m.curves
     )
@@ -199,7 +199,7 @@ def _curves(methods: Sequence[MeasuredMethod]) -> str:
 
 def _lines(methods: Sequence[MeasuredMethod], curves: Mapping[str, Any]) -> str:
     return "".join(
-        f'<polyline class="s{place % COLOURS}" points="{curve_points(curves[method.name])}"/>'
+        f'<polyline class="s{place % COLORS}" points="{curve_points(curves[method.name])}"/>'
         for place, method in enumerate(methods)
         if method.name in curves
     )
@@ -231,7 +231,7 @@ def _cases(
         return ""
     place_of = {view: place for place, view in enumerate(views.views)}
     blocks = [
-        "<p>For each prompt in a view: photo, rendering and truth, then what every method answers, its relevancy "
+        "<p>For each prompt in a view: photo, rendering and ground truth, then what every method answers, its relevancy "
         "above and its mask at the automatic threshold below. First seed.</p>"
     ]
     for view, prompt in cases:
@@ -242,7 +242,9 @@ def _cases(
             f"<figcaption>{word}</figcaption></figure>"
             for kind, word in (("photo", "photo"), ("render", "rendering"))
         ]
-        shared.append(image(own[0].gallery.cases[view, prompt]["truth"], f"truth of {prompt}", "truth"))
+        shared.append(
+            image(own[0].gallery.cases[view, prompt]["ground_truth"], f"truth of {prompt}", "ground_truth")
+        )
         columns = "".join(_column(method, view, prompt) for method in own)
         blocks.append(
             f'<div class="versus"><p><b>{escape(prompt)}</b> in {escape(view)}</p>'
@@ -277,7 +279,7 @@ def _details(methods: Sequence[MeasuredMethod]) -> str:
         "IoU_lerf_2d",
         "IoU_lerf_3d",
     )
-    names = "prompt,IoU,fixed 0.5,oracle,PA,P,AP,localisation,lerf-2d,lerf-3d,threshold,best threshold,views"
+    names = "prompt,IoU,fixed 0.5,oracle,PA,P,AP,localization,lerf-2d,lerf-3d,threshold,best threshold,views"
     parts = []
     for method in methods:
         numbers = {key: method.of_prompts(key) for key in keys}

@@ -23,14 +23,14 @@ _PAPER = {
 """Columns of the paper's Table 1: key of a row, heading, digits (-1 bytes, -2 seconds)."""
 
 _HONEST = {
-    "mIoU_fixed": ("mIoU 0.5", 3), "mIoU_oracle": ("oracle", 3), "localization": ("localisation", 3),
+    "mIoU_fixed": ("mIoU 0.5", 3), "mIoU_oracle": ("oracle", 3), "localization": ("localization", 3),
     "language_seconds": ("language", -2),
 }  # fmt: skip
 """Columns that the paper does not have."""
 
 _OTHERS = {
     "official_mIoU": ("official mIoU", 3), "official_mPA": ("mPA", 3), "official_mP": ("mP", 3),
-    "official_mAP": ("mAP", 3), "lerf_2d_mIoU": ("lerf-2d mIoU", 3), "lerf_2d_localization": ("localisation", 3),
+    "official_mAP": ("mAP", 3), "lerf_2d_mIoU": ("lerf-2d mIoU", 3), "lerf_2d_localization": ("localization", 3),
     "lerf_3d_mIoU": ("lerf-3d mIoU", 3), "lerf_3d_acc_25": ("Acc@0.25", 3), "lerf_3d_acc_50": ("Acc@0.5", 3),
 }  # fmt: skip
 
@@ -86,7 +86,7 @@ def _language_lines(language: Mapping[str, Any]) -> list[str]:
     lines = ["", f"{'':<22}" + "".join(f"{name:>8}" for name in COLUMNS)]
     for name, row in protocol_rows(language):
         lines.append(f"{name:<22}" + "".join(f"{number(row.get(key)):>8}" for key in COLUMNS))
-    lines.append(f"{'localisation':<22}{number(strict['localization']):>8}")
+    lines.append(f"{'localization':<22}{number(strict['localization']):>8}")
     if language.get("lerf_2d"):
         lines.append(f"{'  lerf-2d':<22}{number(language['lerf_2d']['localization']):>8}")
     lines.append("")
@@ -95,7 +95,7 @@ def _language_lines(language: Mapping[str, Any]) -> list[str]:
         numbers = (row["mIoU_auto"], row["mAP"], row["localization"])
         cells = "".join(f"{number(value):>8}" for value in numbers)
         lines.append(f"{kind + ' prompts':<22}{cells}{row['prompts']:>7}")
-    lines += ["(by kind: mIoU auto, mAP, localisation, prompts)", ""] if kinds else []
+    lines += ["(by kind: mIoU auto, mAP, localization, prompts)", ""] if kinds else []
     prompts = language["per_prompt"]
     width = min(40, max(len(prompt) for prompt in prompts))
     lines.append(f"{'prompt':<{width}}{'IoU':>8}{'AP':>8}{'loc':>8}{'views':>7}")

@@ -79,7 +79,7 @@ def scene_box(means: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Sequential:
-    """Linear layers with ReLU between them, initialised like nn.Linear but from the given generator only."""
+    """Linear layers with ReLU between them, initialized like nn.Linear but from the given generator only."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     layers: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(widths):

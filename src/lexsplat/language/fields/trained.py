@@ -37,7 +37,7 @@ class TrainedField(nn.Module):
         semantics: s_G ``[N, 8]``.
         uncertainty_logits: Inverse sigmoid of u ``[N]``.
         smoother: The MLP of Eq. 13.
-        normalise_rendering: Scale the rendered s to unit length before decoding, as the authors' code does.
+        normalize_rendering: Scale the rendered s to unit length before decoding, as the authors' code does.
         method: Name under which results are reported, "trained" or "lifted+tuned".
         generator: Of the decoder's initial weights.
     """
@@ -49,7 +49,7 @@ class TrainedField(nn.Module):
         uncertainty_logits: Tensor,
         smoother: SmoothingMLP,
         *,
-        normalise_rendering: bool = False,
+        normalize_rendering: bool = False,
         method: str = "trained",
         generator: torch.Generator | None = None,
     ) -> None:
@@ -62,7 +62,7 @@ class TrainedField(nn.Module):
             )
         self.codebook = codebook
         self.method = method
-        self.normalise_rendering = normalise_rendering
+        self.normalize_rendering = normalize_rendering
         self.semantics = nn.Parameter(semantics.detach().clone())
         self.uncertainty_logits = nn.Parameter(uncertainty_logits.detach().clone())
         self.decoder = mlp((SEMANTIC_CHANNELS, *DECODER_WIDTHS, codebook.num_codes), generator)
@@ -76,7 +76,7 @@ class TrainedField(nn.Module):
         *,
         generator: torch.Generator,
         num_frequencies: int = 0,
-        normalise_rendering: bool = False,
+        normalize_rendering: bool = False,
     ) -> TrainedField:
         """The start of training: s_G from N(0, 1), u almost zero (`INITIAL_UNCERTAINTY`)."""
         count = len(gaussians)
@@ -86,7 +86,7 @@ class TrainedField(nn.Module):
             torch.randn(count, SEMANTIC_CHANNELS, generator=generator),
             torch.full((count,), math.log(INITIAL_UNCERTAINTY / (1 - INITIAL_UNCERTAINTY))),
             SmoothingMLP(center.cpu(), extent.cpu(), num_frequencies, generator=generator),
-            normalise_rendering=normalise_rendering,
+            normalize_rendering=normalize_rendering,
             generator=generator,
         )
         return field.to(gaussians.device)
@@ -108,7 +108,7 @@ class TrainedField(nn.Module):
 
     def decode(self, semantics: Tensor) -> Tensor:
         """D_MLP before its softmax (Eq. 8): ``[..., 8]`` to logits ``[..., K]``."""
-        if self.normalise_rendering:
+        if self.normalize_rendering:
             semantics = functional.normalize(semantics, dim=-1)
         return self.decoder(semantics)
 
@@ -149,7 +149,7 @@ class TrainedField(nn.Module):
         return {
             "kind": "trained",
             "method": self.method,
-            "normalise_rendering": str(self.normalise_rendering).lower(),
+            "normalize_rendering": str(self.normalize_rendering).lower(),
         }
 
     @classmethod
@@ -169,7 +169,7 @@ class TrainedField(nn.Module):
             tensors["semantics"],
             tensors["uncertainty_logits"],
             SmoothingMLP(tensors["smoother.center"], tensors["smoother.extent"], num_frequencies),
-            normalise_rendering=metadata.get("normalise_rendering") == "true",
+            normalize_rendering=metadata.get("normalize_rendering") == "true",
             method=metadata.get("method", "trained"),
         )
         own = {name: value for name, value in tensors.items() if not name.startswith("codebook.")}

@@ -32,7 +32,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views, codes_at_pixels
 from lexsplat.language.fields import LiftedField
-from lexsplat.rendering import SPREAD_CHANNELS, prepare, spread
+from lexsplat.rendering import BACK_PROJECTED_CHANNELS, back_project, prepare
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -42,7 +42,7 @@ ROWS = 16_384
 
 
 @dataclass(frozen=True)
-class AveragingConfig:
+class AveragedConfig:
     """Settings of the averaging.
 
     Args:
@@ -89,7 +89,7 @@ class MeanFeatures:
         chosen = index if isinstance(index, slice) else index.cpu().numpy()
         return torch.from_numpy(np.asarray(self.means[chosen], np.float32)).to(self.totals.device)
 
-    def visible(self, config: AveragingConfig) -> Tensor:
+    def visible(self, config: AveragedConfig) -> Tensor:
         """Which Gaussians the training views have seen ``[N]`` bool."""
         return (self.totals >= config.min_visibility) & (self.totals > 0)
 
@@ -106,7 +106,7 @@ def average_features(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
     feature_maps: Mapping[str, FeatureMap],
-    config: AveragingConfig,
+    config: AveragedConfig,
     *,
     valid: Valid = all_valid,
     scratch: Path | None = None,
@@ -173,7 +173,7 @@ def features_of_codes(code_maps: Mapping[str, NDArray[np.integer]], codebook: Co
 def field_from_means(
     found: MeanFeatures,
     codebook_config: CodebookConfig,
-    config: AveragingConfig,
+    config: AveragedConfig,
     *,
     seed: int = 0,
     memory: int = budget.DEFAULT_MEMORY,
@@ -193,7 +193,7 @@ def field_from_means(
     device, (count, dimensions) = found.totals.device, found.means.shape
     looked_at = min(codebook_config.sample_size, count)
     what, number = f"a sample of {looked_at:,} Gaussians", codebook_config.num_codes
-    budget.require_sample("embed", what, looked_at, dimensions, number, 0, memory, share=0.5)
+    budget.require_sample("language", what, looked_at, dimensions, number, 0, memory, share=0.5)
     visible = found.visible(config)
     with one_thread():  # the last bit of a similarity may decide between two codes
         codewords = _fit(found, visible, codebook_config, seed)
@@ -248,16 +248,18 @@ def _weighted_sum(
         counts *= torch.from_numpy(counting).flatten()
     prepared = prepare(gaussians, camera)
     size = camera.height, camera.width
-    for start in range(columns.start, columns.stop, SPREAD_CHANNELS):
-        stop = min(start + SPREAD_CHANNELS, columns.stop)
+    for start in range(columns.start, columns.stop, BACK_PROJECTED_CHANNELS):
+        stop = min(start + BACK_PROJECTED_CHANNELS, columns.stop)
         values = (flat[at, start:stop].float() * counts[:, None]).unflatten(0, size).to(gaussians.device)
-        sums[:, start - columns.start : stop - columns.start] += spread(gaussians, camera, values, prepared)
+        sums[:, start - columns.start : stop - columns.start] += back_project(
+            gaussians, camera, values, prepared
+        )
     if weights is not None:
         values = (counts * flat.any(-1)[at]).view(*size, 1).to(gaussians.device)
-        weights += spread(gaussians, camera, values, prepared)[:, 0]
+        weights += back_project(gaussians, camera, values, prepared)[:, 0]
 
 
-def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragingConfig) -> Camera:
+def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragedConfig) -> Camera:
     """The camera with about as many pixels as the map has cells: more would say nothing more.
 
     Gaussians without the mip filter look larger in smaller pictures than they are; they are taken at full size.
@@ -270,7 +272,7 @@ def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: Av
 
 def _ranges(dimensions: int, count: int, memory_bytes: int) -> Iterator[range]:
     """Dimensions in ranges so small that their sums, with one copy in work, keep to the bound."""
-    width = max(1, min(dimensions, memory_bytes // (4 * max(count, 1)) - SPREAD_CHANNELS))
+    width = max(1, min(dimensions, memory_bytes // (4 * max(count, 1)) - BACK_PROJECTED_CHANNELS))
     for start in range(0, dimensions, width):
         yield range(start, min(start + width, dimensions))
 

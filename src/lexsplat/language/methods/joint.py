@@ -20,8 +20,8 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views
 from lexsplat.language.fields import TrainedField
-from lexsplat.language.methods.trained_settings import EmbeddingConfig
-from lexsplat.language.methods.trainer import EmbeddingTrainer
+from lexsplat.language.methods.trained_settings import TrainedConfig
+from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.reconstruction import EVENT_EVERY, STAGE, Reconstructor
 from lexsplat.reconstruction.adam import below_prefix, with_prefix
 from lexsplat.runtime.checkpoints import Checkpoint
@@ -50,7 +50,7 @@ class JointTrainer:
         cameras: Mapping[str, Camera],
         code_maps: Mapping[str, NDArray[np.uint8]],
         codebook: Codebook,
-        config: EmbeddingConfig,
+        config: TrainedConfig,
         *,
         seed: int = 0,
     ) -> None:
@@ -63,7 +63,7 @@ class JointTrainer:
         )
         self.config = replace(config, iterations=reconstructor.config.iterations)
         self.cameras = {name: camera.downscaled(config.render_downscale) for name, camera in cameras.items()}
-        self.language = EmbeddingTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
+        self.language = FieldTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
         self._losses = {"loss": float("nan")}
 
     @property
@@ -138,5 +138,5 @@ class JointTrainer:
         """
         self.reconstructor.load_state_dict(below_prefix("geometry/", state))
         gaussians = self.reconstructor.gaussians()
-        self.language = EmbeddingTrainer(gaussians, self.codebook, self.config, seed=self.seed)
+        self.language = FieldTrainer(gaussians, self.codebook, self.config, seed=self.seed)
         self.language.load_state_dict(below_prefix("language/", state))

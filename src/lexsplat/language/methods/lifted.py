@@ -29,8 +29,8 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views, codes_at_pixels
 from lexsplat.language.fields import SEMANTIC_CHANNELS, LiftedField, TrainedField
 from lexsplat.language.methods.trained import train_field
-from lexsplat.language.methods.trained_settings import EmbeddingConfig
-from lexsplat.language.methods.trainer import EmbeddingTrainer
+from lexsplat.language.methods.trained_settings import TrainedConfig
+from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.rendering import accumulate_codes
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -42,7 +42,7 @@ ROWS = 65_536
 
 
 @dataclass(frozen=True)
-class LiftingConfig:
+class LiftedConfig:
     """Settings of the lifting.
 
     Args:
@@ -50,9 +50,9 @@ class LiftingConfig:
         min_visibility: A Gaussian with less weight than this over all training views, in pixels, counts as
             never seen.
         prior_visibility: Weight in pixels at which the histogram is half believed; below it u tends to 1.
-        use_smoothing: Mix the distributions of neighbours in, in the spirit of Eq. 14. Off by default: it changed
+        use_smoothing: Mix the distributions of neighbors in, in the spirit of Eq. 14. Off by default: it changed
             nothing for the better where every surface is seen; it also fills in what no training view shows.
-        neighbours: How many.
+        neighbors: How many.
         min_smoothing_weight: w_s of Eq. 14.
         memory_bytes: Bound for the dense histogram; beyond it the views are passed over several times, for a
             range of codes each.
@@ -62,13 +62,13 @@ class LiftingConfig:
     min_visibility: float = 0.01
     prior_visibility: float = 1.0
     use_smoothing: bool = False
-    neighbours: int = 8
+    neighbors: int = 8
     min_smoothing_weight: float = 0.1
     memory_bytes: int = 1 << 30
 
     def __post_init__(self) -> None:
-        if self.top < 1 or self.neighbours < 1 or self.memory_bytes < 1:
-            raise ValueError("top, neighbours and memory_bytes must be positive")
+        if self.top < 1 or self.neighbors < 1 or self.memory_bytes < 1:
+            raise ValueError("top, neighbors and memory_bytes must be positive")
         if self.min_visibility < 0 or self.prior_visibility < 0 or self.min_smoothing_weight < 0:
             raise ValueError("min_visibility, prior_visibility and min_smoothing_weight must not be negative")
 
@@ -96,17 +96,17 @@ class CodeHistogram:
         """Share of all weight that lies outside the kept codes: the error of the sparsity, 0 to 1."""
         return float(1 - self.weights.sum().double() / self.totals.sum().double().clamp_min(1e-12))
 
-    def uncertainties(self, config: LiftingConfig) -> Tensor:
-        """u ``[N]`` in 0..1: normalised entropy, believed as far as the Gaussian was seen.
+    def uncertainties(self, config: LiftedConfig) -> Tensor:
+        """u ``[N]`` in 0..1: normalized entropy, believed as far as the Gaussian was seen.
 
         u = 1 - (1 - H / log K) v with v = W / (W + W_0); what was never seen has u = 1.
         """
-        normalised = self.entropies / math.log(max(self.num_codes, 2))
+        normalized = self.entropies / math.log(max(self.num_codes, 2))
         seen = self.totals / (self.totals + config.prior_visibility).clamp_min(1e-12)
-        uncertainties = (1 - (1 - normalised) * seen).clamp(0, 1)
+        uncertainties = (1 - (1 - normalized) * seen).clamp(0, 1)
         return torch.where(self.visible(config), uncertainties, torch.ones_like(uncertainties))
 
-    def visible(self, config: LiftingConfig) -> Tensor:
+    def visible(self, config: LiftedConfig) -> Tensor:
         """Which Gaussians the training views have seen ``[N]`` bool."""
         return (self.totals >= config.min_visibility) & (self.totals > 0)
 
@@ -116,7 +116,7 @@ def accumulate_histogram(
     cameras: Mapping[str, Camera],
     code_maps: Mapping[str, NDArray[np.uint8]],
     num_codes: int,
-    config: LiftingConfig,
+    config: LiftedConfig,
     *,
     listener: Listener = silent,
 ) -> CodeHistogram:
@@ -169,7 +169,7 @@ def lift(
     cameras: Mapping[str, Camera],
     code_maps: Mapping[str, NDArray[np.uint8]],
     codebook: Codebook,
-    config: LiftingConfig,
+    config: LiftedConfig,
     *,
     listener: Listener = silent,
 ) -> LiftedField:
@@ -181,9 +181,9 @@ def lift(
 
 
 def field_from_histogram(
-    gaussians: Gaussians, histogram: CodeHistogram, codebook: Codebook, config: LiftingConfig
+    gaussians: Gaussians, histogram: CodeHistogram, codebook: Codebook, config: LiftedConfig
 ) -> LiftedField:
-    """Distributions from a histogram: visibility gate, smoothing if set, normalised over the kept codes."""
+    """Distributions from a histogram: visibility gate, smoothing if set, normalized over the kept codes."""
     visible = histogram.visible(config)
     uncertainties = histogram.uncertainties(config)
     weights = histogram.weights / histogram.weights.sum(1, keepdim=True).clamp_min(1e-30)
@@ -203,47 +203,47 @@ def smooth_codes(
     uncertainties: Tensor,
     visible: Tensor,
     num_codes: int,
-    config: LiftingConfig,
+    config: LiftedConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Mix neighbours in, the counterpart of Eq. 10 and 14 for distributions.
+    """Mix neighbors in, the counterpart of Eq. 10 and 14 for distributions.
 
-    Minimising (1 - u) |q - p|^2 + max(u, w_s) |q - m|^2, with p the Gaussian's own distribution and m the
-    mean of its neighbours in space weighted by 1 - u_j, gives q = ((1 - u) p + max(u, w_s) m) / (1 - u +
-    max(u, w_s)): a certain Gaussian keeps to itself, an uncertain one follows its neighbours, one that was
+    Minimizing (1 - u) |q - p|^2 + max(u, w_s) |q - m|^2, with p the Gaussian's own distribution and m the
+    mean of its neighbors in space weighted by 1 - u_j, gives q = ((1 - u) p + max(u, w_s) m) / (1 - u +
+    max(u, w_s)): a certain Gaussian keeps to itself, an uncertain one follows its neighbors, one that was
     never seen is filled in by them.
 
     Args:
-        means: Centres ``[N, 3]``.
+        means: Centers ``[N, 3]``.
         codes: ``[N, T]`` uint8.
         weights: ``[N, T]``, rows sum to 1, or 0 where not visible.
         uncertainties: ``[N]``.
-        visible: ``[N]`` bool; only these are neighbours.
+        visible: ``[N]`` bool; only these are neighbors.
         num_codes: K.
         config: Settings.
 
     Returns:
-        Codes ``[N, T]`` uint8 and weights ``[N, T]``, rows normalised again.
+        Codes ``[N, T]`` uint8 and weights ``[N, T]``, rows normalized again.
     """
     sources = visible.nonzero()[:, 0]
     if len(sources) == 0:
         return codes, weights
     points = means.detach().cpu().numpy()
     tree = cKDTree(points[sources.cpu().numpy()])
-    near = min(config.neighbours + 1, len(sources))
+    near = min(config.neighbors + 1, len(sources))
     pull = uncertainties.clamp(min=config.min_smoothing_weight)
     share = pull / (1 - uncertainties + pull).clamp_min(1e-12)
     new_codes, new_weights = torch.zeros_like(codes), torch.zeros_like(weights)
     for rows in _row_ranges(len(points)):
         _, local = tree.query(points[rows], k=near, workers=-1)
-        neighbours = sources[torch.as_tensor(local.reshape(-1, near), device=means.device)]
-        trust = (1 - uncertainties)[neighbours]
+        neighbors = sources[torch.as_tensor(local.reshape(-1, near), device=means.device)]
+        trust = (1 - uncertainties)[neighbors]
         own = torch.arange(rows.start, rows.stop, device=means.device)
-        trust = torch.where(neighbours == own[:, None], torch.zeros_like(trust), trust)
+        trust = torch.where(neighbors == own[:, None], torch.zeros_like(trust), trust)
         trust = trust / trust.sum(1, keepdim=True).clamp_min(1e-12)
         mixed = weights.new_zeros(len(own), num_codes)
         mixed.scatter_add_(1, codes[rows].long(), (1 - share[rows])[:, None] * weights[rows])
         for column in range(near):
-            index, portion = neighbours[:, column], (share[rows] * trust[:, column])[:, None]
+            index, portion = neighbors[:, column], (share[rows] * trust[:, column])[:, None]
             mixed.scatter_add_(1, codes[index].long(), portion * weights[index])
         top = mixed.topk(codes.shape[1], dim=1)
         new_codes[rows] = top.indices.to(torch.uint8)
@@ -259,7 +259,7 @@ class TuningConfig:
         fit_steps: Steps that fit s_G and the decoder to the distributions, without rendering.
         batch_size: Gaussians of such a step, drawn in proportion to 1 - u (certain and well seen).
         fit_lr: Learning rate of s_G and the decoder in these steps; the smoothing MLP has a tenth of it.
-        iterations: Rendered steps afterwards; what is not set here is set by `EmbeddingConfig`.
+        iterations: Rendered steps afterwards; what is not set here is set by `TrainedConfig`.
         semantics_lr: Learning rate of s_G in the rendered steps, which start close to the goal.
     """
 
@@ -280,7 +280,7 @@ def tune(
     cameras: Mapping[str, Camera],
     code_maps: Mapping[str, NDArray[np.uint8]],
     config: TuningConfig,
-    embedding: EmbeddingConfig,
+    embedding: TrainedConfig,
     *,
     seed: int = 0,
     checkpoint: Checkpoint | None = None,
@@ -297,7 +297,7 @@ def tune(
         embedding: Settings of the rendered steps, but for what `TuningConfig` sets.
         seed: Of the decoder's start and of all samples.
         checkpoint: Where the rendered steps are saved on the way, and go on from.
-        listener: Hears of stages "fit" and "embed".
+        listener: Hears of stages "fit" and "language".
     """
     generator = torch.Generator().manual_seed(seed)
     field = TrainedField.initial(
@@ -305,7 +305,7 @@ def tune(
         lifted.codebook,
         generator=generator,
         num_frequencies=embedding.num_frequencies,
-        normalise_rendering=embedding.normalise_rendering,
+        normalize_rendering=embedding.normalize_rendering,
     )
     field.method = "lifted+tuned"
     with torch.no_grad():
@@ -313,7 +313,7 @@ def tune(
         field.uncertainty_logits.copy_(lifted.uncertainties.clamp(0.01, 0.9).logit())
     fit_semantics(field, lifted, gaussians, config, generator=generator, listener=listener)
     rendered = replace(embedding, iterations=config.iterations, semantics_lr=config.semantics_lr)
-    trainer = EmbeddingTrainer(gaussians, lifted.codebook, rendered, seed=seed, field=field)
+    trainer = FieldTrainer(gaussians, lifted.codebook, rendered, seed=seed, field=field)
     return train_field(
         gaussians,
         cameras,
@@ -341,8 +341,8 @@ def principal_semantics(lifted: LiftedField) -> Tensor:
     for rows in torch.arange(len(lifted.codes), device=lifted.codes.device).split(ROWS):
         usage += lifted.select(rows).code_probabilities().sum(0)
     share = usage / usage.sum().clamp_min(1e-12)
-    centred = (features - share @ features) * share.sqrt()[:, None]
-    axes = torch.linalg.svd(centred.double(), full_matrices=False).Vh[:SEMANTIC_CHANNELS].float()
+    centered = (features - share @ features) * share.sqrt()[:, None]
+    axes = torch.linalg.svd(centered.double(), full_matrices=False).Vh[:SEMANTIC_CHANNELS].float()
     projected = (features - share @ features) @ axes.T
     spread = (share @ projected.square()).sqrt().clamp_min(1e-6)
     coordinates = functional.pad(projected / spread, (0, SEMANTIC_CHANNELS - projected.shape[1]))

@@ -14,8 +14,8 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import MASKED_CODE, check_views, codes_at_pixels
 from lexsplat.language.fields import TrainedField
-from lexsplat.language.methods.trained_settings import EmbeddingConfig
-from lexsplat.language.methods.trainer import EmbeddingTrainer
+from lexsplat.language.methods.trained_settings import TrainedConfig
+from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.rendering import PreparedView, prepare
 from lexsplat.runtime.divergence import KEEP_EVERY, Guard
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 __all__ = [
     "MASKED_CODE",
     "REPORT_EVERY",
-    "EmbeddingConfig",
-    "EmbeddingTrainer",
+    "TrainedConfig",
+    "FieldTrainer",
     "check_views",
     "codes_at_pixels",
     "train_field",
@@ -42,11 +42,11 @@ def train_field(
     cameras: Mapping[str, Camera],
     code_maps: Mapping[str, NDArray[np.uint8]],
     codebook: Codebook,
-    config: EmbeddingConfig,
+    config: TrainedConfig,
     *,
     seed: int = 0,
     listener: Listener = silent,
-    trainer: EmbeddingTrainer | None = None,
+    trainer: FieldTrainer | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> TrainedField:
     """Train the paper's language field on frozen Gaussians.
@@ -58,7 +58,7 @@ def train_field(
         codebook: The discrete feature space S.
         config: Settings.
         seed: Of the initial field, the order of views and the samples.
-        listener: Hears of stage "embed" with the losses.
+        listener: Hears of stage "language" with the losses.
         trainer: One that was begun, to go on with.
         checkpoint: Where the training is saved on the way, and goes on from.
 
@@ -68,7 +68,7 @@ def train_field(
     """
     names = sorted(cameras)
     check_views(names, code_maps)
-    trainer = trainer or EmbeddingTrainer(gaussians, codebook, config, seed=seed)
+    trainer = trainer or FieldTrainer(gaussians, codebook, config, seed=seed)
     if checkpoint is not None:
         checkpoint.resume(trainer)
     views = _prepare_views(trainer.gaussians, cameras, config)
@@ -83,7 +83,7 @@ def train_field(
                 if done % REPORT_EVERY == 0 or done == config.iterations:
                     metrics = {key: float(value) for key, value in losses.items()}
                     trainer.check_loss(metrics["loss"])
-                    listener(Event("embed", done, config.iterations, metrics))
+                    listener(Event("language", done, config.iterations, metrics))
                 guard.after_step(done == config.iterations)
                 if checkpoint is not None:
                     checkpoint.after_step(trainer)
@@ -91,7 +91,7 @@ def train_field(
 
 
 def _prepare_views(
-    gaussians: Gaussians, cameras: Mapping[str, Camera], config: EmbeddingConfig
+    gaussians: Gaussians, cameras: Mapping[str, Camera], config: TrainedConfig
 ) -> dict[str, tuple[Camera, PreparedView | None]]:
     """Cameras at the size to render, with their projections as far as memory allows (geometry is fixed)."""
     left = config.memory_bytes

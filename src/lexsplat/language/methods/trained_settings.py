@@ -8,7 +8,7 @@ from lexsplat.language.losses import SmoothingWeight, UncertaintyForm
 
 
 @dataclass(frozen=True)
-class EmbeddingConfig:
+class TrainedConfig:
     """Settings of the language training. Defaults suit a CPU; `as_in_paper` and `as_released` give the
     others.
 
@@ -36,7 +36,7 @@ class EmbeddingConfig:
         smoothing_every: Steps from one smoothing to the next (paper: 1; authors' code: 10).
         smoothing_sample: Gaussians of a step that enter Eq. 14, drawn at random; 0 takes all (paper).
         num_frequencies: Of the positional encoding in Eq. 13 (paper's table: 0).
-        normalise_rendering: Scale the rendered s to unit length before decoding (authors' code).
+        normalize_rendering: Scale the rendered s to unit length before decoding (authors' code).
         clip_decoder_grad: Largest norm of the decoder's gradient, which keeps a bad batch from ruining it;
             None is off (paper).
         memory_bytes: Bound for projections of views kept between steps; further views are projected anew each
@@ -65,7 +65,7 @@ class EmbeddingConfig:
     smoothing_every: int = 1
     smoothing_sample: int = 2048
     num_frequencies: int = 0
-    normalise_rendering: bool = False
+    normalize_rendering: bool = False
     clip_decoder_grad: float | None = 1.0
     memory_bytes: int = 1 << 30
 
@@ -80,7 +80,7 @@ class EmbeddingConfig:
         if not self.render_downscale > 0 or not self.final_lr_factor > 0:
             raise ValueError("render_downscale and final_lr_factor must be positive")
 
-    def as_in_paper(self) -> EmbeddingConfig:
+    def as_in_paper(self) -> TrainedConfig:
         """30,000 iterations over full maps with a constant learning rate of 0.001."""
         return replace(
             self,
@@ -98,7 +98,7 @@ class EmbeddingConfig:
             clip_decoder_grad=None,
         )
 
-    def as_released(self) -> EmbeddingConfig:
+    def as_released(self) -> TrainedConfig:
         """What the authors' released code does where it differs from the paper."""
         return replace(
             self.as_in_paper(),
@@ -108,5 +108,5 @@ class EmbeddingConfig:
             smoothing_weight="linear",
             smoothing_squared=True,
             smoothing_every=10,
-            normalise_rendering=True,
+            normalize_rendering=True,
         )

@@ -23,13 +23,13 @@ from lexsplat.language.losses import (
     total_loss,
     uncertainty_loss,
 )
-from lexsplat.language.methods.trained_settings import EmbeddingConfig
+from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction.adam import check_moments
 from lexsplat.rendering import PreparedView
 from lexsplat.runtime.errors import TrainingError
 
 
-class EmbeddingTrainer:
+class FieldTrainer:
     """The language training as single steps, so that it can also run beside a reconstruction.
 
     Args:
@@ -44,7 +44,7 @@ class EmbeddingTrainer:
         self,
         gaussians: Gaussians,
         codebook: Codebook,
-        config: EmbeddingConfig,
+        config: TrainedConfig,
         *,
         seed: int = 0,
         field: TrainedField | None = None,
@@ -62,7 +62,7 @@ class EmbeddingTrainer:
             codebook,
             generator=self.generator,
             num_frequencies=config.num_frequencies,
-            normalise_rendering=config.normalise_rendering,
+            normalize_rendering=config.normalize_rendering,
         )
         if len(self.field.semantics) != len(gaussians):
             raise ValueError(f"{len(gaussians)} Gaussians, but the field has {len(self.field.semantics)}")
@@ -128,9 +128,9 @@ class EmbeddingTrainer:
             cross_entropy = cross_entropy_loss(logits, codes)
             return {"cross_entropy": cross_entropy, "semantic": config.lambda_ce * cross_entropy}
         cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten().index_select(0, pixels))
-        regulariser = uncertainty_loss(self._not_masked(uncertainty, code_map), config.uncertainty_form)
-        semantic = semantic_loss(cross_entropy, regulariser, config.lambda_ce, config.lambda_u)
-        return {"cross_entropy": cross_entropy, "uncertainty": regulariser, "semantic": semantic}
+        regularizer = uncertainty_loss(self._not_masked(uncertainty, code_map), config.uncertainty_form)
+        semantic = semantic_loss(cross_entropy, regularizer, config.lambda_ce, config.lambda_u)
+        return {"cross_entropy": cross_entropy, "uncertainty": regularizer, "semantic": semantic}
 
     def _not_masked(self, uncertainty: Tensor, code_map: Any) -> Tensor:
         """Those of rendered values ``[H, W]`` whose pixels are not masked; all as they are where none is."""

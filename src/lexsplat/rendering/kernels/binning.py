@@ -23,8 +23,8 @@ SLACK = 1e-3
 """Pixels added to every side of a box, so that rounding never cuts a contribution off."""
 RADIX_BITS = 11
 
-# Columns of the table of ellipses: centre, half conic, opacity (padded to 32 bytes).
-CENTRE_X, CENTRE_Y, HALF_A, CONIC_B, HALF_C, OPACITY, ELLIPSE_FIELDS = 0, 1, 2, 3, 4, 5, 8
+# Columns of the table of ellipses: center, half conic, opacity (padded to 32 bytes).
+CENTER_X, CENTER_Y, HALF_A, CONIC_B, HALF_C, OPACITY, ELLIPSE_FIELDS = 0, 1, 2, 3, 4, 5, 8
 # Columns of the table of boxes: tile columns [first, last), pixel rows [first, last).
 TILE_FIRST, TILE_LAST, ROW_FIRST, ROW_LAST, BOX_FIELDS = 0, 1, 2, 3, 4
 
@@ -85,14 +85,14 @@ def find_boxes(
     for k in range(start, stop):
         n = order[k]
         x, y = np.float64(means2d[n, 0]), np.float64(means2d[n, 1])
-        ellipses[k, CENTRE_X] = means2d[n, 0]
-        ellipses[k, CENTRE_Y] = means2d[n, 1]
+        ellipses[k, CENTER_X] = means2d[n, 0]
+        ellipses[k, CENTER_Y] = means2d[n, 1]
         ellipses[k, HALF_A] = half * conics[n, 0]
         ellipses[k, CONIC_B] = conics[n, 1]
         ellipses[k, HALF_C] = half * conics[n, 2]
         ellipses[k, OPACITY] = opacities[n]
         reach_x, reach_y = extents[n, 0] + SLACK, extents[n, 1] + SLACK
-        # First and last pixel whose centre (index + 0.5) is inside; clamped before the cast, so it always fits.
+        # First and last pixel whose center (index + 0.5) is inside; clamped before the cast, so it always fits.
         left = math.ceil(min(max(x - reach_x - 0.5, 0.0), float(width)))
         right = math.floor(min(max(x + reach_x - 0.5, -1.0), float(width - 1)))
         top = math.ceil(min(max(y - reach_y - 0.5, 0.0), float(height)))

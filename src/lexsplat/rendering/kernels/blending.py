@@ -12,8 +12,8 @@ import numpy as np
 
 from lexsplat.rendering.kernels.arrays import F32, I32, I64
 from lexsplat.rendering.kernels.binning import (
-    CENTRE_X,
-    CENTRE_Y,
+    CENTER_X,
+    CENTER_Y,
     CONIC_B,
     HALF_A,
     HALF_C,
@@ -122,8 +122,8 @@ def seen_from_tile(ellipses: F32, k: int, left: int, top: int, columns: Any) -> 
         dx of the columns, vectors ``across`` and ``slope`` and a number ``down``, with which -1/8 of the exponent
         is ``across + slope dy + down dy^2``; dy of row 0; opacity.
     """
-    dx = columns - (ellipses[k, CENTRE_X] - np.float32(left) - HALF)
-    dy = np.float32(top) + HALF - ellipses[k, CENTRE_Y]
+    dx = columns - (ellipses[k, CENTER_X] - np.float32(left) - HALF)
+    dy = np.float32(top) + HALF - ellipses[k, CENTER_Y]
     across = dx * dx * (EIGHTH * ellipses[k, HALF_A])
     slope = dx * (EIGHTH * ellipses[k, CONIC_B])
     return dx, across, slope, EIGHTH * ellipses[k, HALF_C], dy, ellipses[k, OPACITY]

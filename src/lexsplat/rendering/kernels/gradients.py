@@ -81,7 +81,7 @@ def _load_tile(
 def _exponent_gradient(behind: F32, j: int, weight: Any, row_alpha: Any, dots: Any) -> Any:
     """Gradient by the exponent along row ``j``; takes what the Gaussian contributes out of ``behind``.
 
-    ``dots`` is the Gaussian's colour times the upstream gradient of each pixel.
+    ``dots`` is the Gaussian's color times the upstream gradient of each pixel.
     """
     # d loss / d alpha = T dots - rest / (1 - alpha), and d alpha / d exponent = -alpha.
     share = weight * dots
@@ -96,7 +96,7 @@ def _exponent_gradient(behind: F32, j: int, weight: Any, row_alpha: Any, dots: A
 def _feature_gradients(
     first: int, last: int, colors: int, channels: int, weights: F32, upstream: F32, row: int, rows: F32
 ) -> None:
-    """Sum of weight times upstream gradient for the channels after the colours, four at a time.
+    """Sum of weight times upstream gradient for the channels after the colors, four at a time.
 
     The last group of four overlaps the one before it; fewer than four channels go one by one.
     """
@@ -200,7 +200,7 @@ def blend_backward(
                 g1 += gradient * dy
                 g2 += gradient * (dy * dy)
             if touched:
-                # Without colours the two sums after the moments are zero and features overwrite them.
+                # Without colors the two sums after the moments are zero and features overwrite them.
                 store_totals(rows, row, g0, g0 * dx, g1, g0 * dx * dx)
                 store_totals(rows, row + 4, g1 * dx, g2, r0, r1)
                 if colors == 3:

@@ -51,7 +51,7 @@ def _rotation(quat: F32, index: int, matrix: F64) -> float:
 
 @kernel
 def _to_camera(camera: F64, means: F32, n: int) -> Triple:
-    """Centre of a Gaussian in camera space."""
+    """Center of a Gaussian in camera space."""
     x, y, z = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
     tx = camera[0] * x + camera[1] * y + camera[2] * z + camera[9]
     ty = camera[3] * x + camera[4] * y + camera[5] * z + camera[10]
@@ -73,9 +73,9 @@ def _find_axes(camera: F64, log_scales: F32, n: int, rotation: F64, scale: F64, 
 
 
 @kernel
-def _clamped_slope(slope: float, focal: float, centre: float, size: float) -> float:
+def _clamped_slope(slope: float, focal: float, center: float, size: float) -> float:
     margin = CLAMP_MARGIN * 0.5 * size / focal
-    return min(max(slope, -(centre / focal + margin)), (size - centre) / focal + margin)
+    return min(max(slope, -(center / focal + margin)), (size - center) / focal + margin)
 
 
 @kernel
@@ -204,7 +204,7 @@ def _through_axes(
 
 @kernel
 def _quaternion_gradient(quats: F32, n: int, length: float, g: F64, grad_quats: F32) -> None:
-    """Through the rotation matrix and the normalisation of the quaternion."""
+    """Through the rotation matrix and the normalization of the quaternion."""
     w, x, y, z = quats[n, 0] / length, quats[n, 1] / length, quats[n, 2] / length, quats[n, 3] / length
     gw = 2.0 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     gx = 2.0 * (-2.0 * x * (g[4] + g[8]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]))
@@ -239,7 +239,7 @@ def project_backward(
 ) -> None:
     """Gradients of `project`. Gaussians that were not seen get zeros.
 
-    ``grad_shaded [N, 3]`` is what their colours say about the means, and is added.
+    ``grad_shaded [N, 3]`` is what their colors say about the means, and is added.
     """
     rotation, axes, scale = np.empty(9), np.empty(9), np.empty(3)
     grad_axes, grad_rotation = np.empty(9), np.empty(9)
@@ -288,7 +288,7 @@ def project_backward(
         grad_slope_y = -py * (axes[6] * gv0 + axes[7] * gv1 + axes[8] * gv2)
         gtz = -(gu0 * u[0] + gu1 * u[1] + gu2 * u[2] + gv0 * v[0] + gv1 * v[1] + gv2 * v[2]) / tz
 
-        # The clamped slope is a constant; the unclamped one and the centre are t / tz.
+        # The clamped slope is a constant; the unclamped one and the center are t / tz.
         if slope_x != tx / tz:
             grad_slope_x = 0.0
         if slope_y != ty / tz:

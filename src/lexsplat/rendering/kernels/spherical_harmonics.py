@@ -1,4 +1,4 @@
-"""Colours from real spherical harmonics up to degree 4, forward and backward."""
+"""Colors from real spherical harmonics up to degree 4, forward and backward."""
 
 from __future__ import annotations
 

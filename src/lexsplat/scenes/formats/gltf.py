@@ -4,7 +4,7 @@ Activated values go out, as the extension wants them: scales and opacities, and 
 in application attributes (their names begin with an underscore, and viewers pass over them); its codebook is an
 accessor that ``extras.lexsplat`` of the primitive names.
 
-A glTF viewer has y up and metres. The data keep the scene's axes and units; the node turns them, and scales them
+A glTF viewer has y up and meters. The data keep the scene's axes and units; the node turns them, and scales them
 where the scale is known (``lexsplat scale``).
 """
 
@@ -41,7 +41,7 @@ def write_glb(
         gaussians: What to write; spherical harmonics beyond degree 3 are left out, as the extension ends there.
         path: The file.
         language: Codes and codebook to write along.
-        world: Up and scale of the scene; z is up and a unit a metre when left out.
+        world: Up and scale of the scene; z is up and a unit a meter when left out.
 
     Raises:
         ValueError: If there is no Gaussian, a value is not finite, or the language does not fit.
@@ -122,11 +122,11 @@ def _language_attributes(language: StoredLanguage, buffer: _Buffer) -> tuple[dic
 
 
 def _node(world: World | None) -> dict[str, Any]:
-    """The node that turns the scene upright, and scales it to metres where they are known."""
+    """The node that turns the scene upright, and scales it to meters where they are known."""
     up = np.array([0.0, 0.0, 1.0]) if world is None else world.up.direction
     node: dict[str, Any] = {"mesh": 0, "rotation": _upright(up)}
-    if world is not None and world.metres_per_unit is not None:
-        node["scale"] = [world.metres_per_unit] * 3
+    if world is not None and world.meters_per_unit is not None:
+        node["scale"] = [world.meters_per_unit] * 3
     return node
 
 

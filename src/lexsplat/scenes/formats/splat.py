@@ -1,7 +1,7 @@
 """The ``.splat`` format of the web viewers: 32 bytes a Gaussian, no header, no spherical harmonics.
 
-Position and standard deviations as float32, colour and opacity as bytes, rotation (wxyz) as bytes around 128.
-gsplat has a writer too; it changes the order of the Gaussians and rounds colours down, so labels by index would
+Position and standard deviations as float32, color and opacity as bytes, rotation (wxyz) as bytes around 128.
+gsplat has a writer too; it changes the order of the Gaussians and rounds colors down, so labels by index would
 no longer fit the file. The tests hold that both agree in everything else.
 """
 

@@ -14,7 +14,7 @@ from lexsplat.geometry.gaussians import SH_C0, Gaussians
 
 
 def colors_of(gaussians: Gaussians) -> Tensor:
-    """Colour of every Gaussian seen from nowhere in particular: ``[N, 3]`` uint8."""
+    """Color of every Gaussian seen from nowhere in particular: ``[N, 3]`` uint8."""
     rgb = gaussians.sh0[:, 0].detach() * SH_C0 + 0.5
     return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
@@ -46,7 +46,7 @@ def write_labels_csv(
 
 
 def write_points_ply(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.1) -> int:
-    """A plain coloured point cloud (x, y, z, red, green, blue): one point for each Gaussian that shows.
+    """A plain colored point cloud (x, y, z, red, green, blue): one point for each Gaussian that shows.
 
     Returns:
         Number of points.

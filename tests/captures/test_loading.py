@@ -1,0 +1,496 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.written_captures import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    cameras_around,
+    save,
+    shared_data,
+    write_colmap,
+    write_images,
+    write_json,
+    write_transforms,
+)
+
+from lexsplat.captures import load_capture, load_mask, load_masks, stem_of
+from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
+
+NAMES = [f"{index:04d}.png" for index in range(1, 18)]
+
+
+def assert_tells(error: LexsplatError, *parts: str) -> None:
+    """The message has subject, expected, found and remedy, in one line, and these words."""
+    message = str(error)
+    assert error.subject
+    assert error.expected
+    assert error.found
+    assert error.remedy
+    assert all(text in message for text in ("expected", "found", "; "))
+    assert "\n" not in message
+    for part in parts:
+        assert part in message, message
+
+
+def fails(path, *parts, kind=CaptureError, **options):
+    with pytest.raises(kind) as caught:
+        load_capture(path, **options)
+    assert_tells(caught.value, *parts)
+
+
+class TestTransforms:
+    def test_views_have_the_cameras_that_were_written(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        scene = load_capture(tmp_path)
+        assert list(scene.views) == NAMES
+        for view, camera in zip(scene.views.values(), cameras_around(len(NAMES))):
+            np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
+            np.testing.assert_allclose(view.camera.K, [[FOCAL, 0, 32], [0, FOCAL, 24], [0, 0, 1]])
+            assert view.capture_size == (WIDTH, HEIGHT)
+        assert scene.source == "transforms"
+        assert scene.points.shape == (0, 3)
+        positions = np.array([view.camera.position for view in scene.train_views])
+        assert scene.extent == pytest.approx(1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1)))
+
+    def test_the_json_file_itself_may_be_given(self, tmp_path):
+        write_transforms(tmp_path, NAMES[:3])
+        assert list(load_capture(tmp_path / "transforms.json").views) == NAMES[:3]
+
+    def test_a_frame_overrides_the_intrinsics_at_the_top(self, tmp_path):
+        document = write_transforms(tmp_path, NAMES[:3])
+        document["frames"][1] |= {"fl_x": 70.0, "fl_y": 71.0, "cx": 20.0, "cy": 22.0, "w": 40, "h": 44}
+        write_images(tmp_path / "images", NAMES[1:2], (40, 44))
+        write_json(tmp_path, document)
+        scene = load_capture(tmp_path)
+        sizes = [(view.camera.width, view.camera.height) for view in scene.views.values()]
+        assert sizes == [(64, 48), (40, 44), (64, 48)]
+        np.testing.assert_allclose(scene.views[NAMES[1]].camera.K, [[70, 0, 20], [0, 71, 22], [0, 0, 1]])
+
+    @pytest.mark.parametrize("fisheye", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+    def test_fisheye_cameras_are_undistorted_as_such(self, tmp_path, fisheye):
+        write_transforms(tmp_path, NAMES[:2], k1=0.1, k2=0.01, **fisheye)
+        lens = load_capture(tmp_path).views[NAMES[0]].lens
+        assert lens.model == "OPENCV_FISHEYE"
+        assert lens.params[4:] == (0.1, 0.01, 0.0, 0.0)
+
+    def test_opencv_distortion_takes_opencv_order(self, tmp_path):
+        numbers = {"k1": 0.01, "k2": 0.02, "p1": 0.003, "p2": 0.004, "k3": 0.05, "k4": 0.06}
+        write_transforms(tmp_path, NAMES[:2], **numbers)
+        lens = load_capture(tmp_path).views[NAMES[0]].lens
+        assert lens.model == "FULL_OPENCV"
+        assert lens.params[4:] == (0.01, 0.02, 0.003, 0.004, 0.05, 0.06, 0.0, 0.0)
+
+    def test_a_pose_of_three_rows_and_one_with_scale_are_taken(self, tmp_path):
+        document = write_transforms(tmp_path, NAMES[:2])
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])[:3]
+            pose[:, :3] *= 2.5
+            frame["transform_matrix"] = pose.tolist()
+        write_json(tmp_path, document)
+        for view, camera in zip(load_capture(tmp_path).views.values(), cameras_around(2)):
+            np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
+
+    def test_frames_without_a_file_are_skipped_with_one_warning_that_lists_them(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        for name in (NAMES[2], NAMES[9]):
+            (tmp_path / "images" / name).unlink()
+        scene = load_capture(tmp_path)
+        assert len(scene.views) == len(NAMES) - 2
+        (warning,) = scene.warnings
+        assert "2 of 17" in warning
+        assert NAMES[2] in warning
+        assert NAMES[9] in warning
+
+    def test_nerfstudio_test_filenames_are_the_split(self, tmp_path):
+        write_transforms(tmp_path, NAMES, test_filenames=[f"images/{NAMES[3]}", f"images/{NAMES[5]}"])
+        assert load_capture(tmp_path).test_names == (NAMES[3], NAMES[5])
+
+    def test_nerf_synthetic_has_its_split_sizes_from_the_images_and_white_behind_alpha(self, tmp_path):
+        rgba = np.zeros((20, 20, 4), np.uint8)
+        rgba[:10] = [255, 0, 0, 255]
+        rgba[10:, :10] = [0, 0, 255, 51]
+        for part in ("train", "test"):
+            frames = [
+                {"file_path": f"./{part}/r_{i}", "transform_matrix": np.eye(4).tolist()} for i in (0, 1)
+            ]
+            write_json(tmp_path, {"camera_angle_x": np.pi / 2, "frames": frames}, f"transforms_{part}.json")
+            for i in (0, 1):
+                save(tmp_path / part / f"r_{i}.png", np.zeros((20, 20, 3)))
+                Image.fromarray(rgba).save(tmp_path / part / f"r_{i}.png")
+        scene = load_capture(tmp_path)
+        assert scene.train_names == ("train/r_0.png", "train/r_1.png")
+        assert scene.test_names == ("test/r_0.png", "test/r_1.png")
+        assert scene.background == (1.0, 1.0, 1.0)
+        view = scene.views["test/r_0.png"]
+        assert view.stem == "test/r_0"
+        np.testing.assert_allclose(view.camera.K, [[10, 0, 10], [0, 10, 10], [0, 0, 1]])
+        image = view.load_image()
+        np.testing.assert_allclose(image[0, 0], [1, 0, 0])
+        np.testing.assert_allclose(image[15, 5], [0.8, 0.8, 1.0], atol=1e-6)
+        np.testing.assert_allclose(image[15, 15], [1, 1, 1])
+
+    def test_only_nerf_synthetic_has_white_behind_alpha(self, tmp_path):
+        document = write_transforms(tmp_path, NAMES[:2])
+        rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+        for name in NAMES[:2]:
+            Image.fromarray(rgba).save(tmp_path / "images" / name)
+        assert load_capture(tmp_path).background == (0.0, 0.0, 0.0)
+        intrinsics = {key: document.pop(key) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+        for frame in document["frames"]:
+            frame |= intrinsics
+        write_json(tmp_path, document)
+        scene = load_capture(tmp_path)
+        assert scene.background == (0.0, 0.0, 0.0), "intrinsics of each frame are no reason for white"
+        assert scene.views[NAMES[0]].load_image().max() == 0
+
+    def test_fox_is_loaded_without_its_17_missing_frames(self):
+        scene = load_capture(shared_data("fox"), downscale=8)
+        assert len(scene.views) == 50
+        assert len(scene.warnings) == 1
+        assert scene.warnings[0].count(".jpg") == 17
+        view = scene.views["0001.jpg"]
+        image = view.load_image()
+        assert image.shape == (view.camera.height, view.camera.width, 3) == (237, 133, 3)
+        assert 0.4 < image.mean() < 0.7
+
+
+class TestSplit:
+    def test_every_eighth_view_counts_from_the_first(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        scene = load_capture(tmp_path)
+        assert scene.test_names == (NAMES[0], NAMES[8], NAMES[16])
+        assert sorted(scene.train_names + scene.test_names) == NAMES
+        assert [view.name for view in scene.test_views] == list(scene.test_names)
+        assert load_capture(tmp_path, test_every=5).test_names == tuple(NAMES[::5])
+        assert load_capture(tmp_path, test_every=0).test_names == ()
+
+    def test_views_with_segmentations_come_before_every_eighth(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        save(tmp_path / "segmentations" / "0004" / "red_apple.png", np.ones((HEIGHT, WIDTH)))
+        assert load_capture(tmp_path).test_names == (NAMES[3],)
+
+    def test_test_views_json_comes_before_segmentations(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        save(tmp_path / "segmentations" / "0004" / "apple.png", np.ones((HEIGHT, WIDTH)))
+        write_json(tmp_path, ["0002", "0007"], "test_views.json")
+        assert load_capture(tmp_path).test_names == (NAMES[1], NAMES[6])
+
+    def test_given_names_come_before_all_and_may_be_stems(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        write_json(tmp_path, ["0002"], "test_views.json")
+        assert load_capture(tmp_path, test_names=["0009.png", "0003"]).test_names == (NAMES[2], NAMES[8])
+        assert load_capture(tmp_path, test_names=[]).test_names == ()
+
+    def test_unknown_and_exhaustive_splits_are_refused(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        fails(tmp_path, "'0099'", "no view", test_names=["0099"])
+        fails(tmp_path, "learn from", test_names=NAMES)
+        write_json(tmp_path, {"test": ["0001"]}, "test_views.json")
+        fails(tmp_path, "test_views.json", "list of image stems", kind=FileFormatError)
+        write_json(tmp_path, ["nowhere"], "test_views.json")
+        fails(tmp_path, "test_views.json", "nowhere")
+        with pytest.raises(ValueError, match="test_every"):
+            load_capture(tmp_path, test_every=1)
+
+    def test_a_single_view_is_learned_from(self, tmp_path):
+        write_transforms(tmp_path, NAMES[:1])
+        assert load_capture(tmp_path).train_names == (NAMES[0],)
+
+
+class TestImages:
+    def one(self, tmp_path, name="a.png"):
+        write_transforms(tmp_path, [name, "z.png"])
+        return tmp_path / "images" / name
+
+    @pytest.mark.parametrize(
+        ("mode", "value", "expected"),
+        [
+            ("L", 51, 0.2),
+            ("RGB", (51, 51, 51), 0.2),
+            ("RGBA", (255, 255, 255, 51), 0.2),
+            ("LA", (255, 51), 0.2),
+            ("P", 51, None),
+            ("1", 1, 1.0),
+            ("I;16", 13107, 0.2),
+            ("F", 0.2, 0.2),
+            ("CMYK", (0, 0, 0, 204), 0.2),
+        ],
+    )
+    def test_every_mode_becomes_rgb_in_0_to_1(self, tmp_path, mode, value, expected):
+        suffix = "tif" if mode in ("F", "CMYK") else "png"
+        path = self.one(tmp_path, f"a.{suffix}")
+        image = Image.new(mode, (WIDTH, HEIGHT), value)
+        if mode == "P":
+            image, expected = Image.new("RGB", (WIDTH, HEIGHT), (51, 51, 51)).convert("P"), 0.2
+        image.save(path)
+        loaded = load_capture(tmp_path).views[path.name].load_image()
+        assert loaded.shape == (HEIGHT, WIDTH, 3)
+        assert loaded.dtype == np.float32
+        np.testing.assert_allclose(loaded, expected, atol=0.003)
+
+    def test_exif_orientation_is_left_alone_because_poses_belong_to_stored_pixels(self, tmp_path):
+        path = self.one(tmp_path, "a.jpg")
+        pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        pixels[: HEIGHT // 2] = 255
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.fromarray(pixels).save(path, exif=exif, quality=95)
+        image = load_capture(tmp_path).views["a.jpg"].load_image()
+        assert image.shape == (HEIGHT, WIDTH, 3)
+        assert image[:20].min() > 0.9
+        assert image[-20:].max() < 0.1
+
+    def test_photos_scaled_after_the_cameras_were_computed_scale_the_camera(self, tmp_path):
+        write_transforms(tmp_path, NAMES[:2], w=259, h=195, fl_x=240.0, fl_y=240.0, cx=129.5, cy=97.5)
+        write_images(tmp_path / "images", NAMES[:2], (65, 49))  # 259 / 4 and 195 / 4, rounded up
+        view = load_capture(tmp_path).views[NAMES[0]]
+        assert view.capture_size == (65, 49)
+        assert view.camera.K[0, 0] == pytest.approx(240 * 65 / 259)
+        assert view.camera.K[1, 2] == pytest.approx(24.5)
+
+    def test_downscale_and_size_set_what_is_loaded(self, tmp_path):
+        write_transforms(tmp_path, NAMES[:2])
+        view = load_capture(tmp_path, downscale=2.5).views[NAMES[1]]
+        assert (view.camera.width, view.camera.height) == (26, 19)
+        assert view.camera.K[0, 0] == pytest.approx(FOCAL * 26 / WIDTH)
+        assert view.load_image().shape == (19, 26, 3)
+        assert view.load_image((8, 5)).shape == (5, 8, 3)
+        np.testing.assert_allclose(view.load_image(), 0.5, atol=0.01)
+        for bad in (0, -1, float("nan")):
+            with pytest.raises(ValueError, match="downscale"):
+                load_capture(tmp_path, downscale=bad)
+
+    def test_a_photo_of_another_aspect_is_refused(self, tmp_path):
+        path = self.one(tmp_path)
+        save(path, np.zeros((WIDTH, HEIGHT, 3)))
+        fails(tmp_path, str(path), "64x48", "48x64", "on its side")
+        save(path, np.zeros((HEIGHT, WIDTH - 4, 3)))
+        fails(tmp_path, str(path), "64x48", "60x48")
+
+    def test_an_unreadable_photo_is_told_when_the_scene_is_loaded(self, tmp_path):
+        path = self.one(tmp_path)
+        for content in (b"", b"no image", b"\x89PNG\r\n\x1a\n"):
+            path.write_bytes(content)
+            fails(tmp_path, str(path), "image")
+
+    @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif", "bmp"])
+    def test_a_truncated_photo_is_told_when_it_is_read(self, tmp_path, suffix):
+        path = self.one(tmp_path, f"a.{suffix}")
+        noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(path)
+        whole = path.read_bytes()
+        view = load_capture(tmp_path).views[path.name]
+        path.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(CaptureError) as caught:
+            view.load_image()
+        assert_tells(caught.value, str(path))
+
+    def test_a_photo_that_changed_or_went_since_loading_is_told(self, tmp_path):
+        path = self.one(tmp_path)
+        view = load_capture(tmp_path).views["a.png"]
+        save(path, np.zeros((10, 10, 3)))
+        with pytest.raises(CaptureError) as caught:
+            view.load_image()
+        assert_tells(caught.value, str(path), "64x48", "10x10")
+        path.unlink()
+        with pytest.raises(CaptureError) as caught:
+            view.load_image()
+        assert_tells(caught.value, str(path), "no such file")
+
+    def test_a_decompression_bomb_is_refused(self, tmp_path, monkeypatch):
+        path = self.one(tmp_path)
+        monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+        fails(tmp_path, str(path), "pixels")
+
+    def test_pixels_can_be_left_out_by_masks(self, tmp_path):
+        self.one(tmp_path)
+        mask = np.zeros((HEIGHT, WIDTH))
+        mask[:, :32] = 1
+        save(tmp_path / "masks" / "a.png.png", mask)
+        views = load_capture(tmp_path, downscale=2).views
+        np.testing.assert_array_equal(views["a.png"].load_valid(), mask[::2, ::2] > 0)
+        assert views["z.png"].load_valid() is None
+
+
+class TestBadCaptures:
+    def test_missing_and_empty_folders(self, tmp_path):
+        fails(tmp_path / "nowhere", "nowhere", "no such folder")
+        fails(tmp_path, str(tmp_path), "empty folder")
+        (tmp_path / "notes.txt").write_text("x")
+        fails(tmp_path, "neither cameras nor photos")
+        fails(tmp_path / "notes.txt", "a file")
+
+    def test_photos_without_cameras_point_to_poses(self, tmp_path):
+        write_images(tmp_path, NAMES[:3])
+        fails(tmp_path, "3 photos without cameras", f"lexsplat poses {tmp_path}")
+
+    def test_no_photo_at_all(self, tmp_path):
+        write_transforms(tmp_path, NAMES[:3], images=False)
+        fails(tmp_path, "3 images, none of which")
+        write_json(tmp_path, {"frames": []})
+        fails(tmp_path, "0 images")
+
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, "0.1", None, [1], 10**400])
+    def test_a_pose_that_is_not_numbers_names_the_image(self, tmp_path, value):
+        document = write_transforms(tmp_path, NAMES[:3])
+        document["frames"][1]["transform_matrix"][0][3] = value
+        write_json(tmp_path, document)
+        if value == "0.1":  # numpy reads it, and so it is a number
+            load_capture(tmp_path)
+        else:
+            fails(tmp_path, "transforms.json", NAMES[1])
+
+    @pytest.mark.parametrize(
+        "pose", [np.zeros((4, 4)), np.diag([1, 1, -1, 1]), np.diag([1, 2, 1, 1]), np.eye(3)]
+    )
+    def test_a_pose_that_is_no_rotation_names_the_image(self, tmp_path, pose):
+        document = write_transforms(tmp_path, NAMES[:3])
+        document["frames"][1]["transform_matrix"] = pose.tolist()
+        write_json(tmp_path, document)
+        fails(tmp_path, "transforms.json", NAMES[1])
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"fl_x": float("nan")},
+            {"fl_x": "wide"},
+            {"fl_x": True},
+            {"fl_x": 0},
+            {"fl_x": -5.0, "fl_y": -5.0},
+            {"fl_x": 10**400},
+            {"fl_x": None, "fl_y": None},
+            {"w": 1e12, "h": 1e12},
+            {"w": 0},
+            {"w": -64},
+            {"cx": [1]},
+            {"k1": float("inf")},
+            {"k1": 1e300},
+            {"camera_model": "EQUIRECTANGULAR"},
+            {"camera_model": 7},
+            {"equirectangular": True},
+            {"ftheta_p0": 0.1},
+        ],
+    )
+    def test_intrinsics_that_cannot_be(self, tmp_path, change):
+        write_transforms(tmp_path, NAMES[:2], **change)
+        fails(tmp_path, "transforms.json")
+
+    @pytest.mark.parametrize(
+        "content", [b"", b"{", b"[]", b'{"frames": 3}', b"\xff\xfe", b"[" * 100_000, b"3"]
+    )
+    def test_a_file_that_is_no_transforms_json(self, tmp_path, content):
+        (tmp_path / "transforms.json").write_bytes(content)
+        fails(tmp_path, "transforms.json", kind=FileFormatError)
+
+    @pytest.mark.parametrize("frame", [3, None, {}, {"file_path": 7}])
+    def test_frames_of_the_wrong_kind(self, tmp_path, frame):
+        document = write_transforms(tmp_path, NAMES[:2])
+        write_json(tmp_path, {**document, "frames": [*document["frames"], frame]})
+        fails(tmp_path, "transforms.json", "file_path")
+
+    @pytest.mark.parametrize(
+        "name", ["../a.png", "images/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png", "", "a\0"]
+    )
+    def test_names_that_leave_the_capture(self, tmp_path, name):
+        document = write_transforms(tmp_path, NAMES[:2])
+        document["frames"][1]["file_path"] = name
+        write_json(tmp_path, document)
+        fails(tmp_path, "transforms.json", "inside the capture")
+
+    def test_the_same_image_twice(self, tmp_path):
+        document = write_transforms(tmp_path, NAMES[:3])
+        document["frames"][1]["file_path"] = document["frames"][0]["file_path"]
+        write_json(tmp_path, document)
+        fails(tmp_path, NAMES[0], "twice")
+
+
+class TestMasks:
+    def capture(self, root, names, **masks):
+        write_transforms(root, names)
+        for folder, size in masks.items():
+            save(root / "segmentations" / folder.replace("__", "/") / "red_apple.png", np.ones(size[::-1]))
+        return root
+
+    def test_masks_are_found_by_view_and_prompt(self, tmp_path):
+        self.capture(tmp_path, NAMES, **{"0004": (64, 48)})
+        save(tmp_path / "segmentations" / "0004" / "pot.png", np.zeros((48, 64)))
+        masks = load_masks(load_capture(tmp_path))
+        assert {name: list(prompts) for name, prompts in masks.items()} == {"0004.png": ["pot", "red apple"]}
+        assert load_mask(masks["0004.png"]["red apple"]).all()
+        assert not load_mask(masks["0004.png"]["pot"]).any()
+
+    def test_a_capture_without_masks_has_none(self, tmp_path):
+        write_transforms(tmp_path, NAMES)
+        scene = load_capture(tmp_path)
+        assert scene.segmentations is None
+        assert load_masks(scene) == {}
+
+    def test_equal_stems_in_subfolders_need_the_subfolder(self, tmp_path):
+        names = ["left/0001.png", "right/0001.png", "right/0002.png"]
+        self.capture(tmp_path, names, left__0001=(64, 48), **{"0002": (64, 48)})
+        assert list(load_masks(load_capture(tmp_path))) == ["left/0001.png", "right/0002.png"]
+        save(tmp_path / "segmentations" / "0001" / "x.png", np.ones((48, 64)))
+        with pytest.raises(CaptureError) as caught:
+            load_masks(load_capture(tmp_path))
+        assert_tells(caught.value, "2 views")
+
+    def test_a_mask_whose_stem_matches_no_view_is_told(self, tmp_path):
+        scene = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
+        with pytest.raises(CaptureError) as caught:
+            load_masks(scene)
+        assert_tells(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
+
+    def test_a_mask_of_another_aspect_is_told_and_a_scaled_one_taken(self, tmp_path):
+        scene = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
+        assert list(load_masks(scene)) == ["0004.png"]
+        save(tmp_path / "segmentations" / "0004" / "bad.png", np.ones((48, 48)))
+        with pytest.raises(CaptureError) as caught:
+            load_masks(scene)
+        assert_tells(caught.value, "bad.png", "64x48", "48x48")
+
+    @pytest.mark.parametrize(("high", "dtype"), [(1, np.uint8), (255, np.uint8), (65535, np.uint16)])
+    def test_masks_of_any_depth(self, tmp_path, high, dtype):
+        ground_truth = np.random.default_rng(0).random((9, 7)) > 0.5
+        Image.fromarray((ground_truth * high).astype(dtype)).save(tmp_path / "m.png")
+        np.testing.assert_array_equal(load_mask(tmp_path / "m.png"), ground_truth)
+
+    def test_masks_drawn_on_distorted_photos_are_undistorted_like_them(self, tmp_path):
+        write_transforms(tmp_path, NAMES[:3], k1=-0.2)
+        y, x = np.mgrid[:HEIGHT, :WIDTH]
+        disk = ((x - 12) ** 2 + (y - 12) ** 2 < 64).astype(float)
+        save(tmp_path / "images" / NAMES[0], np.repeat(disk[..., None], 3, 2))
+        save(tmp_path / "segmentations" / "0001" / "disk.png", disk)
+        scene = load_capture(tmp_path)
+        view = scene.views[NAMES[0]]
+        mask = view.load_mask(load_masks(scene)[NAMES[0]]["disk"])
+        assert mask.shape == view.capture_size[::-1]
+        seen = view.load_image(view.capture_size)[..., 0] > 0.5
+        assert (mask != seen).mean() < 0.01
+        # Barrel distortion draws corners inwards; undone, the disk near the corner grows.
+        assert mask.sum() > 1.1 * disk.sum()
+
+
+def test_colmap_is_preferred_because_it_has_points(tmp_path):
+    write_transforms(tmp_path, NAMES[:3])
+    write_colmap(tmp_path, NAMES[:3])
+    assert load_capture(tmp_path).source == "colmap"
+    assert load_capture(tmp_path / "transforms.json").source == "transforms"
+
+
+def test_stems_keep_folders_and_dots():
+    assert [stem_of(n) for n in ("a.png", "b/a.x.jpg", ".hidden", "b.c/a")] == [
+        "a",
+        "b/a.x",
+        ".hidden",
+        "b.c/a",
+    ]
+
+
+def test_names_in_other_alphabets_are_kept(tmp_path):
+    names = ["größe 1.png", "猫.png", "a#b.png"]
+    write_transforms(tmp_path, names)
+    assert list(load_capture(tmp_path, test_names=["猫"]).views) == sorted(names)
+    assert json.loads((tmp_path / "transforms.json").read_text())["frames"]

@@ -1,0 +1,363 @@
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image, ImageOps
+from support.written_captures import save
+from test_loading import assert_tells, fails
+from test_pose_agreement import move
+from test_triangulation import texture
+
+from lexsplat.captures import PoseConfig, load_capture, poses_from_photos
+from lexsplat.captures.sfm import photos
+from lexsplat.captures.sfm.photos import find_photos
+from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
+from lexsplat.geometry.cameras import look_at
+from lexsplat.runtime.errors import CaptureError
+
+SIZE = (240, 180)
+COUNT = 9
+
+
+def room_cameras() -> list:
+    return [
+        look_at(
+            [1.0 + 0.5 * np.cos(a), 0.9 + 0.3 * np.sin(2 * a), 1.0 + 0.5 * np.sin(a)],
+            [0.2, 0.2, 0.2],
+            [0, 1, 0],
+            *SIZE,
+            0.9,
+        )
+        for a in np.linspace(-0.6, 2.0, COUNT)
+    ]
+
+
+def room_photo(camera, textures: list[np.ndarray]) -> np.ndarray:
+    """A corner of a room: the planes x = 0, y = 0 and z = 0, each with its texture over 2 units."""
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
+    with np.errstate(divide="ignore"):
+        distance = -camera.position / rays
+    distance[distance <= 0] = np.inf
+    wall = distance.argmin(-1)
+    hit = camera.position + rays * distance.min(-1)[..., None]
+    image = np.zeros((SIZE[1], SIZE[0], 3))
+    for axis, pattern in enumerate(textures):
+        on_axis = wall == axis
+        u, v = np.abs(np.delete(hit, axis, -1)[on_axis].T) * 128
+        low_u, low_v = np.minimum(u.astype(int), 254), np.minimum(v.astype(int), 254)
+        fu, fv = np.clip(u - low_u, 0, 1)[:, None], np.clip(v - low_v, 0, 1)[:, None]
+        rows = [pattern[low_v + d, low_u] * (1 - fu) + pattern[low_v + d, low_u + 1] * fu for d in (0, 1)]
+        image[on_axis] = rows[0] * (1 - fv) + rows[1] * fv
+    return image
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+    for index, camera in enumerate(room_cameras()):
+        save(folder / f"{index}.png", room_photo(camera, textures))
+    save(folder / "unrelated.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
+    events = []
+    return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), listener=events.append), events
+
+
+def test_photos_are_placed_and_the_one_that_cannot_be_is_named(room):
+    _, poses, events = room
+    assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
+    assert poses.unregistered == ("unrelated.png",)
+    assert "9 of 10 photos placed" in poses.note
+    assert events[-1].done == events[-1].total
+    assert events[-1].metrics == {"registered": 9, "photos": 10}
+
+
+def assert_same_up_to_a_similarity(found: list, ground_truth: list) -> None:
+    for a in range(COUNT):
+        for b in range(a):
+            turns = [c[a].viewmat[:3, :3] @ c[b].viewmat[:3, :3].T for c in (ground_truth, found)]
+            cosine = (np.trace(turns[0].T @ turns[1]) - 1) / 2
+            assert np.degrees(np.arccos(np.clip(cosine, -1, 1))) < 1.0
+    distances = [
+        np.array([np.linalg.norm(c[a].position - c[b].position) for a in range(COUNT) for b in range(a)])
+        for c in (ground_truth, found)
+    ]
+    ratio = distances[1] / distances[0]
+    np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.1)
+
+
+def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
+    folder, poses, _ = room
+    scene = load_capture(poses.root, images=folder, test_every=0)
+    found = [scene.views[f"{index}.png"].camera for index in range(COUNT)]
+    assert_same_up_to_a_similarity(found, room_cameras())
+    assert len(scene.points) == poses.points > 200
+    assert poses.images == folder, "photos that need nothing are not copied"
+    assert not (poses.root / "images").exists()
+    assert not (poses.root / ".poses").exists(), "what was worked with is gone"
+
+
+def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_path, monkeypatch):
+    folder, _, _ = room
+    mapping, moved = pycolmap.incremental_mapping, []
+
+    def misled_once(*arguments, **options):
+        found = mapping(*arguments, **options)
+        if not moved:
+            moved.extend(
+                number for number in found[0].reg_image_ids() if found[0].image(number).name == "4.png"
+            )
+            move(found[0], moved[0])
+        return found
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", misled_once)
+    poses = poses_from_photos(folder, tmp_path / "poses")
+    assert moved, "there was something to put right"
+    scene = load_capture(poses.root, images=folder, test_every=0)
+    assert_same_up_to_a_similarity(
+        [scene.views[f"{index}.png"].camera for index in range(COUNT)], room_cameras()
+    )
+
+
+def test_folders_that_are_no_capture_are_told(tmp_path):
+    for folder, found in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "found 0")):
+        with pytest.raises(CaptureError) as caught:
+            poses_from_photos(folder, tmp_path / "out")
+        assert_tells(caught.value, str(folder), found)
+
+
+def test_photos_that_do_not_overlap_leave_no_output(tmp_path):
+    for index in range(3):
+        save(tmp_path / "photos" / f"{index}.png", np.full((60, 80, 3), 0.3 * index))
+    with pytest.raises(CaptureError) as caught:
+        poses_from_photos(tmp_path / "photos", tmp_path / "out")
+    assert_tells(caught.value, "3 photos of which none")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "photos" / "1.png").write_bytes(b"no image")
+    with pytest.raises(CaptureError) as caught:
+        poses_from_photos(tmp_path / "photos", tmp_path / "out")
+    assert_tells(caught.value, "1.png")
+    fails(tmp_path / "photos", "lexsplat poses")
+
+
+FOCAL_35 = 36
+"""Focal length in EXIF, for 35 mm film."""
+
+
+def save_as_phone(path, image: np.ndarray, orientation: int, focal: float | None = FOCAL_35) -> None:
+    """A JPEG whose pixels are stored turned, as a phone does, and whose EXIF data say so."""
+    # The inverse of each turn, by Pillow: orientations 6 and 8 undo each other, all others themselves.
+    turns = {
+        1: None, 2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180,
+        4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90,
+        7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270,
+    }  # fmt: skip
+    pixels = Image.fromarray((np.clip(image, 0, 1) * 255).round().astype(np.uint8))
+    stored = pixels if turns[orientation] is None else pixels.transpose(turns[orientation])
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    if focal is not None:
+        exif.get_ifd(0x8769)[0xA405] = focal
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stored.save(path, quality=98, subsampling=0, exif=exif)
+
+
+def smooth(height: int, width: int) -> np.ndarray:
+    y, x = np.mgrid[:height, :width] / 40
+    return np.stack([0.5 + 0.4 * np.sin(x + 2 * y), 0.5 + 0.4 * np.cos(2 * x - y), 0.3 + 0.01 * x], -1)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_turned_as_pillow_turns_them(tmp_path, orientation):
+    save_as_phone(tmp_path / "a.jpg", smooth(30, 50), orientation)
+    with Image.open(tmp_path / "a.jpg") as image:
+        expected = np.asarray(ImageOps.exif_transpose(image))
+        np.testing.assert_array_equal(turned_upright(np.asarray(image), orientation), expected)
+    assert expected.shape == (30, 50, 3)
+
+
+def test_photos_stored_turned_are_copied_upright_and_keep_their_focal_length(tmp_path):
+    """COLMAP's rule for a focal length on 35 mm film: the diagonals of film (43.27 mm) and picture correspond."""
+    folder = tmp_path / "photos"
+    for index, orientation in enumerate((1, 6, 3, 8)):
+        save_as_phone(folder / "day" / f"{index}.jpg", smooth(120, 160), orientation, 28)
+    save_as_phone(folder / "zoomed.jpg", smooth(120, 160), 6, 56)
+    save_as_phone(folder / "unknown.jpg", smooth(120, 160), 1, None)
+    prepared = prepare_photos(folder, tmp_path / "out")
+    assert prepared.images == tmp_path / "out" / "images"
+    assert prepared.names == tuple(find_photos(folder))
+    for name in prepared.names:
+        copy = Image.open(prepared.images / name)
+        assert copy.getexif().get(0x0112, 1) == 1
+        assert np.abs(np.asarray(copy) / 255 - smooth(120, 160)).mean() < 0.01
+    groups = {frozenset(group) for group in prepared.lenses}
+    assert groups == {
+        frozenset(f"day/{index}.jpg" for index in range(4)),
+        frozenset({"zoomed.jpg"}),
+        frozenset({"unknown.jpg"}),
+    }
+    database_path = tmp_path / "database.db"
+    pycolmap.Database.open(database_path).close()
+    for group in prepared.lenses:
+        pycolmap.import_images(database_path, prepared.images, pycolmap.CameraMode.SINGLE, list(group))
+    database = pycolmap.Database.open(database_path)
+    cameras = {image.name: database.read_camera(image.camera_id) for image in database.read_all_images()}
+    database.close()
+    for name, focal in (("day/1.jpg", 28), ("day/0.jpg", 28), ("zoomed.jpg", 56)):
+        assert (cameras[name].width, cameras[name].height) == (160, 120)
+        assert cameras[name].has_prior_focal_length
+        assert cameras[name].focal_length == pytest.approx(focal * 200 / 43.2666, rel=1e-3)
+    assert not cameras["unknown.jpg"].has_prior_focal_length
+    before = {name: (prepared.images / name).stat().st_mtime_ns for name in prepared.names}
+    again = prepare_photos(folder, tmp_path / "out")
+    assert again.names == prepared.names
+    assert before == {name: (prepared.images / name).stat().st_mtime_ns for name in prepared.names}
+
+
+def test_photos_of_other_kinds_are_converted_under_names_of_their_own(tmp_path):
+    folder = tmp_path / "photos"
+    save(folder / "a.png", smooth(40, 60))
+    pixels = (smooth(40, 60) * 255).astype(np.uint8)
+    Image.fromarray(pixels).convert("CMYK").save(folder / "b.jpg")
+    Image.fromarray(pixels).save(folder / "a.webp", lossless=True)
+    Image.fromarray(pixels).convert("RGBA").save(folder / "c.png")
+    prepared = prepare_photos(folder, tmp_path / "out")
+    assert prepared.names == ("a.jpg", "a.png", "b.jpg", "c.png")
+    for name in prepared.names:
+        with Image.open(prepared.images / name) as image:
+            assert image.mode == "RGB"
+            assert np.abs(np.asarray(image) / 255 - smooth(40, 60)).mean() < 0.03, name
+
+
+def test_photos_are_sought_apart_from_masks_truth_and_the_output(tmp_path):
+    for name in ("1.png", "walk/2.png", "masks/1.png", "segmentations/1/mug.png", "out/heatmaps/mug/1.png"):
+        save(tmp_path / name, np.zeros((8, 8, 3)))
+    assert find_photos(tmp_path, tmp_path / "out") == ["1.png", "walk/2.png"]
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    """The room as a phone shows it: stored turned, with a sticker on the lens that is masked; the global mapper."""
+    folder = tmp_path_factory.mktemp("phone")
+    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+    sticker = np.random.default_rng(5).random((90, 70, 3)).repeat(2, 0)[:90].repeat(2, 1)[:, :70]
+    for index, camera in enumerate(room_cameras()):
+        photo = room_photo(camera, textures)
+        if index == 4:  # the sticker was off
+            save_as_phone(folder / "images" / f"{index}.jpg", photo, 6)
+            continue
+        photo[-90:, -70:] = sticker
+        save_as_phone(folder / "images" / f"{index}.jpg", photo, (6, 8, 3)[index % 3])
+        mask = np.ones((SIZE[1], SIZE[0]))
+        mask[-90:, -70:] = 0
+        # Half of them as COLMAP calls them and barely not black, the others by stem, at half the size.
+        if index % 2:
+            save(folder / "masks" / f"{index}.jpg.png", mask * 3 / 255)
+        else:
+            save(folder / "masks" / f"{index}.png", mask[::2, ::2])
+    save(folder / "masks" / "nobody.png", np.ones((4, 4)))
+    config = PoseConfig(mapper="global")
+    return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), config)
+
+
+def test_turned_photos_get_upright_cameras_that_are_the_true_ones(phone):
+    _, poses = phone
+    assert len(poses.registered) == COUNT, poses.note
+    scene = load_capture(poses.root, images=poses.images, test_every=0)
+    found = [scene.views[f"{index}.jpg"].camera for index in range(COUNT)]
+    assert {(view.lens.width, view.lens.height) for view in scene.views.values()} == {SIZE}
+    assert_same_up_to_a_similarity(found, room_cameras())
+
+
+def test_masked_pixels_give_no_features(phone):
+    _, poses = phone
+    model = pycolmap.Reconstruction(poses.root / "sparse" / "0")
+    for image in model.images.values():
+        places = np.array([point.xy for point in image.points2D])
+        assert len(places) > 100
+        if image.name == "4.jpg":
+            continue
+        hidden = (places[:, 0] > SIZE[0] - 68) & (places[:, 1] > SIZE[1] - 88)
+        assert not hidden.any()
+    assert any("nobody.png" in note for note in poses.notes)
+    valid = load_capture(poses.root, images=poses.images, test_every=0).views["0.jpg"].load_valid()
+    assert not valid[-88:, -68:].any()
+    assert valid[:80].all()
+
+
+def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch):
+    """Each photo is compared with the next one alone, and that shows nothing: every second one is blank."""
+    monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
+    monkeypatch.setattr(photos, "SEQUENTIAL_OVERLAP", 1)
+    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+    cameras = room_cameras()
+    for index, camera in enumerate(cameras):
+        save(tmp_path / "photos" / f"{index}.png", room_photo(camera, textures))
+        save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
+    with pytest.raises(CaptureError, match="none could be placed"):
+        poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
+    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
+    assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
+    views = load_capture(poses.root, images=poses.images, test_every=0).views
+    assert_same_up_to_a_similarity([views[f"{index}.png"].camera for index in range(COUNT)], cameras)
+
+
+def test_a_mask_of_another_shape_is_told_before_anything_is_done(tmp_path):
+    for index in range(3):
+        save(tmp_path / "photos" / f"{index}.png", smooth(40, 60))
+    save(tmp_path / "photos" / "masks" / "1.png", np.ones((60, 40)))
+    with pytest.raises(CaptureError) as caught:
+        poses_from_photos(tmp_path / "photos", tmp_path / "out")
+    assert_tells(caught.value, "1.png", "60x40", "40x60")
+    with pytest.raises(CaptureError) as caught:
+        poses_from_photos(tmp_path / "photos", tmp_path / "photos")
+    assert_tells(caught.value, "--output")
+
+
+def three_photos(folder, suffix: str = ".jpg") -> None:
+    for index in range(3):
+        save(folder / f"{index}{suffix}", np.random.default_rng(index).random((96, 128, 3)))
+
+
+def test_a_photo_that_is_cut_off_is_told_before_anything_is_done(tmp_path):
+    """pycolmap would take the gray half for a part of the place, and the training would stumble over it later."""
+    three_photos(tmp_path / "photos")
+    path = tmp_path / "photos" / "1.jpg"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(CaptureError) as caught:
+        prepare_photos(tmp_path / "photos", tmp_path / "output")
+    assert_tells(caught.value, "1.jpg", "damaged", "truncated")
+    assert not (tmp_path / "output").exists()
+
+
+@pytest.mark.parametrize("name", [b"a\nb.jpg", b"a\\b.jpg", b"\xff\xfe.jpg", b"sub\x7f/a.jpg"])
+def test_photos_with_names_that_no_camera_file_can_hold_are_told_before_anything_is_done(tmp_path, name):
+    three_photos(tmp_path / "photos")
+    path = Path(os.fsdecode(os.fsencode(tmp_path / "photos") + b"/" + name))
+    path.parent.mkdir(exist_ok=True)
+    shutil.copy(tmp_path / "photos" / "0.jpg", path)
+    with pytest.raises(CaptureError) as caught:
+        prepare_photos(tmp_path / "photos", tmp_path / "output")
+    assert_tells(caught.value, "photos", "rename")
+    str(caught.value).encode("utf-8")
+
+
+@pytest.mark.parametrize(
+    "name", ["100%.jpg", "%s.jpg", "\U0001f600.jpg", "[red]{x}.jpg", "2.JPG", "a'b \"c.jpg"]
+)
+def test_photos_may_have_odd_names(tmp_path, name):
+    three_photos(tmp_path / "photos")
+    shutil.copy(tmp_path / "photos" / "0.jpg", tmp_path / "photos" / name)
+    assert name in prepare_photos(tmp_path / "photos", tmp_path / "output").names
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="max_side"):
+        PoseConfig(max_side=10)
+    assert PoseConfig().compares_all(80)
+    assert not PoseConfig().compares_all(81)
+    assert not PoseConfig(pairs="sequential").compares_all(5)
+    assert PoseConfig(pairs="exhaustive").compares_all(500)

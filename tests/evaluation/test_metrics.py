@@ -1,0 +1,195 @@
+import math
+import sys
+
+import numpy as np
+import pytest
+import sklearn.metrics
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from skimage.metrics import peak_signal_noise_ratio
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from lexsplat.evaluation import metrics
+
+MASKS = arrays(bool, (5, 7))
+# Few distinct values, so that ties are common.
+SCORES = arrays(np.float32, (5, 7), elements=st.sampled_from([i / 16 for i in range(17)]))
+
+
+def picture(seed, size=(37, 41, 3)):
+    return np.random.default_rng(seed).random(size).astype(np.float32)
+
+
+# Pictures
+
+
+def test_psnr_of_a_constant_difference_of_a_tenth_is_20_db():
+    assert metrics.psnr(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) == pytest.approx(20)
+    assert metrics.psnr(picture(0), picture(0)) == math.inf
+
+
+def test_psnr_agrees_with_scikit_image():
+    expected = peak_signal_noise_ratio(picture(0).astype(float), picture(1).astype(float), data_range=1)
+    assert metrics.psnr(picture(0), picture(1)) == pytest.approx(expected)
+
+
+def test_ssim_agrees_with_torchmetrics_where_the_window_lies_inside():
+    image = np.clip(picture(0) * 0.3 + np.linspace(0, 0.7, 41)[None, :, None], 0, 1)
+    target = np.clip(image + 0.1 * (picture(1) - 0.5), 0, 1)
+    pair = [torch.from_numpy(side.astype(np.float64)).permute(2, 0, 1)[None] for side in (image, target)]
+    _, full = structural_similarity_index_measure(*pair, data_range=1.0, return_full_image=True)
+    expected = float(full[..., 5:-5, 5:-5].mean())
+    assert metrics.ssim(image, target) == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_of_equal_pictures_is_one_and_small_pictures_are_refused():
+    assert metrics.ssim(picture(0), picture(0)) == pytest.approx(1)
+    with pytest.raises(ValueError, match="11x11"):
+        metrics.ssim(picture(0, (10, 30, 3)), picture(0, (10, 30, 3)))
+
+
+@pytest.mark.parametrize("measure", [metrics.psnr, metrics.ssim])
+def test_pictures_of_two_sizes_are_refused(measure):
+    with pytest.raises(ValueError, match="one shape"):
+        measure(picture(0), picture(0)[1:])
+
+
+def test_lpips_says_why_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", None)
+    function, reason = metrics.load_lpips()
+    assert function is None
+    assert "pip install 'lexsplat[lpips]'" in reason
+
+
+# Masks, strict
+
+
+@given(MASKS, MASKS)
+def test_mask_scores_agree_with_scikit_learn(prediction, ground_truth):
+    flat = ground_truth.ravel(), prediction.ravel()
+    assert metrics.pixel_accuracy(prediction, ground_truth) == pytest.approx(
+        sklearn.metrics.accuracy_score(*flat)
+    )
+    expected = sklearn.metrics.jaccard_score(*flat, zero_division=1.0)
+    assert metrics.iou(prediction, ground_truth) == pytest.approx(expected)
+    if prediction.any():
+        assert metrics.precision(prediction, ground_truth) == pytest.approx(
+            sklearn.metrics.precision_score(*flat)
+        )
+
+
+def test_mask_scores_by_hand():
+    prediction = np.array([[True, True, False, False]])
+    ground_truth = np.array([[False, True, True, True]])
+    assert metrics.iou(prediction, ground_truth) == 1 / 4
+    assert metrics.pixel_accuracy(prediction, ground_truth) == 1 / 4
+    assert metrics.precision(prediction, ground_truth) == 1 / 2
+
+
+def test_empty_masks():
+    empty, full = np.zeros((2, 2), bool), np.ones((2, 2), bool)
+    assert metrics.iou(empty, empty) == metrics.precision(empty, empty) == 1
+    assert metrics.iou(empty, full) == metrics.precision(empty, full) == 0
+
+
+def test_masks_must_be_boolean_and_of_one_shape():
+    with pytest.raises(ValueError, match="boolean"):
+        metrics.iou(np.zeros((2, 2)), np.zeros((2, 2), bool))
+    with pytest.raises(ValueError, match="one shape"):
+        metrics.iou(np.zeros((2, 3), bool), np.zeros((2, 2), bool))
+
+
+@given(SCORES, MASKS.filter(np.any))
+def test_average_precision_agrees_with_scikit_learn_interpolated_at_101_recalls(scores, ground_truth):
+    precisions, recalls, _ = sklearn.metrics.precision_recall_curve(ground_truth.ravel(), scores.ravel())
+    precisions, recalls = precisions[:-1], recalls[:-1]  # without the point (1, 0) that no threshold makes
+    expected = [precisions[recalls >= k / 100].max() for k in range(101)]
+    assert metrics.average_precision(scores, ground_truth) == pytest.approx(np.mean(expected))
+
+
+@given(SCORES, MASKS)
+def test_average_precision_is_bounded_and_deaf_to_monotone_changes(scores, ground_truth):
+    value = metrics.average_precision(scores, ground_truth)
+    if not ground_truth.any():
+        assert math.isnan(value)
+        return
+    assert 0 <= value <= 1
+    assert metrics.average_precision(scores**3 / 2 + 0.1, ground_truth) == pytest.approx(value)
+
+
+def test_average_precision_by_hand():
+    # Ranked: hit, miss, hit. Precision 1 up to recall 1/2 (points 0 to 50), then 2/3 (50 points).
+    value = metrics.average_precision(np.array([[0.9, 0.5, 0.2]]), np.array([[True, False, True]]))
+    assert value == pytest.approx((51 * 1 + 50 * 2 / 3) / 101)
+
+
+def test_a_perfect_ranking_has_average_precision_one():
+    ground_truth = np.zeros((10, 10), bool)
+    ground_truth[2:5] = True
+    assert metrics.average_precision(ground_truth * 0.5 + 0.1, ground_truth) == 1
+
+
+def test_a_score_that_is_not_a_number_is_refused():
+    with pytest.raises(ValueError, match="finite"):
+        metrics.average_precision(np.array([[np.nan, 1.0]]), np.array([[True, False]]))
+
+
+def test_localization_looks_at_the_peak_only():
+    ground_truth = np.zeros((3, 4), bool)
+    ground_truth[1, 1] = True
+    scores = np.full((3, 4), 0.4)
+    assert metrics.localization(scores, ground_truth) == pytest.approx(1 / 12), (
+        "a flat map is worth the object's area"
+    )
+    scores[1, 1] = 0.5
+    assert metrics.localization(scores, ground_truth) == 1
+    scores[0, 0] = 0.6
+    assert metrics.localization(scores, ground_truth) == 0
+    assert math.isnan(metrics.localization(scores, ~(ground_truth | True)))
+
+
+def test_resizing_scores_keeps_pixel_centers():
+    ramp = np.tile((np.arange(8) + 0.5) / 8, (4, 1)).astype(np.float32)
+    larger = metrics.resize_scores(ramp, 16, 8)
+    assert larger.shape == (8, 16)
+    np.testing.assert_allclose(
+        larger[:, 1:-1], np.tile((np.arange(16) + 0.5) / 16, (8, 1))[:, 1:-1], atol=1e-6
+    )
+    assert metrics.resize_scores(ramp, 8, 4) is ramp
+
+
+@given(SCORES, MASKS, st.integers(0, 1000))
+def test_threshold_counts_equal_the_mask_at_that_threshold(scores, ground_truth, step):
+    threshold = step / 1000
+    counts = metrics.threshold_counts(scores, ground_truth)
+    predicted = scores >= threshold
+    found = counts.at(threshold)
+    assert found.iou == pytest.approx(metrics.iou(predicted, ground_truth))
+    assert found.accuracy == pytest.approx(metrics.pixel_accuracy(predicted, ground_truth))
+    assert found.precision == pytest.approx(metrics.precision(predicted, ground_truth))
+    assert counts.iou[step] == found.iou
+
+
+def test_counts_of_two_views_add_up_to_the_counts_of_both():
+    rng = np.random.default_rng(0)
+    scores, ground_truth = rng.random((2, 6, 5)), rng.random((2, 6, 5)) > 0.7
+    both = metrics.threshold_counts(scores, ground_truth)
+    total = metrics.threshold_counts(scores[0], ground_truth[0]) + metrics.threshold_counts(
+        scores[1], ground_truth[1]
+    )
+    np.testing.assert_array_equal(both.hits, total.hits)
+    precisions, recalls = total.curve
+    assert recalls[-1] == 1
+    assert np.all(np.diff(recalls) >= 0)
+    assert precisions[-1] == pytest.approx(ground_truth.mean())
+
+
+# Averages
+
+
+def test_prompts_are_averaged_within_an_image_before_images():
+    values = {"a": {"x": 1.0, "y": 0.0}, "b": {"x": 1.0}, "c": {"x": math.nan}}
+    assert metrics.mean_over_images(values) == pytest.approx(0.75)
+    assert metrics.mean_over_images({"c": {"x": math.nan}}) is None

@@ -1,0 +1,670 @@
+"""Encoders: real architectures with tiny random weights, against direct calls of transformers."""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lexsplat.features import hub
+from lexsplat.features.clip import _plain_attention, check_patches
+from lexsplat.features.dino import _ramp, _window_starts
+from lexsplat.features.encoders import ClipEncoder, DinoEncoder, load_clip, load_dino, resize_images
+from lexsplat.runtime.errors import ModelError
+
+MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
+PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True)
+def full_precision(request, monkeypatch):
+    """Bfloat16 is tested by itself; everything else is compared to the last digits."""
+    if "bfloat16" not in request.node.name:
+        monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda: False)
+
+
+def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatch):
+    clip = load_clip("bundled")
+    crops = torch.rand(12, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+    found = []
+    for on in (False, True):
+        monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda on=on: on)
+        found.append((clip.encode_images(crops), clip.encode_text(PROMPTS)))
+    cosines = (found[0][0] * found[1][0]).sum(-1)
+    assert cosines.min() > 0.999
+    assert not torch.equal(found[0][0], found[1][0]), "bfloat16 was used"
+    assert torch.equal(found[0][1], found[1][1])
+
+
+def test_only_the_image_tower_of_few_patches_gets_plain_attention():
+    clip = load_clip("bundled")
+    assert clip._model.vision_model.config._attn_implementation == "eager"
+    assert clip._model.text_model.config._attn_implementation == "sdpa"
+    clip._model.vision_model.config._attn_implementation = "sdpa"
+    _plain_attention(clip._model, clip._model.config.vision_config, 8 * 14)
+    assert clip._model.vision_model.config._attn_implementation == "sdpa", "14 x 14 patches are not few"
+    _plain_attention(torch.nn.Linear(2, 2), object(), 48)  # a model that is built otherwise is left alone
+
+
+def _seeded(build):
+    torch.manual_seed(0)
+    model = build()
+    with torch.no_grad():  # the usual initialization is so small that every image would look the same
+        for parameter in model.parameters():
+            parameter.copy_(torch.randn_like(parameter) * 0.15)
+    return model.eval()
+
+
+def _save(model, folder: Path) -> Path:
+    model.save_pretrained(folder)
+    preprocessing = {"image_mean": MEAN, "image_std": STD}
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    return folder
+
+
+def _normalized(images: torch.Tensor) -> torch.Tensor:
+    pixels = (images.double().numpy() - np.reshape(MEAN, (3, 1, 1))) / np.reshape(STD, (3, 1, 1))
+    return torch.from_numpy(pixels).float()
+
+
+def _unit(features: torch.Tensor) -> torch.Tensor:
+    return features / features.norm(dim=-1, keepdim=True)
+
+
+def _images(count: int, size: int) -> torch.Tensor:
+    return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory) -> Path:
+    from transformers import CLIPConfig, CLIPModel
+
+    folder = tmp_path_factory.mktemp("clip")
+    tokenizer = load_clip("bundled")._tokenizer
+    config = CLIPConfig(
+        text_config={
+            "vocab_size": len(tokenizer), "hidden_size": 24, "intermediate_size": 40, "num_hidden_layers": 2,
+            "num_attention_heads": 2, "max_position_embeddings": 11, "bos_token_id": tokenizer.bos_token_id,
+            "eos_token_id": tokenizer.eos_token_id, "pad_token_id": tokenizer.pad_token_id,
+        },
+        vision_config={
+            "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
+            "image_size": 40, "patch_size": 8,
+        },
+        projection_dim=20,
+    )  # fmt: skip
+    tokenizer.save_pretrained(folder)
+    return _save(_seeded(lambda: CLIPModel(config)), folder)
+
+
+@pytest.fixture(scope="module")
+def siglip_folder(tmp_path_factory) -> Path:
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import PreTrainedTokenizerFast, SiglipConfig, SiglipModel
+
+    folder = tmp_path_factory.mktemp("siglip")
+    words = ["<pad>", "<unk>", "a", "red", "apple", "the", "wooden", "table", "stack", "of", "books"]
+    backend = Tokenizer(models.WordLevel({word: i for i, word in enumerate(words)}, unk_token="<unk>"))
+    backend.pre_tokenizer = pre_tokenizers.Whitespace()
+    PreTrainedTokenizerFast(tokenizer_object=backend, pad_token="<pad>", unk_token="<unk>").save_pretrained(
+        folder
+    )
+    tower = {"intermediate_size": 40, "num_hidden_layers": 2, "num_attention_heads": 2, "hidden_size": 24}
+    config = SiglipConfig(
+        text_config={**tower, "vocab_size": len(words), "max_position_embeddings": 9},
+        vision_config={**tower, "image_size": 32, "patch_size": 8},
+    )
+    return _save(_seeded(lambda: SiglipModel(config)), folder)
+
+
+def test_clip_image_embeddings_equal_transformers_own(clip_folder):
+    from transformers import CLIPModel
+
+    encoder = ClipEncoder(clip_folder, "tiny")
+    images = _images(5, 40)
+    with torch.no_grad():
+        model = CLIPModel.from_pretrained(clip_folder)
+        pooled = model.vision_model(pixel_values=_normalized(images)).pooler_output
+        expected = _unit(model.visual_projection(pooled))
+    assert (encoder.image_size, encoder.dim) == (40, 20)
+    torch.testing.assert_close(encoder.encode_images(images), expected, atol=1e-5, rtol=0)
+
+
+def test_patches_are_the_values_of_the_last_attention_written_out(clip_folder):
+    """Reference: the tower layer by layer, then LayerNorm, two matrices, LayerNorm and the projection by hand."""
+    from transformers import CLIPModel
+
+    images = _images(3, 40)
+    model = CLIPModel.from_pretrained(clip_folder, attn_implementation="eager").eval()
+    tower = model.vision_model
+    with torch.no_grad():
+        hidden = tower(pixel_values=_normalized(images), output_hidden_states=True).hidden_states[-2]
+        last = tower.encoder.layers[-1]
+
+        def norm(x, module):
+            middle = x - x.mean(-1, keepdim=True)
+            return (
+                middle / (middle.square().mean(-1, keepdim=True) + module.eps).sqrt() * module.weight
+                + module.bias
+            )
+
+        value, out = last.self_attn.v_proj, last.self_attn.out_proj
+        tokens = norm(hidden, last.layer_norm1) @ value.weight.T + value.bias
+        tokens = tokens @ out.weight.T + out.bias
+        tokens = norm(tokens, tower.post_layernorm) @ model.visual_projection.weight.T
+    encoder = ClipEncoder(clip_folder, "tiny")
+    whole, patches = encoder.encode_patches(images)
+    torch.testing.assert_close(whole, encoder.encode_images(images))
+    assert encoder.patches == 5
+    torch.testing.assert_close(patches, _unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
+
+
+def test_nothing_of_an_evaluation_is_held_once_it_is_answered(clip_folder):
+    encoder = ClipEncoder(clip_folder, "tiny")
+    encoder.encode_images(_images(2, 40))
+    encoder.encode_patches(_images(2, 40))
+    encoder.encode_images(_images(2, 40))
+    held = [
+        o for o in gc.get_objects() if issubclass(type(o), torch.Tensor) and o.shape[:2] == (2, 26)
+    ]  # 25 patches, class
+    assert held == []
+
+
+def test_threads_get_their_own_patches(clip_folder):
+    encoder = ClipEncoder(clip_folder, "tiny")
+    images = _images(12, 40).split(2)
+    expected = [encoder.encode_patches(pair)[1] for pair in images]
+    barrier = threading.Barrier(3)
+
+    def work(index: int) -> list[torch.Tensor]:
+        barrier.wait()
+        return [encoder.encode_patches(images[i])[1] for i in range(index, 6, 3)]
+
+    with ThreadPoolExecutor(3) as pool:
+        for index, found in enumerate(pool.map(work, range(3))):
+            for tensor, reference in zip(found, expected[index::3]):
+                torch.testing.assert_close(tensor, reference, atol=1e-5, rtol=0)
+
+
+def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_folder, clip_folder):
+    encoder = ClipEncoder(siglip_folder, "tiny siglip")
+    assert encoder.patches == 0
+    with pytest.raises(ModelError, match=r"--features\.crop-tokens class"):
+        encoder.encode_patches(_images(1, 32))
+    with pytest.raises(ModelError, match=r"found siglip.*--features\.crop-tokens class"):
+        check_patches(siglip_folder, "tiny siglip")
+    check_patches(clip_folder, "tiny")
+
+
+def test_clip_text_embeddings_equal_transformers_own_and_long_prompts_are_cut(clip_folder):
+    from transformers import AutoTokenizer, CLIPModel
+
+    encoder = ClipEncoder(clip_folder, "tiny")
+    model, tokenizer = CLIPModel.from_pretrained(clip_folder), AutoTokenizer.from_pretrained(clip_folder)
+    long = " ".join(["red apple"] * 20)
+    found = encoder.encode_text([*PROMPTS, long])
+    for prompt, row in zip([*PROMPTS, long], found):  # one by one: padding must not matter
+        ids = tokenizer(prompt)["input_ids"]
+        ids = ids if len(ids) <= 11 else [*ids[:10], tokenizer.eos_token_id]
+        with torch.no_grad():
+            expected = model.text_projection(model.text_model(input_ids=torch.tensor([ids])).pooler_output)
+        torch.testing.assert_close(row, _unit(expected)[0], atol=1e-5, rtol=0)
+
+
+def test_siglip_embeddings_equal_transformers_own(siglip_folder):
+    from transformers import SiglipModel
+
+    encoder = ClipEncoder(siglip_folder, "tiny siglip")
+    model = SiglipModel.from_pretrained(siglip_folder)
+    images = _images(3, 32)
+    # Padded to the full length of 9 with <pad> = 0, no mask, lower case.
+    ids = torch.tensor([[2, 3, 4, 0, 0, 0, 0, 0, 0], [5, 6, 7, 0, 0, 0, 0, 0, 0]])
+    with torch.no_grad():
+        by_image = model.vision_model(pixel_values=_normalized(images)).pooler_output
+        by_text = model.text_model(input_ids=ids).pooler_output
+    assert (encoder.image_size, encoder.dim) == (32, 24)
+    torch.testing.assert_close(encoder.encode_images(images), _unit(by_image), atol=1e-5, rtol=0)
+    found = encoder.encode_text(["A red apple", "the wooden table"])
+    torch.testing.assert_close(found, _unit(by_text), atol=1e-5, rtol=0)
+
+
+def test_siglip2_of_free_size_gets_its_patches_as_its_own_processor_makes_them(siglip_folder, tmp_path):
+    transformers = pytest.importorskip("transformers")
+    if not hasattr(transformers, "Siglip2Model"):
+        pytest.skip("this transformers has no SigLIP 2")
+    tower = {"intermediate_size": 40, "num_hidden_layers": 1, "num_attention_heads": 2, "hidden_size": 24}
+    config = transformers.Siglip2Config(
+        text_config={**tower, "vocab_size": 11, "max_position_embeddings": 9},
+        vision_config={**tower, "num_patches": 16, "patch_size": 8},
+    )
+    model = _seeded(lambda: transformers.Siglip2Model(config))
+    _save(model, tmp_path)
+    for file in siglip_folder.glob("tokenizer*"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    encoder = ClipEncoder(tmp_path, "tiny siglip2")
+    assert encoder.image_size == 32
+    images = _images(2, 32)
+    pixels = _normalized(images)
+    patches = torch.stack([
+        torch.stack([
+            image[:, 8 * row : 8 * row + 8, 8 * col : 8 * col + 8].permute(1, 2, 0).reshape(-1)
+            for row in range(4) for col in range(4)
+        ])
+        for image in pixels
+    ])  # fmt: skip
+    with torch.no_grad():
+        expected = model.vision_model(patches, torch.ones(2, 16), torch.tensor([[4, 4]] * 2)).pooler_output
+    torch.testing.assert_close(encoder.encode_images(images), _unit(expected), atol=1e-5, rtol=0)
+
+
+def test_an_empty_prompt_is_refused():
+    encoder = load_clip("bundled")
+    for prompts in ([], [""], ["apple", "  "]):
+        with pytest.raises(ValueError, match="not empty"):
+            encoder.encode_text(prompts)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"), [((37, 53), (64, 64)), ((90, 120), (32, 48)), ((16, 16), (16, 16))]
+)
+def test_resizing_equals_pillow_bicubic(source, target):
+    image = torch.rand(3, *source, generator=torch.Generator().manual_seed(2))
+    found = resize_images(image[None], *target)[0]
+    for plane, resized in zip(image, found):
+        expected = Image.fromarray(plane.numpy()).resize((target[1], target[0]), Image.Resampling.BICUBIC)
+        np.testing.assert_allclose(resized.numpy(), np.clip(np.asarray(expected), 0, 1), atol=2e-5)
+
+
+def _vit(registers: int = 0):
+    from transformers import ViTConfig, ViTModel
+
+    config = ViTConfig(
+        hidden_size=24,
+        intermediate_size=40,
+        num_hidden_layers=3,
+        num_attention_heads=2,
+        image_size=32,
+        patch_size=8,
+    )
+    return ViTModel(config, add_pooling_layer=False)
+
+
+def _dinov2(registers: int):
+    import transformers
+
+    sizes = {"hidden_size": 24, "num_hidden_layers": 3, "num_attention_heads": 2}
+    options = {**sizes, "image_size": 28, "patch_size": 14}
+    if not registers:
+        return transformers.Dinov2Model(transformers.Dinov2Config(**options))
+    config = transformers.Dinov2WithRegistersConfig(**options, num_register_tokens=registers)
+    return transformers.Dinov2WithRegistersModel(config)
+
+
+def _dinov3(registers: int):
+    transformers = pytest.importorskip("transformers")
+    if not hasattr(transformers, "DINOv3ViTModel"):
+        pytest.skip("this transformers has no DINOv3")
+    config = transformers.DINOv3ViTConfig(
+        hidden_size=24, intermediate_size=40, num_hidden_layers=3, num_attention_heads=2, image_size=32,
+        patch_size=16, num_register_tokens=registers,
+    )  # fmt: skip
+    return transformers.DINOv3ViTModel(config)
+
+
+@pytest.mark.parametrize(("build", "registers"), [(_vit, 0), (_dinov2, 0), (_dinov2, 4), (_dinov3, 3)])
+def test_dense_tokens_and_keys_equal_transformers_own_without_special_tokens(build, registers, tmp_path):
+    model = _seeded(lambda: build(registers))
+    encoder = DinoEncoder(_save(model, tmp_path), "tiny")
+    patch = encoder.patch_size
+    rows, cols = 3, 5
+    image = torch.rand(3, rows * patch, cols * patch, generator=torch.Generator().manual_seed(3))
+    options = {"interpolate_pos_encoding": True} if build is _vit else {}
+    with torch.no_grad():
+        output = model(_normalized(image[None]), output_hidden_states=True, **options)
+    expected = output.last_hidden_state[0, 1 + registers :].reshape(rows, cols, 24)
+    found = encoder.encode_dense(image, short_side=rows * patch, facet="token")
+    assert encoder.num_layers == 3
+    torch.testing.assert_close(found, _unit(expected), atol=1e-5, rtol=0)
+
+    # Keys of layer 1 by hand: its input, through its first normalization and its key projection.
+    layers = [(n, m) for n, m in model.named_modules() if n.endswith("layer.1") or n.endswith("layers.1")]
+    layer = layers[0][1]
+    norm = next(m for n, m in layer.named_modules() if n in ("norm1", "layernorm_before"))
+    key = next(m for n, m in layer.named_modules() if n.endswith(("k_proj", ".key")))
+    with torch.no_grad():
+        expected = key(norm(output.hidden_states[1]))[0, 1 + registers :].reshape(rows, cols, 24)
+    found = encoder.encode_dense(image, short_side=rows * patch, facet="key", layer=1)
+    torch.testing.assert_close(found, _unit(expected), atol=1e-5, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def dino(tmp_path_factory) -> DinoEncoder:
+    return DinoEncoder(_save(_seeded(_vit), tmp_path_factory.mktemp("vit")), "tiny")
+
+
+def test_a_smaller_stride_evaluates_the_model_on_shifted_images(dino):
+    image = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(4))
+    fine = dino.encode_dense(image, short_side=32, stride=2, facet="token")
+    assert fine.shape == (16, 24, 24)
+    # Cell 4 k + 2 of the fine grid has its center at 8 k + 5: the patch that starts at 8 k + 1.
+    padded = torch.nn.functional.pad(image[None], (3, 3, 3, 3), mode="replicate")[0]
+    shifted = padded[:, 3 + 1 : 3 + 1 + 32, 3 - 1 : 3 - 1 + 48]
+    expected = dino.encode_dense(shifted, short_side=32, facet="token")
+    torch.testing.assert_close(fine[2::4, 1::4], expected, atol=1e-5, rtol=0)
+
+
+def test_fine_features_lie_where_the_image_content_is(tmp_path):
+    """With a model that only averages color, features of a ramp must be the ramp at the cells' centers."""
+    from transformers import ViTConfig, ViTModel
+
+    config = ViTConfig(
+        hidden_size=4,
+        intermediate_size=4,
+        num_hidden_layers=1,
+        num_attention_heads=1,
+        image_size=32,
+        patch_size=8,
+    )
+    model = ViTModel(config, add_pooling_layer=False)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.zero_()
+        # Channels (mean red, its negative, 1, -1): zero mean, so that normalizing keeps the ratio.
+        weight = model.embeddings.patch_embeddings.projection.weight
+        weight[0, 0], weight[1, 0] = 1 / 64, -1 / 64
+        model.embeddings.patch_embeddings.projection.bias[:] = torch.tensor([0.0, 0.0, 1.0, -1.0])
+        for module in model.modules():
+            if isinstance(module, torch.nn.LayerNorm):
+                module.weight.fill_(1.0)
+    folder = _save(model, tmp_path)
+    (folder / "preprocessor_config.json").write_text(
+        json.dumps({"image_mean": [0] * 3, "image_std": [1] * 3})
+    )
+    encoder = DinoEncoder(folder, "color")
+    ramp = (torch.arange(64) + 0.5) / 64
+    image = ramp.expand(3, 32, 64)
+    for stride, tolerance in ((8, 1e-4), (2, 1e-4), (4, 1e-4)):
+        found = encoder.encode_dense(image, short_side=32, stride=stride, facet="token")
+        red = found[..., 0] / found[..., 2]
+        centers = (torch.arange(64 // stride) + 0.5) * stride / 64
+        inner = slice(4 // stride + 1, -4 // stride - 1)  # at the border a patch sees repeated pixels
+        assert (red[:, inner] - centers[inner]).abs().max() < tolerance
+
+
+def test_windows_cover_a_large_image_and_agree_with_one_evaluation_for_a_local_model(dino, tmp_path):
+    image = torch.rand(3, 64, 120, generator=torch.Generator().manual_seed(5))
+    whole = dino.encode_dense(image, short_side=64, facet="token")
+    windowed = dino.encode_dense(image, short_side=64, facet="token", max_tokens=20)
+    assert windowed.shape == whole.shape
+    torch.testing.assert_close(windowed.norm(dim=-1), torch.ones(8, 15), atol=1e-5, rtol=0)
+    # Without attention and positions a token depends on its patch alone, so windows change nothing.
+    model = _seeded(_vit)
+    with torch.no_grad():
+        model.embeddings.position_embeddings.zero_()
+        for name, parameter in model.named_parameters():
+            if "v_proj" in name or "attention.value" in name:
+                parameter.zero_()
+    local = DinoEncoder(_save(model, tmp_path), "local")
+    whole = local.encode_dense(image, short_side=64, facet="token")
+    windowed = local.encode_dense(image, short_side=64, facet="token", max_tokens=20)
+    torch.testing.assert_close(windowed, whole, atol=1e-5, rtol=0)
+
+
+def test_attention_never_sees_more_patches_than_allowed(dino, monkeypatch):
+    seen = []
+
+    def counted(pixels, facet, layer):
+        rows, cols = pixels.shape[-2] // 8, pixels.shape[-1] // 8
+        seen.append(rows * cols)
+        return torch.ones(rows, cols, 24)
+
+    monkeypatch.setattr(dino, "_forward", counted)
+    for height, width, limit in ((64, 120, 20), (32, 400, 7), (400, 32, 7), (64, 64, 1)):
+        seen.clear()
+        dino.encode_dense(torch.rand(3, height, width), short_side=min(height, width), max_tokens=limit)
+        assert seen
+        assert max(seen) <= limit
+
+
+@pytest.mark.parametrize(("total", "window"), [(5, 9), (9, 9), (10, 9), (100, 7), (13, 1), (64, 16)])
+def test_windows_cover_everything_and_overlap(total, window):
+    starts = _window_starts(total, window)
+    covered = np.zeros(total, dtype=int)
+    for start in starts:
+        assert 0 <= start <= max(0, total - window)
+        covered[start : start + window] += 1
+    assert covered.min() >= 1
+    assert (_ramp(window) > 0).all()
+    if window >= 4:
+        assert max(np.diff(starts), default=0) <= window - window // 4 + 1
+
+
+def test_threads_get_their_own_keys(dino):
+    images = [torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(seed)) for seed in range(6)]
+    expected = [dino.encode_dense(image, short_side=32) for image in images]
+    barrier = threading.Barrier(3)
+
+    def work(index: int) -> list[torch.Tensor]:
+        barrier.wait()
+        return [dino.encode_dense(images[i], short_side=32) for i in range(index, 6, 3)]
+
+    with ThreadPoolExecutor(3) as pool:
+        for index, found in enumerate(pool.map(work, range(3))):
+            for tensor, reference in zip(found, expected[index::3]):
+                torch.testing.assert_close(tensor, reference, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "options", [{"stride": 0}, {"facet": "value"}, {"layer": 3}, {"layer": -4}]
+)  # the tiny model has three layers
+def test_bad_dense_options_are_refused(dino, options):
+    with pytest.raises(ValueError):
+        dino.encode_dense(torch.rand(3, 32, 32), **options)
+
+
+def test_the_content_hash_follows_the_weights_and_the_configuration(clip_folder, tmp_path):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(clip_folder, copy)
+    assert hub.content_hash(copy) == hub.content_hash(clip_folder)
+    (copy / "README.md").write_text("prose does not matter")
+    assert hub.content_hash(copy) == hub.content_hash(clip_folder)
+    weights = bytearray((copy / "model.safetensors").read_bytes())
+    weights[-1] ^= 1
+    (copy / "model.safetensors").write_bytes(weights)
+    assert hub.content_hash(copy) != hub.content_hash(clip_folder)
+
+
+def test_normalization_falls_back_to_the_family_with_a_warning(siglip_folder, tmp_path, caplog):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(siglip_folder, copy)
+    (copy / "preprocessor_config.json").unlink()
+    with caplog.at_level(logging.WARNING, logger="lexsplat"):
+        encoder = ClipEncoder(copy, "bare")
+    assert "no preprocessing file" in caplog.text
+    assert encoder._mean.flatten().tolist() == [0.5, 0.5, 0.5]
+
+
+# -- where models come from
+
+
+@pytest.mark.parametrize(
+    ("load", "name"), [(load_clip, "lexsplat/no-such-clip"), (load_dino, "lexsplat/no-such-dino")]
+)
+def test_a_missing_model_ends_in_one_line_with_three_ways_out(load, name, monkeypatch, tmp_path):
+    import huggingface_hub
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    calls = []
+
+    def no_network(repo, **options):
+        calls.append(options)
+        if options.get("local_files_only"):
+            raise huggingface_hub.errors.LocalEntryNotFoundError("nothing cached")
+        raise ConnectionError("no route")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", no_network)
+    start = time.perf_counter()
+    with pytest.raises(ModelError) as caught:
+        load(name)
+    message = str(caught.value)
+    kind = "clip" if load is load_clip else "dino"
+    assert "\n" not in message
+    for part in (name, "internet", f"--{kind} FOLDER", f"--{kind} bundled"):
+        assert part in message
+    assert calls[0]["local_files_only"]  # the cache comes first
+    assert calls[-1]["etag_timeout"] <= 10
+    assert all("safetensors" in " ".join(c["allow_patterns"]) for c in calls if "allow_patterns" in c)
+    assert time.perf_counter() - start < 5
+
+
+def test_an_invalid_name_and_a_wrong_folder_are_told(tmp_path, clip_folder, siglip_folder):
+    with pytest.raises(ModelError, match="neither a folder nor a valid model name"):
+        load_clip("not a//name")
+    with pytest.raises(ModelError, match="an empty folder"):
+        load_clip(str(tmp_path))
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ModelError, match=r"model\.safetensors"):
+        load_dino(str(tmp_path))
+    with pytest.raises(ModelError, match="CLIP-like"):
+        load_clip(str(hub.BUNDLED_ENCODERS / "dino"))
+    with pytest.raises(ModelError, match="vision transformer"):
+        load_dino(str(clip_folder))
+
+
+def test_truncated_weights_are_told(clip_folder, tmp_path):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(clip_folder, copy)
+    weights = (copy / "model.safetensors").read_bytes()
+    (copy / "model.safetensors").write_bytes(weights[: len(weights) // 2])
+    with pytest.raises(ModelError, match="transformers can load"):
+        load_clip(str(copy))
+
+
+def test_pickled_weights_are_never_loaded(clip_folder, tmp_path):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(clip_folder, copy)
+    (copy / "model.safetensors").unlink()
+    torch.save({"weight": torch.zeros(1)}, copy / "pytorch_model.bin")
+    with pytest.raises(ModelError, match=r"expected .*model\.safetensors"):
+        load_clip(str(copy))
+
+
+def test_safetensors_come_from_the_conversion_request_where_main_has_none(clip_folder, monkeypatch, tmp_path):
+    import shutil
+    from types import SimpleNamespace
+
+    import huggingface_hub
+
+    bare, converted = tmp_path / "bare", tmp_path / "converted"
+    shutil.copytree(clip_folder, bare)
+    (bare / "model.safetensors").unlink()
+    shutil.copytree(clip_folder, converted)
+
+    def fetch(repo, *, revision="main", local_files_only=False, **options):
+        if local_files_only:
+            raise huggingface_hub.errors.LocalEntryNotFoundError("nothing cached")
+        return str(converted if revision == "refs/pr/7" else bare)
+
+    request = SimpleNamespace(git_reference="refs/pr/7")
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", fetch)
+    monkeypatch.setattr(
+        huggingface_hub.HfApi, "get_repo_discussions", lambda *args, **options: iter([request])
+    )
+    assert hub.model_folder("someone/model", "clip") == converted
+
+
+def test_a_cached_model_is_found_without_network_even_under_a_request(clip_folder, monkeypatch, tmp_path):
+    """The cache's own layout: models--A--B/{refs,snapshots}; nothing is mocked but the place."""
+    import shutil
+
+    import huggingface_hub
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    home = tmp_path / "models--someone--model"
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    (home / "refs" / "refs" / "pr").mkdir(parents=True)  # the revision's name is "refs/pr/7"
+    (home / "refs" / "refs" / "pr" / "7").write_text(commit)
+    shutil.copytree(clip_folder, home / "snapshots" / commit)
+    found = huggingface_hub.snapshot_download(
+        "someone/model", revision="refs/pr/7", local_files_only=True, cache_dir=tmp_path
+    )
+    original = huggingface_hub.snapshot_download
+    monkeypatch.setattr(
+        huggingface_hub,
+        "snapshot_download",
+        lambda *args, **options: original(*args, cache_dir=tmp_path, **options),
+    )
+    assert hub.model_folder("someone/model", "clip") == Path(found)
+
+
+def test_sharded_weights_need_every_shard(clip_folder, tmp_path):
+    import shutil
+
+    folder = tmp_path / "sharded"
+    shutil.copytree(clip_folder, folder)
+    (folder / "model.safetensors").rename(folder / "model-00001-of-00002.safetensors")
+    index = {"weight_map": {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}}
+    (folder / "model.safetensors.index.json").write_text(json.dumps(index))
+    assert not hub.is_model_folder(folder)
+    (folder / "model-00002-of-00002.safetensors").write_bytes(b"")
+    assert hub.is_model_folder(folder)
+
+
+# -- the encoders that ship with the package
+
+
+def test_the_embedded_encoders_know_sizes_from_their_configuration():
+    clip, dino = load_clip("bundled"), load_dino("bundled")
+    assert (clip.image_size, clip.dim) == (48, 128)
+    assert (dino.patch_size, dino.dim) == (8, 128)
+    assert clip.encode_images(torch.rand(2, 3, 30, 50)).shape == (2, 128)
+    assert dino.encode_dense(torch.rand(3, 60, 80), short_side=48, stride=4).shape == (12, 16, 128)
+
+
+def test_the_embedded_clip_tells_colors_apart():
+    """Its captions name colors: flat pictures of a color must lie nearest to that color's words."""
+    encoder = load_clip("bundled")
+    colors = {
+        "red": (0.8, 0.1, 0.1),
+        "green": (0.1, 0.6, 0.15),
+        "blue": (0.1, 0.2, 0.8),
+        "yellow": (0.9, 0.8, 0.1),
+    }
+    images = torch.stack([torch.tensor(rgb).reshape(3, 1, 1).expand(3, 64, 64) for rgb in colors.values()])
+    similarity = (
+        encoder.encode_images(images) @ encoder.encode_text([f"something {name}" for name in colors]).T
+    )
+    assert similarity.argmax(1).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_embeddings_on_cuda_agree_with_the_cpu():
+    images = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(6))
+    on_cpu, on_gpu = load_clip("bundled", "cpu"), load_clip("bundled", "cuda")
+    assert (on_cpu.encode_images(images) * on_gpu.encode_images(images)).sum(-1).min() > 0.999
+    assert (on_cpu.encode_text(PROMPTS) * on_gpu.encode_text(PROMPTS)).sum(-1).min() > 0.9999
+    dense = [
+        load_dino("bundled", device).encode_dense(images[0], short_side=64) for device in ("cpu", "cuda")
+    ]
+    assert (dense[0] * dense[1]).sum(-1).min() > 0.999

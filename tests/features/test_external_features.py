@@ -1,0 +1,183 @@
+"""Features of other programs, from a folder of arrays through ``build`` to an answer."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import save_file
+from support.tiny_capture import SPHERES, camera_poses, trace
+from test_features import HEIGHT, WIDTH, make_scene
+
+from lexsplat import cli
+from lexsplat.codebook import Codebook
+from lexsplat.features import FeatureMap, external_identity, load_external_features
+from lexsplat.features.encoders import load_clip
+from lexsplat.runtime.errors import FileFormatError, MemoryBudgetError
+
+VIEWS, SIZE = 12, (96, 72)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return make_scene(tmp_path / "images", count=2)
+
+
+def write_arrays(folder: Path, array: np.ndarray) -> Path:
+    for stem in ("left/0", "left/1"):
+        (folder / stem).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"{stem}.npy", array)
+    return folder
+
+
+def numbered(height: int, width: int) -> np.ndarray:
+    """Unit vectors that tell row and column."""
+    row, column = np.mgrid[:height, :width] + 0.5
+    angle, tilt = 0.5 + row / height, 0.5 + column / width
+    parts = [np.cos(angle) * np.cos(tilt), np.cos(angle) * np.sin(tilt), np.sin(angle)]
+    return np.stack(parts, -1).astype(np.float32)
+
+
+@pytest.mark.parametrize("ending", ["npy", "safetensors", "pair"])
+def test_what_is_finer_than_the_pictures_is_read_at_their_pixels(scene, tmp_path, ending):
+    for name, view in scene.views.items():
+        scene.views[name] = dataclasses.replace(view, camera=view.camera.downscaled(4))
+    large = numbered(HEIGHT * 2, WIDTH * 2)
+    folder = write_arrays(tmp_path / "arrays", large)
+    for path in folder.rglob("*.npy"):
+        if ending == "safetensors":
+            save_file({"clip": torch.from_numpy(large)}, path.with_suffix(".safetensors"))
+            path.unlink()
+        elif ending == "pair":
+            np.save(path.with_name(path.stem + "_f.npy"), large.reshape(-1, 3))
+            pixels = np.arange(large[..., 0].size).reshape(1, *large.shape[:2])
+            np.save(path.with_name(path.stem + "_s.npy"), pixels)
+            path.unlink()
+    found = load_external_features(folder, scene)["left/0.png"].clip
+    assert found.shape == (8, 12, 3)
+    np.testing.assert_allclose(found, large[4::8, 4::8], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"),
+    [((16, 24), True), ((15, 24), True), ((16, 25), True), ((24, 16), False), ((3, 24), False)],
+)
+def test_an_array_has_the_photos_shape_but_for_a_cell(scene, tmp_path, shape, fits):
+    folder = write_arrays(tmp_path / "arrays", numbered(*shape))
+    maps = load_external_features(folder, scene)
+    if fits:
+        assert maps["left/0.png"].clip.shape == (*shape, 3)
+    else:
+        with pytest.raises(FileFormatError, match="photo's shape, 48x32, found"):
+            maps["left/0.png"]
+
+
+def test_features_that_words_cannot_be_compared_with_are_refused(scene, tmp_path):
+    maps = load_external_features(write_arrays(tmp_path, numbered(4, 6)), scene, dimension=512)
+    with pytest.raises(
+        FileFormatError, match=r"depth 512, as the encoder of the words.*found 3; name with --clip"
+    ):
+        maps["left/0.png"]
+
+
+def test_a_map_beyond_the_memory_is_refused_before_it_is_read(scene, tmp_path):
+    maps = load_external_features(write_arrays(tmp_path, numbered(HEIGHT, WIDTH)), scene, memory=1 << 20)
+    with pytest.raises(MemoryBudgetError, match="features of 48x32x3 of a view"):
+        maps["left/0.png"]
+
+
+def test_pixels_without_a_feature_have_no_code(scene, tmp_path):
+    array = numbered(HEIGHT, WIDTH)
+    array[:, :10] = 0
+    folder = write_arrays(tmp_path, array)
+    found = load_external_features(folder, scene)["left/0.png"]
+    codes = Codebook(torch.eye(3)).assign(found)
+    assert (codes[:, :10] == 255).all()
+    assert (codes[:, 10:] < 3).all()
+    with pytest.raises(FileFormatError, match=r"num-codes 255"):
+        load_external_features(folder, scene, allow_holes=False)["left/0.png"]
+    # Where 255 is a code, masks say what does not count; the map itself has no number for it.
+    assert Codebook(torch.eye(256)).assign(FeatureMap(torch.zeros(1, 1, 256))).item() == 0
+
+
+def test_numbers_too_large_for_a_length_are_refused(scene, tmp_path):
+    folder = write_arrays(tmp_path, np.full((4, 6, 3), 1e30, np.float32))
+    with pytest.raises(FileFormatError, match="beyond 1e19"):
+        load_external_features(folder, scene)["left/0.png"]
+
+
+def test_the_identity_follows_every_file_that_is_read(scene, tmp_path):
+    for stem in ("left/0", "left/1"):
+        (tmp_path / stem).parent.mkdir(exist_ok=True)
+        np.save(tmp_path / f"{stem}_f.npy", np.eye(3))
+        np.save(tmp_path / f"{stem}_s.npy", np.zeros((1, 4, 6)))
+    before = external_identity(tmp_path, scene)
+    assert len(before) == 4
+    np.save(tmp_path / "left/1_s.npy", np.zeros((2, 4, 6)))
+    assert external_identity(tmp_path, scene) != before
+
+
+# -- through the command line
+
+
+@pytest.fixture(scope="module")
+def segments(tmp_path_factory) -> Path:
+    """What LangSplat's preprocessing writes of the tiny capture: four levels, -1 for none, features of words."""
+    folder = tmp_path_factory.mktemp("language")
+    features = load_clip("bundled").encode_text(["table top", *SPHERES, "object"]).numpy()
+    for number, (rotation, translation) in enumerate(camera_poses(VIEWS), start=1):
+        hit = trace(rotation, translation, 1.1 * SIZE[0], *SIZE)[1].astype(int)
+        levels = np.full((4, *hit.shape), -1, np.float32)
+        levels[0] = np.where(hit > 0, hit, -1)
+        levels[1] = hit
+        levels[:, :, -8:] = -1
+        np.save(folder / f"view_{number:02d}_f.npy", features.astype(np.float16))
+        np.save(folder / f"view_{number:02d}_s.npy", levels)
+    return folder
+
+
+def embed(capture: Path, output: Path, built: Path, features: Path, *options: str) -> int:
+    return cli.main([
+        "language", str(capture), "--output", str(output), "--splats", str(built / "gaussians.ply"),
+        "--clip", "bundled", "--device", "cpu", "--codebook.num-codes", "16",
+        "--features-from", str(features), *options,
+    ])  # fmt: skip
+
+
+def test_masks_of_another_program_become_answers(tiny_capture, built, segments, tmp_path, capsys):
+    output = tmp_path / "scene"
+    assert embed(tiny_capture, output, built, segments, "--method", "lifted") == 0
+    with Image.open(output / "codes" / "view_01.png") as image:
+        codes = np.asarray(image)
+    assert codes.shape == SIZE[::-1]
+    assert (codes[:, -8:] == 255).all()
+    assert (codes[:, :-8] < 16).all()
+    measure(output)
+
+    assert embed(tiny_capture, output, built, segments) == 0  # averaged, the default
+    measure(output)
+    stages = json.loads((output / "scene.json").read_text())["stages"]
+    capsys.readouterr()
+    assert embed(tiny_capture, output, built, segments) == 0
+    assert "features: 1/1 kept" in capsys.readouterr().err
+    assert json.loads((output / "scene.json").read_text())["stages"] == stages
+
+
+def measure(output: Path) -> None:
+    """Most of every thing is found."""
+    assert cli.main(["evaluate", str(output)]) == 0
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["language"]["strict"]["auto"]["mIoU"] > 0.7
+    assert metrics["language"]["strict"]["mAP"] > 0.9
+
+
+def test_a_view_without_an_array_is_told_before_anything_is_made(tiny_capture, built, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert embed(tiny_capture, tmp_path / "scene", built, tmp_path / "empty") == 1
+    assert "expected view_01.npy, view_01.safetensors or view_01_f.npy" in capsys.readouterr().err
+    assert not (tmp_path / "scene" / "gaussians.ply").exists()

@@ -1,0 +1,662 @@
+"""Feature extraction: the cache on disk, what it depends on, memory, and features from elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from lexsplat.features import (
+    FeatureConfig,
+    FeatureMap,
+    FeatureMaps,
+    TextCache,
+    extract_features,
+    load_external_features,
+    pca_image,
+)
+from lexsplat.features.cache import resize_grid
+from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
+from lexsplat.geometry.cameras import Camera
+from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError
+
+WIDTH, HEIGHT = 48, 32
+
+
+@pytest.fixture(scope="module", autouse=True)
+def two_threads():
+    """So that two workers run, whatever the machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+class ColorEncoder:
+    """Embeds the mean color; counts its work."""
+
+    name, image_size, dim, patches = "color", 8, 4, 2
+    device = torch.device("cpu")
+
+    def __init__(self, content_hash="color", fail_after=None):
+        self.content_hash = content_hash
+        self.crops, self.texts, self.fail_after = 0, 0, fail_after
+        self._lock = threading.Lock()
+
+    def encode_images(self, images):
+        with self._lock:
+            self.crops += len(images)
+            if self.fail_after is not None and self.crops > self.fail_after:
+                raise RuntimeError("stopped in the middle")
+        mean = images.mean((-2, -1))
+        return F.normalize(torch.cat([mean, torch.ones(len(mean), 1)], 1), dim=-1)
+
+    def encode_patches(self, images):
+        """Quarters of the crops, by their mean colors."""
+        quarters = F.adaptive_avg_pool2d(images, 2).permute(0, 2, 3, 1)
+        ones = torch.ones(*quarters.shape[:3], 1)
+        return self.encode_images(images), F.normalize(torch.cat([quarters, ones], -1), dim=-1)
+
+    def encode_text(self, prompts):
+        self.texts += len(prompts)
+        codes = torch.tensor([[float(ord(c)) for c in prompt.ljust(4)[:4]] for prompt in prompts])
+        return F.normalize(codes, dim=-1)
+
+
+class GridEncoder:
+    """Dense features: the image itself, a cell for each block of ``stride`` pixels."""
+
+    name, content_hash, dim = "grid", "grid", 4
+    device = torch.device("cpu")
+
+    def __init__(self):
+        self.images = 0
+
+    def encode_dense(self, image, *, short_side=224, stride=None, facet="key", layer=None, max_tokens=4096):
+        self.images += 1
+        blocks = F.avg_pool2d(image, stride).permute(1, 2, 0)
+        return F.normalize(torch.cat([blocks, torch.ones(*blocks.shape[:2], 1)], -1), dim=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class FakeLens:
+    params: tuple[float, ...] = (40.0, 24.0, 16.0)
+    width: int = WIDTH
+    height: int = HEIGHT
+
+
+@dataclasses.dataclass(frozen=True)
+class FakeView:
+    name: str
+    image_path: Path
+    camera: Camera
+    loads: list
+    lens: FakeLens = FakeLens()
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ignore_path: Path | None = None
+
+    @property
+    def stem(self):
+        return self.name.rsplit(".", 1)[0]
+
+    @property
+    def capture_size(self):
+        with Image.open(self.image_path) as image:
+            return image.size
+
+    def load_image(self, size=None):
+        self.loads.append(self.name)
+        with Image.open(self.image_path) as image:
+            resized = (
+                image if size is None or image.size == size else image.resize(size, Image.Resampling.BOX)
+            )
+            return np.asarray(resized, dtype=np.float32) / 255
+
+
+def make_scene(folder: Path, count: int = 5):
+    rng = np.random.default_rng(0)
+    K = np.array([[40.0, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]])
+    views, loads = {}, []
+    for index in range(count):
+        name = f"left/{index}.png"
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)).save(path)
+        views[name] = FakeView(name, path, Camera(WIDTH, HEIGHT, K, np.eye(4)), loads)
+    return SimpleNamespace(views=views, loads=loads)
+
+
+CONFIG = FeatureConfig(
+    crop_sizes=(0.25, 0.5), crop_strides=(0.5, 0.5), map_cells=8, dino_stride=2, dino_short_side=HEIGHT
+)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return make_scene(tmp_path / "images")
+
+
+def test_the_maps_are_those_of_crops_embedded_one_by_one(scene, tmp_path):
+    maps = extract_features(scene, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path / "cache")
+    assert list(maps) == list(scene.views)
+    for name, view in scene.views.items():
+        image = view.load_image()
+        levels = grid_levels(WIDTH, HEIGHT, CONFIG.crop_sizes, CONFIG.crop_strides)
+        vectors = []
+        for left, top, size in np.concatenate([level.boxes for level in levels]).tolist():
+            patch = image[top : top + size, left : left + size]
+            planes = [
+                Image.fromarray(patch[..., c]).resize((8, 8), Image.Resampling.BICUBIC) for c in range(3)
+            ]
+            color = [np.clip(np.asarray(plane), 0, 1).mean() for plane in planes]
+            vectors.append(np.array([*color, 1.0]) / np.linalg.norm([*color, 1.0]))
+        expected = dense_map(levels, torch.tensor(np.array(vectors)).float(), WIDTH, HEIGHT, 12, 8)
+        found = maps[name]
+        assert found.clip.shape == (8, 12, 4)
+        torch.testing.assert_close(found.clip, expected, atol=2e-3, rtol=0)  # half precision on disk
+        blocks = image.reshape(16, 2, 24, 2, 3).mean((1, 3))  # the grid encoder's cells, 16 x 24
+        assert found.dino.shape == (8, 12, 4)
+        dense = np.concatenate([blocks, np.ones((16, 24, 1))], -1)
+        dense = torch.from_numpy(dense / np.linalg.norm(dense, axis=-1, keepdims=True)).float()
+        torch.testing.assert_close(found.dino, resize_grid(dense, 12, 8), atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("tokens", ["patch", "both"])
+def test_patches_speak_beside_or_instead_of_the_whole_crops(tokens, scene, tmp_path):
+    config = dataclasses.replace(CONFIG, crop_tokens=tokens)
+    maps = extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path / "cache")
+    levels = grid_levels(WIDTH, HEIGHT, CONFIG.crop_sizes, CONFIG.crop_strides)
+    boxes = np.concatenate([level.boxes for level in levels])
+    for name, view in scene.views.items():
+        image = torch.from_numpy(view.load_image()).permute(2, 0, 1)
+        crops = torch.cat(list(cut_crops(image, boxes, 8, 64)))
+        whole, patches = ColorEncoder().encode_patches(crops)
+        expected = patch_map(levels, patches.flatten(1, 2), WIDTH, HEIGHT, 12, 8)
+        if tokens == "both":
+            expected = expected + mean_map(levels, whole, WIDTH, HEIGHT, 12, 8)
+        torch.testing.assert_close(maps[name].clip, F.normalize(expected, dim=-1), atol=2e-3, rtol=0)
+
+
+def test_patches_that_do_not_fit_are_refused_with_a_budget_that_does(scene, tmp_path):
+    class Fine(ColorEncoder):
+        patches = 100
+
+    config = dataclasses.replace(CONFIG, crop_tokens="both", memory=4 << 20)
+    with pytest.raises(MemoryBudgetError, match=r"features\.crop-tokens class"):
+        extract_features(scene, Fine(), None, config, cache_dir=tmp_path)
+    whole = dataclasses.replace(config, crop_tokens="class")
+    assert len(extract_features(scene, Fine(), None, whole, cache_dir=tmp_path)) == 5
+
+
+def test_what_patches_say_is_stored_for_one_size_of_the_maps(scene, tmp_path):
+    config = dataclasses.replace(CONFIG, crop_tokens="both")
+    assert _work(scene, tmp_path) == (True, 5)
+    assert _work(scene, tmp_path, config) == (True, 0)
+    assert _work(scene, tmp_path, dataclasses.replace(config, crop_tokens="patch")) == (False, 0)
+    assert _work(scene, tmp_path, dataclasses.replace(config, map_cells=5)) == (True, 0)
+
+
+def test_a_cached_map_of_patches_that_does_not_fit_is_told(scene, tmp_path):
+    config = dataclasses.replace(CONFIG, crop_tokens="patch")
+    maps = extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path)
+    path = sorted(tmp_path.glob("*.clip.safetensors"))[0]
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    for patches in (None, torch.zeros(3, 3, 4), torch.full((8, 12, 4), torch.nan), torch.zeros(8, 12)):
+        changed = {name: value for name, value in tensors.items() if name != "patches"}
+        save_file(changed if patches is None else {**changed, "patches": patches}, path, metadata)
+        maps.forget()
+        refused = []
+        for name in maps:
+            try:
+                _ = maps[name]
+            except FileFormatError as error:
+                refused.append(str(error))
+        assert len(refused) == 1
+        assert "cached features" in refused[0]
+
+
+def test_maps_are_unit_length_and_without_dino_have_none(scene, tmp_path):
+    maps = extract_features(scene, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
+    for found in maps.values():
+        assert found.dino is None
+        torch.testing.assert_close(found.clip.norm(dim=-1), torch.ones(8, 12))
+
+
+@pytest.mark.parametrize("size", [(4000, 8), (8, 4000)])
+def test_the_maps_of_a_long_strip_have_no_more_cells_than_those_of_a_picture_of_16_by_1(size, tmp_path):
+    scene = make_scene(tmp_path, count=1)
+    (view,) = scene.views.values()
+    Image.new("RGB", size, (90, 20, 60)).save(view.image_path)
+    seen = []
+
+    class Asked(GridEncoder):
+        def encode_dense(self, image, *, short_side=224, **rest):
+            seen.append(short_side)
+            return super().encode_dense(image, short_side=short_side, **rest)
+
+    config = dataclasses.replace(
+        CONFIG, crop_sizes=(0.5,), crop_strides=(1.0,), map_cells=20, dino_short_side=100
+    )
+    maps = extract_features(scene, ColorEncoder(), Asked(), config, cache_dir=tmp_path / "cache")
+    rows, cols = maps[view.name].clip.shape[:2]
+    assert rows * cols == pytest.approx(16 * 20**2, rel=0.2)
+    assert max(rows, cols) / min(rows, cols) == pytest.approx(500, rel=0.2), "cells stay square"
+    assert seen == [round(100 * (16 / 500) ** 0.5)]
+
+
+def test_a_second_run_costs_nothing_and_gives_the_same(scene, tmp_path):
+    first = extract_features(scene, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
+    before = {name: first[name].clip for name in first}
+    scene.loads.clear()
+    clip, dino = ColorEncoder(), GridEncoder()
+    events = []
+    again = extract_features(scene, clip, dino, CONFIG, cache_dir=tmp_path, listener=events.append)
+    assert (clip.crops, dino.images, scene.loads) == (0, 0, [])
+    assert [(event.done, event.total) for event in events] == [(5, 5)]
+    for name in again:
+        assert torch.equal(again[name].clip, before[name])
+
+
+@pytest.mark.parametrize("mode", ["grid", "random"])
+def test_the_number_of_threads_changes_nothing(mode, scene, tmp_path):
+    config = dataclasses.replace(CONFIG, mode=mode, random_crops=40, random_levels=3, random_sizes=(0.2, 0.6))
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        maps = extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path / str(threads))
+        assert torch.get_num_threads() == threads
+        found.append({name: features.clip for name, features in maps.items()})
+    torch.set_num_threads(2)
+    for name in found[0]:
+        torch.testing.assert_close(found[0][name], found[1][name], atol=1e-3, rtol=0)
+
+
+def test_a_killed_run_goes_on_with_what_is_missing(scene, tmp_path):
+    torch.set_num_threads(1)
+    try:
+        whole = ColorEncoder()
+        extract_features(scene, whole, None, CONFIG, cache_dir=tmp_path / "whole")
+        small = dataclasses.replace(CONFIG, memory=4 * 24 * 12 * 64 * 8)  # batches of eight crops
+        broken = ColorEncoder(fail_after=whole.crops // 2)
+        with pytest.raises(RuntimeError, match="stopped in the middle"):
+            extract_features(scene, broken, None, small, cache_dir=tmp_path / "cache")
+        assert not list((tmp_path / "cache").glob(".*"))  # no half-written file stays
+        stored = len(list((tmp_path / "cache").glob("*.safetensors")))
+        assert 0 < stored < 5
+        rest, events = ColorEncoder(), []
+        extract_features(scene, rest, None, small, cache_dir=tmp_path / "cache", listener=events.append)
+        assert rest.crops == whole.crops * (5 - stored) // 5
+        assert [event.done for event in events] == list(range(stored, 6))
+    finally:
+        torch.set_num_threads(2)
+
+
+def test_an_error_in_one_worker_stops_all_and_restores_the_threads(scene, tmp_path):
+    with pytest.raises(RuntimeError, match="stopped in the middle"):
+        extract_features(scene, ColorEncoder(fail_after=0), None, CONFIG, cache_dir=tmp_path)
+    assert torch.get_num_threads() == 2
+    assert threading.active_count() < 10
+
+
+def test_an_unreadable_image_is_told(scene, tmp_path):
+    name = "left/3.png"
+
+    class Broken(FakeView):
+        def load_image(self, size=None):
+            raise CaptureError(self.image_path, expected="an image", found="a truncated file")
+
+    old = scene.views[name]
+    scene.views[name] = Broken(old.name, old.image_path, old.camera, [])
+    with pytest.raises(CaptureError, match="truncated"):
+        extract_features(scene, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
+
+
+def _work(scene, tmp_path, config=CONFIG, clip_hash="color"):
+    clip, dino = ColorEncoder(clip_hash), GridEncoder()
+    extract_features(scene, clip, dino, config, cache_dir=tmp_path)
+    return clip.crops > 0, dino.images
+
+
+def test_the_cache_follows_everything_that_changes_features_and_nothing_else(scene, tmp_path):
+    assert _work(scene, tmp_path) == (True, 5)
+    assert _work(scene, tmp_path) == (False, 0)
+    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, map_cells=5, memory=1 << 25, seed=3)) == (
+        False,
+        0,
+    )
+    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, crop_sizes=(0.3, 0.5))) == (True, 0)
+    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, dino_stride=4)) == (False, 5)
+    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, max_short_side=20)) == (True, 5)
+    assert _work(scene, tmp_path, clip_hash="another") == (True, 0)
+    path = scene.views["left/0.png"].image_path  # same name, same size, other content
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 7, np.uint8)).save(path)
+    assert _work(scene, tmp_path) == (True, 1)
+    view = scene.views["left/1.png"]
+    scene.views["left/1.png"] = dataclasses.replace(view, lens=FakeLens((41.0, 24.0, 16.0)))
+    assert _work(scene, tmp_path) == (True, 1)
+    scene.views["left/1.png"] = dataclasses.replace(view, background=(1.0, 1.0, 1.0))
+    assert _work(scene, tmp_path) == (True, 1)
+    scene.views["left/1.png"] = dataclasses.replace(view, camera=view.camera.downscaled(2))
+    assert _work(scene, tmp_path) == (False, 0)  # the working resolution is not what features are made from
+
+
+def test_a_damaged_cache_file_is_made_anew(scene, tmp_path):
+    extract_features(scene, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
+    files = sorted(tmp_path.glob("*.clip.safetensors"))
+    files[0].write_bytes(files[0].read_bytes()[:-10])
+    files[1].write_bytes(b"")
+    clip = ColorEncoder()
+    maps = extract_features(scene, clip, None, CONFIG, cache_dir=tmp_path)
+    assert clip.crops > 0
+    assert len([maps[name] for name in maps]) == 5
+    files[0].unlink()
+    save_file({"other": torch.zeros(1)}, files[0], {"format_version": "1", "facts": "{}"})
+    fresh = extract_features(scene, clip, None, CONFIG, cache_dir=tmp_path)
+    with pytest.raises(FileFormatError, match="delete the file"):
+        [fresh[name] for name in fresh]
+
+
+def test_the_same_picture_under_two_names_is_encoded_once(scene, tmp_path):
+    torch.set_num_threads(1)
+    twin = dataclasses.replace(scene.views["left/0.png"], name="right/0.png")
+    single = ColorEncoder()
+    views = {"left/0.png": scene.views["left/0.png"]}
+    one = SimpleNamespace(views=views)
+    extract_features(one, single, None, CONFIG, cache_dir=tmp_path / "one")
+    both = SimpleNamespace(views={**views, "right/0.png": twin})
+    clip = ColorEncoder()
+    maps = extract_features(both, clip, None, CONFIG, cache_dir=tmp_path / "both")
+    torch.set_num_threads(2)
+    assert clip.crops == single.crops
+    assert torch.equal(maps["left/0.png"].clip, maps["right/0.png"].clip)
+
+
+def test_what_lies_on_disk_is_small_and_half_precision(scene, tmp_path):
+    extract_features(scene, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
+    for path in tmp_path.glob("*.safetensors"):
+        tensors = load_file(path)
+        large = tensors.get("embeddings", tensors.get("features"))
+        assert large.dtype == torch.float16
+
+
+def test_views_draw_different_random_crops_that_do_not_depend_on_each_other(scene, tmp_path):
+    config = dataclasses.replace(CONFIG, mode="random", random_crops=20, random_levels=2)
+    extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path / "all")
+    first = {"left/0.png": scene.views["left/0.png"]}
+    alone = SimpleNamespace(views=first)
+    extract_features(alone, ColorEncoder(), None, config, cache_dir=tmp_path / "alone")
+    (path,) = (tmp_path / "alone").glob("*.safetensors")
+    stored = {file.name: load_file(file)["lefts.0"] for file in (tmp_path / "all").glob("*.safetensors")}
+    assert torch.equal(load_file(path)["lefts.0"], stored[path.name])
+    assert len({tuple(lefts.tolist()) for lefts in stored.values()}) == 5
+
+
+def test_maps_in_memory_never_exceed_their_bound_and_the_latest_stay():
+    loads = []
+
+    def load(name):
+        loads.append(name)
+        return FeatureMap(torch.zeros(10, 10, 4), torch.zeros(10, 10, 6))
+
+    maps = FeatureMaps("abcd", load, cache_bytes=2 * 4000)
+    for name in "abacad":
+        _ = maps[name]
+        assert maps.cached_bytes <= 8000
+    assert loads == ["a", "b", "c", "d"]  # a was asked for often enough to stay
+    _ = maps["b"]
+    assert loads[-1] == "b"
+    with pytest.raises(KeyError):
+        maps["nothing"]
+    tiny = FeatureMaps("a", load, cache_bytes=10)
+    assert tiny["a"].nbytes == 4000
+    assert tiny.cached_bytes == 0
+
+
+def test_resizing_a_grid_keeps_cell_centers():
+    """A linear ramp of angles sampled at cell centers must stay the same ramp at any size."""
+
+    def ramp(rows, cols):
+        angle = ((torch.arange(cols) + 0.5) / cols * 0.5).expand(rows, cols)
+        return torch.stack([angle.cos(), angle.sin()], -1)
+
+    for rows, cols in ((4, 20), (16, 80), (8, 30)):
+        found = resize_grid(ramp(8, 40), cols, rows)
+        inner = slice(cols // 20 + 1, -cols // 20 - 1)
+        torch.testing.assert_close(found[:, inner], ramp(rows, cols)[:, inner], atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"mode": "spiral"}, {"crop_sizes": ()}, {"crop_sizes": (0.1,)}, {"map_cells": 0}, {"memory": 0},
+        {"dino_stride": 0}, {"crop_sizes": (0.0,) * 7}, {"random_sizes": (0.4, 0.2)}, {"random_crops": 0},
+        {"dino_facet": "query"}, {"crop_tokens": "words"}, {"crop_tokens": "both", "mode": "random"},
+    ],
+)  # fmt: skip
+def test_bad_settings_are_refused_at_once(bad):
+    with pytest.raises(ValueError):
+        FeatureConfig(**bad)
+
+
+# -- features from elsewhere
+
+
+def _external(scene, folder, write):
+    for view in scene.views.values():
+        path = folder / view.stem
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path)
+    return folder
+
+
+def test_arrays_from_elsewhere_are_read_by_stem_and_normalized(scene, tmp_path):
+    array = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float16)
+    folder = _external(scene, tmp_path / "npy", lambda path: np.save(f"{path}.npy", array))
+    maps = load_external_features(folder, scene)
+    assert list(maps) == list(scene.views)
+    expected = array.astype(np.float32)
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    np.testing.assert_allclose(maps["left/2.png"].clip.numpy(), expected, atol=1e-6)
+    tensors = {"clip": torch.from_numpy(array), "dino": torch.ones(5, 7, 2)}
+    folder = _external(scene, tmp_path / "st", lambda path: save_file(tensors, f"{path}.safetensors"))
+    found = load_external_features(folder, scene)["left/2.png"]
+    np.testing.assert_allclose(found.clip.numpy(), expected, atol=1e-6)
+    torch.testing.assert_close(found.dino, torch.full((5, 7, 2), 0.5**0.5))
+
+
+def test_segments_with_features_are_painted_and_levels_averaged(scene, tmp_path):
+    features = np.array([[2.0, 0], [0, 3.0]], np.float32)
+    segments = np.array([[[0, 1], [-1, 0]], [[1, 1], [-1, -1]]], np.float32)
+
+    def write(path):
+        np.save(f"{path}_f.npy", features)
+        np.save(f"{path}_s.npy", segments)
+
+    found = load_external_features(_external(scene, tmp_path / "fs", write), scene)["left/0.png"]
+    half = 0.5**0.5
+    expected = torch.tensor([[[half, half], [0, 1]], [[0, 0], [1, 0]]])  # no segment: zero
+    torch.testing.assert_close(found.clip, expected)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((4, 4)), r"expected features \[h, w, D\]"),
+        (np.full((2, 2, 3), np.nan), "NaN"),
+        (np.zeros((2, 2, 3), "U1"), "array of numbers"),
+        (np.array([[["a", {}]]], dtype=object), "without pickled objects"),
+    ],
+)
+def test_wrong_arrays_from_elsewhere_are_told(array, message, scene, tmp_path):
+    folder = _external(scene, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True))
+    with pytest.raises(FileFormatError, match=message):
+        load_external_features(folder, scene)["left/0.png"]
+
+
+def test_missing_and_mismatched_arrays_from_elsewhere_are_told(scene, tmp_path):
+    with pytest.raises(FileFormatError, match="no folder"):
+        load_external_features(tmp_path / "nowhere", scene)
+    folder = _external(
+        scene, tmp_path / "x", lambda path: np.save(f"{path}.npy", np.ones((2, 2, 3), np.float32))
+    )
+    np.save(folder / "left/1.npy", np.ones((2, 2, 5), np.float32))
+    maps = load_external_features(folder, scene)
+    _ = maps["left/0.png"]
+    with pytest.raises(FileFormatError, match="depth"):
+        maps["left/1.png"]
+    (folder / "left/1.npy").unlink()
+    with pytest.raises(FileFormatError, match=r"left/1\.npy"):
+        load_external_features(folder, scene)
+    (folder / "left/1.npy").write_bytes(b"\x93NUMPY")
+    with pytest.raises(FileFormatError, match="npy array"):
+        load_external_features(folder, scene)["left/1.png"]
+    np.save(folder / "left/0_s.npy", np.full((2, 2), 4))
+    np.save(folder / "left/0_f.npy", np.ones((4, 3)))
+    (folder / "left/0.npy").unlink()
+    with pytest.raises(FileFormatError, match="whole numbers from -1 to 3"):
+        load_external_features(folder, scene)["left/0.png"]
+
+
+# -- text and pictures
+
+
+def test_a_prompt_is_embedded_once_and_kept_on_disk(tmp_path):
+    encoder = ColorEncoder()
+    cache = TextCache(tmp_path)
+    prompts = ["red apple", 'äpfel\n"quoted"', "red apple", "__metadata__"]
+    found = cache.encode("color", prompts, lambda: encoder)
+    assert encoder.texts == 3
+    torch.testing.assert_close(found, ColorEncoder().encode_text(prompts))
+
+    def never():
+        raise AssertionError("the encoder is not needed")
+
+    torch.testing.assert_close(TextCache(tmp_path).encode("color", prompts, never), found)
+    more = TextCache(tmp_path).encode("color", ["new", "red apple"], lambda: encoder)
+    assert encoder.texts == 4
+    torch.testing.assert_close(more[1], found[0])
+    torch.testing.assert_close(TextCache(tmp_path).encode("color", prompts, never), found)
+
+
+def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkeypatch):
+    """In a batch the last bits of an embedding depend on what else is in it."""
+    batches, written = [], []
+
+    class Watched(ColorEncoder):
+        def encode_text(self, prompts):
+            batches.append(list(prompts))
+            return super().encode_text(prompts)
+
+    from lexsplat.features import text
+
+    def write(path, tensors, metadata):
+        written.append(len(tensors))
+
+    monkeypatch.setattr(text, "write_tensors", write)
+    TextCache(tmp_path).encode("color", ["apple", "pear", "apple"], Watched)
+    assert batches == [["apple"], ["pear"]]
+    assert written == [2]
+
+
+def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path, caplog):
+    in_the_way = tmp_path / "texts"
+    in_the_way.write_text("no folder")
+    found = TextCache(in_the_way).encode("color", ["apple"], ColorEncoder)
+    assert found.shape == (1, 4)
+    assert "not kept" in caplog.text
+
+
+def test_a_prompt_whose_end_is_not_heard_is_told(caplog):
+    from lexsplat.features.encoders import load_clip
+
+    clip = load_clip("bundled")
+    clip.encode_text(["something that one could drink from"])
+    assert not caplog.records
+    clip.encode_text(["a very " * 200 + "red apple"])
+    assert "too long: the model hears 24 of its 804 tokens" in caplog.text
+
+
+def test_text_of_another_model_is_never_used(tmp_path):
+    TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
+    other = ColorEncoder("other")
+    TextCache(tmp_path).encode("other", ["apple"], lambda: other)
+    assert other.texts == 1
+    with pytest.raises(ValueError, match="not the model"):
+        TextCache(tmp_path).encode("third", ["apple"], ColorEncoder)
+
+
+def test_a_damaged_text_cache_is_made_anew_and_empty_prompts_are_refused(tmp_path):
+    TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(b"nonsense")
+    assert TextCache(tmp_path).encode("color", ["apple"], ColorEncoder).shape == (1, 4)
+    for prompts in ([], [" "]):
+        with pytest.raises(ValueError, match="not empty"):
+            TextCache(tmp_path).encode("color", prompts, ColorEncoder)
+
+
+def test_the_pca_picture_equals_sklearns_components():
+    from sklearn.decomposition import PCA
+
+    features = torch.from_numpy(np.random.default_rng(0).normal(size=(12, 9, 6)) * [5, 4, 3, 0.5, 0.2, 0.1])
+    picture = pca_image(features)
+    assert picture.dtype == np.uint8
+    assert picture.shape == (12, 9, 3)
+    parts = PCA(3).fit_transform(features.reshape(-1, 6).numpy())
+    low, high = np.percentile(parts, [2, 98], axis=0)
+    expected = np.round(np.clip((parts - low) / (high - low), 0, 1) * 255).reshape(12, 9, 3)
+    for channel in range(3):  # the sign of a component is arbitrary
+        found = picture[..., channel].astype(float)
+        off = min(
+            np.abs(found - expected[..., channel]).max(), np.abs(255 - found - expected[..., channel]).max()
+        )
+        assert off <= 1
+
+
+def test_the_pca_picture_of_equal_or_few_features_is_calm():
+    assert (pca_image(torch.ones(3, 4, 8)) == 128).all()
+    picture = pca_image(torch.rand(5, 5, 1))
+    assert picture.shape == (5, 5, 3)
+    assert (picture[..., 1:] == 128).all()
+    with pytest.raises(ValueError):
+        pca_image(torch.ones(3, 4))
+
+
+def test_the_sparse_settings_take_a_sixth_of_the_crops():
+    def crops(config):
+        return sum(map(len, grid_levels(1297, 840, config.crop_sizes, config.crop_strides)))
+
+    assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
+
+
+def test_embedded_settings_with_the_embedded_encoders_find_the_red_half(tmp_path):
+    """The whole way, photo to answer: relevancy for a color is higher where the color is."""
+    from lexsplat.features.encoders import load_clip, load_dino
+
+    picture = np.zeros((240, 320, 3), np.uint8)
+    picture[:, :160], picture[:, 160:] = (200, 30, 30), (30, 60, 200)
+    path = tmp_path / "a.png"
+    Image.fromarray(picture).save(path)
+    view = FakeView("a.png", path, Camera(320, 240, np.diag([200.0, 200.0, 1.0]), np.eye(4)), [])
+    clip = load_clip("bundled")
+    scene = SimpleNamespace(views={"a.png": view})
+    maps = extract_features(
+        scene, clip, load_dino("bundled"), FeatureConfig.bundled(), cache_dir=tmp_path / "c"
+    )
+    found = maps["a.png"]
+    assert found.clip.shape == (120, 160, 128)
+    assert found.dino.shape == (120, 160, 128)
+    red, blue = clip.encode_text(["something red", "something blue"])
+    reddish = found.clip @ (red - blue)
+    assert reddish[:, :72].min() > 0 > reddish[:, 88:].max()

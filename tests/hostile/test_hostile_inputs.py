@@ -1,0 +1,226 @@
+"""Whatever lies in a file, a reader ends in a right result or in one typed line: never in anything else.
+
+`hostile_readers.py` has every reader with a sound input and what is done to it (`hostile_mutations.py`). It runs in
+two processes beside each other, each with a gigabyte of memory to spare and seconds for each input; a crash, a hang
+or a traceback fails the test that belongs to the reader.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from support import hostile_mutations, hostile_readers
+from support.tiny_capture import write_capture
+from support.written_captures import write_colmap, write_transforms
+
+from lexsplat.captures import load_capture
+from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
+from lexsplat.runtime.files import PICKLES, read_tensors
+from lexsplat.scenes.formats.reading import read_splats
+
+pytestmark = [
+    pytest.mark.xdist_group("hostile"),  # the corpus runs once, for all tests of this file
+    pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux"),
+]
+
+LEAST_INPUTS = 10_000
+GIGABYTE = 1 << 30
+HALVES = (
+    (
+        "colmap_binary", "transforms", "feature_cache", "journal", "spz", "text_cache", "phrases", "masks", "jpeg",
+        "splat", "viewer_memory", "segment_features", "checkpoints", "points_cache", "lerf_ovs", "webp",
+        "trained_scene_folder",
+    ),
+    (
+        "colmap_text", "scene_folder", "splat_ply", "codebook", "code_maps", "compressed_ply", "ksplat", "png",
+        "tiff", "bmp", "ovs3d", "npy_features", "safetensors_features", "split_file", "model_folder",
+        "reconstruction_checkpoints",
+    ),
+)  # fmt: skip
+"""About as much work each."""
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory):
+    """What came of all inputs, by reader."""
+    shared = Path("/dev/shm")
+    base = tmp_path_factory.mktemp("hostile")
+    script = Path(hostile_readers.__file__)
+    runs = []
+    for number, names in enumerate(HALVES):
+        # A folder in memory: ten thousand small files would otherwise wait for a disk.
+        work = (shared if os.access(shared, os.W_OK) else base) / f"lexsplat-hostile-{os.getpid()}-{number}"
+        output = base / f"{number}.json"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        command = [sys.executable, str(script), str(work), str(output), *names]
+        with open(output.with_suffix(".log"), "w") as complaints:
+            process = subprocess.Popen(command, stdout=complaints, stderr=complaints, env=environment)
+        runs.append((process, work, output))
+    reports = {}
+    for process, work, output in runs:
+        try:
+            process.wait(timeout=1500)
+        finally:
+            process.kill()
+            shutil.rmtree(work, ignore_errors=True)
+        if output.exists():
+            reports.update(json.loads(output.read_text()))
+        if process.returncode:
+            current = output.with_suffix(".current")
+            tried = current.read_text() if current.exists() else "the start"
+            reports[tried.split()[0]] = {
+                "crash": f"ended with {process.returncode} at {tried}: {complaints[-2000:]}"
+            }
+    return reports
+
+
+def test_every_reader_is_in_the_corpus():
+    assert sorted(name for names in HALVES for name in names) == sorted(hostile_readers.READERS)
+
+
+@pytest.mark.parametrize("name", sorted(hostile_readers.READERS))
+def test_every_input_is_read_rightly_or_refused_in_one_typed_line(corpus, name):
+    assert name in corpus, "its process ended before it came to this reader"
+    report = corpus[name]
+    assert "crash" not in report, report.get("crash")
+    assert not report["failures"], "\n".join(report["failures"][:20])
+    assert report["peak"] < hostile_readers.BASE_BYTES + GIGABYTE
+
+
+def test_there_are_more_than_ten_thousand_inputs_of_every_kind(corpus):
+    assert sum(report["inputs"] for report in corpus.values()) >= LEAST_INPUTS
+    kinds = {kind for report in corpus.values() for kind in report["kinds"]}
+    assert {"truncated", "flipped", "numbers", "moved", "foreign", "structure", "names", "counts"} <= kinds
+    # A corpus that is only refused, or only taken, tests half of the readers' work.
+    refused = sum(sum(report["errors"].values()) for report in corpus.values())
+    right = sum(report["right"] for report in corpus.values())
+    assert refused > 4000
+    assert right > 1000
+
+
+def test_the_corpus_is_the_same_every_time():
+    content = bytes(range(200))
+    first, second = (list(hostile_mutations.binary(content, np.random.default_rng(1))) for _ in range(2))
+    assert first == second
+
+
+# -- what cannot be made by changing bytes
+
+
+@pytest.mark.parametrize("ending", PICKLES)
+def test_pickles_are_refused_with_the_way_out(tmp_path, ending):
+    path = tmp_path / f"model{ending}"
+    path.write_bytes(b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x93\x94.")
+    for read in (read_splats, read_tensors):
+        with pytest.raises(FileFormatError, match=r"safetensors\.torch\.save_file, or export a \.ply"):
+            read(path)
+
+
+def test_a_pickle_among_features_is_refused_with_the_way_out(tmp_path):
+    from lexsplat.features import load_external_features
+
+    write_transforms(tmp_path / "capture", ["a.png", "b.png"])
+    (tmp_path / "features").mkdir()
+    (tmp_path / "features" / "a.pt").write_bytes(b"PK\x03\x04")
+    with pytest.raises(FileFormatError, match=r"safetensors\.torch\.save_file"):
+        load_external_features(tmp_path / "features", load_capture(tmp_path / "capture"))
+
+
+def test_symlinks_that_lead_nowhere_or_in_circles_are_missing_photos(tmp_path):
+    write_colmap(tmp_path, ["a.png", "b.png", "c.png", "d.png"])
+    for name, target in (("b.png", "nowhere.png"), ("c.png", "c.png"), ("d.png", "../images")):
+        (tmp_path / "images" / name).unlink()
+        (tmp_path / "images" / name).symlink_to(target)
+    scene = load_capture(tmp_path)
+    assert list(scene.views) == ["a.png"]
+    assert "3 of 4 images have no file" in scene.warnings[0]
+
+
+def test_photos_that_are_no_files_are_not_waited_for(tmp_path):
+    write_colmap(tmp_path, ["a.png", "b.png"])
+    (tmp_path / "images" / "b.png").unlink()
+    os.mkfifo(tmp_path / "images" / "b.png")  # whoever opens it waits for ever
+    assert list(load_capture(tmp_path).views) == ["a.png"]
+
+
+def test_names_in_other_alphabets_are_names(tmp_path):
+    names = ["写真/景色.png", "дом и сад.png", "صورة.png", "e\u0301te\u0301.png", "a\u202fb.png"]
+    write_colmap(tmp_path / "colmap", names)
+    write_transforms(tmp_path / "json", names)
+    assert set(load_capture(tmp_path / "colmap").views) == set(names)
+    assert set(load_capture(tmp_path / "json").views) == set(names)
+
+
+def test_two_photos_that_would_share_their_files_are_refused(tmp_path):
+    write_colmap(tmp_path, ["a.png", "a.jpg"])
+    with pytest.raises(CaptureError, match="differ in more than their endings"):
+        load_capture(tmp_path)
+
+
+def turn_around(model: Path) -> None:
+    """All cameras look the other way: everything is behind them."""
+    lines = []
+    for line in (model / "images.txt").read_text().split("\n"):
+        words = line.split()
+        if len(words) == 10:
+            w, x, y, z = map(float, words[1:5])
+            # Half a turn about the camera's y axis, before the pose: (0, 0, 1, 0) times the quaternion.
+            words[1:5] = map(str, (-y, z, w, -x))
+            tx, ty, tz = map(float, words[5:8])
+            words[5:8] = map(str, (-tx, ty, -tz))
+        lines.append(" ".join(words))
+    (model / "images.txt").write_text("\n".join(lines))
+
+
+def same_pose(model: Path) -> None:
+    lines = (model / "images.txt").read_text().split("\n")
+    pose = lines[0].split()[1:8]
+    for row, line in enumerate(lines):
+        words = line.split()
+        if len(words) == 10:
+            lines[row] = " ".join([words[0], *pose, *words[8:]])
+    (model / "images.txt").write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize("kind", ["behind", "one view", "identical views", "identical photos"])
+def test_captures_that_make_no_scene_end_well_or_in_one_line(tmp_path, kind):
+    """Cameras that see nothing, one view only, views at one place: a scene of finite numbers, or a typed error."""
+    from lexsplat.codebook import CodebookConfig
+    from lexsplat.features import FeatureConfig
+    from lexsplat.pipeline.build import build
+    from lexsplat.pipeline.config import BuildConfig
+    from lexsplat.reconstruction import ReconstructionConfig
+    from lexsplat.scenes.scene import open_scene
+
+    capture = write_capture(tmp_path / "capture", views=1 if kind == "one view" else 3, width=32, height=24)
+    shutil.rmtree(capture / "segmentations", ignore_errors=True)
+    model = capture / "sparse" / "0"
+    if kind == "behind":
+        turn_around(model)
+    elif kind.startswith("identical"):
+        same_pose(model)
+        if kind == "identical photos":
+            for path in (capture / "images").iterdir():
+                Image.fromarray(np.full((24, 32, 3), 77, np.uint8)).save(path)
+    config = BuildConfig(
+        clip="bundled", dino="none", device="cpu", iterations=20, downscale=1.0,
+        reconstruction=ReconstructionConfig(max_gaussians=300, sh_degree=1),
+        features=FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24),
+        codebook=CodebookConfig(num_codes=4, steps=5),
+    )  # fmt: skip
+    told = ""
+    try:
+        build(capture, tmp_path / "scene", config)
+    except LexsplatError as error:
+        told = str(error)
+    assert "\n" not in told
+    if not told:
+        hostile_readers.check_open_scene(open_scene(tmp_path / "scene", device="cpu"))

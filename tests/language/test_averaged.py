@@ -1,0 +1,269 @@
+"""Claims about averaged features; the reference is the float64 renderer by definition and sums over its weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from support.language_scene import label_accuracy, make_scene
+from support.rendering_reference import blend, front_camera, project, random_gaussians, to_float64
+from torch.nn.functional import normalize
+
+from lexsplat.codebook import CodebookConfig
+from lexsplat.features import FeatureMap
+from lexsplat.language.fields import LiftedField
+from lexsplat.language.methods.averaged import (
+    AveragedConfig,
+    MeanFeatures,
+    average_features,
+    features_of_codes,
+    field_from_means,
+)
+from lexsplat.runtime.errors import MemoryBudgetError
+from lexsplat.runtime.memory import parse_bytes
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CODES = CodebookConfig(num_codes=5, use_dino=False)
+FULL_SIZE = AveragedConfig(shortest_side=10_000)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+@pytest.fixture(scope="module")
+def small():
+    return make_scene(per_ball=6, views=3, width=20, height=15)
+
+
+def random_features(cameras, dimensions: int = 7, seed: int = 0) -> dict[str, FeatureMap]:
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: FeatureMap(
+            normalize(torch.randn(camera.height, camera.width, dimensions, generator=generator), dim=-1)
+        )
+        for name, camera in cameras.items()
+    }
+
+
+def reference(gaussians, cameras, maps) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of alpha T F and of alpha T over views and pixels that have a feature, float64."""
+    dimensions = next(iter(maps.values())).clip.shape[-1]
+    sums, totals = np.zeros((len(gaussians), dimensions)), np.zeros(len(gaussians))
+    for name, camera in cameras.items():
+        projected = project(to_float64(gaussians), camera, gaussians.antialiased)
+        weights = blend(projected, torch.zeros(len(gaussians), 1), camera)[2].detach().numpy()
+        features = maps[name].clip.double().numpy()
+        known = np.abs(features).sum(-1) > 0
+        weights = weights.reshape(len(gaussians), *known.shape)[:, known]
+        sums += weights @ features[known]
+        totals += weights.sum(1)
+    return sums, totals
+
+
+def test_each_gaussian_has_the_mean_of_the_features_it_has_a_share_in(small) -> None:
+    maps = random_features(small.cameras)
+    found = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
+    sums, totals = reference(small.gaussians, small.cameras, maps)
+    np.testing.assert_allclose(found.totals.numpy(), totals, rtol=1e-4, atol=1e-5)
+    seen = totals > 0.01
+    np.testing.assert_allclose(
+        found.means[seen], sums[seen] / totals[seen, None], atol=2e-3
+    )  # half precision
+
+
+def test_cells_without_a_feature_count_for_nothing(small) -> None:
+    maps = random_features(small.cameras)
+    for name, found in maps.items():
+        found.clip[:, :9] = 0
+        maps[name] = FeatureMap(found.clip)
+    found = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
+    sums, totals = reference(small.gaussians, small.cameras, maps)
+    np.testing.assert_allclose(found.totals.numpy(), totals, rtol=1e-4, atol=1e-5)
+    seen = totals > 0.01
+    np.testing.assert_allclose(found.means[seen], sums[seen] / totals[seen, None], atol=2e-3)
+
+
+def test_masked_pixels_count_for_nothing_also_within_a_cell_that_counts(small) -> None:
+    """Cells of 4 x 3 pixels; the mask ends in the middle of some."""
+    coarse = {
+        name: FeatureMap(normalize(torch.randn(5, 5, 7, generator=torch.Generator().manual_seed(0)), dim=-1))
+        for name in small.cameras
+    }
+    mask = np.ones((15, 20), bool)
+    mask[4:, :9] = False
+    asked = []
+
+    def valid(name: str, size: tuple[int, int]) -> np.ndarray | None:
+        asked.append(size)
+        return mask if name != "view1" else None
+
+    found = average_features(small.gaussians, small.cameras, coarse, FULL_SIZE, valid=valid)
+    fine = {}
+    for name, camera in small.cameras.items():
+        pixels = coarse[name].clip.repeat_interleave(3, 0).repeat_interleave(4, 1)
+        assert pixels.shape[:2] == (camera.height, camera.width)
+        fine[name] = FeatureMap(
+            pixels * torch.from_numpy(mask if name != "view1" else mask | True)[..., None]
+        )
+    sums, totals = reference(small.gaussians, small.cameras, fine)
+    np.testing.assert_allclose(found.totals.numpy(), totals / 12, rtol=1e-4, atol=1e-5)  # in cells
+    seen = totals > 0.12
+    np.testing.assert_allclose(found.means[seen], sums[seen] / totals[seen, None], atol=2e-3)
+    assert set(asked) == {(20, 15)}
+
+
+@pytest.mark.parametrize("memory", [1, 30 * 4 * 67, 30 * 4 * 70])
+def test_a_small_bound_of_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_path) -> None:
+    maps = random_features(small.cameras)
+    whole = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
+    bounded = replace(FULL_SIZE, memory_bytes=memory)
+    heard = []
+    found = average_features(
+        small.gaussians, small.cameras, maps, bounded, scratch=tmp_path / "new", listener=heard.append
+    )
+    assert torch.equal(found.totals, whole.totals)
+    np.testing.assert_allclose(np.asarray(found.means, float), np.asarray(whole.means, float), atol=1e-3)
+    assert (heard[-1].done, heard[-1].total) == ({1: 21, 30 * 4 * 67: 9, 30 * 4 * 70: 6}[memory],) * 2
+    assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
+
+
+def test_the_balls_get_their_codes_and_those_are_the_features_that_were_shown(scene) -> None:
+    maps = features_of_codes(scene.code_maps, scene.codebook)
+    found = average_features(scene.gaussians, scene.cameras, maps, AveragedConfig())
+    field = field_from_means(found, replace(CODES, num_codes=20), AveragedConfig())
+    assert field.codebook.dino is None
+    ball = (field.codebook.clip @ scene.codebook.clip.T).argmax(1)  # that each code speaks of
+    assert (ball[field.codes[:, 0].long()].numpy() == scene.labels).mean() > 0.97
+    renamed = LiftedField(
+        scene.codebook, ball[field.codes.long()].to(torch.uint8), field.weights, field.uncertainties
+    )
+    assert label_accuracy(renamed, scene) > 0.97
+
+
+def test_a_thing_of_few_pixels_keeps_a_code_of_its_own_where_views_disagree_at_random(scene) -> None:
+    """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still says what it is."""
+    generator = np.random.default_rng(1)
+    wrong = {
+        name: np.where(
+            (codes == 4) & (generator.random(codes.shape) < 0.4), generator.integers(0, 4, codes.shape), codes
+        )
+        for name, codes in scene.code_maps.items()
+    }
+    maps = features_of_codes(wrong, scene.codebook)
+    found = average_features(scene.gaussians, scene.cameras, maps, AveragedConfig())
+    field = field_from_means(found, CODES, AveragedConfig())
+    said = (normalize(found.rows(slice(None)), dim=-1) @ scene.codebook.clip.T).argmax(1).numpy()
+    assert (said[scene.labels == 4] == 4).mean() > 0.9
+    assert float(field.uncertainties[scene.labels == 4].mean()) > 1.5 * float(
+        field.uncertainties[scene.labels == 0].mean()
+    )
+
+
+def test_a_gaussian_that_no_view_shows_says_nothing(scene) -> None:
+    hidden = scene.gaussians.map(lambda tensor: torch.cat([tensor, tensor[:1]]))
+    hidden.means[-1] = torch.tensor([50.0, 0.0, 50.0])
+    maps = features_of_codes(scene.code_maps, scene.codebook)
+    found = average_features(hidden, scene.cameras, maps, AveragedConfig())
+    field = field_from_means(found, CODES, AveragedConfig())
+    assert float(field.weights[-1].sum()) == 0
+    assert float(field.uncertainties[-1]) == 1
+    torch.testing.assert_close(field.weights[:-1].sum(1), torch.ones(len(hidden) - 1))
+    none = MeanFeatures(found.means[-1:], found.totals[-1:])  # a scene that no view shows
+    silent = field_from_means(none, CODES, AveragedConfig())
+    assert silent.codebook.num_codes == 1
+    assert float(silent.weights.sum()) == 0
+
+
+def test_weights_are_the_softmax_of_the_cosines_by_hand() -> None:
+    means = np.array([[1, 0], [0, 1], [0.6, 0.6]], np.float16)
+    found = MeanFeatures(means, torch.tensor([1.0, 3.0, 0.25]))
+    config = AveragedConfig(top=2, temperature=0.5)
+    field = field_from_means(found, CodebookConfig(num_codes=2, kmeans_iterations=0), config, seed=0)
+    unit = means.astype(float) / np.linalg.norm(means.astype(float), axis=1, keepdims=True)
+    for row in range(3):
+        cosines = field.codebook.clip.double().numpy() @ unit[row]
+        expected = np.exp(cosines / 0.5) / np.exp(cosines / 0.5).sum()
+        np.testing.assert_allclose(field.weights[row].numpy(), np.sort(expected)[::-1], atol=1e-5)
+        assert int(field.codes[row, 0]) == cosines.argmax()
+    length = float(np.linalg.norm(means[2].astype(float)))
+    expected = [1 - 1 * 1 / 1.25, 1 - 3 / 3.25, 1 - length * 0.5]
+    np.testing.assert_allclose(field.uncertainties.numpy(), expected, atol=1e-5)
+
+
+def test_the_number_of_threads_changes_no_bit_of_what_is_averaged() -> None:
+    gaussians, camera = random_gaussians(20_000, 0, scale=0.02), front_camera(160, 120)
+    maps = random_features({"a": camera}, dimensions=70)
+    results = []
+    for threads in (1, 2, 4):
+        torch.set_num_threads(threads)  # back to one after each test
+        found = average_features(gaussians, {"a": camera}, maps, AveragedConfig())
+        field = field_from_means(found, replace(CODES, num_codes=20), AveragedConfig())
+        means = torch.from_numpy(np.asarray(found.means))
+        results.append([found.totals, means, field.codes, field.weights, field.uncertainties])
+    assert int((results[0][0] > 0).sum()) > 5_000
+    for other in results[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(results[0], other))
+
+
+def test_views_are_taken_at_the_size_of_their_maps_and_weights_are_cells_all_the_same(scene) -> None:
+    """Half of the size gives nearly the same means; without the mip filter views stay as they are."""
+    cameras = {name: camera.downscaled(0.25) for name, camera in scene.cameras.items()}  # four times as large
+    maps = features_of_codes(scene.code_maps, scene.codebook)
+    small = average_features(scene.gaussians, cameras, maps, AveragedConfig(shortest_side=24))
+    large = average_features(scene.gaussians, cameras, maps, AveragedConfig(shortest_side=96))
+    well = large.totals > 1
+    assert int(well.sum()) > 100
+    cosine = normalize(small.rows(well.nonzero()[:, 0]), dim=-1) * normalize(
+        large.rows(well.nonzero()[:, 0]), dim=-1
+    )
+    assert float(cosine.sum(-1).median()) > 0.99
+    assert float((small.totals.sum() / large.totals.sum() - 1).abs()) < 0.1
+    classic = replace(scene.gaussians, antialiased=False)
+    first = average_features(classic, cameras, maps, AveragedConfig(shortest_side=24))
+    second = average_features(classic, cameras, maps, AveragedConfig(shortest_side=96))
+    assert torch.equal(first.totals, second.totals)
+
+
+def test_a_sample_of_gaussians_that_does_not_fit_is_refused_with_one_that_does() -> None:
+    found = MeanFeatures(np.ones((5000, 64), np.float16), torch.ones(5000))
+    with pytest.raises(MemoryBudgetError, match=r"sample-size \d+") as refusal:
+        field_from_means(found, CODES, AveragedConfig(), memory=2_000_000)
+    message = str(refusal.value)
+    fits = int(message.split("sample-size ")[1].split()[0].rstrip(".,)"))
+    enough = parse_bytes(message.split("give --memory ")[1].split(",")[0].replace(" ", ""))
+    field_from_means(found, CODES, AveragedConfig(), memory=enough)
+    assert 100 < fits < 5000
+    field_from_means(found, replace(CODES, sample_size=fits), AveragedConfig(), memory=2_000_000)
+
+
+def test_codes_out_of_range_are_no_features(scene) -> None:
+    codes = np.array([[0, 4], [255, -1]], np.int16)
+    found = features_of_codes({"a": codes}, scene.codebook)["a"].clip
+    assert torch.equal(found[0], scene.codebook.clip[[0, 4]])
+    assert float(found[1].abs().sum()) == 0
+
+
+def test_views_that_are_missing_or_of_another_dimension_are_told(small) -> None:
+    maps = random_features(small.cameras)
+    with pytest.raises(ValueError, match="no training view"):
+        average_features(small.gaussians, {}, maps, FULL_SIZE)
+    with pytest.raises(ValueError, match="view1"):
+        average_features(
+            small.gaussians, small.cameras, {n: m for n, m in maps.items() if n != "view1"}, FULL_SIZE
+        )
+    maps["view1"] = FeatureMap(torch.ones(15, 20, 3))
+    with pytest.raises(ValueError, match="3 dimensions"):
+        average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"top": 0}, {"temperature": 0}, {"shortest_side": 0}, {"memory_bytes": 0}, {"min_visibility": -1}]
+)
+def test_bad_settings_are_refused(bad) -> None:
+    with pytest.raises(ValueError, match="must"):
+        AveragedConfig(**bad)

@@ -1,0 +1,251 @@
+"""Claims about the language fields; references are float64 layers and the renderer by definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from support.language_scene import make_codebook, make_scene
+from support.rendering_reference import blend, project, to_float64
+from torch import nn
+
+from lexsplat.language.fields import (
+    INITIAL_UNCERTAINTY,
+    LanguageField,
+    LiftedField,
+    SmoothingMLP,
+    TrainedField,
+    field_from_tensors,
+    positional_encoding,
+    scene_box,
+)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(per_ball=8, views=2, width=16, height=12, num_codes=70)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def make_trained(scene, **options) -> TrainedField:
+    field = TrainedField.initial(scene.gaussians, scene.codebook, generator=generator(), **options)
+    with torch.no_grad():
+        field.uncertainty_logits.copy_(torch.randn(len(scene.gaussians), generator=generator(1)))
+    return field
+
+
+def make_lifted(scene, columns: int = 4) -> LiftedField:
+    rng = np.random.default_rng(0)
+    count = len(scene.gaussians)
+    codes = np.stack([rng.permutation(scene.codebook.num_codes)[:columns] for _ in range(count)]).astype(
+        np.uint8
+    )
+    weights = rng.random((count, columns))
+    weights /= weights.sum(1, keepdims=True)
+    weights[3] = 0
+    return LiftedField(
+        scene.codebook, torch.tensor(codes), torch.tensor(weights), torch.tensor(rng.random(count))
+    )
+
+
+def layers_by_hand(network: nn.Sequential, values: np.ndarray) -> np.ndarray:
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            values = values @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
+        else:
+            values = np.maximum(values, 0)
+    return values
+
+
+def softmax(values: np.ndarray) -> np.ndarray:
+    exponentials = np.exp(values - values.max(-1, keepdims=True))
+    return exponentials / exponentials.sum(-1, keepdims=True)
+
+
+def rendered_by_definition(scene, name: str, values: np.ndarray) -> np.ndarray:
+    projected = project(to_float64(scene.gaussians), scene.cameras[name], scene.gaussians.antialiased)
+    return blend(projected, torch.from_numpy(values), scene.cameras[name])[0].detach().numpy()
+
+
+def test_layers_are_those_of_the_papers_tables(scene) -> None:
+    field = make_trained(scene)
+    decoder = [
+        (layer.in_features, layer.out_features) for layer in field.decoder if isinstance(layer, nn.Linear)
+    ]
+    smoother = [
+        (layer.in_features, layer.out_features)
+        for layer in field.smoother.layers
+        if isinstance(layer, nn.Linear)
+    ]
+    assert decoder == [(8, 128), (128, 256), (256, 70)]
+    assert smoother == [(3, 128), (128, 128), (128, 128), (128, 8)]
+    for network in (field.decoder, field.smoother.layers):
+        kinds = [type(layer) for layer in network]
+        assert kinds[:-1] == [nn.Linear, nn.ReLU] * (len(kinds) // 2)
+        assert kinds[-1] is nn.Linear
+
+
+def test_training_starts_from_normal_semantics_and_almost_no_uncertainty(scene) -> None:
+    field = TrainedField.initial(scene.gaussians, scene.codebook, generator=generator())
+    assert abs(float(field.semantics.detach().mean())) < 0.2
+    assert float(field.semantics.detach().std()) == pytest.approx(1, abs=0.1)
+    np.testing.assert_allclose(field.uncertainties, INITIAL_UNCERTAINTY, rtol=1e-5)
+
+
+def test_the_start_depends_on_its_generator_only(scene) -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    first = make_trained(scene).tensors()
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(2)
+    second = make_trained(scene).tensors()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("num_frequencies", [0, 1, 3])
+def test_positional_encoding_is_nerfs(num_frequencies: int) -> None:
+    positions = np.random.default_rng(0).uniform(-1, 1, (4, 3))
+    encoded = positional_encoding(torch.tensor(positions), num_frequencies).numpy()
+    for row, position in zip(encoded, positions):
+        angles = [2.0**octave * np.pi * value for octave in range(num_frequencies) for value in position]
+        np.testing.assert_allclose(row, [*position, *np.sin(angles), *np.cos(angles)], atol=1e-6)
+
+
+@pytest.mark.parametrize("num_frequencies", [0, 2])
+def test_smoothing_mlp_is_equation_13_on_the_normalized_scene(num_frequencies: int) -> None:
+    center, extent = torch.tensor([1.0, -2.0, 0.5]), torch.tensor(2.0)
+    network = SmoothingMLP(center, extent, num_frequencies, generator=generator())
+    means = torch.randn(6, 3, generator=generator(2)) * 3
+    unit = np.clip((means.double().numpy() - center.numpy()) / 2.0, -2, 2)
+    encoded = positional_encoding(torch.tensor(unit), num_frequencies).numpy()
+    np.testing.assert_allclose(network(means).detach(), layers_by_hand(network.layers, encoded), atol=1e-5)
+
+
+def test_scene_box_holds_the_scene_and_not_its_floaters() -> None:
+    points = torch.rand(1000, 3, generator=generator()) * torch.tensor([2.0, 4.0, 1.0])
+    points[:5] = 1e4
+    center, extent = scene_box(points)
+    np.testing.assert_allclose(center, [1, 2, 0.5], atol=0.1)
+    assert float(extent) == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_trained_field_renders_equation_8(scene, normalize: bool) -> None:
+    field = make_trained(scene, normalize_rendering=normalize)
+    semantics = rendered_by_definition(scene, "view1", field.semantics.detach().double().numpy())
+    if normalize:
+        semantics = semantics / np.maximum(np.linalg.norm(semantics, axis=-1, keepdims=True), 1e-12)
+    expected = softmax(layers_by_hand(field.decoder, semantics))
+    found = field.render_code_probabilities(scene.gaussians, scene.cameras["view1"])
+    assert found.shape == (12, 16, 70)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    own = field.semantics.detach().double().numpy()
+    own = own / np.linalg.norm(own, axis=1, keepdims=True) if normalize else own
+    np.testing.assert_allclose(
+        field.code_probabilities(), softmax(layers_by_hand(field.decoder, own)), atol=1e-5
+    )
+
+
+def test_semantics_and_uncertainty_are_rendered_together(scene) -> None:
+    field = make_trained(scene)
+    semantics, uncertainty = field.render_semantics(scene.gaussians, scene.cameras["view0"])
+    expected = rendered_by_definition(scene, "view0", field.uncertainties.double().numpy()[:, None])[..., 0]
+    np.testing.assert_allclose(uncertainty.detach(), expected, atol=1e-5)
+    assert semantics.shape == (12, 16, 8)
+    assert uncertainty.min() >= 0
+    assert uncertainty.max() <= 1
+
+
+def test_language_gradients_never_reach_geometry(scene) -> None:
+    gaussians = scene.gaussians.map(lambda tensor: tensor.clone().requires_grad_())
+    field = make_trained(scene)
+    semantics, uncertainty = field.render_semantics(gaussians, scene.cameras["view0"])
+    (field.decode(semantics).square().sum() + uncertainty.sum()).backward()
+    assert all(tensor.grad is None for tensor in gaussians.tensors().values())
+    assert field.semantics.grad.abs().sum() > 0
+    assert field.uncertainty_logits.grad.abs().sum() > 0
+
+
+def test_smoothing_gradients_never_reach_the_places(scene) -> None:
+    means = scene.gaussians.means.clone().requires_grad_()
+    smoother = make_trained(scene).smoother
+    smoother(means).square().sum().backward()
+    assert means.grad is None
+    assert smoother.layers[0].weight.grad.abs().sum() > 0
+
+
+def test_lifted_field_renders_its_distributions(scene) -> None:
+    field = make_lifted(scene)
+    dense = np.zeros((len(scene.gaussians), 70))
+    for n in range(len(dense)):
+        for code, weight in zip(field.codes[n].tolist(), field.weights[n].tolist()):
+            dense[n, code] += weight
+    np.testing.assert_allclose(field.code_probabilities(), dense, atol=1e-7)
+    found = field.render_code_probabilities(scene.gaussians, scene.cameras["view1"])
+    np.testing.assert_allclose(found, rendered_by_definition(scene, "view1", dense), atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [make_trained, make_lifted])
+def test_rendered_scores_are_the_table_applied_to_the_probabilities(scene, make) -> None:
+    field, camera = make(scene), scene.cameras["view0"]
+    table = torch.rand(70, 3, generator=generator(3))
+    probabilities = field.render_code_probabilities(scene.gaussians, camera)
+    scores = field.render_scores(scene.gaussians, camera, table)
+    torch.testing.assert_close(scores, probabilities @ table, rtol=0, atol=1e-5)
+
+
+def test_lifted_scores_rendered_are_the_rendering_of_the_3d_scores(scene) -> None:
+    field = make_lifted(scene)
+    table = torch.rand(70, 40, generator=generator(3))
+    in_space = (field.code_probabilities() @ table).double().numpy()
+    found = field.render_scores(scene.gaussians, scene.cameras["view0"], table)
+    np.testing.assert_allclose(found, rendered_by_definition(scene, "view0", in_space), atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [make_trained, make_lifted])
+def test_a_field_survives_a_safetensors_file(scene, make, tmp_path) -> None:
+    field = make(scene)
+    field.method = "renamed"
+    save_file(field.tensors(), tmp_path / "language.safetensors", field.metadata())
+    with safe_open(tmp_path / "language.safetensors", "pt") as file:
+        again = field_from_tensors({name: file.get_tensor(name) for name in file.keys()}, file.metadata())  # noqa: SIM118
+    assert type(again) is type(field)
+    assert isinstance(again, LanguageField)
+    assert again.method == "renamed"
+    assert again.codebook.lambda_dino == field.codebook.lambda_dino
+    camera = scene.cameras["view0"]
+    assert torch.equal(
+        again.render_code_probabilities(scene.gaussians, camera),
+        field.render_code_probabilities(scene.gaussians, camera),
+    )
+    assert torch.equal(again.uncertainties, field.uncertainties)
+
+
+def test_settings_of_a_trained_field_are_stored(scene) -> None:
+    field = make_trained(scene, normalize_rendering=True, num_frequencies=2)
+    again = TrainedField.from_tensors(field.tensors(), field.metadata())
+    assert again.normalize_rendering
+    assert again.smoother.num_frequencies == 2
+
+
+def test_bad_input_is_refused(scene) -> None:
+    book = make_codebook(3)
+    with pytest.raises(ValueError, match="code 3 is not in a codebook of 3"):
+        LiftedField(book, torch.tensor([[3]], dtype=torch.uint8), torch.ones(1, 1), torch.zeros(1))
+    with pytest.raises(ValueError, match="uint8"):
+        LiftedField(book, torch.tensor([[1]]), torch.ones(1, 1), torch.zeros(1))
+    with pytest.raises(ValueError, match=r"table must be \[70, P\]"):
+        make_lifted(scene).scores(torch.ones(3, 1))
+    with pytest.raises(ValueError, match="neither semantics"):
+        field_from_tensors({})
+    tensors = make_trained(scene).tensors()
+    del tensors["decoder.0.weight"]
+    with pytest.raises(ValueError, match="does not fit"):
+        field_from_tensors(tensors)

@@ -1,0 +1,120 @@
+"""Language beside geometry from the first step: geometry hears nothing of it, language follows density control."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.captures import load_capture
+from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.codebook import Codebook
+from lexsplat.language.methods.joint import JointTrainer
+from lexsplat.language.methods.trained_settings import TrainedConfig
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
+from lexsplat.runtime.checkpoints import Checkpoint
+
+GEOMETRY = ReconstructionConfig(iterations=120, sh_degree=1, densify_min_every=10, max_gaussians=3000)
+LANGUAGE = TrainedConfig(pixel_sample=256, smoothing_sample=64)
+CODES = 4
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_capture):
+    return load_capture(tiny_capture, downscale=2.0)
+
+
+@pytest.fixture(scope="module")
+def points(scene):
+    return initial_points(scene)
+
+
+def trainer(scene, points, strategy="default") -> JointTrainer:
+    from dataclasses import replace
+
+    cameras = {name: scene.views[name].camera for name in scene.train_names}
+    rng = np.random.default_rng(0)
+    code_maps = {name: rng.integers(0, CODES, (12, 16), dtype=np.uint8) for name in cameras}
+    codebook = Codebook(torch.eye(CODES, 6), None, 0.0)
+    reconstructor = Reconstructor(scene, replace(GEOMETRY, strategy=strategy), points, seed=1)
+    return JointTrainer(reconstructor, cameras, code_maps, codebook, LANGUAGE, seed=2)
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_geometry_comes_out_bit_for_bit_as_without_language(scene, points, strategy):
+    joint = trainer(scene, points, strategy)
+    joint.run()
+    gaussians, field = joint.result()
+    alone = Reconstructor(scene, joint.reconstructor.config, points, seed=1)
+    alone.run()
+    for name, tensor in alone.gaussians().tensors().items():
+        assert torch.equal(gaussians.tensors()[name], tensor), name
+    assert len(field.semantics) == len(gaussians)
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_language_goes_where_density_control_takes_its_gaussian(scene, points, strategy):
+    joint = trainer(scene, points, strategy)
+    changes = 0
+    while not joint.done:
+        before = joint.language.field.semantics.detach().clone()
+        colors = joint.reconstructor.gaussians().sh0.clone()
+        joint.reconstructor.step()
+        origins = joint.reconstructor.origins
+        after = joint.reconstructor.gaussians()
+        if origins is None:
+            assert len(after) == len(before)
+            continue
+        changes += 1
+        assert len(origins) == len(after)
+        assert int(origins.max()) < len(before)
+        # A copy has the color of what it was copied from, up to the step that the optimizer takes.
+        assert (after.sh0 - colors[origins]).abs().max() < 0.05
+        joint.language.replace_gaussians(after, origins)
+        assert torch.equal(joint.language.field.semantics.detach(), before[origins])
+    assert changes > 2
+
+
+def test_a_joint_training_that_was_stopped_goes_on_bit_for_bit(scene, points, tmp_path):
+    whole = trainer(scene, points)
+    whole.run()
+
+    class StopsAtSixty(Checkpoint):
+        def after_step(self, trainer) -> None:
+            if trainer.reconstructor.steps_done == 60:
+                self.save(trainer)
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(scene, points).run(checkpoint=StopsAtSixty(tmp_path / "state", "same"))
+    resumed = trainer(scene, points)
+    assert Checkpoint(tmp_path / "state", "same").resume(resumed)
+    assert resumed.reconstructor.steps_done == 60
+    resumed.run()
+    for (name, ours), theirs in zip(
+        whole.result()[1].tensors().items(), resumed.result()[1].tensors().values()
+    ):
+        assert torch.equal(ours, theirs), name
+
+
+def test_joint_training_is_of_the_trained_field_only():
+    with pytest.raises(ValueError, match="trained"):
+        BuildConfig(joint=True)
+    assert BuildConfig(joint=True, method="trained").joint
+
+
+def test_the_command_line_trains_jointly(tiny_capture, tmp_path):
+    import json
+
+    from lexsplat import cli, open_scene
+
+    output = tmp_path / "scene"
+    options = ["--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "60",
+               "--codebook.num-codes", "8", "--method", "trained", "--joint", "--downscale", "2"]  # fmt: skip
+    assert cli.main(["build", str(tiny_capture), "--output", str(output), *options]) == 0
+    stages = json.loads((output / "scene.json").read_text())["stages"]
+    assert list(stages) == ["features", "codebook", "reconstruct", "language"]
+    opened = open_scene(output)
+    assert opened.field.method == "trained"
+    assert opened.scores(["ball"]).shape == (1, len(opened.gaussians))

@@ -1,0 +1,133 @@
+"""Settings: sizes in words, and what is chosen where nothing is said."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lexsplat.features import FeatureConfig
+from lexsplat.language.methods.averaged import AveragedConfig
+from lexsplat.language.methods.lifted import LiftedConfig, TuningConfig
+from lexsplat.language.methods.trained_settings import TrainedConfig
+from lexsplat.pipeline.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig
+from lexsplat.reconstruction import ReconstructionConfig
+from lexsplat.runtime.device import choose_device
+from lexsplat.runtime.errors import BackendError
+from lexsplat.runtime.memory import parse_bytes
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("4GB", 4 << 30), ("512 MiB", 512 << 20), ("1.5g", 3 << 29), ("1000", 1000), ("2tb", 2 << 40)],
+)
+def test_sizes_are_read_as_people_write_them(text, count):
+    assert parse_bytes(text) == count
+
+
+@pytest.mark.parametrize("text", ["", "0", "GB", "-1GB", "4 GBs", "1e9", "lots"])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(ValueError, match="like 4GB"):
+        parse_bytes(text)
+
+
+@given(width=st.integers(1, 20_000), height=st.integers(1, 20_000))
+def test_photos_are_never_enlarged_and_end_near_the_size_that_suits_the_device(width, height):
+    resolved = BuildConfig().resolved("cpu", (width, height))
+    assert resolved.downscale >= 1
+    pixels = width * height / resolved.downscale**2
+    assert pixels <= CPU_PIXELS * 1.8  # factors are whole halves
+
+
+def test_what_is_given_is_not_overruled():
+    config = BuildConfig(downscale=3.0, iterations=77, features=FeatureConfig(map_cells=9))
+    resolved = config.resolved("cpu", (4000, 3000))
+    assert (resolved.downscale, resolved.iterations, resolved.reconstruction.iterations) == (3.0, 77, 77)
+    assert resolved.features.map_cells == 9
+
+
+def test_the_number_of_steps_suits_the_device():
+    assert BuildConfig().resolved("cpu", (10, 10)).reconstruction.iterations == CPU_ITERATIONS
+    assert BuildConfig().resolved("cuda", (10, 10)).reconstruction.iterations == 30_000
+
+
+def test_features_suit_the_encoder_and_the_device():
+    bundled = BuildConfig(clip="bundled").resolved("cpu", (10, 10))
+    assert bundled.features == FeatureConfig.bundled()
+    assert BuildConfig().resolved("cpu", (10, 10)).features == FeatureConfig.sparse()
+    assert BuildConfig().resolved("cuda", (10, 10)).features == FeatureConfig()
+
+
+@pytest.mark.parametrize(("clip", "suited"), [("bundled", "bundled"), ("some/clip", "sparse")])
+def test_one_setting_of_the_features_leaves_the_others_as_they_suit(clip, suited):
+    suited = getattr(FeatureConfig, suited)()
+    random = {"mode": "random", "crop_tokens": None}  # whose crops speak as wholes
+    for change in ({"dino_facet": "token"}, random, {"map_cells": 9}, {"seed": 3}, {"crop_tokens": "class"}):
+        config = BuildConfig(clip=clip, features=FeatureConfig(**change)).resolved("cpu", (10, 10))
+        assert config.features == replace(suited, **change)
+        assert config.resolved("cpu", (10, 10)) == config
+    sizes = (0.1,) * len(FeatureConfig().crop_sizes)  # their strides are the usual ones, and stay
+    config = BuildConfig(clip=clip, features=FeatureConfig(crop_sizes=sizes)).resolved("cpu", (10, 10))
+    strides = FeatureConfig().crop_strides
+    assert config.features == replace(suited, crop_sizes=sizes, crop_strides=strides)
+
+
+def test_steps_set_in_the_part_they_belong_to_are_taken():
+    given = BuildConfig(reconstruction=ReconstructionConfig(iterations=50))
+    assert given.resolved("cpu", (10, 10)).reconstruction.iterations == 50
+    both = replace(given, iterations=60)
+    assert both.resolved("cpu", (10, 10)).reconstruction.iterations == 60
+
+
+def test_fingerprints_hold_what_decides_a_result_and_nothing_else():
+    config = BuildConfig()
+    idle = [
+        replace(config, reconstruction=ReconstructionConfig(image_memory=9)),
+        replace(config, features=FeatureConfig(memory=9)),
+        replace(config, features=FeatureConfig(random_crops=9)),
+        replace(config, trained=TrainedConfig(iterations=9)),
+        replace(config, tuning=TuningConfig(iterations=9)),
+        replace(config, lifted=LiftedConfig(top=3)),
+        replace(config, averaged=AveragedConfig(memory_bytes=9)),
+        replace(config, features=FeatureConfig(dino_stride=9)),
+        replace(config, features=FeatureConfig(crop_tokens="class")),
+    ]
+    assert all(other.decisive() == config.decisive() for other in idle)
+    touched = [
+        replace(config, features=FeatureConfig(map_cells=9)),
+        replace(config, features=FeatureConfig(crop_tokens="both")),
+        replace(config, features=FeatureConfig(mode="random")),
+        replace(config, averaged=AveragedConfig(top=3)),
+        replace(config, method="lifted+tuned"),
+    ]
+    assert all(other.decisive() != config.decisive() for other in touched)
+    random = replace(config, features=FeatureConfig(mode="random", random_crops=9))
+    assert random.decisive() != replace(random, features=FeatureConfig(mode="random")).decisive()
+    lifted = replace(config, method="lifted")
+    assert replace(lifted, averaged=AveragedConfig(top=3)).decisive() == lifted.decisive()
+    assert replace(lifted, lifted=LiftedConfig(top=3)).decisive() != lifted.decisive()
+    assert replace(lifted, lifted=LiftedConfig(memory_bytes=9)).decisive() == lifted.decisive()
+    assert replace(lifted, features=FeatureConfig(dino_stride=9)).decisive() != lifted.decisive()
+    trained = replace(config, method="trained")
+    assert replace(trained, lifted=LiftedConfig(top=3)).decisive() == trained.decisive()
+    longer = replace(trained, trained=TrainedConfig(iterations=9))
+    assert longer.decisive() != trained.decisive()
+    both = replace(config, method="lifted+tuned")
+    for part in ({"lifted": LiftedConfig(top=3)}, {"tuning": TuningConfig(iterations=9)}):
+        assert replace(both, **part).decisive() != both.decisive()
+    plain = replace(lifted, dino="none")
+    assert replace(plain, features=FeatureConfig(dino_stride=9)).decisive() == plain.decisive()
+
+
+def test_resolving_twice_changes_nothing():
+    once = BuildConfig(clip="bundled").resolved("cpu", (800, 600))
+    assert once.resolved("cpu", (800, 600)) == once
+    assert replace(once, seed=1) != once
+
+
+def test_cuda_where_there_is_none_is_told_in_one_line(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto") == "cpu"
+    with pytest.raises(BackendError, match="use --device cpu"):
+        choose_device("cuda")

@@ -1,0 +1,158 @@
+"""From photos alone, or a video, to a scene: by the command line, twice, and found again for evaluation."""
+
+import json
+import os
+import shutil
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.written_captures import save
+from test_photos import (
+    COUNT,
+    SIZE,
+    assert_same_up_to_a_similarity,
+    room_cameras,
+    room_photo,
+    save_as_phone,
+)
+from test_triangulation import texture
+
+from lexsplat import cli
+from lexsplat.captures import load_annotations, load_capture, poses_from_photos
+from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.progress import Event
+from lexsplat.scenes.folder import SceneFolder
+
+QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4"]
+
+
+def textures() -> list[np.ndarray]:
+    return [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+
+
+def run(command: str, capture, output, *further: str) -> int:
+    return cli.main([command, str(capture), "--output", str(output), *QUICK, *further])
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """The room as a phone stores it, with ground truth for one photo and a mask for another."""
+    folder = tmp_path_factory.mktemp("phone")
+    for index, camera in enumerate(room_cameras()):
+        save_as_phone(folder / f"{index}.jpg", room_photo(camera, textures()), 6 if index % 2 else 1)
+    save(folder / "unrelated.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
+    save(folder / "segmentations" / "3" / "wall.png", np.ones((SIZE[1], SIZE[0])))
+    mask = np.ones((SIZE[1], SIZE[0]))
+    mask[:40] = 0
+    save(folder / "masks" / "5.png", mask)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(photos, tmp_path_factory):
+    output = tmp_path_factory.mktemp("scene") / "room"
+    assert run("reconstruct", photos, output) == 0
+    return output
+
+
+def test_photos_alone_become_a_scene_of_upright_views(photos, scene):
+    record = json.loads((scene / "scene.json").read_text())
+    assert record["capture"] == str(photos)
+    assert record["stages"]["poses"]["registered"] == COUNT
+    assert record["stages"]["poses"]["unregistered"] == ["unrelated.png"]
+    views = SceneFolder.open(scene).read_cameras()
+    assert {name: view.split for name, view in views.items()} == {
+        f"{index}.jpg": "test" if index == 3 else "train" for index in range(COUNT)
+    }, "the photo with ground truth is held out"
+    assert_same_up_to_a_similarity([views[f"{index}.jpg"].camera for index in range(COUNT)], room_cameras())
+
+
+def test_the_photos_truth_and_masks_are_found_again(photos, scene, tmp_path):
+    capture = reload_capture(SceneFolder.open(scene))
+    assert len(capture.views) == COUNT
+    assert capture.test_names == ("3.jpg",)
+    assert list(load_annotations(capture).masks["3.jpg"]) == ["wall"]
+    valid = {name: view.load_valid() for name, view in capture.views.items()}
+    assert [name for name in valid if valid[name] is not None] == ["5.jpg"]
+    assert 0.6 < valid["5.jpg"].mean() < 0.8
+    moved = shutil.copytree(photos, tmp_path / "moved")
+    assert reload_capture(SceneFolder.open(scene), moved).root == moved
+
+
+def test_building_again_places_no_photo_again_until_a_setting_changes(photos, scene, tmp_path):
+    copy = shutil.copytree(scene, tmp_path / "copy")
+    model = copy / "poses" / "sparse" / "0" / "images.bin"
+    before = model.stat().st_mtime_ns
+    assert run("reconstruct", photos, copy) == 0
+    assert model.stat().st_mtime_ns == before
+    assert run("reconstruct", photos, copy, "--poses.max-side", "239") == 0
+    assert model.stat().st_mtime_ns != before
+
+
+def test_an_output_that_is_the_photos_folder_is_refused(photos, capsys):
+    assert run("reconstruct", photos, photos) == 1
+    assert "--output" in capsys.readouterr().err
+    assert not (photos / "poses").exists()
+    assert run("reconstruct", photos / "walk.mp4", photos.parent / "nothing") == 1
+    assert "walk.mp4: expected a video, found no such file" in capsys.readouterr().err
+
+
+def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
+    folder, output = tmp_path / "photos", tmp_path / "out"
+    for index, camera in enumerate(room_cameras()):
+        save(folder / f"{index}.png", room_photo(camera, textures()))
+
+    def stop(event: Event) -> None:
+        if event.stage == "poses" and event.done == COUNT:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        poses_from_photos(folder, output, listener=stop)
+    assert (output / ".poses" / "database.db").is_file()
+    assert not (output / "sparse").exists()
+    # Nothing is left to be seen in the photos: what is placed now is placed by features that were kept.
+    for file in folder.iterdir():
+        times, size = file.stat().st_mtime_ns, file.stat().st_size
+        Image.new("RGB", SIZE).save(file)
+        file.write_bytes(file.read_bytes().ljust(size, b"\0"))
+        os.utime(file, ns=(times, times))
+    poses = poses_from_photos(folder, output)
+    assert len(poses.registered) == COUNT
+    views = load_capture(output, images=folder, test_every=0).views
+    assert_same_up_to_a_similarity([views[f"{i}.png"].camera for i in range(COUNT)], room_cameras())
+    assert not (output / ".poses").exists()
+
+
+def test_a_video_becomes_a_scene_that_needs_the_video_no_more(tmp_path):
+    av = pytest.importorskip("av", reason="needs the extra `video` (PyAV)")
+    video = tmp_path / "walk.mp4"
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("mpeg4", rate=Fraction(10), options={"qscale": "2", "flags": "+qscale"})
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        for camera in room_cameras():
+            pixels = (room_photo(camera, textures()) * 255).astype(np.uint8)
+            for _ in range(2):  # every picture twice: of the two, one is enough
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode())
+    output = tmp_path / "scene"
+    assert run("reconstruct", video, output, "--frames", str(COUNT)) == 0
+    frames = sorted(path.name for path in (output / "poses" / "images").glob("*.jpg"))
+    assert len(frames) == COUNT
+    assert len({int(name[6:12]) // 2 for name in frames}) == COUNT
+    assert len(SceneFolder.open(output).read_cameras()) >= COUNT - 1
+    video.unlink()
+    capture = reload_capture(SceneFolder.open(output))
+    assert next(iter(capture.views.values())).load_image().shape[2] == 3
+
+
+def test_photos_that_are_gone_are_told(tmp_path):
+    folder = tmp_path / "photos"
+    for index, camera in enumerate(room_cameras()[:5]):
+        save(folder / f"{index}.png", room_photo(camera, textures()))
+    assert run("reconstruct", folder, tmp_path / "scene", "--test-every", "0") == 0
+    shutil.rmtree(folder)
+    with pytest.raises(SceneFolderError, match="--capture"):
+        reload_capture(SceneFolder.open(tmp_path / "scene"))

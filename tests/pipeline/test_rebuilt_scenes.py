@@ -1,0 +1,182 @@
+"""Questions to a scene while it is rebuilt: the old answer or the new one, never a mix of both, and never none."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+
+import pytest
+import torch
+from conftest import QUICK_BUILD
+
+from lexsplat import cli, open_scene
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.previous import drop_previous, keep_previous
+
+
+@pytest.fixture
+def scene(built, tmp_path):
+    return shutil.copytree(built, tmp_path / "scene")
+
+
+class Builder:
+    """Makes another version of a scene, as a build does: each has its own Gaussians, language, and fingerprints.
+
+    All versions have as many Gaussians, so that numbers alone give no mix away.
+    """
+
+    def __init__(self, root) -> None:
+        self.folder = SceneFolder.open(root)
+        self.gaussians = self.folder.read_gaussians()
+        self.tensors, self.metadata = read_tensors(self.folder.language_path)
+        self.start = self.gaussians.means.clone()
+
+    def begin(self, version: int) -> None:
+        """The first half: new Gaussians beside the language of the old ones."""
+        keep_previous(self.folder)
+        self.folder.save()
+        self.folder.reopen("reconstruct")
+        self.gaussians.means.copy_(self.start + version)
+        self.folder.write_gaussians(self.gaussians)
+        self.folder.finish("reconstruct", f"version {version}", 0.0)
+
+    def end(self, version: int) -> None:
+        """The second half: the language that belongs to them."""
+        self.folder.reopen("language")
+        tensors = {**self.tensors, "uncertainties": torch.full_like(self.tensors["uncertainties"], version)}
+        metadata = {**self.metadata, "reconstruction": f"version {version}"}
+        write_tensors(self.folder.language_path, tensors, metadata)
+        self.folder.finish("language", f"language {version}", 0.0)
+        self.folder.record.pop("building")
+        self.folder.save()
+        drop_previous(self.folder)
+
+
+def version_of(scene, start) -> tuple[int, int]:
+    """The version of the Gaussians and that of the language."""
+    moved = float((scene.gaussians.means - start).mean())
+    return round(moved), round(float(scene.field.uncertainties.mean()))
+
+
+def test_while_a_scene_is_rebuilt_the_one_before_answers(scene):
+    builder = Builder(scene)
+    builder.begin(1)
+    builder.end(1)
+    builder.begin(2)
+    opened = open_scene(scene, device="cpu")
+    assert version_of(opened, builder.start) == (1, 1)
+    assert opened.folder.root == scene, "what is written goes to the scene itself"
+    builder.end(2)
+    assert version_of(open_scene(scene, device="cpu"), builder.start) == (2, 2)
+    assert not list(scene.glob("*previous*"))
+
+
+def test_gaussians_that_change_while_a_scene_is_opened_are_noticed(scene, monkeypatch):
+    builder = Builder(scene)
+    builder.begin(1)
+    builder.end(1)
+    read = SceneFolder.read_gaussians
+    begun = []
+
+    def as_if_a_build_began(folder):
+        if not begun:
+            begun.append(builder.begin(2))
+        return read(folder)
+
+    monkeypatch.setattr(SceneFolder, "read_gaussians", as_if_a_build_began)
+    assert version_of(open_scene(scene, device="cpu"), builder.start) == (1, 1)
+    assert begun
+
+
+def test_without_the_scene_before_it_a_mix_is_refused_in_one_line(scene):
+    builder = Builder(scene)
+    builder.begin(1)
+    shutil.rmtree(scene / "previous")  # as if the folder was copied without it
+    with pytest.raises(SceneFolderError, match="being rebuilt"):
+        open_scene(scene, device="cpu")
+
+
+def test_what_is_kept_is_as_open_to_others_as_the_scene_itself(scene):
+    scene.chmod(0o755)
+    keep_previous(SceneFolder.open(scene))
+    assert (scene / "previous").stat().st_mode & 0o777 == 0o755
+
+
+def test_a_build_that_stopped_half_way_leaves_the_last_whole_scene(scene):
+    builder = Builder(scene)
+    builder.begin(1)
+    builder.end(1)
+    builder.begin(2)
+    again = Builder(
+        scene
+    )  # another build goes on: what it finds is not whole and must not replace what is kept
+    again.begin(3)
+    assert version_of(open_scene(scene, device="cpu"), builder.start) == (1, 1)
+
+
+def test_what_is_about_to_be_replaced_is_neither_measured_nor_changed(scene, capsys):
+    builder = Builder(scene)
+    builder.begin(1)
+    for command in (["evaluate"], ["edit"]):
+        arguments = [str(scene), *(["delete", "--select", "red ball"] if command == ["edit"] else [])]
+        assert cli.main([*command, *arguments]) == 1
+        assert "one at work, or stopped half way" in capsys.readouterr().err
+    assert cli.main(["query", str(scene), "red ball", "--json"]) == 0
+
+
+def test_a_build_keeps_the_scene_until_the_new_one_is_whole(scene, tiny_capture, monkeypatch):
+    seen = []
+
+    def stop(*_, **__):
+        seen.append(open_scene(scene, device="cpu").folder.content.name)
+        raise KeyboardInterrupt
+
+    before = open_scene(scene, device="cpu").gaussians.means
+    monkeypatch.setattr("lexsplat.pipeline.build.make_averaged_field", stop)
+    changed = [*QUICK_BUILD, "--seed", "5"]
+    assert cli.main(["build", str(tiny_capture), "--output", str(scene), *changed]) == 130
+    assert seen == ["previous"]
+    assert torch.equal(open_scene(scene, device="cpu").gaussians.means, before)
+    monkeypatch.undo()
+    assert cli.main(["build", str(tiny_capture), "--output", str(scene), *changed]) == 0
+    assert not (scene / "previous").exists()
+    assert not torch.equal(open_scene(scene, device="cpu").gaussians.means, before)
+
+
+def test_many_questions_beside_many_builds_see_one_version_each(scene):
+    builder = Builder(scene)
+    builder.begin(1)
+    builder.end(1)
+    stop, wrong, seen = threading.Event(), [], []
+
+    def ask() -> None:
+        while not stop.is_set():
+            try:
+                opened = open_scene(scene, device="cpu")
+            except SceneFolderError as error:
+                seen.append(str(error))
+                continue
+            versions = version_of(opened, builder.start)
+            seen.append(versions[0])
+            if versions[0] != versions[1]:
+                wrong.append(versions)
+
+    askers = [threading.Thread(target=ask) for _ in range(3)]
+    for asker in askers:
+        asker.start()
+    try:
+        version = 1
+        while len(seen) < 60 and not wrong:
+            version += 1
+            builder.begin(version)
+            builder.end(version)
+    finally:
+        stop.set()
+        for asker in askers:
+            asker.join()
+    assert not wrong
+    refused = [said for said in seen if isinstance(said, str)]
+    assert len(refused) <= len(seen) / 10, "builds of a millisecond, without end, may outrun a reader"
+    assert version_of(open_scene(scene, device="cpu"), builder.start) == (version, version)

@@ -1,0 +1,60 @@
+"""What is packed: every file of the demo that git knows, and nothing that lies about beside them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pytest brings it along
+
+REPOSITORY = Path(__file__).parents[2]
+DATA = REPOSITORY / "src" / "lexsplat"
+
+
+def patterns() -> list[str]:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    return project["tool"]["setuptools"]["package-data"]["lexsplat"]
+
+
+def packed(root: Path) -> set[str]:
+    found = (path for pattern in patterns() for path in root.glob(pattern) if path.is_file())
+    return {path.relative_to(root).as_posix() for path in found}
+
+
+def test_every_file_of_the_demo_is_packed():
+    shipped = {
+        path.relative_to(DATA).as_posix()
+        for path in (DATA / "demo").rglob("*")
+        if path.is_file()
+        and path.suffix not in (".py", ".pyc")
+        and path.name[0] != "."
+        and "ground_truth" not in path.parts
+    }
+    assert len(shipped) > 400
+    assert shipped | {"py.typed"} == packed(DATA)
+
+
+def test_the_data_of_a_wheel_stay_under_forty_megabytes():
+    assert sum((DATA / path).stat().st_size for path in packed(DATA)) < 38_000_000
+
+
+@pytest.mark.parametrize(
+    "stray",
+    [
+        "demo/__pycache__/demo.cpython-311.pyc",
+        "demo/scenes/tabletop/truth/view_000.npz",
+        "demo/scenes/tabletop/truth/things.json",
+        "demo/scenes/tabletop/images/.DS_Store",
+        "demo/scene/codes/view_000.png",
+    ],
+)
+def test_what_tools_and_runs_leave_beside_the_demo_is_not_packed(tmp_path, stray):
+    path = tmp_path / stray
+    path.parent.mkdir(parents=True)
+    path.touch()
+    assert packed(tmp_path) == set()

@@ -1,0 +1,228 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.question_scene import lifted_cloud, texts
+
+from lexsplat.queries import relevancy as queries
+from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.runtime.errors import QueryError
+
+FORMS = ("feature", "code")
+
+
+def distributions(shape, seed, sharpness=3.0):
+    logits = sharpness * torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+    return logits.softmax(-1)
+
+
+@pytest.fixture(scope="module")
+def lifted():
+    return lifted_cloud()
+
+
+# Text
+
+
+@pytest.mark.parametrize("prompts", [[], [""], ["apple", "  \n"], ""])
+def test_an_empty_prompt_is_an_error_with_a_remedy(prompts):
+    with pytest.raises(QueryError, match="red apple"):
+        queries.expand_templates(prompts)
+
+
+def test_templates_multiply_prompts_in_order():
+    found = queries.expand_templates(["  red   apple ", "cup {x}"], ["a {}", "the {}."])
+    assert found == ["a red apple", "the red apple.", "a cup {x}", "the cup {x}."]
+    with pytest.raises(ValueError, match="once"):
+        queries.expand_templates(["apple"], ["a photo"])
+
+
+def test_averaged_templates_are_mean_directions_whatever_the_lengths():
+    a, b = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 5.0]])
+    found = queries.average_templates(torch.cat([a, b, b, b]), 2)
+    torch.testing.assert_close(found, torch.tensor([[0.5**0.5, 0.5**0.5], [0.0, 1.0]]))
+
+
+def test_prompts_are_embedded_by_one_call():
+    calls = []
+
+    def encode(batch):
+        calls.append(batch)
+        return torch.tensor([[float(len(text)), 1.0] for text in batch])
+
+    found = queries.embed_prompts(["ab", "abcd"], encode, ("{}", "{}!"))
+    assert calls == [["ab", "ab!", "abcd", "abcd!"]]
+    assert found.shape == (2, 2)
+
+
+# Relevancy
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 4), st.integers(1, 5), st.floats(0.5, 100), st.integers(0, 1000))
+def test_relevancy_is_the_least_favorable_pairwise_softmax(prompts, negatives, temperature, seed):
+    rng = np.random.default_rng(seed)
+    positive, negative = rng.uniform(-1, 1, (7, prompts)), rng.uniform(-1, 1, (7, negatives))
+    pairs = np.exp(temperature * positive[..., None]) / (
+        np.exp(temperature * positive[..., None]) + np.exp(temperature * negative[:, None, :])
+    )
+    found = queries.pairwise_relevancy(torch.tensor(positive), torch.tensor(negative), temperature)
+    np.testing.assert_allclose(found.numpy(), pairs.min(-1), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("codes", "dim"), [(5, 64), (64, 64), (96, 32)])
+@pytest.mark.parametrize("sharpness", [0.1, 3.0, 30.0])
+def test_cosines_without_the_feature_map_equal_those_with_it(codes, dim, sharpness):
+    codewords = texts(codes, dim, 0) * torch.linspace(0.5, 2, codes)[:, None]
+    probabilities = distributions((9, 11, codes), 1, sharpness)
+    prompts = texts(6, dim, 2)
+    expected = queries.feature_cosines_naive(probabilities.double(), codewords.double(), prompts.double())
+    found = queries.feature_cosines(probabilities, codewords, prompts)
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5)
+
+
+def test_cosines_do_not_depend_on_the_scale_and_an_empty_row_has_none():
+    probabilities, codewords, prompts = distributions((8, 10), 0), texts(10, 16, 1), texts(3, 16, 2)
+    found = queries.feature_cosines(0.01 * probabilities, codewords, prompts)
+    torch.testing.assert_close(found, queries.feature_cosines(probabilities, codewords, prompts))
+    assert not queries.feature_cosines(torch.zeros(2, 10), codewords, prompts).any()
+
+
+def test_blocks_do_not_show(monkeypatch):
+    probabilities, codewords, prompts = distributions((50, 10), 0), texts(10, 16, 1), texts(3, 16, 2)
+    whole = queries.feature_cosines(probabilities, codewords, prompts)
+    monkeypatch.setattr(queries, "_CHUNK", 7)
+    torch.testing.assert_close(queries.feature_cosines(probabilities, codewords, prompts), whole)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_both_forms_agree_on_hard_codes(form):
+    codewords, positives, negatives = texts(6, 16, 0), texts(2, 16, 1), texts(4, 16, 2)
+    found = queries.probability_relevancy(
+        torch.eye(6), codewords, positives, negatives, QueryConfig(form=form)
+    )
+    torch.testing.assert_close(found, queries.code_relevancy(codewords, positives, negatives))
+
+
+def test_the_code_form_is_linear_and_the_feature_form_is_not():
+    codewords, positives, negatives = texts(6, 16, 0), texts(2, 16, 1), texts(4, 16, 2)
+    mixed = torch.tensor([[0.25, 0.75, 0, 0, 0, 0]])
+    table = queries.code_relevancy(codewords, positives, negatives)
+    expected = 0.25 * table[:1] + 0.75 * table[1:2]
+    by_code = queries.probability_relevancy(mixed, codewords, positives, negatives, QueryConfig(form="code"))
+    torch.testing.assert_close(by_code, expected)
+    by_feature = queries.probability_relevancy(
+        mixed, codewords, positives, negatives, QueryConfig(form="feature")
+    )
+    assert (by_feature - expected).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_not_covered_is_not_relevant(form):
+    codewords, positives, negatives = texts(6, 16, 0), texts(2, 16, 1), texts(4, 16, 2)
+    full = distributions((1, 6), 3)
+    rows = torch.cat([full, 0.4 * full, 0 * full])
+    composite = queries.probability_relevancy(rows, codewords, positives, negatives, QueryConfig(form=form))
+    torch.testing.assert_close(composite[1], 0.4 * composite[0])
+    assert not composite[2].any()
+    config = QueryConfig(form=form, coverage="divide")
+    divided = queries.probability_relevancy(rows, codewords, positives, negatives, config)
+    torch.testing.assert_close(divided[1], composite[0])
+    assert not divided[2].any()
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("coverage", ["composite", "divide"])
+def test_a_view_is_answered_as_its_distributions_are(lifted, form, coverage):
+    field, gaussians, camera = lifted
+    config = QueryConfig(form=form, coverage=coverage)
+    positives, negatives = texts(3, 16, 5), texts(4, 16, 6)
+    found = queries.render_relevancy(field, gaussians, camera, positives, negatives, config)
+    probabilities = field.render_code_probabilities(gaussians, camera)
+    expected = queries.probability_relevancy(probabilities, field.codebook.clip, positives, negatives, config)
+    assert found.shape == (3, 36, 48)
+    torch.testing.assert_close(found, expected.permute(2, 0, 1), rtol=0, atol=2e-5)
+    assert not found[:, 0, 0].any(), "nothing is in the corner"
+
+
+def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted):
+    from lexsplat.rendering import render
+
+    field, gaussians, camera = lifted
+    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form="code")
+    scores = queries.gaussian_relevancy(field, positives, negatives, config)
+    rendered = render(gaussians, camera, features=scores.T.contiguous(), color=False).features
+    found = queries.render_relevancy(field, gaussians, camera, positives, negatives, config)
+    torch.testing.assert_close(found, rendered.permute(2, 0, 1), rtol=0, atol=1e-5)
+    assert found.max() > 0.1
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
+    field, _, _ = lifted
+    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form=form)
+    found = queries.gaussian_relevancy(field, positives, negatives, config)
+    dense = queries.probability_relevancy(
+        field.code_probabilities(), field.codebook.clip, positives, negatives, config
+    )
+    torch.testing.assert_close(found, dense.T, rtol=0, atol=1e-6)
+    assert not found[:, :20].any(), "Gaussians without language answer nothing"
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("coverage", ["composite", "divide"])
+def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, coverage, monkeypatch):
+    """``[N, K]`` of millions of Gaussians would be gigabytes."""
+    field, _, _ = lifted
+    positives, negatives = texts(3, 16, 5), texts(4, 16, 6)
+    config = QueryConfig(form=form, coverage=coverage)
+    whole = queries.gaussian_relevancy(field, positives, negatives, config)
+    most = []
+
+    def probabilities(self):
+        most.append(len(self.codes))
+        return original(self)
+
+    original = type(field).code_probabilities
+    monkeypatch.setattr(type(field), "code_probabilities", probabilities)
+    monkeypatch.setattr(queries, "_GAUSSIANS", 7)
+    found = queries.gaussian_relevancy(field, positives, negatives, config)
+    torch.testing.assert_close(found, whole, rtol=0, atol=1e-6)
+    assert max(most, default=0) <= 7
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_several_prompts_at_once_are_each_alone(lifted, form):
+    field, gaussians, camera = lifted
+    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form=form)
+    together = queries.render_relevancy(field, gaussians, camera, positives, negatives, config)
+    for index in range(3):
+        alone = queries.render_relevancy(
+            field, gaussians, camera, positives[index : index + 1], negatives, config
+        )
+        torch.testing.assert_close(alone[0], together[index], rtol=0, atol=1e-6)
+
+
+def test_embeddings_of_another_encoder_are_refused():
+    with pytest.raises(ValueError, match=r"positives must be \[\*, 16\]"):
+        queries.code_relevancy(texts(6, 16, 0), texts(2, 8, 1), texts(4, 16, 2))
+
+
+@pytest.mark.parametrize(
+    "change", [{"temperature": 0}, {"form": "both"}, {"negatives": ()}, {"threshold": 1.5}, {"coverage": "?"}]
+)
+def test_a_setting_that_cannot_be_is_refused(change):
+    with pytest.raises(ValueError):
+        QueryConfig(**change)
+
+
+# Ranking
+
+
+def test_ranking_is_best_first_and_ties_keep_their_order():
+    scores = torch.tensor([[0.2, 0.9, 0.9, 0.1]])
+    indices, values = queries.ranking(scores, 3)
+    assert indices.tolist() == [[1, 2, 0]]
+    torch.testing.assert_close(values, torch.tensor([[0.9, 0.9, 0.2]]))
+    assert queries.ranking(scores, 10)[0].shape == (1, 4)

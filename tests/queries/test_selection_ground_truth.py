@@ -1,0 +1,76 @@
+"""The ground truth tool: on balls whose labels, places and sizes are known."""
+
+import numpy as np
+import pytest
+import torch
+from selection_ground_truth import (
+    GroundTruthView,
+    lift_labels,
+    selection_f1,
+    surface_points,
+    true_box,
+)
+from support.language_scene import CENTERS, RADIUS, make_scene, trace
+
+from lexsplat.geometry.cameras import Camera
+
+
+def traced(camera: Camera) -> GroundTruthView:
+    """Exact labels (1 to 5, 0 for none) and depth of a view of the balls."""
+    codes = trace(camera)
+    ys, xs = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([xs, ys, np.ones_like(xs)], -1) @ np.linalg.inv(camera.K).T  # depth 1 along the axis
+    world = rays @ camera.viewmat[:3, :3]
+    lengths = np.linalg.norm(world, axis=-1)
+    depth = np.zeros(codes.shape)
+    for code, center in enumerate(CENTERS):
+        here = codes == code
+        half = (world / lengths[..., None]) @ (camera.position - center)
+        root = half**2 - ((camera.position - center) @ (camera.position - center) - RADIUS**2)
+        depth[here] = ((-half - np.sqrt(np.maximum(root, 0))) / lengths)[here]
+    return GroundTruthView(camera, np.where(codes == 255, 0, codes + 1), depth)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(per_ball=150, width=96, height=72)
+
+
+@pytest.fixture(scope="module")
+def views(scene):
+    return [traced(camera) for camera in scene.cameras.values()]
+
+
+def test_lifted_labels_are_those_of_the_balls(scene, views):
+    lifted = lift_labels(scene.gaussians, views, 6)
+    seen = lifted.weights > 1
+    assert seen.float().mean() > 0.8
+    right = lifted.labels[seen].numpy() == scene.labels[seen.numpy()] + 1
+    assert right.mean() > 0.95  # Gaussians at a silhouette may stick out more than they lie on the ball
+    assert (lifted.purity[seen] > 0.5).float().mean() > 0.9
+
+
+def test_what_lies_behind_the_exact_surface_gets_no_label(scene, views):
+    inner = scene.gaussians.select(torch.arange(len(scene.labels)))
+    ball = scene.labels == 0
+    inner.means[ball] = torch.from_numpy(CENTERS[0]).float()  # hidden in the middle of the ball
+    lifted = lift_labels(inner, views, 6, tolerance=0.0)
+    assert (lifted.weights[torch.from_numpy(ball)] == 0).all()
+    assert (lifted.labels[torch.from_numpy(ball)] == 0).all()
+
+
+def test_exact_points_lie_on_the_balls_and_their_boxes_have_the_balls_size(views):
+    for number, center in enumerate(CENTERS, start=1):
+        points = surface_points(views, number, stride=1)
+        assert np.linalg.norm(points - center, axis=1) == pytest.approx(RADIUS, abs=1e-6)
+        box = true_box(points, np.array([0, 0, 1.0]))
+        assert box.center[:2] == pytest.approx(center[:2], abs=0.06)
+        assert box.half_sizes[:2] == pytest.approx(RADIUS, abs=0.06)
+
+
+def test_f1_by_hand():
+    mask, ground_truth = torch.tensor([1, 1, 1, 0, 0]).bool(), torch.tensor([1, 1, 0, 1, 0]).bool()
+    f1, precision, recall = selection_f1(mask, ground_truth, torch.tensor([1.0, 2, 3, 4, 100]))
+    assert (precision, recall) == (pytest.approx(3 / 6), pytest.approx(3 / 7))
+    assert f1 == pytest.approx(2 * 3 / (6 + 7))
+    assert selection_f1(~ground_truth & False, ground_truth, torch.ones(5))[0] == 0

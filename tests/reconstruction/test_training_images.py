@@ -1,0 +1,56 @@
+"""Photos for training: from the file or from the cache the same, and never more cache than allowed."""
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.captures import load_capture
+from lexsplat.reconstruction.image_losses import ssim_target
+from lexsplat.reconstruction.photos import TrainingImages
+
+PHOTO_BYTES = 96 * 72 * 3
+MOMENT_BYTES = 2 * 4 * PHOTO_BYTES
+
+
+@pytest.fixture(scope="module")
+def views(tiny_capture):
+    return load_capture(tiny_capture).train_views
+
+
+@pytest.mark.parametrize("memory", [0, 2 * PHOTO_BYTES, 10 * PHOTO_BYTES + MOMENT_BYTES, 1 << 30])
+def test_targets_do_not_depend_on_the_cache_and_stay_within_it(views, memory):
+    images = TrainingImages(views, memory=memory)
+    for _ in range(2):
+        for view in views:
+            target = images.target(view.name)
+            expected = ssim_target(torch.from_numpy(np.round(view.load_image() * 255)).float() / 255)
+            assert torch.equal(target.image, expected.image)
+            assert torch.equal(target.mean, expected.mean)
+            assert torch.equal(target.variance, expected.variance)
+            assert images.cached_bytes <= memory
+
+
+def test_a_photo_that_fits_is_read_once(views, monkeypatch):
+    reads = []
+    view_type = type(views[0])
+    original = view_type.load_image
+    monkeypatch.setattr(
+        view_type, "load_image", lambda self, size: reads.append(self.name) or original(self, size)
+    )
+    images = TrainingImages(views, memory=2 * PHOTO_BYTES)
+    for _ in range(3):
+        for view in views[:4]:
+            images.target(view.name)
+    assert [reads.count(view.name) for view in views[:4]] == [1, 1, 3, 3]
+
+
+def test_shrunken_images_and_cameras_agree(views):
+    images = TrainingImages(views, memory=1 << 20, shrink=2.0)
+    camera = images.camera(views[0].name)
+    assert (camera.width, camera.height) == (48, 36)
+    assert images.target(views[0].name).image.shape == (36, 48, 3)
+    np.testing.assert_allclose(camera.K[:2], views[0].camera.K[:2] / 2)
+
+
+def test_views_without_a_mask_use_all_pixels(views):
+    assert TrainingImages(views, memory=0).valid(views[0].name) is None

@@ -1,0 +1,402 @@
+"""The parts of the CPU rasterizer on their own: projection, harmonics, pairs, vectors, the kernel cache."""
+
+import logging
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numba.core.caching import NullCache
+from support.rendering_reference import front_camera, random_gaussians
+
+from lexsplat.geometry.cameras import look_at
+from lexsplat.rendering import cpu_backend, pairs
+from lexsplat.rendering.kernels import binning, blending, gradients, lanes
+from lexsplat.rendering.kernels.jit import parallel
+
+# ------------------------------------------------------------------------------------------ against gsplat's twins
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_projection_equals_gsplats_torch_twin(antialiased):
+    from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+
+    gaussians, camera = random_gaussians(500, 3, antialiased=antialiased), front_camera(160, 120)
+    gaussians.opacity_logits[:] = 3.0
+    leaves = {k: v.double().requires_grad_() for k, v in gaussians.tensors().items()}
+    covariances, _ = _quat_scale_to_covar_preci(
+        leaves["quats"], leaves["log_scales"].exp(), compute_preci=False
+    )
+    radii, means2d, depths, conics, compensations = _fully_fused_projection(
+        leaves["means"], covariances, torch.from_numpy(camera.viewmat)[None], torch.from_numpy(camera.K)[None],
+        160, 120, calc_compensations=True,
+    )  # fmt: skip
+    opacities = leaves["opacity_logits"].sigmoid()
+    if antialiased:
+        opacities = opacities * compensations[0]
+    ours = gaussians.map(lambda t: t.clone().requires_grad_())
+    found = cpu_backend.project(ours, camera, 0.01)
+    drawn = found[4] > 0
+    # Their box is for opacity 1, ours for the opacity there is: what we draw they draw, and hardly less.
+    assert (radii[0].amin(-1) > 0)[drawn].all()
+    assert drawn.float().mean() > 0.5
+    for mine, theirs in zip(found[:4], (means2d[0], conics[0], opacities, depths[0])):
+        assert torch.allclose(mine[drawn].double(), theirs[drawn], rtol=2e-5, atol=2e-5)
+
+    g = torch.Generator().manual_seed(0)
+    grads = [torch.randn(t.shape, generator=g) * drawn.reshape(-1, *[1] * (t.ndim - 1)) for t in found[:3]]
+    torch.autograd.backward(found[:3], grads)
+    torch.autograd.backward((means2d[0], conics[0], opacities), [t.double() for t in grads])
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        mine, theirs = getattr(ours, name).grad.double(), leaves[name].grad
+        assert torch.allclose(mine, theirs, rtol=2e-4, atol=2e-5 * float(theirs.abs().max())), name
+
+
+def test_what_is_not_drawn_could_not_be_seen():
+    # Radius 0 promises that no pixel gets alpha >= 1/255 (checked in float64 without any box).
+    from support import rendering_reference as reference
+
+    gaussians, camera = random_gaussians(400, 8, antialiased=True), front_camera(40, 30)
+    gaussians.means.mul_(2.5)
+    leaves = {k: v.double() for k, v in gaussians.tensors().items()}
+    projected = reference.project(leaves, camera, antialiased=True)
+    *_, radii, extents, _ = cpu_backend.project(gaussians, camera, 0.01)
+    hidden = (radii == 0) & (projected["depth"] > 0.01)
+    assert int(hidden.sum()) > 50
+    xs, ys = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(30) + 0.5, indexing="xy")
+    offset = torch.stack([xs, ys], -1).double() - projected["means2d"][:, None, None]
+    power = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", offset, projected["conic"], offset)
+    alpha = projected["opacity"][:, None, None] * torch.exp(-power)
+    assert (alpha[hidden] < 1 / 255).all()
+    # And no alpha >= 1/255 lies outside the box.
+    outside = (offset.abs() > extents[:, None, None] + 1e-3).any(-1)
+    drawn = radii > 0
+    assert (alpha[drawn][outside[drawn]] < 1 / 255 * (1 + 1e-5)).all()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_colors_equal_gsplats_torch_twin(degree):
+    from gsplat.cuda._torch_impl import _spherical_harmonics
+
+    gaussians, camera = random_gaussians(300, degree, degree=4), front_camera()
+    leaves = {k: v.double().requires_grad_() for k, v in gaussians.tensors().items()}
+    coefficients = torch.cat([leaves["sh0"], leaves["shN"]], 1)
+    direction = leaves["means"] - torch.from_numpy(camera.position)
+    expected = (_spherical_harmonics(degree, direction, coefficients) + 0.5).clamp_min(0)
+    ours = gaussians.map(lambda t: t.clone().requires_grad_())
+    projected = list(cpu_backend.project(ours, camera, 0.01))
+    projected[4] = torch.ones(300, dtype=torch.int32)  # colors of all, drawn or not
+    projected[6] = ours.means
+    found = cpu_backend.shade(ours, camera, tuple(projected), degree)
+    assert torch.allclose(found.double(), expected, atol=1e-5)
+    grad = torch.randn(300, 3, generator=torch.Generator().manual_seed(1))
+    found.backward(grad)
+    expected.backward(grad.double())
+    for name in ("means", "sh0", "shN"):
+        theirs = leaves[name].grad if leaves[name].grad is not None else torch.zeros_like(leaves[name])
+        assert torch.allclose(getattr(ours, name).grad.double(), theirs, atol=2e-5, rtol=1e-4), name
+
+
+# ----------------------------------------------------------------------------------------------------------- pairs
+
+
+def random_ellipses(count: int, width: int, height: int, rng: np.random.Generator):
+    """Means, conics, opacities, extents, depths, radii of ellipses around and outside the image."""
+    means = (rng.uniform(-0.3, 1.3, (count, 2)) * (width, height)).astype(np.float32)
+    angle, long, ratio = (
+        rng.uniform(0, np.pi, count),
+        rng.lognormal(1.0, 1.0, count),
+        rng.uniform(0.02, 1, count),
+    )
+    c, s, v1, v2 = np.cos(angle), np.sin(angle), long**2 + 0.3, (long * ratio) ** 2 + 0.3
+    xx, xy, yy = c * c * v1 + s * s * v2, c * s * (v1 - v2), s * s * v1 + c * c * v2
+    conics = (np.stack([yy, -xy, xx], 1) / (v1 * v2)[:, None]).astype(np.float32)
+    opacities = rng.uniform(0.004, 1, count).astype(np.float32)
+    reach = np.sqrt(2 * np.log(opacities * 255.0))[:, None] * np.sqrt(np.stack([xx, yy], 1))
+    depths = rng.choice(np.float32([0.5, 1, 1, 2]), count) * rng.uniform(0.5, 2, count).astype(np.float32)
+    radii = np.where(rng.uniform(size=count) < 0.9, 1, 0).astype(np.int32)
+    return means, conics, opacities, reach.astype(np.float32), depths, radii
+
+
+@pytest.fixture
+def poisoned_memory(monkeypatch):
+    """Memory of np.empty full of what must never be read: NaN, or an index far outside."""
+    empty = np.empty
+
+    def poisoned(shape, dtype=float, *args, **options):
+        array = empty(shape, dtype, *args, **options)
+        array.fill(np.nan if array.dtype.kind == "f" else -(2**30))
+        return array
+
+    monkeypatch.setattr(np, "empty", poisoned)
+
+
+def test_pairs_of_a_thousand_random_scenes_are_complete_permutations(poisoned_memory):
+    rng = np.random.default_rng(0)
+    for _ in range(1000):
+        count, width, height = int(rng.integers(1, 120)), int(rng.integers(1, 90)), int(rng.integers(1, 90))
+        means, conics, opacities, reach, depths, radii = random_ellipses(count, width, height, rng)
+        found = pairs.find_pairs(means, conics, opacities, reach, depths, radii, width, height)
+        total = int(found.tile_offsets[-1])
+        # Sorted by depth, ties by index, visible ones only.
+        visible = np.flatnonzero(radii)
+        assert np.array_equal(found.order, visible[np.argsort(depths[visible], kind="stable")])
+        # Every slot of both lists was written exactly once.
+        assert np.array_equal(np.sort(found.pairs), np.arange(total))
+        assert found.pair_offsets[-1] == total == len(found.members)
+        # Both lists name the same Gaussian, and tiles keep the depth order.
+        owner = np.repeat(np.arange(len(visible)), np.diff(found.pair_offsets))
+        assert np.array_equal(owner[found.pairs], found.members)
+        tile = np.repeat(np.arange(found.tiles), np.diff(found.tile_offsets))
+        assert (np.diff(tile.astype(np.int64) * count + found.members) > 0).all()
+        # Exactly the tiles that the box of the ellipse overlaps at a pixel center.
+        n = found.order
+        columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
+        in_x = np.abs(columns - means[n, :1].astype(float)) <= reach[n, :1] + binning.SLACK
+        in_y = np.abs(rows - means[n, 1:].astype(float)) <= reach[n, 1:] + binning.SLACK
+        tiles_x = np.stack([in_x[:, i : i + 16].any(1) for i in range(0, width, 16)], 1)
+        tiles_y = np.stack([in_y[:, i : i + 16].any(1) for i in range(0, height, 16)], 1)
+        expected = np.stack(np.nonzero((tiles_y[:, :, None] & tiles_x[:, None]).reshape(len(n), -1)), 1)
+        listed = np.stack([found.members, tile], 1)
+        assert np.array_equal(listed[np.lexsort((tile, found.members))], expected)
+
+
+def test_every_number_that_is_read_was_written_before(poisoned_memory):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        count, width, height, channels = (
+            150,
+            int(rng.integers(1, 70)),
+            int(rng.integers(1, 70)),
+            3 + int(rng.integers(6)),
+        )
+        projected = random_ellipses(count, width, height, rng)
+        found = pairs.find_pairs(*projected, width, height)
+        values = rng.uniform(size=(len(found.order), channels)).astype(np.float32)
+        lists = (found.ellipses, found.boxes, found.tile_offsets, found.members)
+        image, alpha = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
+        blending.blend(0, found.tiles, *lists, values, np.ones(3, np.float32), found.tiles_x, image, alpha)
+        assert np.isfinite(image).all()
+        assert np.isfinite(alpha).all()
+        rows = np.empty(len(found.members) * gradients.row_width(channels), np.float32)
+        gradients.blend_backward(
+            0, found.tiles, *lists, found.pairs, values, found.tiles_x, 3, True,
+            image, alpha, np.ones_like(image), np.ones_like(alpha), rows,
+        )  # fmt: skip
+        assert np.isfinite(rows).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(2**-20, 2**30, width=32), min_size=0, max_size=200), st.integers(0, 2**32 - 1))
+def test_the_radix_sort_is_numpys_stable_sort(depths, seed):
+    keys = np.array(depths, np.float32)
+    radii = np.random.default_rng(seed).integers(0, 2, len(keys)).astype(np.int32)
+    order, scratch = np.zeros(len(keys), np.int32), np.zeros(len(keys), np.int32)
+    count = binning.sort_visible(keys.view(np.uint32), radii, order, scratch)
+    visible = np.flatnonzero(radii)
+    assert np.array_equal(order[:count], visible[np.argsort(keys[visible], kind="stable")])
+
+
+# ----------------------------------------------------------------------------------------------------------- lanes
+
+
+@numba.njit
+def _with_lanes(a, b, out):
+    x, y = lanes.load(a, 0), lanes.load(b, 0)
+    lanes.store(out, 0, x + y)
+    lanes.store(out, 16, x - np.float32(2))
+    lanes.store(out, 32, x * y)
+    lanes.store(out, 48, x / y)
+    lanes.store(out, 64, lanes.select_greater(x, y, x, lanes.splat(np.float32(7))))
+    lanes.store_totals(out, 80, x, y, x * y, lanes.splat(np.float32(1)))
+    out[84] = lanes.total(x)
+    out[85] = lanes.any_positive(x)
+    out[86] = lanes.any_positive(lanes.select_greater(x, np.float32(0), np.float32(-1), x))
+
+
+def test_lanes_compute_what_numpy_computes():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 16)).astype(np.float32)
+    out = np.zeros(87, np.float32)
+    _with_lanes(a, b, out)
+    expected = [a + b, a - 2, a * b, a / b, np.where(a > b, a, 7)]
+    assert out[:80] == pytest.approx(np.concatenate(expected), rel=1e-6)
+    sums = [a.sum(), b.sum(), (a * b).sum(), 16, a.sum(), 1, 0]
+    assert out[80:] == pytest.approx(np.array(sums), rel=1e-5, abs=1e-5)
+
+
+@numba.njit
+def _alpha_at(s, opacity):
+    row = blending.alpha_of(lanes.splat(s), lanes.splat(np.float32(0)), np.float32(0), opacity)
+    return lanes.total(row) / np.float32(16)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0, 5.6), st.floats(0.004, 1.0))
+def test_alpha_is_the_exponential_to_three_millionths(exponent, opacity):
+    exact = min(opacity * math.exp(-exponent), 0.999)
+    assume(abs(exact * 255 - 1) > 1e-4)
+    found = _alpha_at(np.float32(-exponent / 8), np.float32(opacity))
+    assert found == pytest.approx(exact if exact >= 1 / 255 else 0.0, rel=3e-6)
+
+
+def test_a_tile_is_finished_when_its_last_pixel_is():
+    for place in range(blending.PIXELS):
+        live = np.full(blending.PIXELS, -0.5, np.float32)
+        assert blending.tile_finished(live)
+        live[place] = 2e-4
+        assert not blending.tile_finished(live)
+
+
+# ----------------------------------------------------------------------------------------------- threads and cache
+
+
+def test_parallel_hands_out_every_item_once_and_passes_errors_on():
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            seen = np.zeros(101, int)
+
+            def mark(start, stop, target):
+                target[start:stop] += 1
+
+            parallel(mark, 101, 7, seen)
+            assert (seen == 1).all()
+
+            def fail(start, stop):
+                raise ZeroDivisionError
+
+            with pytest.raises(ZeroDivisionError):
+                parallel(fail, 101, 7)
+    finally:
+        torch.set_num_threads(before)
+
+
+PROBE = """
+import logging, sys
+logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+from lexsplat.rendering.kernels import binning, jit
+import numpy as np
+binning.offsets_of(np.ones((2, 3), np.int64), np.zeros(4, np.int64))
+print("hits", sum(binning.offsets_of.stats.cache_hits.values()))
+print("at", binning.offsets_of.stats.cache_path)
+"""
+
+
+def run_probe(**environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout
+
+
+def test_compiled_kernels_are_found_again_where_numba_cache_dir_says(tmp_path):
+    first, second = run_probe(NUMBA_CACHE_DIR=str(tmp_path)), run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+    assert "compiling CPU kernels, once" in first
+    assert "hits 0" in first
+    assert "hits 1" in second
+    assert str(tmp_path) in second
+
+
+def test_kernels_of_another_processor_do_no_harm_and_those_of_this_one_are_announced(tmp_path):
+    # A home on a network, a disk that moves to another machine: once they were compiled anew without a word.
+    here = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    run_probe(**here)
+    other = run_probe(**here, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
+    assert "compiling CPU kernels, once" in other
+    assert "hits 0" in other
+    assert "hits 1" in run_probe(**here)
+
+
+def test_what_is_never_compiled_is_not_announced(tmp_path):
+    # Whoever only looks compiles no gradients, and was told "compiling, once" at every start.
+    assert "compiling" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+    assert "compiling" not in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+
+
+def test_every_compilation_of_ours_is_announced_once_and_nobody_elses(monkeypatch, caplog):
+    from lexsplat.reconstruction import adam_kernel as optimizer_kernels
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.setattr(jit, "_announced", False)
+    monkeypatch.setattr(jit, "_dispatchers", set(jit._dispatchers))
+    numbers = [np.ones(3, np.float32) for _ in range(4)]
+    with caplog.at_level(logging.INFO, logger="lexsplat"):
+        numba.njit(lambda x: x + 1)(3)
+        assert not caplog.records
+        for _ in range(2):
+            fresh = jit.kernel(optimizer_kernels._adam.py_func)
+            fresh._cache = NullCache()
+            fresh(0, 3, *numbers, *[np.float32(0.5)] * 6)
+    assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
+
+
+def test_two_processes_that_compile_at_once_do_each_other_no_harm(tmp_path):
+    command = [sys.executable, "-c", PROBE]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    both = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        for _ in range(2)
+    ]
+    assert [process.communicate()[1] for process in both] == [b"", b""]
+    assert [process.returncode for process in both] == [0, 0]
+    assert "hits 1" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+
+
+def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tmp_path, monkeypatch):
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    real = Path.mkdir
+
+    def mkdir(self, *args, **options):
+        if "__pycache__" in self.parts:
+            raise PermissionError(self)
+        return real(self, *args, **options)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    folder = jit._cache_folder.__wrapped__()
+    assert folder.startswith(str(tmp_path / "home" / "lexsplat" / "kernels-"))
+
+
+@pytest.mark.parametrize("homeless", [False, True])
+def test_where_nothing_can_be_written_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch, homeless):
+    # Homeless: a container whose user has no entry in /etc/passwd, and no HOME.
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(jit.tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
+
+    def refused(self, *args, **options):
+        raise PermissionError(self)
+
+    def no_home(self):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "mkdir", refused)
+    if homeless:
+        monkeypatch.setattr(Path, "expanduser", no_home)
+    folder = jit._cache_folder.__wrapped__()
+    assert folder == str(tmp_path / "lexsplat-kernels-")
+
+
+def test_a_far_turned_camera_keeps_depths_positive():
+    camera = look_at(np.array([0.0, 0, 0]), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]), 64, 48, 1.2)
+    gaussians = random_gaussians(300, 4, scale=0.05)
+    _, _, _, depths, radii, *_ = cpu_backend.project(gaussians, camera, 0.2)
+    assert (depths[radii > 0] >= 0.2).all()
+    assert (radii[(gaussians.means[:, 0] < 0.2 - 1e-5)] == 0).all()

@@ -1,0 +1,161 @@
+"""A full disk: one line, exit status 1, the last good state as it was, and the build goes on when there is room."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lexsplat.scenes.scene import open_scene
+
+LONGEST = 3000
+"""Seconds after which a command hangs, however busy the machine is: a build takes ten when it is not."""
+
+LIMITED = """
+import resource, signal, sys
+from lexsplat import cli
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond the limit is an error instead of the end
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
+sys.exit(cli.main(sys.argv[2:]))
+"""
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system in memory with room for 600 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if os.geteuid() != 0:
+        pytest.skip("only root may mount a small file system")
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(place)], capture_output=True
+    )
+    if made.returncode:
+        pytest.skip("mounting is not allowed here")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "lexsplat.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=LONGEST)
+
+
+def build_arguments(capture: Path, output: Path) -> list[str]:
+    return [
+        "build", str(capture), "--output", str(output), "--clip", "bundled", "--dino", "none", "--device", "cpu",
+        "--iterations", "6", "--downscale", "2", "--reconstruction.max-gaussians", "1300",
+        "--codebook.num-codes", "8", "--codebook.steps", "5", "--features.crop-sizes", "0.5",
+        "--features.crop-strides", "0.5", "--features.map-cells", "16",
+        # What is written must not depend on how busy the machine is: no savings by the clock.
+        "--checkpoint-seconds", "1e6",
+    ]  # fmt: skip
+
+
+def assert_one_line(done: subprocess.CompletedProcess) -> None:
+    """What people see of a command that could not write."""
+    assert done.returncode == 1, done.stderr[-2000:]
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert len(errors) == 1, done.stderr[-2000:]
+    assert any(words in errors[0] for words in ("No space left", "File too large", "space")), errors[0]
+
+
+def content(folder: Path) -> dict[str, str]:
+    """Hashes of all files of a folder."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): hashlib.blake2b(path.read_bytes()).hexdigest() for path in files}
+
+
+def no_left_overs(folder: Path) -> bool:
+    return not list(folder.rglob(".*.tmp"))
+
+
+def test_a_build_on_a_full_disk_ends_in_one_line_and_goes_on_when_there_is_room(
+    tiny_capture, small_disk, tmp_path
+):
+    ballast = small_disk / "ballast"
+    ballast.write_bytes(b"\0" * 560_000)
+    arguments = build_arguments(tiny_capture, small_disk / "scene")
+    assert_one_line(run(*arguments))
+    assert no_left_overs(small_disk / "scene")
+    ballast.unlink()  # 600 kB are still not enough for everything: further on it is full again, or done
+    second = run(*arguments)
+    if second.returncode:
+        assert_one_line(second)
+    shutil.move(small_disk / "scene", tmp_path / "scene")
+    assert run(*build_arguments(tiny_capture, tmp_path / "scene")).returncode == 0
+    assert len(open_scene(tmp_path / "scene", device="cpu").gaussians) > 0
+
+
+def test_a_scene_on_a_full_disk_stays_as_it_was(built, small_disk, tmp_path):
+    scene = tmp_path / "scene"
+    shutil.copytree(built, scene)
+    before = content(scene)
+    (small_disk / "ballast").write_bytes(b"\0" * 590_000)
+    assert_one_line(run("export", str(scene), str(small_disk / "scene.ply")))
+    assert not (small_disk / "scene.ply").exists()
+    assert content(scene) == before
+    open_scene(scene, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def limited():
+    """Runs the command line so that no file can become larger than so many bytes: a full disk without a mount."""
+    if not hasattr(resource, "RLIMIT_FSIZE") or not hasattr(signal, "SIGXFSZ"):
+        pytest.skip("no limit of file sizes on this system")
+
+    def command(size: int, *arguments: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            [sys.executable, "-c", LIMITED, str(size), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=LONGEST,
+        )
+
+    return command
+
+
+@pytest.mark.parametrize("size", [200, 3_000, 60_000])
+def test_a_build_that_cannot_write_keeps_the_scene_that_was_there(
+    built, tiny_capture, tmp_path, limited, size
+):
+    scene = tmp_path / "scene"
+    shutil.copytree(built, scene)
+    before = content(scene)
+    done = limited(
+        size, *build_arguments(tiny_capture, scene)
+    )  # other settings: everything is to be done again
+    assert_one_line(done)
+    assert no_left_overs(scene)
+    after = content(scene)
+    changed = [name for name in before if after.get(name) != before[name]]
+    # Whatever was written is whole; Gaussians and language were too large to be written at all.
+    assert not {"gaussians.ply", "language.safetensors"} & set(changed) or size > 10_000
+    again = run(*build_arguments(tiny_capture, scene))
+    assert again.returncode == 0, again.stderr[-1000:]
+    open_scene(scene, device="cpu")
+
+
+def test_an_edit_and_an_export_that_cannot_write_leave_nothing_half_done(built, tmp_path, limited):
+    before = content(built)
+    for ending in ("ply", "splat", "glb"):
+        done = limited(2_000, "export", str(built), str(tmp_path / f"out.{ending}"))
+        assert_one_line(done)
+        assert not (tmp_path / f"out.{ending}").exists()
+    scene = tmp_path / "scene"
+    shutil.copytree(built, scene)
+    assert run("edit", str(scene), "delete", "--select", "red apple", "--threshold", "0.01").returncode == 0
+    before_save = content(scene)
+    assert_one_line(limited(2_000, "edit", str(scene), "save", "--output", str(tmp_path / "edited")))
+    assert content(scene) == before_save
+    assert not (tmp_path / "edited").exists() or not (tmp_path / "edited" / "scene.json").exists()
+    assert no_left_overs(tmp_path)
+    assert content(built) == before

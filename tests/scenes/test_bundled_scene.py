@@ -1,0 +1,76 @@
+"""The finished scene that ships: small, whole, answers at once, and is never written to."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat import cli, open_scene
+from lexsplat.captures import load_mask
+from lexsplat.evaluation.demo import demo_capture
+from lexsplat.features.encoders import load_clip
+from lexsplat.scenes.folder import BUNDLED_SCENE
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return open_scene("demo", device="cpu")
+
+
+def snapshot() -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")}
+
+
+def test_it_takes_at_most_six_megabytes():
+    assert sum(path.stat().st_size for path in BUNDLED_SCENE.rglob("*")) <= 6_000_000
+
+
+def test_it_says_nothing_of_the_machine_that_built_it():
+    text = (BUNDLED_SCENE / "scene.json").read_text()
+    assert not re.search(r'"/[a-z]', text)
+    assert json.loads(text)["capture"] is None
+
+
+def test_its_language_is_of_the_encoder_that_ships(scene):
+    assert scene.folder.record["stages"]["features"]["clip_hash"] == load_clip("bundled").content_hash
+
+
+@pytest.mark.parametrize("prompt", ["red apple", "blue mug", "rubber duck", "pumpkin"])
+def test_what_is_asked_for_is_where_the_exact_mask_says(scene, prompt):
+    found = []
+    for folder in sorted((demo_capture() / "segmentations").iterdir())[::4]:
+        mask = load_mask(folder / f"{prompt.replace(' ', '_')}.png")
+        relevancy = scene.relevancy([prompt], folder.name)[0]
+        y, x = np.unravel_index(int(torch.argmax(relevancy)), relevancy.shape)
+        scale = mask.shape[0] / relevancy.shape[0]
+        found.append(bool(mask[int((y + 0.5) * scale), int((x + 0.5) * scale)]))
+    assert found
+    assert all(found)
+
+
+def test_the_command_line_answers_beside_the_user_and_leaves_the_package_alone(tmp_path, monkeypatch, capsys):
+    before = snapshot()
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["query", "demo", "red apple", "red mug"]) == 0
+    apple, mug, last = capsys.readouterr().out.splitlines()
+    assert "probably not" not in apple
+    assert mug.endswith("probably not in this scene")  # the mug is blue
+    assert "demo_heatmaps" in last
+    assert list((tmp_path / "demo_heatmaps").rglob("*.png"))
+    assert cli.main(["evaluate", "demo"]) == 1
+    assert "lexsplat demo" in capsys.readouterr().err
+    assert cli.main(["info", "demo"]) == 0
+    assert "None" not in capsys.readouterr().out
+    assert snapshot() == before
+
+
+def test_a_folder_called_demo_comes_first(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    os.mkdir("demo")
+    assert cli.main(["info", "demo"]) == 1
+    assert "no scene.json in it" in capsys.readouterr().err

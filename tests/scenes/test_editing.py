@@ -1,0 +1,239 @@
+"""Edits: what is touched changes as worked out by hand, what is not does not; nothing is lost in the journal."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from support.language_scene import make_scene
+
+from lexsplat.language.fields import LiftedField
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
+from lexsplat.scenes.editing import Editor, Motion, Step, recolored
+from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.scene import Scene, open_scene
+
+
+@pytest.fixture(scope="module")
+def base():
+    made = make_scene(per_ball=30)
+    gaussians = replace(
+        made.gaussians, shN=torch.randn(150, 3, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    )
+    codes = torch.from_numpy(made.labels.astype(np.uint8))[:, None]
+    field = LiftedField(made.codebook, codes, torch.ones(150, 1), torch.linspace(0, 1, 150))
+    views = {name: StoredView(name, camera, "train") for name, camera in made.cameras.items()}
+    return Scene(gaussians, field, views, "bundled"), made.labels
+
+
+def choose(editor: Editor, *balls: int) -> Selection:
+    """The balls of some codes, as they are now: language says which."""
+    mask = torch.isin(editor.scene.field.codes[:, 0], torch.tensor(balls, dtype=torch.uint8))
+    return Selection(
+        editor.scene.gaussians, editor.scene.cameras, mask, mask.float(), phrase=f"balls {balls}"
+    )
+
+
+def same(a: Scene, b: Scene) -> bool:
+    tensors = [(x.gaussians.tensors() | x.field.tensors()) for x in (a, b)]
+    return all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[0])
+
+
+def test_delete_and_keep_take_language_along(base):
+    scene, labels = base
+    editor = Editor(scene)
+    editor.delete(choose(editor, 0, 1))
+    assert torch.equal(editor.scene.gaussians.means, scene.gaussians.means[labels > 1])
+    assert editor.scene.field.codes[:, 0].tolist() == labels[labels > 1].tolist()
+    editor.keep(choose(editor, 3))
+    assert torch.equal(editor.scene.gaussians.means, scene.gaussians.means[labels == 3])
+    assert torch.equal(editor.scene.field.uncertainties, scene.field.uncertainties[labels == 3])
+    assert len(scene.gaussians) == 150, "the scene itself stays"
+
+
+def test_move_moves_only_what_was_chosen(base):
+    scene, labels = base
+    editor = Editor(scene)
+    turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    chosen = choose(editor, 2)
+    editor.move(chosen, Motion(translation=(1.0, 0, 0), rotation=turn, scale=2.0))
+    after, before = editor.scene.gaussians, scene.gaussians
+    offset = before.means[labels == 2].numpy() - chosen.center
+    expected = chosen.center + [1.0, 0, 0] + 2 * np.stack([-offset[:, 1], offset[:, 0], offset[:, 2]], 1)
+    assert after.means[labels == 2].numpy() == pytest.approx(expected, abs=1e-5)
+    assert torch.allclose(after.scales[labels == 2], 2 * before.scales[labels == 2])
+    for name, tensor in before.tensors().items():
+        assert torch.equal(getattr(after, name)[labels != 2], tensor[labels != 2]), name
+    # z of degree 1 stays, x and y mix: the colors turned along.
+    assert torch.allclose(after.shN[labels == 2][:, 1], before.shN[labels == 2][:, 1], atol=1e-6)
+    assert not torch.allclose(after.shN[labels == 2][:, 0], before.shN[labels == 2][:, 0], atol=1e-3)
+
+
+def test_a_duplicate_says_what_the_original_says(base):
+    scene, labels = base
+    editor = Editor(scene)
+    editor.duplicate(choose(editor, 4), Motion(translation=(0, 0, 1.5)))
+    gaussians, field = editor.scene.gaussians, editor.scene.field
+    assert len(gaussians) == 180
+    assert torch.equal(gaussians.means[:150], scene.gaussians.means)
+    copy = gaussians.means[150:] - torch.tensor([0, 0, 1.5])
+    assert torch.allclose(copy, scene.gaussians.means[labels == 4], atol=1e-6)
+    assert field.codes[150:, 0].tolist() == [4] * 30
+    assert len(choose(editor, 4).instances) == 2
+
+
+def test_recoloring_changes_hue_and_keeps_shading(base):
+    scene, labels = base
+    thing = scene.gaussians.select(torch.from_numpy(labels == 0))
+    shade = torch.linspace(-1.0, 0.5, 30)
+    thing = replace(thing, sh0=shade[:, None, None].expand(30, 1, 3).clone())
+    red = recolored(thing, (0.8, 0.2, 0.1), 1.0)
+    color = red.sh0[:, 0] * 0.28209479177387814 + 0.5
+    shares = thing.opacities / thing.opacities.sum()
+    assert torch.allclose((color * shares[:, None]).sum(0), torch.tensor([0.8, 0.2, 0.1]), atol=1e-4)
+    assert torch.allclose(color[:, 0] / color[:, 1], torch.full((30,), 4.0), rtol=1e-3)
+    old = shade * 0.28209479177387814 + 0.5
+    assert torch.allclose(color[:, 0] / color[0, 0], old / old[0], rtol=1e-3)
+    assert not red.shN.any()
+    assert torch.allclose(recolored(thing, (0.8, 0.2, 0.1), 0.0).sh0, thing.sh0, atol=1e-6)
+
+
+@given(st.lists(st.sampled_from(["delete", "recolor", "move", "duplicate", "undo", "redo"]), max_size=9))
+@settings(max_examples=25, deadline=None)
+def test_a_journal_read_again_gives_the_same_scene(base, tmp_path_factory, actions):
+    scene, _ = base
+    journal = tmp_path_factory.mktemp("edit") / "edits.jsonl"
+    editor = Editor(scene, journal)
+    for number, action in enumerate(actions):
+        if action in ("undo", "redo"):
+            getattr(editor, action)()
+            continue
+        chosen = choose(editor, number % 5)
+        if not chosen:
+            continue
+        options = {
+            "recolor": {"color": (0.1 * (number % 5), 0.5, 0.9), "strength": 0.7},
+            "move": {"motion": Motion(translation=(0.1, 0.2, number), scale=1.1)},
+            "duplicate": {"motion": Motion(translation=(0.0, 0.3, 0.1))},
+        }.get(action, {})
+        getattr(editor, action)(chosen, **options)
+    again = Editor(scene, journal)
+    assert same(again.scene, editor.scene)
+    assert [str(step) for step in again.steps] == [str(step) for step in editor.steps]
+    assert len(again.undone) == len(editor.undone)
+
+
+def test_undo_and_redo_lead_back_and_forth_exactly(base):
+    scene, _ = base
+    editor = Editor(scene)
+    states = [editor.scene]
+    for ball in (0, 1, 2):
+        editor.move(choose(editor, ball), Motion(translation=(0.1, 0, 0.2)))
+        states.append(editor.scene)
+    for state in reversed(states[:-1]):
+        assert editor.undo()
+        assert same(editor.scene, state)
+    assert not editor.undo()
+    for state in states[1:]:
+        assert editor.redo()
+        assert same(editor.scene, state)
+    assert not editor.redo()
+    editor.undo()
+    editor.delete(choose(editor, 4))
+    assert not editor.redo(), "a new step forgets what was undone"
+
+
+def test_discarding_leaves_nothing(base, tmp_path):
+    scene, _ = base
+    editor = Editor(scene, tmp_path / "edits.jsonl")
+    editor.delete(choose(editor, 0))
+    assert (tmp_path / "edits.jsonl").exists()
+    editor.discard()
+    assert same(editor.scene, scene)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_torn_last_line_is_left_out(base, tmp_path, caplog):
+    scene, _ = base
+    journal = tmp_path / "edits.jsonl"
+    editor = Editor(scene, journal)
+    editor.delete(choose(editor, 0))
+    first = editor.scene
+    editor.delete(choose(editor, 1))
+    journal.write_text(journal.read_text()[:-40])
+    again = Editor(scene, journal)
+    assert "cut off" in caplog.text
+    assert same(again.scene, first)
+    again.delete(choose(again, 2))
+    assert len(Editor(scene, journal).steps) == 2
+
+
+@pytest.mark.parametrize(
+    "damage", ["{}\n", '{"step": "delete"}\n', "not json\n", '{"undo": true}\n{"undo": true}\n']
+)
+def test_damaged_journals_are_told(base, tmp_path, damage):
+    scene, _ = base
+    journal = tmp_path / "edits.jsonl"
+    editor = Editor(scene, journal)
+    editor.delete(choose(editor, 0))
+    journal.write_text(journal.read_text() + damage)
+    with pytest.raises(FileFormatError, match="line"):
+        Editor(scene, journal)
+
+
+def test_a_journal_of_another_scene_is_refused(base, tmp_path):
+    scene, _ = base
+    journal = tmp_path / "edits.jsonl"
+    editor = Editor(scene, journal)
+    editor.keep(choose(editor, 0))
+    with pytest.raises(SceneFolderError, match="another"):
+        Editor(editor.scene, journal)
+
+
+def test_what_cannot_be_done_leaves_no_trace(base, tmp_path):
+    scene, _ = base
+    editor = Editor(scene, tmp_path / "edits.jsonl")
+    old = choose(editor, 1)
+    with pytest.raises(QueryError, match="something to edit"):
+        editor.delete(choose(editor, 9))
+    with pytest.raises(ValueError, match="color"):
+        editor.recolor(old, (2.0, 0, 0))
+    with pytest.raises(ValueError, match="proper rotation"):
+        editor.move(old, Motion(rotation=np.diag([1.0, 1, -1])))
+    assert not (tmp_path / "edits.jsonl").exists()
+    editor.delete(choose(editor, 0))
+    with pytest.raises(ValueError, match="select again"):
+        editor.delete(old)
+
+
+def test_a_step_survives_json(base):
+    mask = torch.rand(1001, generator=torch.Generator().manual_seed(1)) < 0.3
+    step = Step("move", mask, {"scale": 2.0, "translation": [1, 2, 3]}, "a mug")
+    back = Step.from_json(json.loads(json.dumps(step.to_json())))
+    assert torch.equal(back.mask, mask)
+    assert (back.kind, back.values, back.phrase) == (step.kind, step.values, step.phrase)
+
+
+def test_a_saved_edit_is_a_scene(base, tmp_path):
+    scene, labels = base
+    folder = SceneFolder(tmp_path / "scene")
+    folder.write_cameras({name: (view.camera, view.split) for name, view in scene.views.items()})
+    folder.write_gaussians(scene.gaussians)
+    write_field(scene.field, {"reconstruction": "f"}, folder.language_path)
+    folder.finish("reconstruct", "f", 1.0, gaussians=150)
+    folder.finish("language", "g", 1.0)
+    editor = Editor(open_scene(folder.root, device="cpu"), folder.root / "edits.jsonl")
+    editor.delete(choose(editor, 0))
+    editor.save(tmp_path / "saved")
+    saved = open_scene(tmp_path / "saved", device="cpu")
+    assert torch.equal(saved.gaussians.means, scene.gaussians.means[labels != 0])
+    assert saved.field.codes[:, 0].tolist() == labels[labels != 0].tolist()
+    assert saved.folder.record["edits"] == ["delete balls (0,) (30 Gaussians)"]
+    with pytest.raises(SceneFolderError, match="exists"):
+        editor.save(tmp_path / "saved")

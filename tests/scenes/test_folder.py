@@ -1,0 +1,154 @@
+"""Scene folder: whole files or none, stages that know what they were made from."""
+
+import dataclasses
+import json
+import multiprocessing
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.geometry.cameras import look_at
+from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.scenes.folder import SceneFolder
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+    target = tmp_path / "a.json"
+    write_json(target, {"old": 1})
+
+    def cut_short() -> None:
+        with atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError):
+        cut_short()
+    assert read_json(target) == {"old": 1}
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_nan_never_reaches_a_json_file(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "a.json", {"psnr": float("nan")})
+    assert not (tmp_path / "a.json").exists()
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    rate: float = 0.1
+    sizes: tuple[int, ...] = (1, 2)
+    folder: Path = Path("x")
+
+
+def test_fingerprints_change_with_any_field_and_only_then():
+    same = fingerprint(Settings(), {"b": 1, "a": 2})
+    assert same == fingerprint(Settings(), {"a": 2, "b": 1})
+    assert same != fingerprint(Settings(rate=0.2), {"b": 1, "a": 2})
+    assert same != fingerprint(Settings(sizes=(1, 3)), {"b": 1, "a": 2})
+    assert same != fingerprint({"b": 1, "a": 2}, Settings())
+
+
+def test_tensors_and_metadata_survive(tmp_path):
+    tensors = {"codes": torch.arange(6, dtype=torch.uint8).reshape(2, 3).T, "weights": torch.rand(3).half()}
+    write_tensors(tmp_path / "t.safetensors", tensors, {"method": "trained"})
+    back, metadata = read_tensors(tmp_path / "t.safetensors")
+    assert metadata == {"method": "trained"}
+    assert all(torch.equal(back[name], value) for name, value in tensors.items())
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04pickle", b"\xff" * 64])
+def test_what_is_not_safetensors_is_refused(tmp_path, content):
+    (tmp_path / "t.safetensors").write_bytes(content)
+    with pytest.raises(FileFormatError, match="safetensors"):
+        read_tensors(tmp_path / "t.safetensors")
+
+
+def test_a_truncated_safetensors_is_refused(tmp_path):
+    path = tmp_path / "t.safetensors"
+    write_tensors(path, {"a": torch.rand(10)}, {})
+    data = path.read_bytes()
+    for length in range(0, len(data), 7):
+        path.write_bytes(data[:length])
+        with pytest.raises(FileFormatError):
+            read_tensors(path)
+
+
+def test_a_stage_is_finished_only_for_what_it_was_made_from(tmp_path):
+    folder = SceneFolder(tmp_path)
+    folder.finish("reconstruct", "abc", 1.5, gaussians=10)
+    again = SceneFolder.open(tmp_path)
+    assert again.is_finished("reconstruct", "abc")
+    assert not again.is_finished("reconstruct", "abd")
+    assert not again.is_finished("language", "abc")
+    again.reopen("reconstruct")
+    assert not SceneFolder.open(tmp_path).is_finished("reconstruct", "abc")
+
+
+def test_cameras_and_code_maps_survive(tmp_path):
+    folder = SceneFolder(tmp_path)
+    camera = look_at([0, -3, 1], [0, 0, 0], [0, 0, 1], 32, 24, 0.8)
+    folder.write_cameras({"a/b.jpg": (camera, "test")})
+    view = folder.read_cameras()["a/b.jpg"]
+    assert (view.split, view.camera.width, view.camera.height) == ("test", 32, 24)
+    np.testing.assert_array_equal(view.camera.viewmat, camera.viewmat)
+    codes = np.arange(256, dtype=np.uint8).reshape(8, 32)
+    folder.write_code_map("a/b.jpg", codes)
+    np.testing.assert_array_equal(folder.read_code_map("a/b.jpg"), codes)
+
+
+def test_a_folder_that_is_no_scene_says_how_to_make_one(tmp_path):
+    with pytest.raises(SceneFolderError, match=r"lexsplat build CAPTURE --output SCENE"):
+        SceneFolder.open(tmp_path / "nowhere")
+
+
+def test_another_format_version_is_refused(tmp_path):
+    (tmp_path / "scene.json").write_text(json.dumps({"format_version": 99, "stages": {}}))
+    with pytest.raises(SceneFolderError, match="format_version 1, found 99"):
+        SceneFolder.open(tmp_path)
+
+
+def _hold(root: str, ready, release) -> None:
+    with SceneFolder(Path(root)).locked():
+        ready.set()
+        release.wait(30)
+
+
+def test_the_second_builder_is_told_who_is_at_work(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    ready, release = context.Event(), context.Event()
+    process = context.Process(target=_hold, args=(str(tmp_path), ready, release))
+    process.start()
+    try:
+        assert ready.wait(60)
+        with pytest.raises(SceneFolderError, match=str(process.pid)), SceneFolder(tmp_path).locked():
+            pass
+    finally:
+        release.set()
+        process.join(30)
+    with SceneFolder(tmp_path).locked():
+        pass
+
+
+def test_a_builder_clears_what_dead_processes_left_and_nothing_that_is_being_written(tmp_path):
+    dead = multiprocessing.get_context("spawn").Process(target=int)
+    dead.start()
+    dead.join()
+    folder = SceneFolder(tmp_path / "scene")
+    folder.root.mkdir()
+    left = folder.root / "codes" / f".a.png.{dead.pid}.1.tmp"
+    left.parent.mkdir()
+    left.write_bytes(b"half")
+    others = folder.root / ".notes.tmp"
+    others.write_text("not ours")
+    with atomic_path(folder.root / "text.safetensors") as being_written:
+        being_written.write_bytes(b"a query writes this while a build begins")
+        with folder.locked():
+            pass
+        assert being_written.exists()
+    assert not left.exists()
+    assert others.exists()

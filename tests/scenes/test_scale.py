@@ -1,0 +1,118 @@
+"""One known distance gives a scene its scale; up can be told; both are kept and used."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from lexsplat import cli, open_scene
+from lexsplat.geometry.boxes import gravity_up
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A copy of the scene that ships; one built before worlds were stored."""
+    folder = shutil.copytree(BUNDLED_SCENE, tmp_path / "scene")
+    record = json.loads((folder / "scene.json").read_text())
+    record.pop("world", None)
+    (folder / "scene.json").write_text(json.dumps(record))
+    return folder
+
+
+def run(*arguments) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def stored(scene) -> dict:
+    return json.loads((scene / "scene.json").read_text())["world"]
+
+
+def test_up_comes_from_the_cameras_and_the_scale_from_nowhere(scene, capsys):
+    assert run("scale", scene) == 0
+    assert "scale: not known" in capsys.readouterr().out
+    assert run("info", scene, "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    expected = gravity_up(view.camera for view in SceneFolder.open(scene).read_cameras().values())
+    assert facts["up"]["direction"] == pytest.approx(expected.direction, abs=1e-5)
+    assert (facts["up"]["from"], facts["meters_per_unit"]) == ("cameras", None)
+
+
+def test_one_distance_makes_sizes_metres(scene, capsys):
+    pygltflib = pytest.importorskip("pygltflib")
+    assert run("scale", scene, "--distance", 0.35, "--points", "0,0,0", "0,-0.7,0") == 0
+    assert stored(scene)["meters_per_unit"] == pytest.approx(0.5)
+    assert run("find", scene, "red apple", "--json") == 0
+    answer = json.loads("{" + capsys.readouterr().out.partition("{")[2])
+    assert answer["meters_per_unit"] == pytest.approx(0.5)
+    thing = answer["phrases"][0]["instances"][0]
+    assert thing["size_meters"] == pytest.approx([side / 2 for side in thing["size"]], abs=1e-4)
+    assert run("find", scene, "red apple") == 0
+    assert " m, score" in capsys.readouterr().out
+    found = open_scene(scene).select("red apple")
+    assert found.size_meters == pytest.approx(found.size / 2)
+    assert run("export", scene, scene.parent / "all.glb") == 0
+    assert pygltflib.GLTF2().load(str(scene.parent / "all.glb")).nodes[0].scale == pytest.approx([0.5] * 3)
+    assert run("export", scene, scene.parent / "all.ply") == 0
+    assert (scene.parent / "all.ply").read_bytes() == (scene / "gaussians.ply").read_bytes()
+
+
+def test_phrases_name_what_the_distance_is_between(scene, capsys):
+    assert run("scale", scene, "--distance", 0.3, "--between", "red apple", "banana", "--json") == 0
+    world = json.loads(capsys.readouterr().out)
+    found = [open_scene(scene).find(phrase).largest() for phrase in ("red apple", "banana")]
+    measured = float(np.linalg.norm(found[0].center - found[1].center))
+    assert world["meters_per_unit"] == pytest.approx(0.3 / measured)
+    assert run("scale", scene, "--distance", 0.08, "--height-of", "red apple") == 0
+    assert stored(scene)["meters_per_unit"] == pytest.approx(0.08 / found[0].size[2])
+
+
+def test_up_can_be_told_and_is_used_everywhere(scene, capsys):
+    pygltflib = pytest.importorskip("pygltflib")
+    assert run("scale", scene, "--up=-1,0,0") == 0
+    assert "from the user" in capsys.readouterr().out
+    opened = open_scene(scene)
+    assert opened.world.up.direction.tolist() == [-1, 0, 0]
+    assert opened.select("red apple").box.axes[2] == pytest.approx([-1, 0, 0])
+    assert run("export", scene, scene.parent / "all.glb") == 0
+    x, y, z, w = pygltflib.GLTF2().load(str(scene.parent / "all.glb")).nodes[0].rotation
+    turned = np.array([[1 - 2 * (y * y + z * z)], [2 * (x * y + w * z)], [2 * (x * z - w * y)]]) @ [-1.0]
+    assert turned == pytest.approx([0, 1, 0], abs=1e-6), "glTF has y up"
+
+
+def test_building_again_keeps_what_was_told_as_long_as_the_cameras_stay(tiny_capture, tmp_path, caplog):
+    build = ["reconstruct", tiny_capture, "--output", tmp_path, "--device", "cpu", "--iterations", 3]
+    assert run(*build) == 0
+    assert stored(tmp_path)["up"]["direction"] == pytest.approx([0, 0, 1], abs=1e-3)
+    assert run("scale", tmp_path, "--distance", 1, "--points", "0,0,0", "2,0,0", "--up", "0,0.6,0.8") == 0
+    assert run(*build) == 0
+    assert stored(tmp_path)["meters_per_unit"] == 0.5
+    assert stored(tmp_path)["up"]["direction"] == pytest.approx([0, 0.6, 0.8])
+    assert run(*build, "--up", "0,0,2") == 0
+    assert stored(tmp_path)["up"] == {"direction": [0, 0, 1], "reliable": True, "from": "user"}
+    assert stored(tmp_path)["meters_per_unit"] == 0.5
+    record = json.loads((tmp_path / "scene.json").read_text())
+    record["world"]["poses"] = "those of another capture"
+    (tmp_path / "scene.json").write_text(json.dumps(record))
+    assert run(*build) == 0
+    assert stored(tmp_path)["meters_per_unit"] is None
+    assert "the scale no longer holds" in caplog.text
+
+
+def test_what_makes_no_sense_is_refused(scene, capsys):
+    for arguments in (
+        ["--distance", "1"],
+        ["--between", "a", "b"],
+        ["--distance", "1", "--between", "a", "b", "--height-of", "a"],
+        ["--distance", "0", "--height-of", "a"],
+        ["--distance", "1", "--points", "0,0", "1,1,1"],
+        ["--up", "0,0,0,0"],
+    ):
+        with pytest.raises(SystemExit) as caught:
+            run("scale", scene, *arguments)
+        assert caught.value.code == 2
+    assert run("scale", scene, "--distance", 1, "--points", "1,1,1", "1,1,1") == 1
+    assert "none between them" in capsys.readouterr().err
+    assert run("scale", "demo", "--distance", 1, "--points", "1,1,1", "1,1,0") == 1
+    assert "ships with lexsplat" in capsys.readouterr().err

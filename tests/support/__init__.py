@@ -1,0 +1,1 @@
+"""Captures, scenes, references and pretended devices that the tests share."""
