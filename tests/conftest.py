@@ -53,6 +53,14 @@ def built(tiny_capture, tmp_path_factory) -> Path:
     return output
 
 
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory) -> Path:
+    """A tiny CLIP with random weights, saved the way the Hub's are."""
+    from support.encoder_folders import write_clip
+
+    return write_clip(tmp_path_factory.mktemp("clip"))
+
+
 @pytest.fixture
 def pretended_gpu(monkeypatch):
     """A GPU that is none, with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts what is waited for."""

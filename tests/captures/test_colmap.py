@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pycolmap
 import pytest
+from support.refusals import assert_tells, fails
 from support.written_captures import (
     HEIGHT,
     WIDTH,
@@ -14,7 +15,6 @@ from support.written_captures import (
     write_colmap,
     write_images,
 )
-from test_loading import assert_tells, fails
 
 from lexsplat.captures import load_capture, load_masks
 from lexsplat.captures.readers.colmap import read_colmap

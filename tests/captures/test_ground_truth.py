@@ -1,4 +1,6 @@
-"""Readers of other data sets' ground truth, each on a small fixture in its layout, written here by its description."""
+"""Readers of other data sets' ground truth, each on a small fixture in its layout, written here by its
+description.
+"""
 
 import json
 import re

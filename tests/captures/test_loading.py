@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from support.refusals import assert_tells, fails
 from support.written_captures import (
     FOCAL,
     HEIGHT,
@@ -17,28 +18,9 @@ from support.written_captures import (
 )
 
 from lexsplat.captures import load_capture, load_mask, load_masks, stem_of
-from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
+from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 NAMES = [f"{index:04d}.png" for index in range(1, 18)]
-
-
-def assert_tells(error: LexsplatError, *parts: str) -> None:
-    """The message has subject, expected, found and remedy, in one line, and these words."""
-    message = str(error)
-    assert error.subject
-    assert error.expected
-    assert error.found
-    assert error.remedy
-    assert all(text in message for text in ("expected", "found", "; "))
-    assert "\n" not in message
-    for part in parts:
-        assert part in message, message
-
-
-def fails(path, *parts, kind=CaptureError, **options):
-    with pytest.raises(kind) as caught:
-        load_capture(path, **options)
-    assert_tells(caught.value, *parts)
 
 
 class TestTransforms:

@@ -7,6 +7,7 @@ import copy
 import numpy as np
 import pycolmap
 import pytest
+from support.poses import move
 
 from lexsplat.captures.sfm.pose_agreement import agreements, misregistered, place_again, sampson_errors
 from lexsplat.captures.sfm.triangulation import quiet_pycolmap
@@ -23,13 +24,6 @@ def registered(tmp_path):
     with quiet_pycolmap(0), pycolmap.Database.open(path) as database:
         model = pycolmap.synthesize_dataset(options, database)
     return model, path
-
-
-def move(model, number) -> None:
-    """Turn a photo away and put it elsewhere, as a mapper does that was misled."""
-    frame = model.frame(model.image(number).frame_id)
-    turn = pycolmap.Rotation3d(np.array([0.0, np.sin(0.2), 0.0, np.cos(0.2)]))
-    frame.rig_from_world = pycolmap.Rigid3d(turn, np.array([0.7, -0.4, 0.2])) * frame.rig_from_world
 
 
 def center(model, number) -> np.ndarray:

@@ -28,7 +28,7 @@ def test_sigterm_means_after_the_import_what_it_meant_before():
 import os, signal, sys
 if sys.argv[1] == "own":
     signal.signal(signal.SIGTERM, lambda number, frame: (print("told", flush=True), sys.exit(7)))
-from lexsplat.scenes.pycolmap_import import pycolmap
+from lexsplat.captures.sfm.pycolmap_import import pycolmap
 pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2])
 os.kill(os.getpid(), signal.SIGTERM)
 import time
@@ -52,10 +52,10 @@ class Interrupting:
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Interrupting())
 try:
-    from lexsplat.scenes.pycolmap_import import pycolmap
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
 except KeyboardInterrupt:
     print("stopped")
-from lexsplat.scenes.pycolmap_import import pycolmap
+from lexsplat.captures.sfm.pycolmap_import import pycolmap
 print(len(pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2]).params))
 """
     done = subprocess.run(

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from support.rooms import texture
 from support.written_captures import save, write_json, write_transforms
 
 from lexsplat.captures import initial_points, load_capture, random_points_in_frusta, triangulate
@@ -8,14 +8,6 @@ from lexsplat.captures.sfm.triangulation import matching_pairs
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, look_at
 
 SIZE = (160, 120)
-
-
-def texture() -> np.ndarray:
-    """Blobs of many sizes and colors ``[256, 256, 3]``: what SIFT likes."""
-    rng = np.random.default_rng(0)
-    layers = [gaussian_filter(rng.normal(size=(256, 256, 3)), (s, s, 0)) * s for s in (1.0, 2.0, 4.0, 8.0)]
-    image = np.sum(layers, axis=0)
-    return np.clip(0.5 + 0.25 * image / image.std(), 0, 1)
 
 
 def on_the_wall(camera) -> np.ndarray:

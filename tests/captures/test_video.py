@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
-from test_loading import assert_tells
+from support.refusals import assert_tells
 
 from lexsplat.captures.readers.video import (
     FrameMeasures,

@@ -84,7 +84,7 @@ def test_other_encoders_under_the_name_embedded_make_features_anew(
     copy, encoders = tmp_path / "copy", tmp_path / "encoders"
     shutil.copytree(built, copy)
     shutil.copytree(hub.BUNDLED_ENCODERS, encoders)
-    monkeypatch.setattr(hub, "EMBEDDED_ENCODERS", encoders)
+    monkeypatch.setattr(hub, "BUNDLED_ENCODERS", encoders)
     config = json.loads((encoders / "clip" / "config.json").read_text())
     (encoders / "clip" / "config.json").write_text(json.dumps(config | {"logit_scale_init_value": 2.5}))
     before = modified(copy)

@@ -9,30 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from support import color_encoder
-from test_report import Page
+from support.experiments import CONFIG
+from support.report_pages import Page
 
 from lexsplat import cli
-from lexsplat.codebook import CodebookConfig
 from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
-from lexsplat.features import FeatureConfig
-from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.memory import parse_bytes
-
-CONFIG = BuildConfig(
-    clip="color",
-    dino="color",
-    device="cpu",
-    downscale=2.0,
-    iterations=20,
-    method="trained",
-    features=FeatureConfig(crop_sizes=(0.25, 0.4), crop_strides=(0.5, 0.5), map_cells=18),
-    codebook=CodebookConfig(num_codes=6, steps=3),
-    trained=TrainedConfig(iterations=4, pixel_sample=256, smoothing_sample=256),
-)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,11 +47,11 @@ def test_every_row_of_the_papers_table_switches_off_what_it_says():
     assert ablation.changed(config, "full") == config
     assert not ablation.changed(config, "w/o DINO").codebook.use_dino
     assert not ablation.changed(config, "w/o L_lb").codebook.load_balancing
-    assert not ablation.changed(config, "w/o u_G").embedding.use_uncertainty
-    assert not ablation.changed(config, "w/o MLP").embedding.use_smoothing
+    assert not ablation.changed(config, "w/o u_G").trained.use_uncertainty
+    assert not ablation.changed(config, "w/o MLP").trained.use_smoothing
     both = ablation.changed(config, "w/o u_G & MLP")
-    assert not both.embedding.use_uncertainty
-    assert not both.embedding.use_smoothing
+    assert not both.trained.use_uncertainty
+    assert not both.trained.use_smoothing
     assert both.codebook == config.codebook
     with pytest.raises(ValueError, match="w/o everything"):
         ablation.changed(config, "w/o everything")
@@ -77,8 +63,8 @@ def test_a_lifted_field_is_ablated_in_its_quantization_only():
     assert ablation.variants_of("trained") == table_2
     assert ablation.variants_of("lifted+tuned") == tuple(ablation.VARIANTS)
     config = BuildConfig(method="lifted")
-    assert ablation.changed(config, "with neighbors").lifting.use_smoothing
-    assert ablation.changed(config, "one code").lifting.top == 1
+    assert ablation.changed(config, "with neighbors").lifted.use_smoothing
+    assert ablation.changed(config, "one code").lifted.top == 1
 
 
 def test_several_methods_stand_beside_each_other_with_wrong_labels(
@@ -188,7 +174,7 @@ def test_memory_granted_bounds_codebook_and_language(ablated, tiny_capture, tmp_
         experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
     )
     monkeypatch.setattr(
-        ablation, "make_field", lambda *a: granted.append(a[4].embedding.memory_bytes) or field(*a)
+        ablation, "make_field", lambda *a: granted.append(a[4].trained.memory_bytes) or field(*a)
     )
     config = replace(CONFIG, memory="800MB")
     ablation.ablate(tiny_capture, tmp_path, config, seeds=(0,), variants=("full",))

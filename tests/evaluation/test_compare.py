@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 from support import color_encoder
-from test_ablate import CONFIG
-from test_report import Page
+from support.experiments import CONFIG
+from support.report_pages import Page
 
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.evaluation import baselines

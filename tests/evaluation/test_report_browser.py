@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from test_report import evaluated
+from support.report_pages import evaluated
 
 from lexsplat.evaluation.report import write_report
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.encoder_folders import MEAN, STD, save_model, seeded, tiny_vit
 
 from lexsplat.features import hub
 from lexsplat.features.clip import _plain_attention, check_patches
@@ -21,7 +22,6 @@ from lexsplat.features.dino import _ramp, _window_starts
 from lexsplat.features.encoders import ClipEncoder, DinoEncoder, load_clip, load_dino, resize_images
 from lexsplat.runtime.errors import ModelError
 
-MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
 PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]
 
 
@@ -58,22 +58,6 @@ def test_only_the_image_tower_of_few_patches_gets_plain_attention():
     _plain_attention(torch.nn.Linear(2, 2), object(), 48)  # a model that is built otherwise is left alone
 
 
-def _seeded(build):
-    torch.manual_seed(0)
-    model = build()
-    with torch.no_grad():  # the usual initialization is so small that every image would look the same
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn_like(parameter) * 0.15)
-    return model.eval()
-
-
-def _save(model, folder: Path) -> Path:
-    model.save_pretrained(folder)
-    preprocessing = {"image_mean": MEAN, "image_std": STD}
-    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
-    return folder
-
-
 def _normalized(images: torch.Tensor) -> torch.Tensor:
     pixels = (images.double().numpy() - np.reshape(MEAN, (3, 1, 1))) / np.reshape(STD, (3, 1, 1))
     return torch.from_numpy(pixels).float()
@@ -85,28 +69,6 @@ def _unit(features: torch.Tensor) -> torch.Tensor:
 
 def _images(count: int, size: int) -> torch.Tensor:
     return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(1))
-
-
-@pytest.fixture(scope="module")
-def clip_folder(tmp_path_factory) -> Path:
-    from transformers import CLIPConfig, CLIPModel
-
-    folder = tmp_path_factory.mktemp("clip")
-    tokenizer = load_clip("bundled")._tokenizer
-    config = CLIPConfig(
-        text_config={
-            "vocab_size": len(tokenizer), "hidden_size": 24, "intermediate_size": 40, "num_hidden_layers": 2,
-            "num_attention_heads": 2, "max_position_embeddings": 11, "bos_token_id": tokenizer.bos_token_id,
-            "eos_token_id": tokenizer.eos_token_id, "pad_token_id": tokenizer.pad_token_id,
-        },
-        vision_config={
-            "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
-            "image_size": 40, "patch_size": 8,
-        },
-        projection_dim=20,
-    )  # fmt: skip
-    tokenizer.save_pretrained(folder)
-    return _save(_seeded(lambda: CLIPModel(config)), folder)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +88,7 @@ def siglip_folder(tmp_path_factory) -> Path:
         text_config={**tower, "vocab_size": len(words), "max_position_embeddings": 9},
         vision_config={**tower, "image_size": 32, "patch_size": 8},
     )
-    return _save(_seeded(lambda: SiglipModel(config)), folder)
+    return save_model(seeded(lambda: SiglipModel(config)), folder)
 
 
 def test_clip_image_embeddings_equal_transformers_own(clip_folder):
@@ -249,8 +211,8 @@ def test_siglip2_of_free_size_gets_its_patches_as_its_own_processor_makes_them(s
         text_config={**tower, "vocab_size": 11, "max_position_embeddings": 9},
         vision_config={**tower, "num_patches": 16, "patch_size": 8},
     )
-    model = _seeded(lambda: transformers.Siglip2Model(config))
-    _save(model, tmp_path)
+    model = seeded(lambda: transformers.Siglip2Model(config))
+    save_model(model, tmp_path)
     for file in siglip_folder.glob("tokenizer*"):
         (tmp_path / file.name).write_bytes(file.read_bytes())
     encoder = ClipEncoder(tmp_path, "tiny siglip2")
@@ -287,20 +249,6 @@ def test_resizing_equals_pillow_bicubic(source, target):
         np.testing.assert_allclose(resized.numpy(), np.clip(np.asarray(expected), 0, 1), atol=2e-5)
 
 
-def _vit(registers: int = 0):
-    from transformers import ViTConfig, ViTModel
-
-    config = ViTConfig(
-        hidden_size=24,
-        intermediate_size=40,
-        num_hidden_layers=3,
-        num_attention_heads=2,
-        image_size=32,
-        patch_size=8,
-    )
-    return ViTModel(config, add_pooling_layer=False)
-
-
 def _dinov2(registers: int):
     import transformers
 
@@ -323,14 +271,14 @@ def _dinov3(registers: int):
     return transformers.DINOv3ViTModel(config)
 
 
-@pytest.mark.parametrize(("build", "registers"), [(_vit, 0), (_dinov2, 0), (_dinov2, 4), (_dinov3, 3)])
+@pytest.mark.parametrize(("build", "registers"), [(tiny_vit, 0), (_dinov2, 0), (_dinov2, 4), (_dinov3, 3)])
 def test_dense_tokens_and_keys_equal_transformers_own_without_special_tokens(build, registers, tmp_path):
-    model = _seeded(lambda: build(registers))
-    encoder = DinoEncoder(_save(model, tmp_path), "tiny")
+    model = seeded(lambda: build(registers))
+    encoder = DinoEncoder(save_model(model, tmp_path), "tiny")
     patch = encoder.patch_size
     rows, cols = 3, 5
     image = torch.rand(3, rows * patch, cols * patch, generator=torch.Generator().manual_seed(3))
-    options = {"interpolate_pos_encoding": True} if build is _vit else {}
+    options = {"interpolate_pos_encoding": True} if build is tiny_vit else {}
     with torch.no_grad():
         output = model(_normalized(image[None]), output_hidden_states=True, **options)
     expected = output.last_hidden_state[0, 1 + registers :].reshape(rows, cols, 24)
@@ -351,7 +299,7 @@ def test_dense_tokens_and_keys_equal_transformers_own_without_special_tokens(bui
 
 @pytest.fixture(scope="module")
 def dino(tmp_path_factory) -> DinoEncoder:
-    return DinoEncoder(_save(_seeded(_vit), tmp_path_factory.mktemp("vit")), "tiny")
+    return DinoEncoder(save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit")), "tiny")
 
 
 def test_a_smaller_stride_evaluates_the_model_on_shifted_images(dino):
@@ -388,7 +336,7 @@ def test_fine_features_lie_where_the_image_content_is(tmp_path):
         for module in model.modules():
             if isinstance(module, torch.nn.LayerNorm):
                 module.weight.fill_(1.0)
-    folder = _save(model, tmp_path)
+    folder = save_model(model, tmp_path)
     (folder / "preprocessor_config.json").write_text(
         json.dumps({"image_mean": [0] * 3, "image_std": [1] * 3})
     )
@@ -410,13 +358,13 @@ def test_windows_cover_a_large_image_and_agree_with_one_evaluation_for_a_local_m
     assert windowed.shape == whole.shape
     torch.testing.assert_close(windowed.norm(dim=-1), torch.ones(8, 15), atol=1e-5, rtol=0)
     # Without attention and positions a token depends on its patch alone, so windows change nothing.
-    model = _seeded(_vit)
+    model = seeded(tiny_vit)
     with torch.no_grad():
         model.embeddings.position_embeddings.zero_()
         for name, parameter in model.named_parameters():
             if "v_proj" in name or "attention.value" in name:
                 parameter.zero_()
-    local = DinoEncoder(_save(model, tmp_path), "local")
+    local = DinoEncoder(save_model(model, tmp_path), "local")
     whole = local.encode_dense(image, short_side=64, facet="token")
     windowed = local.encode_dense(image, short_side=64, facet="token", max_tokens=20)
     torch.testing.assert_close(windowed, whole, atol=1e-5, rtol=0)

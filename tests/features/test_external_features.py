@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 from safetensors.torch import save_file
+from support.noise_photos import HEIGHT, WIDTH, make_scene
 from support.tiny_capture import SPHERES, camera_poses, trace
-from test_features import HEIGHT, WIDTH, make_scene
 
 from lexsplat import cli
 from lexsplat.codebook import Codebook

@@ -4,28 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tilted_cameras import UP, cameras
 
 from lexsplat.geometry.boxes import Box, box_iou, fit_box, gravity_up
 from lexsplat.geometry.cameras import look_at
-
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def turned(angle: float, center=(0.0, 0.0, 0.0), halves=(1.0, 0.5, 0.25)) -> Box:
     axes = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     return Box(np.array(center, float), axes, np.array(halves, float))
-
-
-def cameras(up, roll=0.0, count=9):
-    rng = np.random.default_rng(0)
-    up = np.asarray(up, float) / np.linalg.norm(up)
-    found = []
-    for _ in range(count):
-        position = rng.normal(size=3)
-        position = 3 * position / np.linalg.norm(position)
-        tilt = up + roll * rng.normal(size=3)
-        found.append(look_at(position, np.zeros(3), tilt, 64, 48, 0.8))
-    return found
 
 
 @given(st.floats(0, 1.5), st.integers(0, 5))

@@ -2,8 +2,8 @@ import json
 
 import numpy as np
 import pytest
-from test_boxes import UP
-from test_boxes import cameras as tilted_cameras
+from support.tilted_cameras import UP
+from support.tilted_cameras import cameras as tilted_cameras
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.world import World, parse_vector, stored_world, world_of

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support import hostile_mutations, hostile_readers
+from support import TESTS_ON_PATH, hostile_mutations, hostile_readers
 from support.tiny_capture import write_capture
 from support.written_captures import write_colmap, write_transforms
 
@@ -59,7 +59,7 @@ def corpus(tmp_path_factory):
         # A folder in memory: ten thousand small files would otherwise wait for a disk.
         work = (shared if os.access(shared, os.W_OK) else base) / f"lexsplat-hostile-{os.getpid()}-{number}"
         output = base / f"{number}.json"
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
         command = [sys.executable, str(script), str(work), str(output), *names]
         with open(output.with_suffix(".log"), "w") as complaints:
             process = subprocess.Popen(command, stdout=complaints, stderr=complaints, env=environment)

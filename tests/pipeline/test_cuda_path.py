@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 from support import color_encoder
+from support.encoder_folders import save_model, seeded, tiny_vit
 from support.held_out import held_out_psnr
 from support.language_scene import make_scene
 from support.tiny_capture import write_capture
 from support.viewer_scene import WORDS, ball_scene
-from test_encoders import _save, _seeded, _vit, clip_folder  # noqa: F401  (a fixture: a tiny model of transformers)
 
 from lexsplat.captures import load_capture
 from lexsplat.captures.sfm.triangulation import initial_points
@@ -129,14 +129,14 @@ def test_a_pose_gets_its_gradient_on_the_gpu(pretended_gpu, balls):
 # -- features and codes
 
 
-def test_features_and_codes_on_the_gpu(pretended_gpu, scene, clip_folder, tmp_path):  # noqa: F811
+def test_features_and_codes_on_the_gpu(pretended_gpu, scene, clip_folder, tmp_path):
     views = dict(list(scene.views.items())[:2])
     few = dataclasses.replace(scene, views=views)
     config = FeatureConfig(
         crop_sizes=(1.0,), crop_strides=(0.5,), map_cells=4, dino_short_side=16, dino_stride=8, dino_layer=1
     )
     maps = {}
-    _save(_seeded(_vit), tmp_path / "dino")
+    save_model(seeded(tiny_vit), tmp_path / "dino")
     for device in ("cpu", "cuda"):
         clip = ClipEncoder(clip_folder, "tiny", device)
         dense = DinoEncoder(tmp_path / "dino", "tiny", device)
@@ -330,9 +330,9 @@ def test_every_command_runs_with_device_cuda(pretended_gpu, built, tiny_capture,
 
 
 def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypatch):
-    from test_ablate import CONFIG
+    from support.experiments import CONFIG
 
-    from lexsplat import baselines
+    from lexsplat.evaluation import baselines
     from lexsplat.evaluation import compare as comparison
 
     color_encoder.install(monkeypatch)

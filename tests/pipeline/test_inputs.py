@@ -8,16 +8,16 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from PIL import Image
-from support.written_captures import save
-from test_photos import (
+from support.rooms import (
     COUNT,
     SIZE,
     assert_same_up_to_a_similarity,
     room_cameras,
     room_photo,
     save_as_phone,
+    texture,
 )
-from test_triangulation import texture
+from support.written_captures import save
 
 from lexsplat import cli
 from lexsplat.captures import load_annotations, load_capture, poses_from_photos

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[2] / "src" / "lexsplat"
 
-# The packages in the order in which data flow. A module may import only its own package and those that stand before it.
+# The packages in the order in which data flow. A module may import only its own package and those before it.
 ORDER = (
     "runtime", "geometry", "captures", "rendering", "reconstruction", "features", "codebook", "language", "queries",
     "scenes", "pipeline", "evaluation", "viewer", "cli", "demo",
@@ -30,7 +30,7 @@ def imported_packages(tree: ast.AST) -> set[str]:
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("lexsplat."):
             found.add(node.module.split(".")[1])
         elif isinstance(node, ast.ImportFrom) and node.module == "lexsplat":
-            found |= {alias.name for alias in node.names}
+            found |= {alias.name for alias in node.names if (PACKAGE / alias.name).is_dir()}
         elif isinstance(node, ast.Import):
             found |= {a.name.split(".")[1] for a in node.names if a.name.startswith("lexsplat.")}
     return found

@@ -1,4 +1,4 @@
-"""The language that the bundled encoders are trained on says what is true: phrases, crops, held-out pairs."""
+"""The language that the embedded encoders are trained on says what is true: phrases, crops, held-out pairs."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def tools_on_path():
 
 
 def labels():
-    from words import COLORS, NAMES, OWNERS, Label
+    from words import COLOURS, NAMES, OWNERS, Label
 
     finishes = {"table": "wooden", "wall": "brick", "cloth": "checkered", "floor": "tiled"}
     parts = {kind: [None] + [part for part, owners in OWNERS.items() if kind in owners] for kind in NAMES}
     return [
-        Label(kind, color, finishes.get(kind), part)
+        Label(kind, colour, finishes.get(kind), part)
         for kind in NAMES
-        for color in COLORS
+        for colour in COLOURS
         for part in parts[kind]
     ]
 
@@ -51,23 +51,23 @@ def test_a_phrase_made_for_a_label_is_true_of_it(seed):
 
 
 @pytest.mark.parametrize(
-    ("words", "wanted", "ground_truth"),
+    ("words", "wanted", "truth"),
     [
-        ("red mug", {"kind": "mug", "color": "red"}, {"red mug": 1, "blue mug": 0, "red apple": 0}),
+        ("red mug", {"kind": "mug", "colour": "red"}, {"red mug": 1, "blue mug": 0, "red apple": 0}),
         ("mug handle", {"kind": "mug", "part": "handle"}, {"red mug": 0, "red mug handle": 1}),
-        ("something red", {"color": "red"}, {"red apple": 1, "red apple stalk": -1, "blue mug": 0}),
+        ("something red", {"colour": "red"}, {"red apple": 1, "red apple stalk": -1, "blue mug": 0}),
         ("fruit", {"quality": "fruit"}, {"red apple": 1, "red apple stalk": 1, "orange pumpkin": 0}),
         ("metal", {"quality": "metal"}, {"gold ring": 1, "white candle saucer": 1, "white candle": 0}),
-        ("yellow thing", {"color": "yellow"}, {"gold ring": -1}),
+        ("yellow thing", {"colour": "yellow"}, {"gold ring": -1}),
     ],
 )  # fmt: skip
-def test_phrases_are_true_false_or_open_of_what_they_should(words, wanted, ground_truth):
+def test_phrases_are_true_false_or_open_of_what_they_should(words, wanted, truth):
     from words import Label, Phrase
 
     phrase = Phrase(words, **wanted)
-    for thing, expected in ground_truth.items():
-        color, kind, *part = thing.split()
-        assert phrase.of(Label(kind, color, part=part[0] if part else None)) == expected, thing
+    for thing, expected in truth.items():
+        colour, kind, *part = thing.split()
+        assert phrase.of(Label(kind, colour, part=part[0] if part else None)) == expected, thing
 
 
 def test_words_of_things_that_no_scene_holds_are_true_of_nothing():
@@ -84,14 +84,14 @@ def test_no_scene_that_ships_holds_a_pair_kept_from_training():
     from words import HELD_OUT_PAIRS
 
     for layout in LAYOUTS.values():
-        assert not HELD_OUT_PAIRS & {(place.kind, place.color) for place in layout.placements}
+        assert not HELD_OUT_PAIRS & {(place.kind, place.colour) for place in layout.placements}
 
 
 def test_the_scene_for_choosing_shares_no_thing_place_or_camera_with_the_demo():
     from layouts import SECOND, TABLETOP
 
     for what in (
-        lambda scene: {(place.kind, place.color) for place in scene.placements},
+        lambda scene: {(place.kind, place.colour) for place in scene.placements},
         lambda scene: {(place.x, place.y) for place in scene.placements},
         lambda scene: {scene.cloth[0], scene.wall, scene.key_light, scene.seed},
         lambda scene: {pose.tobytes() for pose in scene.path.poses(scene.views)},
@@ -99,16 +99,16 @@ def test_the_scene_for_choosing_shares_no_thing_place_or_camera_with_the_demo():
         assert not what(TABLETOP) & what(SECOND)
     # Words for one thing alone are of that scene alone; those of both mean other things in each.
     both = TABLETOP.prompts.keys() & SECOND.prompts.keys()
-    assert all(TABLETOP.prompts[words].kind not in ("name", "color") for words in both)
+    assert all(TABLETOP.prompts[words].kind not in ("name", "colour") for words in both)
 
 
 @pytest.mark.parametrize("scene", ["tabletop", "second"])
 def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
-    from words import COLORS, NAMES, PARTS, QUALITIES
+    from words import COLOURS, NAMES, PARTS, QUALITIES
 
     single = {
         w
-        for group in (NAMES, PARTS, COLORS)
+        for group in (NAMES, PARTS, COLOURS)
         for names in group.values()
         for name in names
         for w in name.split()
@@ -127,10 +127,10 @@ def test_no_phrase_is_trained_that_names_a_pair_kept_from_training(seed):
     from words import HELD_OUT_PAIRS, any_phrase, near_miss
 
     rng = np.random.default_rng(seed)
-    shown = [label for label in labels() if (label.kind, label.color) not in HELD_OUT_PAIRS]
+    shown = [label for label in labels() if (label.kind, label.colour) not in HELD_OUT_PAIRS]
     label = shown[int(rng.integers(len(shown)))]
     for phrase in (near_miss(label, rng), any_phrase(rng)):
-        assert (phrase.kind, phrase.color) not in HELD_OUT_PAIRS, phrase
+        assert (phrase.kind, phrase.colour) not in HELD_OUT_PAIRS, phrase
 
 
 def test_a_made_up_word_is_none_that_means_something():
@@ -143,11 +143,11 @@ def test_a_made_up_word_is_none_that_means_something():
     assert {"metal", "paper", "fur", "wooden"} <= _KNOWN_WORDS, "of these some can come of the syllables"
 
 
-def test_turned_hues_take_red_to_green_and_leave_gray():
+def test_turned_hues_take_red_to_green_and_leave_grey():
     from train_clip import turned_hues
 
-    colors = np.array([[[200, 0, 0], [90, 90, 90], [0, 200, 0]]], np.uint8)
-    turned = turned_hues(colors, 120.0).astype(int)
+    colours = np.array([[[200, 0, 0], [90, 90, 90], [0, 200, 0]]], np.uint8)
+    turned = turned_hues(colours, 120.0).astype(int)
     assert np.abs(turned - [[[0, 200, 0], [90, 90, 90], [0, 0, 200]]]).max() <= 1
 
 
@@ -165,28 +165,28 @@ def test_no_hue_is_turned_so_that_a_kind_looks_as_it_was_kept_from_training():
 
 def test_what_is_blue_is_not_told_to_be_no_bear_since_blue_bears_are_kept_from_training():
     from crops import cut
-    from ground_truth import TruthTable
     from train_clip import leave_open
+    from truth import TruthTable
     from words import FALSE, OPEN, TRUE, Label, Phrase
 
     shown = [Label("mug", "red"), Label("table", "blue")]
     crops = [cut(frame_of_two_halves(), left, 5.0, 20.0) for left in (0.0, 40.0)]
     phrases = [
         Phrase("bear", kind="teddy"), Phrase("something fluffy", quality="fluffy"), Phrase("red ball", kind="ball"),
-        Phrase("table", kind="table"), Phrase("red", color="red"),
+        Phrase("table", kind="table"), Phrase("red", colour="red"),
     ]  # fmt: skip
-    ground_truth = TruthTable(shown).of(phrases, crops)
-    assert ground_truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [FALSE, FALSE, FALSE, TRUE, FALSE]]
-    leave_open(ground_truth, phrases, crops, shown, np.zeros(2))
-    assert ground_truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [OPEN, OPEN, FALSE, TRUE, FALSE]]
+    truth = TruthTable(shown).of(phrases, crops)
+    assert truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [FALSE, FALSE, FALSE, TRUE, FALSE]]
+    leave_open(truth, phrases, crops, shown, np.zeros(2))
+    assert truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [OPEN, OPEN, FALSE, TRUE, FALSE]]
 
 
-def test_texts_whose_colors_add_to_kinds_alike_cost_nothing():
+def test_texts_whose_colours_add_to_kinds_alike_cost_nothing():
     import torch
     from train_clip import composition_loss
 
-    kinds, colors = torch.randn(2, 8), torch.randn(2, 8)
-    corners = torch.stack([kinds[k] + colors[c] for k in (0, 1) for c in (0, 1)])
+    kinds, colours = torch.randn(2, 8), torch.randn(2, 8)
+    corners = torch.stack([kinds[k] + colours[c] for k in (0, 1) for c in (0, 1)])
     assert float(composition_loss(corners)) == pytest.approx(0, abs=1e-10)
     corners[3] += torch.eye(8)[0]
     assert float(composition_loss(corners)) == pytest.approx(1, abs=1e-5)
@@ -203,11 +203,11 @@ def frame_of_two_halves():
 
 def test_a_crop_shows_what_lies_around_its_middle():
     from crops import cut
-    from ground_truth import TruthTable
+    from truth import TruthTable
     from words import FALSE, OPEN, TRUE, Label, Phrase
 
     table = TruthTable([Label("mug", "red"), Label("table", "blue")])
-    phrases = [Phrase("mug", kind="mug"), Phrase("blue table", kind="table", color="blue")]
+    phrases = [Phrase("mug", kind="mug"), Phrase("blue table", kind="table", colour="blue")]
     frame = frame_of_two_halves()
     crops = [cut(frame, left, 5.0, 20.0) for left in (0.0, 40.0, 17.0, 23.5)]
     assert table.of(phrases, crops).tolist() == [[TRUE, FALSE], [FALSE, TRUE], [TRUE, OPEN], [OPEN, TRUE]]
@@ -271,7 +271,7 @@ def test_a_phrase_about_any_part_is_true_of_that_part_alone(seed):
 
 def test_a_thin_part_in_the_very_middle_counts_as_shown_if_asked_for():
     from crops import cut
-    from ground_truth import TruthTable
+    from truth import TruthTable
     from words import OPEN, TRUE, Phrase
 
     frames = frames_with_a_handle()
@@ -281,7 +281,7 @@ def test_a_thin_part_in_the_very_middle_counts_as_shown_if_asked_for():
     weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
     assert all(0.1 < weight < 0.25 for weight in weights)
     assert TruthTable(frames.labels).of(handle, crops).tolist() == [[OPEN], [OPEN]]
-    assert TruthTable(frames.labels, center=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]
+    assert TruthTable(frames.labels, centre=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]
 
 
 def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
@@ -310,7 +310,7 @@ def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
 
 def test_what_a_part_lies_beside_can_be_said_not_to_show_it():
     from crops import cut
-    from ground_truth import BESIDE, TruthTable
+    from truth import BESIDE, TruthTable
     from words import FALSE, OPEN, TRUE, Phrase
 
     frames = frames_with_a_handle()
@@ -321,7 +321,7 @@ def test_what_a_part_lies_beside_can_be_said_not_to_show_it():
     weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
     assert 0.04 < weights[0] < weights[1] < BESIDE
     assert 0.04 < weights[3] < 0.1
-    usual, strict = (TruthTable(frames.labels, center=True, **more) for more in ({}, {"beside": BESIDE}))
+    usual, strict = (TruthTable(frames.labels, centre=True, **more) for more in ({}, {"beside": BESIDE}))
     assert usual.of(handle, crops).ravel().tolist() == [OPEN, OPEN, TRUE, OPEN]
     assert strict.of(handle, crops).ravel().tolist() == [FALSE, FALSE, TRUE, OPEN], (
         "in the middle it stays open"
@@ -364,7 +364,7 @@ def test_where_nothing_is_weighs_in_a_patch_and_is_no_label():
 
 def test_a_patch_shows_what_half_of_it_is_and_not_what_an_eighth_of_it_is():
     from crops import Crop
-    from ground_truth import TruthTable
+    from truth import TruthTable
     from words import FALSE, OPEN, TRUE, Label, Phrase
 
     table = TruthTable(
@@ -385,7 +385,7 @@ def test_a_patch_shows_what_half_of_it_is_and_not_what_an_eighth_of_it_is():
         patch(0, 0, 0),
     ]
     patches.append(patch(0, 0, 0, 16))  # gold may be called yellow: what is possible is not false
-    phrases = [Phrase("mug", kind="mug"), Phrase("blue", color="blue"), Phrase("yellow", color="yellow")]
+    phrases = [Phrase("mug", kind="mug"), Phrase("blue", colour="blue"), Phrase("yellow", colour="yellow")]
     assert table.at_places(phrases, patches).tolist() == [
         [TRUE, TRUE, FALSE],
         [OPEN, TRUE, FALSE],
@@ -401,14 +401,14 @@ def place_questions():
     from words import Phrase
 
     return [
-        Phrase("mug handle", kind="mug", part="handle"), Phrase("mug", kind="mug"), Phrase("red", color="red"),
+        Phrase("mug handle", kind="mug", part="handle"), Phrase("mug", kind="mug"), Phrase("red", colour="red"),
         Phrase("table", kind="table"),
     ]  # fmt: skip
 
 
-def place_answers(frames, crops, seed=0, colorless=None, angles=None):
-    from ground_truth import TruthTable
+def place_answers(frames, crops, seed=0, colourless=None, angles=None):
     from train_clip import ClipTraining, place_truth
+    from truth import TruthTable
 
     count = len(crops)
     return place_truth(
@@ -416,7 +416,7 @@ def place_answers(frames, crops, seed=0, colorless=None, angles=None):
         crops,
         TruthTable(frames.labels),
         np.zeros(count) if angles is None else angles,
-        np.zeros(count, bool) if colorless is None else np.array(colorless),
+        np.zeros(count, bool) if colourless is None else np.array(colourless),
         ClipTraining(dense=1.0),
         np.random.default_rng(seed),
     )
@@ -443,19 +443,19 @@ def test_a_handle_is_asked_for_at_its_patches_and_is_false_at_the_patches_of_the
     assert len({row.tobytes() for row in answers}) > 1, "not the same patches every time"
 
 
-def test_colors_are_not_asked_of_patches_of_crops_without_them():
+def test_colours_are_not_asked_of_patches_of_crops_without_them():
     from words import OPEN, TRUE
 
     frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
-    colored, gray = place_answers(frames, [crop, crop], colorless=[False, True])
-    assert (colored[:, 2] == TRUE).any()
-    assert (gray[:, 2] == OPEN).all()
-    assert (gray[:, 1] == TRUE).any(), "kinds are asked"
+    coloured, grey = place_answers(frames, [crop, crop], colourless=[False, True])
+    assert (coloured[:, 2] == TRUE).any()
+    assert (grey[:, 2] == OPEN).all()
+    assert (grey[:, 1] == TRUE).any(), "kinds are asked"
 
 
 def test_a_patch_that_is_blue_is_not_told_to_be_no_bear_either():
-    from ground_truth import TruthTable
     from train_clip import ClipTraining, place_truth
+    from truth import TruthTable
     from words import FALSE, OPEN, Phrase
 
     frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
@@ -479,8 +479,8 @@ def small_training(**settings):
 
 
 def batch_of(config, seed=0):
-    from ground_truth import TruthTable
     from train_clip import make_batch
+    from truth import TruthTable
 
     frames = frames_with_a_handle(scale=4)
     return make_batch(frames, TruthTable(frames.labels), config, np.random.default_rng(seed))
@@ -507,7 +507,7 @@ def test_what_patches_of_a_mirrored_crop_are_asked_stays_on_them():
         pixels=pixels.byte(),
         texts=[],
         corners=[],
-        ground_truth=torch.empty(8, 0),
+        truth=torch.empty(8, 0),
         patches=marks[..., None].expand(-1, -1, 3),
         left_out=marks[..., None].expand(-1, -1, 22) % 2 == 1,
         places=marks[..., None].expand(-1, -1, 5).to(torch.int8),
@@ -594,7 +594,7 @@ def test_what_training_reads_at_patches_is_what_the_encoder_reads_there(tmp_path
 def test_the_model_may_see_between_two_steps_without_a_trace():
     import torch
 
-    config = small_training(dense=1.0, gray=0.0, turned=0.0)
+    config = small_training(dense=1.0, grey=0.0, turned=0.0)
     batch = batch_of(config)
 
     def dense(before):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import limited_stages
+from support import TESTS_ON_PATH, limited_stages
 from support.tiny_capture import camera_poses, quaternion
 
 from lexsplat import cli
@@ -80,7 +80,9 @@ def run(capture: Path, output: Path, limit: int, *options: str) -> subprocess.Co
         "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5", "--features.map-cells", "16",
         "--features.max-short-side", "120", *options,
     ]  # fmt: skip
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    environment = {
+        **os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2",
+    }  # fmt: skip
     command = [sys.executable, "-c", BUILD, str(limit), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment)
 
@@ -140,7 +142,13 @@ def limited(tmp_path_factory):
         pytest.skip("the hard limit (RLIMIT_DATA) needs Linux")
     folder = tmp_path_factory.mktemp("limited") / "capture"
     limited_stages.write_photos(folder)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    environment = {
+        **os.environ,
+        **TESTS_ON_PATH,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "MALLOC_ARENA_MAX": "2",
+    }
     command = [sys.executable, limited_stages.__file__, str(folder), str(LIBRARIES)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment)
     assert done.returncode == 0, done.stderr[-2000:]

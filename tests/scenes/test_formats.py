@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
-from test_ply import make
+from support.splats import make
 
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.boxes import Up

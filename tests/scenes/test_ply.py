@@ -7,19 +7,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.splats import make
 
-from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.ply import read_ply, write_ply
-
-
-def make(count: int, degree: int, seed: int = 0, antialiased: bool = False) -> Gaussians:
-    g = torch.Generator().manual_seed(seed)
-    rest = (degree + 1) ** 2 - 1
-    r = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
-    return Gaussians(
-        r(count, 3), r(count, 4), r(count, 3), r(count), r(count, 1, 3), r(count, rest, 3), antialiased
-    )
 
 
 @settings(max_examples=25, deadline=None)

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from test_photos import SIZE, room_cameras, room_photo
-from test_triangulation import texture
+
+from support.rooms import SIZE, room_cameras, room_photo, texture
 
 LARGE = (2400, 1800)
 GIANT = (3600, 2700)

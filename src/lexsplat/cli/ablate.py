@@ -28,7 +28,8 @@ class Ablate:
         methods: Which ways to the language, beside each other; none takes that of the settings (trained).
         wrong_labels: Stress test: replace the code of this share of the pixels by a random one, others in every
             view.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
+        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what
+        lies in or beside
             the capture.
         prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
         forms: How codes and text are compared, each beside the others; the paper's is "feature".

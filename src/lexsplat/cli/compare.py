@@ -32,7 +32,8 @@ class Compare:
         output: Where everything goes; that of ``ablate`` shares its Gaussians and features.
         methods: Which rows. "-feature" is the paper's form of relevancy in place of our default.
         seeds: Seeds of codebook and language.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
+        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what
+        lies in or beside
             the capture.
         prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).

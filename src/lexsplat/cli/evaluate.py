@@ -27,7 +27,8 @@ class Evaluate:
 
     Args:
         scene: A scene folder.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what lies in or beside
+        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what
+        lies in or beside
             the capture.
         prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).

@@ -309,7 +309,9 @@ class Bench:
 
     @cached_property
     def _truth_identity(self) -> list[Any]:
-        """Words and ground truth as they are measured, by content: wherever it lies, and whatever its files are called."""
+        """Words and ground truth as they are measured, by content: wherever it lies, and whatever its files
+        are called.
+        """
         masks = {
             view: {p: _digest(m) for p, m in prompts.items()}
             for view, prompts in self.ground_truth.masks.items()

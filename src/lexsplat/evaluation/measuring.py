@@ -265,7 +265,9 @@ class _Evaluation:
         working: NDArray[np.float32],
         mask: NDArray[np.bool_],
     ) -> PairResult:
-        """One prompt in one view under every protocol: maps at the size of the ground truth and at the working size."""
+        """One prompt in one view under every protocol: maps at the size of the ground truth and at the
+        working size.
+        """
         asked = self.config.protocols
         boxes = self.boxes.get(view.name, {}).get(prompt)
         return PairResult(

@@ -1,6 +1,7 @@
 """What an evaluation asks of a method that finds words in a scene: maps, and scores of Gaussians if it has them.
 
-Language fields (`language_field.LanguageField`) are one kind; the rebuilt methods of `lexsplat.evaluation.baselines` others.
+Language fields (`language_field.LanguageField`) are one kind; the rebuilt methods of
+`lexsplat.evaluation.baselines` others.
 """
 
 from __future__ import annotations

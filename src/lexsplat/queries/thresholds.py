@@ -1,7 +1,8 @@
 """Masks from relevancies: by a fixed threshold (the paper's 0.5) or an automatic one for each prompt.
 
 The automatic threshold is found from the scene alone and never sees the truth. Whether a prompt is in the scene at
-all has a say too: `lexsplat.queries.presence.found_thresholds`, which every question goes through, puts 0.5 where it is
+all has a say too: `lexsplat.queries.presence.found_thresholds`, which every question goes through, puts 0.5
+where it is
 not. Dimension letters are those of `lexsplat.queries.relevancy`.
 """
 

@@ -105,11 +105,13 @@ _PROVENANCE = (
 
 
 def provenance(config: Mapping[str, Any], machine: Mapping[str, Any]) -> str:
-    """What somebody needs to repeat the numbers: seed, models, machine, ground truth, versions; all settings folded."""
+    """What somebody needs to repeat the numbers: seed, models, machine, ground truth, versions; all settings
+    folded.
+    """
     known = {**config, **machine}
     rows = [(name, escape(_words(known[name]))) for name in _PROVENANCE if known.get(name) is not None]
     if known.get("ground_truth"):
-        rows.append(("ground_truth", escape(_truth_words(known["ground_truth"]))))
+        rows.append(("ground truth", escape(_ground_truth_words(known["ground_truth"]))))
     versions = machine.get("versions") or {}
     if versions:
         rows.append(("versions", escape(", ".join(f"{name} {value}" for name, value in versions.items()))))
@@ -117,7 +119,7 @@ def provenance(config: Mapping[str, Any], machine: Mapping[str, Any]) -> str:
     return shown + folded_json("machine", machine) + folded_json("config", config)
 
 
-def _truth_words(ground_truth: Mapping[str, Any]) -> str:
+def _ground_truth_words(ground_truth: Mapping[str, Any]) -> str:
     asked = ground_truth.get("prompt_list")
     return f"{ground_truth.get('folder')}, " + (
         f"words of the list {asked}" if asked else "words of the masks"

@@ -231,7 +231,7 @@ def _cases(
         return ""
     place_of = {view: place for place, view in enumerate(views.views)}
     blocks = [
-        "<p>For each prompt in a view: photo, rendering and ground truth, then what every method answers, its relevancy "
+        "<p>For each prompt in a view: photo, rendering and ground truth, then each method's relevancy "
         "above and its mask at the automatic threshold below. First seed.</p>"
     ]
     for view, prompt in cases:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 __all__ = [
     "MASKED_CODE",
     "REPORT_EVERY",
-    "TrainedConfig",
     "FieldTrainer",
+    "TrainedConfig",
     "check_views",
     "codes_at_pixels",
     "train_field",

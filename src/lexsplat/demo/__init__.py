@@ -1,1 +1,0 @@
-"""The scenes and encoders that ship with lexsplat, and the demo that runs the whole system on them."""

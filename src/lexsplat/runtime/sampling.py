@@ -1,0 +1,20 @@
+"""Even subsets of sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def evenly(items: Sequence[T], count: int) -> list[T]:
+    """At most ``count`` items at even distances, in order; the first and the last are among them.
+
+    Args:
+        items: What to choose from.
+        count: How many at most.
+    """
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i * (len(items) - 1) / max(1, count - 1))] for i in range(count)]
