@@ -104,8 +104,8 @@ def main() -> None:
         choices=("first", "refine", "parts", "dense", "handles", "edges"),
         default=["first", "refine", "parts", "dense"],
         help="of the image-text encoder; all but the first go on from the model in OUTPUT; the first four made the "
-        "weights that ship; handles (after parts) and edges (after handles) are experiments (docs/results.md), "
-        "not in them",
+        "weights that ship; handles (after parts) and edges (after handles) are experiments "
+        "(docs/lab-notes/2026-11-encoders.md), not in them",
     )
     parser.add_argument("--dino-steps", type=int, default=600)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
