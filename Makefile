@@ -9,16 +9,19 @@ OUTPUT ?= output/demo
 # Two workers: more only fight over the cores that the kernels already use.
 PYTEST_WORKERS ?= 2
 
-.PHONY: demo test lint install clean help
+.PHONY: demo test test-fast lint install clean help
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
-demo: $(VENV)/.runtime  ## reconstruct, embed, query and evaluate the scene that ships with the package
+demo: $(VENV)/.runtime  ## build, query and evaluate the scene that ships with the package
 	$(BIN)/lexsplat demo --output "$(OUTPUT)"
 
-test: $(VENV)/.dev  ## run the tests
+test: $(VENV)/.dev  ## run all tests
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadgroup
+
+test-fast: $(VENV)/.dev  ## run the tests that are not marked slow, in about a minute
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadgroup -m "not slow"
 
 lint: $(VENV)/.dev  ## style and types
 	$(BIN)/ruff check .
