@@ -54,15 +54,15 @@ def authors(tmp_path):
 
 
 def test_the_authors_folders_are_read_as_they_are(authors):
-    scene = load_capture(authors)
-    assert scene.test_names == ("DSCF4670.JPG", "DSCF4690.JPG"), "views with masks are held out"
-    found = load_annotations(scene)
+    capture = load_capture(authors)
+    assert capture.test_names == ("DSCF4670.JPG", "DSCF4690.JPG"), "views with masks are held out"
+    found = load_annotations(capture)
     assert found.layout == "segmentations"
     assert {view: list(prompts) for view, prompts in found.masks.items()} == {
         "DSCF4670.JPG": ["silver gray curtain", "windows"],
         "DSCF4690.JPG": ["green Yucca plant", "windows"],
     }
-    ground_truth = load_ground_truth(scene.views["DSCF4690.JPG"], found.masks["DSCF4690.JPG"]["windows"])
+    ground_truth = load_ground_truth(capture.views["DSCF4690.JPG"], found.masks["DSCF4690.JPG"]["windows"])
     np.testing.assert_array_equal(ground_truth, disk(20, 20, 8))
 
 
@@ -82,17 +82,17 @@ def test_prompts_that_a_list_does_not_name_are_left_out(authors):
 def test_masks_called_in_the_words_of_the_paper_answer_to_either_list(authors):
     folder = authors / "segmentations" / "DSCF4690"
     (folder / "green Yucca plant.png").rename(folder / "yucca plant.png")
-    scene = load_capture(authors)
-    assert load_annotations(scene, prompt_list="released").prompts() == (
+    capture = load_capture(authors)
+    assert load_annotations(capture, prompt_list="released").prompts() == (
         "green Yucca plant", "silver gray curtain", "windows",
     )  # fmt: skip
-    assert load_annotations(scene, prompt_list="paper").prompts() == ("curtain", "windows", "yucca plant")
+    assert load_annotations(capture, prompt_list="paper").prompts() == ("curtain", "windows", "yucca plant")
 
 
 def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors, caplog):
     save_mask(authors / "segmentations" / "DSCF4690" / "teapot.png", disk(20, 20, 8))
-    scene = load_capture(authors)
-    assert "teapot" not in load_annotations(scene, prompt_list="paper").prompts()
+    capture = load_capture(authors)
+    assert "teapot" not in load_annotations(capture, prompt_list="paper").prompts()
     (message,) = [record.getMessage() for record in caplog.records]
     assert "teapot" in message
     assert "windows" not in message
@@ -100,7 +100,7 @@ def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors,
         for path in (authors / "segmentations" / folder).iterdir():
             path.rename(path.with_name(f"tea {path.name}"))
     with pytest.raises(CaptureError, match="words of the list 'paper'"):
-        load_annotations(scene, prompt_list="paper")
+        load_annotations(capture, prompt_list="paper")
 
 
 def test_the_papers_list_is_the_table_of_its_supplement():
@@ -148,13 +148,13 @@ def ovs3d(tmp_path):
 
 
 def test_3d_ovs_is_read_with_its_class_list(ovs3d):
-    scene = load_capture(ovs3d)
-    assert scene.test_names == ("00.jpg", "03.jpg")
-    found = load_annotations(scene)
+    capture = load_capture(ovs3d)
+    assert capture.test_names == ("00.jpg", "03.jpg")
+    found = load_annotations(capture)
     assert found.layout == "3d-ovs"
     assert found.classes == ("mini offroad car", "wall")
     assert list(found.masks) == ["00.jpg", "03.jpg"]
-    total = sum(load_ground_truth(scene.views["03.jpg"], mask) for mask in found.masks["03.jpg"].values())
+    total = sum(load_ground_truth(capture.views["03.jpg"], mask) for mask in found.masks["03.jpg"].values())
     np.testing.assert_array_equal(total, 1)
 
 
@@ -162,9 +162,9 @@ def test_3d_ovs_numbers_count_the_images_where_names_say_nothing_else(ovs3d):
     for number, name in enumerate(NAMES):
         (ovs3d / "images" / name).rename(ovs3d / "images" / f"DSC{number:03d}.jpg")
     write_colmap(ovs3d, [f"DSC{number:03d}.jpg" for number in range(6)], images=False)
-    scene = load_capture(ovs3d)
-    assert scene.test_names == ("DSC000.jpg", "DSC003.jpg")
-    assert list(load_annotations(scene).masks) == ["DSC000.jpg", "DSC003.jpg"]
+    capture = load_capture(ovs3d)
+    assert capture.test_names == ("DSC000.jpg", "DSC003.jpg")
+    assert list(load_annotations(capture).masks) == ["DSC000.jpg", "DSC003.jpg"]
 
 
 def test_3d_ovs_numbers_that_mean_one_image_by_name_and_another_by_count_are_refused(ovs3d):
@@ -211,9 +211,9 @@ def lerf_ovs(tmp_path):
 
 
 def test_lerf_ovs_labels_beside_the_capture_are_found_and_their_views_held_out(lerf_ovs):
-    scene = load_capture(lerf_ovs)
-    assert scene.test_names == (FRAMES[1], FRAMES[4])
-    found = load_annotations(scene)
+    capture = load_capture(lerf_ovs)
+    assert capture.test_names == (FRAMES[1], FRAMES[4])
+    found = load_annotations(capture)
     assert found.layout == "lerf-ovs"
     assert {view: list(prompts) for view, prompts in found.masks.items()} == {
         FRAMES[1]: ["apple", "sheep"],
@@ -232,10 +232,10 @@ def test_lerf_ovs_objects_of_one_name_are_one_mask_with_several_boxes(lerf_ovs):
 def test_lerf_ovs_masks_are_undistorted_with_their_photo_and_boxes_drawn_anew(lerf_ovs):
     params = (60.0, 60.0, 32.0, 24.0, 0.15, 0.0, 0.0, 0.0)
     write_colmap(lerf_ovs, FRAMES, model=4, params=params, images=False)
-    scene = load_capture(lerf_ovs)
-    found = load_annotations(scene)
+    capture = load_capture(lerf_ovs)
+    found = load_annotations(capture)
     mask, box = found.masks[FRAMES[4]]["apple"], found.boxes[FRAMES[4]]["apple"][0]
-    width, height = scene.views[FRAMES[4]].capture_size
+    width, height = capture.views[FRAMES[4]].capture_size
     assert mask.shape == (height, width) != (HEIGHT, WIDTH)
     rows, columns = np.nonzero(mask)
     assert box.tolist() == [columns.min(), rows.min(), columns.max(), rows.max()]
@@ -277,10 +277,10 @@ def test_labels_of_no_view_or_of_another_aspect_are_refused(lerf_ovs):
 def test_labels_can_be_given_by_folder(lerf_ovs, tmp_path):
     moved = tmp_path / "elsewhere"
     (lerf_ovs.parent / "label" / "teatime").rename(moved)
-    scene = load_capture(lerf_ovs)
-    assert load_annotations(scene).masks == {}
+    capture = load_capture(lerf_ovs)
+    assert load_annotations(capture).masks == {}
     assert layout_of(moved) == "lerf-ovs"
-    assert set(load_annotations(scene, moved).masks) == {FRAMES[1], FRAMES[4]}
+    assert set(load_annotations(capture, moved).masks) == {FRAMES[1], FRAMES[4]}
 
 
 @given(st.lists(st.tuples(st.integers(-5, 45), st.integers(-5, 35)), min_size=3, max_size=9))

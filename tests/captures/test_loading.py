@@ -26,16 +26,16 @@ NAMES = [f"{index:04d}.png" for index in range(1, 18)]
 class TestTransforms:
     def test_views_have_the_cameras_that_were_written(self, tmp_path):
         write_transforms(tmp_path, NAMES)
-        scene = load_capture(tmp_path)
-        assert list(scene.views) == NAMES
-        for view, camera in zip(scene.views.values(), cameras_around(len(NAMES))):
+        capture = load_capture(tmp_path)
+        assert list(capture.views) == NAMES
+        for view, camera in zip(capture.views.values(), cameras_around(len(NAMES))):
             np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
             np.testing.assert_allclose(view.camera.K, [[FOCAL, 0, 32], [0, FOCAL, 24], [0, 0, 1]])
             assert view.capture_size == (WIDTH, HEIGHT)
-        assert scene.source == "transforms"
-        assert scene.points.shape == (0, 3)
-        positions = np.array([view.camera.position for view in scene.train_views])
-        assert scene.extent == pytest.approx(1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1)))
+        assert capture.source == "transforms"
+        assert capture.points.shape == (0, 3)
+        positions = np.array([view.camera.position for view in capture.train_views])
+        assert capture.extent == pytest.approx(1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1)))
 
     def test_the_json_file_itself_may_be_given(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3])
@@ -46,10 +46,10 @@ class TestTransforms:
         document["frames"][1] |= {"fl_x": 70.0, "fl_y": 71.0, "cx": 20.0, "cy": 22.0, "w": 40, "h": 44}
         write_images(tmp_path / "images", NAMES[1:2], (40, 44))
         write_json(tmp_path, document)
-        scene = load_capture(tmp_path)
-        sizes = [(view.camera.width, view.camera.height) for view in scene.views.values()]
+        capture = load_capture(tmp_path)
+        sizes = [(view.camera.width, view.camera.height) for view in capture.views.values()]
         assert sizes == [(64, 48), (40, 44), (64, 48)]
-        np.testing.assert_allclose(scene.views[NAMES[1]].camera.K, [[70, 0, 20], [0, 71, 22], [0, 0, 1]])
+        np.testing.assert_allclose(capture.views[NAMES[1]].camera.K, [[70, 0, 20], [0, 71, 22], [0, 0, 1]])
 
     @pytest.mark.parametrize("fisheye", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
     def test_fisheye_cameras_are_undistorted_as_such(self, tmp_path, fisheye):
@@ -79,9 +79,9 @@ class TestTransforms:
         write_transforms(tmp_path, NAMES)
         for name in (NAMES[2], NAMES[9]):
             (tmp_path / "images" / name).unlink()
-        scene = load_capture(tmp_path)
-        assert len(scene.views) == len(NAMES) - 2
-        (warning,) = scene.warnings
+        capture = load_capture(tmp_path)
+        assert len(capture.views) == len(NAMES) - 2
+        (warning,) = capture.warnings
         assert "2 of 17" in warning
         assert NAMES[2] in warning
         assert NAMES[9] in warning
@@ -102,11 +102,11 @@ class TestTransforms:
             for i in (0, 1):
                 save(tmp_path / part / f"r_{i}.png", np.zeros((20, 20, 3)))
                 Image.fromarray(rgba).save(tmp_path / part / f"r_{i}.png")
-        scene = load_capture(tmp_path)
-        assert scene.train_names == ("train/r_0.png", "train/r_1.png")
-        assert scene.test_names == ("test/r_0.png", "test/r_1.png")
-        assert scene.background == (1.0, 1.0, 1.0)
-        view = scene.views["test/r_0.png"]
+        capture = load_capture(tmp_path)
+        assert capture.train_names == ("train/r_0.png", "train/r_1.png")
+        assert capture.test_names == ("test/r_0.png", "test/r_1.png")
+        assert capture.background == (1.0, 1.0, 1.0)
+        view = capture.views["test/r_0.png"]
         assert view.stem == "test/r_0"
         np.testing.assert_allclose(view.camera.K, [[10, 0, 10], [0, 10, 10], [0, 0, 1]])
         image = view.load_image()
@@ -124,16 +124,16 @@ class TestTransforms:
         for frame in document["frames"]:
             frame |= intrinsics
         write_json(tmp_path, document)
-        scene = load_capture(tmp_path)
-        assert scene.background == (0.0, 0.0, 0.0), "intrinsics of each frame are no reason for white"
-        assert scene.views[NAMES[0]].load_image().max() == 0
+        capture = load_capture(tmp_path)
+        assert capture.background == (0.0, 0.0, 0.0), "intrinsics of each frame are no reason for white"
+        assert capture.views[NAMES[0]].load_image().max() == 0
 
     def test_fox_is_loaded_without_its_17_missing_frames(self):
-        scene = load_capture(shared_data("fox"), downscale=8)
-        assert len(scene.views) == 50
-        assert len(scene.warnings) == 1
-        assert scene.warnings[0].count(".jpg") == 17
-        view = scene.views["0001.jpg"]
+        capture = load_capture(shared_data("fox"), downscale=8)
+        assert len(capture.views) == 50
+        assert len(capture.warnings) == 1
+        assert capture.warnings[0].count(".jpg") == 17
+        view = capture.views["0001.jpg"]
         image = view.load_image()
         assert image.shape == (view.camera.height, view.camera.width, 3) == (237, 133, 3)
         assert 0.4 < image.mean() < 0.7
@@ -142,10 +142,10 @@ class TestTransforms:
 class TestSplit:
     def test_every_eighth_view_counts_from_the_first(self, tmp_path):
         write_transforms(tmp_path, NAMES)
-        scene = load_capture(tmp_path)
-        assert scene.test_names == (NAMES[0], NAMES[8], NAMES[16])
-        assert sorted(scene.train_names + scene.test_names) == NAMES
-        assert [view.name for view in scene.test_views] == list(scene.test_names)
+        capture = load_capture(tmp_path)
+        assert capture.test_names == (NAMES[0], NAMES[8], NAMES[16])
+        assert sorted(capture.train_names + capture.test_names) == NAMES
+        assert [view.name for view in capture.test_views] == list(capture.test_names)
         assert load_capture(tmp_path, test_every=5).test_names == tuple(NAMES[::5])
         assert load_capture(tmp_path, test_every=0).test_names == ()
 
@@ -406,9 +406,9 @@ class TestMasks:
 
     def test_a_capture_without_masks_has_none(self, tmp_path):
         write_transforms(tmp_path, NAMES)
-        scene = load_capture(tmp_path)
-        assert scene.segmentations is None
-        assert load_masks(scene) == {}
+        capture = load_capture(tmp_path)
+        assert capture.segmentations is None
+        assert load_masks(capture) == {}
 
     def test_equal_stems_in_subfolders_need_the_subfolder(self, tmp_path):
         names = ["left/0001.png", "right/0001.png", "right/0002.png"]
@@ -420,17 +420,17 @@ class TestMasks:
         assert_tells(caught.value, "2 views")
 
     def test_a_mask_whose_stem_matches_no_view_is_told(self, tmp_path):
-        scene = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
+        capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
         with pytest.raises(CaptureError) as caught:
-            load_masks(scene)
+            load_masks(capture)
         assert_tells(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
 
     def test_a_mask_of_another_aspect_is_told_and_a_scaled_one_taken(self, tmp_path):
-        scene = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
-        assert list(load_masks(scene)) == ["0004.png"]
+        capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
+        assert list(load_masks(capture)) == ["0004.png"]
         save(tmp_path / "segmentations" / "0004" / "bad.png", np.ones((48, 48)))
         with pytest.raises(CaptureError) as caught:
-            load_masks(scene)
+            load_masks(capture)
         assert_tells(caught.value, "bad.png", "64x48", "48x48")
 
     @pytest.mark.parametrize(("high", "dtype"), [(1, np.uint8), (255, np.uint8), (65535, np.uint16)])
@@ -445,9 +445,9 @@ class TestMasks:
         disk = ((x - 12) ** 2 + (y - 12) ** 2 < 64).astype(float)
         save(tmp_path / "images" / NAMES[0], np.repeat(disk[..., None], 3, 2))
         save(tmp_path / "segmentations" / "0001" / "disk.png", disk)
-        scene = load_capture(tmp_path)
-        view = scene.views[NAMES[0]]
-        mask = view.load_mask(load_masks(scene)[NAMES[0]]["disk"])
+        capture = load_capture(tmp_path)
+        view = capture.views[NAMES[0]]
+        mask = view.load_mask(load_masks(capture)[NAMES[0]]["disk"])
         assert mask.shape == view.capture_size[::-1]
         seen = view.load_image(view.capture_size)[..., 0] > 0.5
         assert (mask != seen).mean() < 0.01

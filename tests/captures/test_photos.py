@@ -41,17 +41,17 @@ def test_photos_are_placed_and_the_one_that_cannot_be_is_named(room):
     _, poses, events = room
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
     assert poses.unregistered == ("unrelated.png",)
-    assert "9 of 10 photos placed" in poses.note
+    assert "9 of 10 photos registered" in poses.note
     assert events[-1].done == events[-1].total
     assert events[-1].metrics == {"registered": 9, "photos": 10}
 
 
 def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
     folder, poses, _ = room
-    scene = load_capture(poses.root, images=folder, test_every=0)
-    found = [scene.views[f"{index}.png"].camera for index in range(COUNT)]
+    capture = load_capture(poses.root, images=folder, test_every=0)
+    found = [capture.views[f"{index}.png"].camera for index in range(COUNT)]
     assert_same_up_to_a_similarity(found, room_cameras())
-    assert len(scene.points) == poses.points > 200
+    assert len(capture.points) == poses.points > 200
     assert poses.images == folder, "photos that need nothing are not copied"
     assert not (poses.root / "images").exists()
     assert not (poses.root / ".poses").exists(), "what was worked with is gone"
@@ -73,9 +73,9 @@ def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_pat
     monkeypatch.setattr(pycolmap, "incremental_mapping", misled_once)
     poses = poses_from_photos(folder, tmp_path / "poses")
     assert moved, "there was something to put right"
-    scene = load_capture(poses.root, images=folder, test_every=0)
+    capture = load_capture(poses.root, images=folder, test_every=0)
     assert_same_up_to_a_similarity(
-        [scene.views[f"{index}.png"].camera for index in range(COUNT)], room_cameras()
+        [capture.views[f"{index}.png"].camera for index in range(COUNT)], room_cameras()
     )
 
 
@@ -201,9 +201,9 @@ def phone(tmp_path_factory):
 def test_turned_photos_get_upright_cameras_that_are_the_true_ones(phone):
     _, poses = phone
     assert len(poses.registered) == COUNT, poses.note
-    scene = load_capture(poses.root, images=poses.images, test_every=0)
-    found = [scene.views[f"{index}.jpg"].camera for index in range(COUNT)]
-    assert {(view.lens.width, view.lens.height) for view in scene.views.values()} == {SIZE}
+    capture = load_capture(poses.root, images=poses.images, test_every=0)
+    found = [capture.views[f"{index}.jpg"].camera for index in range(COUNT)]
+    assert {(view.lens.width, view.lens.height) for view in capture.views.values()} == {SIZE}
     assert_same_up_to_a_similarity(found, room_cameras())
 
 

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from support.poses import move
 
-from lexsplat.captures.sfm.pose_agreement import agreements, misregistered, place_again, sampson_errors
+from lexsplat.captures.sfm.pose_agreement import agreements, misregistered, register_again, sampson_errors
 from lexsplat.captures.sfm.triangulation import quiet_pycolmap
 
 WRONG = 4
@@ -71,7 +71,7 @@ def test_a_misplaced_photo_is_placed_again_where_it_belongs(registered, tmp_path
     move(model, WRONG)
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
     with quiet_pycolmap(0):
-        again = place_again(model, [WRONG], path, tmp_path, tmp_path / "again", options)
+        again = register_again(model, [WRONG], path, tmp_path, tmp_path / "again", options)
     assert set(again.reg_image_ids()) == set(ground_truth)
     # The mapper may turn, move and scale the whole: distances between photos keep their ratios.
     others = sorted(set(ground_truth) - {WRONG})
@@ -93,5 +93,5 @@ def test_a_photo_that_finds_no_place_that_agrees_is_left_out(registered, tmp_pat
     misled = copy.deepcopy(model)
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **options: {0: misled})
     with quiet_pycolmap(0):
-        again = place_again(model, [WRONG], path, tmp_path, tmp_path / "again", None)
+        again = register_again(model, [WRONG], path, tmp_path, tmp_path / "again", None)
     assert set(again.reg_image_ids()) == everyone - {WRONG}

@@ -85,8 +85,8 @@ def test_triangulation_reports_and_repeats_bit_for_bit(wall, points):
 def test_masked_pixels_are_not_matched(tmp_path):
     """What is left of x = 0 on the wall is masked in all photos but one, which has no mask."""
     write_wall(tmp_path, texture())
-    scene = load_capture(tmp_path, test_every=0)
-    for name, view in list(scene.views.items())[1:]:
+    capture = load_capture(tmp_path, test_every=0)
+    for name, view in list(capture.views.items())[1:]:
         save(tmp_path / "masks" / f"{name}.png", (on_the_wall(view.camera)[..., :1] > 0).repeat(3, 2))
     positions, _ = triangulate(load_capture(tmp_path, test_every=0))
     assert len(positions) > 100
@@ -146,11 +146,11 @@ def test_random_points_are_seen_by_most_views_and_repeat_with_the_seed(wall):
 
 def test_held_out_views_take_no_part(tmp_path):
     write_wall(tmp_path, texture(), count=4)
-    scene = load_capture(tmp_path, test_names=["1", "2"])
-    for view in scene.test_views:
+    capture = load_capture(tmp_path, test_names=["1", "2"])
+    for view in capture.test_views:
         view.image_path.write_bytes(b"never read")
-    random_points_in_frusta(scene, 50, np.random.default_rng(0))
-    triangulate(scene)  # would raise on the broken images
+    random_points_in_frusta(capture, 50, np.random.default_rng(0))
+    triangulate(capture)  # would raise on the broken images
 
 
 def test_views_are_matched_with_their_neighbors(wall):

@@ -139,9 +139,9 @@ def test_symlinks_that_lead_nowhere_or_in_circles_are_missing_photos(tmp_path):
     for name, target in (("b.png", "nowhere.png"), ("c.png", "c.png"), ("d.png", "../images")):
         (tmp_path / "images" / name).unlink()
         (tmp_path / "images" / name).symlink_to(target)
-    scene = load_capture(tmp_path)
-    assert list(scene.views) == ["a.png"]
-    assert "3 of 4 images have no file" in scene.warnings[0]
+    capture = load_capture(tmp_path)
+    assert list(capture.views) == ["a.png"]
+    assert "3 of 4 images have no file" in capture.warnings[0]
 
 
 def test_photos_that_are_no_files_are_not_waited_for(tmp_path):

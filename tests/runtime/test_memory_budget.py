@@ -158,7 +158,7 @@ def limited(tmp_path_factory):
 @pytest.mark.parametrize(
     ("stage", "expected"),
     [
-        ("poses", "9 of 9 photos placed"),
+        ("poses", "9 of 9 photos registered"),
         ("triangulation", " points"),
         ("undistortion", "1458x1087 [120, 90, 40]"),
         ("turning", "2700x3600"),

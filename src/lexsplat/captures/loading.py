@@ -54,24 +54,24 @@ def load_capture(
     """
     if not 0 < downscale < 1e6:
         raise ValueError(f"downscale must be positive, got {downscale:g}")
-    capture = _read_capture(Path(path), None if images is None else Path(images))
-    warnings = [*capture.warnings, *_told_missing(capture)]
-    masked, strays = find_ignore_masks([capture.root / IGNORE_FOLDER], [p.name for p in capture.photos])
+    files = _read_camera_files(Path(path), None if images is None else Path(images))
+    warnings = [*files.warnings, *_missing_files(files)]
+    masked, strays = find_ignore_masks([files.root / IGNORE_FOLDER], [p.name for p in files.photos])
     # Masks of photos that found no place are no mistake: `prepare_photos` has told which fit none.
     warnings += strays if beside is None else []
     views = {
-        photo.name: _make_view(photo, capture, downscale, masked.get(photo.name))
-        for photo in sorted(capture.photos, key=lambda photo: photo.name)
+        photo.name: _make_view(photo, files, downscale, masked.get(photo.name))
+        for photo in sorted(files.photos, key=lambda photo: photo.name)
     }
-    _check_names([photo.name for photo in capture.photos], capture.origin)
-    root = capture.root if beside is None else Path(beside)
+    _check_names([photo.name for photo in files.photos], files.origin)
+    root = files.root if beside is None else Path(beside)
     segmentations = root / SEGMENTATIONS
     has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
     chosen, split_warnings = choose_test_names(
         list(views),
         root=root,
         test_names=test_names,
-        listed=capture.test_names,
+        listed=files.test_names,
         annotated=_annotated(root, list(views)),
         test_every=test_every,
     )
@@ -83,34 +83,34 @@ def load_capture(
         views=views,
         train_names=tuple(name for name in views if name not in set(chosen)),
         test_names=chosen,
-        points=capture.points,
-        point_colors=capture.point_colors,
+        points=files.points,
+        point_colors=files.point_colors,
         segmentations=segmentations if has_masks else None,
         warnings=tuple(warnings),
-        source=capture.source,
-        background=capture.background,
+        source=files.source,
+        background=files.background,
     )
 
 
-def _told_missing(capture: CameraFiles) -> list[str]:
+def _missing_files(files: CameraFiles) -> list[str]:
     """A warning that lists the images without a file, if there are any.
 
     Raises:
         CaptureError: If none is there.
     """
-    if not capture.photos:
+    if not files.photos:
         raise CaptureError(
-            capture.origin,
+            files.origin,
             expected="images with files",
-            found=f"{len(capture.missing)} images, none of which is there",
+            found=f"{len(files.missing)} images, none of which is there",
             remedy="put the images where the capture names them, for COLMAP into images/",
         )
-    if not capture.missing:
+    if not files.missing:
         return []
-    total = len(capture.photos) + len(capture.missing)
-    names = ", ".join(sorted(capture.missing))
+    total = len(files.photos) + len(files.missing)
+    names = ", ".join(sorted(files.missing))
     return [
-        f"{capture.origin}: {len(capture.missing)} of {total} images have no file and are skipped: {names}"
+        f"{files.origin}: {len(files.missing)} of {total} images have no file and are skipped: {names}"
     ]
 
 
@@ -147,7 +147,7 @@ def _annotated(root: Path, names: list[str]) -> set[str]:
     return set() if found is None else annotated_names(*found, names, root / "images")
 
 
-def _read_capture(path: Path, images: Path | None) -> CameraFiles:
+def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:
     if path.is_file() and path.suffix == ".json":
         return read_transforms(path)
     if not path.is_dir():
@@ -193,7 +193,7 @@ def _photos_of(path: Path) -> list[Path]:
     return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
 
 
-def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path | None) -> View:
+def _make_view(photo: Photo, files: CameraFiles, downscale: float, mask: Path | None) -> View:
     """Fit the lens to the photo's real size and replace it by a pinhole camera; ``mask`` says which pixels count."""
     found = image_size(photo.path)
     stated = (photo.lens.width, photo.lens.height)
@@ -203,7 +203,7 @@ def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path 
         turned = " (turned on its side)" if sizes_agree(found[::-1], stated) else ""
         raise CaptureError(
             photo.path,
-            expected=f"{stated[0]}x{stated[1]} pixels as in {capture.origin}, or scaled uniformly",
+            expected=f"{stated[0]}x{stated[1]} pixels as in {files.origin}, or scaled uniformly",
             found=f"{found[0]}x{found[1]}{turned}",
             remedy="use the photos the cameras were computed from, not cropped or rotated",
         )
@@ -213,7 +213,7 @@ def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path 
         camera = Camera(width, height, K, photo.viewmat)
     except ValueError as error:
         raise CaptureError(
-            capture.origin,
+            files.origin,
             expected=f"a usable camera for image {photo.name}",
             found=str(error),
             remedy="correct the camera, or run COLMAP again with a simpler camera model",
@@ -224,7 +224,7 @@ def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path 
         camera=camera if downscale == 1 else camera.downscaled(downscale),
         capture_size=(width, height),
         lens=lens,
-        background=capture.background,
+        background=files.background,
         ignore_path=photo.ignore_path or mask,
     )
     if view.ignore_path is not None:

@@ -24,7 +24,7 @@ _FLOATS = ("F64", "F32", "F16", "BF16")
 
 def load_external_features(
     folder: Path,
-    scene: Capture,
+    capture: Capture,
     *,
     memory: int = budget.DEFAULT_MEMORY,
     dimension: int | None = None,
@@ -45,7 +45,7 @@ def load_external_features(
 
     Args:
         folder: Where the arrays are.
-        scene: Every view must have its array.
+        capture: Every view must have its array.
         memory: Bytes that reading a map may take; a quarter of it is for maps that are kept.
         dimension: Depth that the features must have to be compared with words; None takes any.
         allow_holes: Whether pixels may have no feature.
@@ -61,11 +61,11 @@ def load_external_features(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileFormatError(folder, expected="a folder with one array a view", found="no folder")
-    sources = external_sources(folder, scene)
+    sources = external_sources(folder, capture)
     depth: dict[str, int] = {}
 
     def load(name: str) -> FeatureMap:
-        path, reading = sources[name], _Reading(scene.views[name], memory)
+        path, reading = sources[name], _Reading(capture.views[name], memory)
         found = reading.segments(path) if path.name.endswith("_f.npy") else reading.arrays(path)
         dims = {"clip": found.clip.shape[-1]} | ({} if found.dino is None else {"dino": found.dino.shape[-1]})
         if dimension is not None and dims["clip"] != dimension:
@@ -90,19 +90,19 @@ def load_external_features(
     return FeatureMaps(list(sources), load, memory // 4)
 
 
-def external_sources(folder: Path, scene: Capture) -> dict[str, Path]:
+def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:
     """The file of each view by its name; of a pair, the features.
 
     Raises:
         FileFormatError: If a view has none.
     """
-    return {name: _source(folder, view.stem) for name, view in scene.views.items()}
+    return {name: _source(folder, view.stem) for name, view in capture.views.items()}
 
 
-def external_identity(folder: Path, scene: Capture) -> list[str]:
+def external_identity(folder: Path, capture: Capture) -> list[str]:
     """Name, size and time of every file that is read: what tells that features have changed."""
     files = []
-    for path in external_sources(folder, scene).values():
+    for path in external_sources(folder, capture).values():
         files.append(path)
         if path.name.endswith("_f.npy"):
             files.append(_segments_of(path))

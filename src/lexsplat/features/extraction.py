@@ -171,7 +171,7 @@ class FeatureConfig:
 
 
 def extract_features(
-    scene: Capture,
+    capture: Capture,
     clip: ImageTextEncoder,
     dino: DenseEncoder | None,
     config: FeatureConfig | None = None,
@@ -185,7 +185,7 @@ def extract_features(
     once, one thread each, which is faster than one view on several threads.
 
     Args:
-        scene: Its views are read one after the other, at the resolution they were captured in.
+        capture: Its views are read one after the other, at the resolution they were captured in.
         clip: Embeds crops.
         dino: Dense features beside CLIP; None for CLIP alone.
         config: Settings; None for the defaults.
@@ -202,7 +202,7 @@ def extract_features(
     """
     config = config or FeatureConfig()
     cache_dir = Path(cache_dir)
-    entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in scene.views.items()}
+    entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in capture.views.items()}
     missing = [name for name, entry in entries.items() if not entry.is_complete()]
     done, total = len(entries) - len(missing), len(entries)
     listener(Event("features", done, total))
@@ -211,7 +211,7 @@ def extract_features(
     )
     largest = 1
     for name, entry in entries.items():
-        photo = scene.views[name].lens.width, scene.views[name].lens.height
+        photo = capture.views[name].lens.width, capture.views[name].lens.height
         budget.check_photo(photo, config.memory, entry.image_size)
         largest = max(
             largest, budget.photo_bytes(photo, entry.image_size) + _patch_bytes(entry, clip, config)
@@ -221,7 +221,7 @@ def extract_features(
     for name in missing:
         pictures.setdefault((entries[name].clip, entries[name].dino), []).append(name)
     twins = {names[0]: names for names in pictures.values()}
-    for name in _Extraction(scene.views, entries, list(twins), clip, dino, config, workers).run():
+    for name in _Extraction(capture.views, entries, list(twins), clip, dino, config, workers).run():
         done += len(twins[name])
         listener(Event("features", done, total))
 
@@ -250,7 +250,7 @@ def _patch_bytes(entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig) -
 
 
 def load_level_maps(
-    scene: Capture, clip: ImageTextEncoder, config: FeatureConfig, cache_dir: Path, name: str
+    capture: Capture, clip: ImageTextEncoder, config: FeatureConfig, cache_dir: Path, name: str
 ) -> tuple[Tensor, list[float]]:
     """The CLIP map of each crop size of one view, from features that `extract_features` has stored.
 
@@ -260,7 +260,7 @@ def load_level_maps(
     Raises:
         FileFormatError: If the view's features are not stored.
     """
-    entry = _Entry.of(scene.views[name], clip, None, config, Path(cache_dir))
+    entry = _Entry.of(capture.views[name], clip, None, config, Path(cache_dir))
     return read_levels(entry.clip, *entry.map_size)
 
 

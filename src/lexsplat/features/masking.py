@@ -12,20 +12,20 @@ from lexsplat.captures import Capture
 from lexsplat.features.cache import FeatureMap, FeatureMaps
 
 
-def without_masked_cells(maps: FeatureMaps, scene: Capture) -> FeatureMaps:
+def without_masked_cells(maps: FeatureMaps, capture: Capture) -> FeatureMaps:
     """Feature maps whose cells without any pixel that counts are zero, which the codebook passes over.
 
     Args:
         maps: Maps by view name.
-        scene: The views.
+        capture: The views.
     """
-    if all(scene.views[name].ignore_path is None for name in maps if name in scene.views):
+    if all(capture.views[name].ignore_path is None for name in maps if name in capture.views):
         return maps
 
     def load(name: str) -> FeatureMap:
         found = maps[name]
         height, width = found.clip.shape[:2]
-        share = scene.views[name].valid_share((width, height))
+        share = capture.views[name].valid_share((width, height))
         if share is None:
             return found
         counts = torch.from_numpy(share > 0)[..., None].to(found.clip.device)

@@ -114,7 +114,7 @@ def annotated_names(layout: str, folder: Path, names: Collection[str], image_fol
 
 
 def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: PromptList | None) -> None:
-    """Refuse what `load_annotations` could not use, before hours are spent on a scene.
+    """Refuse what `load_annotations` could not use, before hours are spent on a capture.
 
     Args:
         root: The folder of the capture.
@@ -122,7 +122,7 @@ def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: Pro
         prompt_list: Whose words are to be asked, if not what the masks are called.
 
     Raises:
-        CaptureError: If the folder is none, or the capture is called like no scene that has prompt lists.
+        CaptureError: If the folder is none, or the capture is called like no capture that has prompt lists.
     """
     if folder is not None and not folder.is_dir():
         raise CaptureError(folder, expected="a folder with masks or labels", found="no such folder")
@@ -131,12 +131,12 @@ def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: Pro
 
 
 def load_annotations(
-    scene: Capture, folder: Path | None = None, prompt_list: PromptList | None = None
+    capture: Capture, folder: Path | None = None, prompt_list: PromptList | None = None
 ) -> Annotations:
     """The ground truth of a capture, in whichever layout it is.
 
     Args:
-        scene: The capture.
+        capture: The capture.
         folder: Where the ground truth is; None looks in and beside the capture (`find_annotations`).
         prompt_list: Ask the words of the paper or of the released code, for captures called like its scenes;
             None asks what the masks are called. Masks may be called in the words of either; others are left out.
@@ -149,9 +149,9 @@ def load_annotations(
             folder is none, the capture has no prompt lists, or no mask is called like one of their prompts.
         FileFormatError: If a label file is not what LangSplat's reader expects.
     """
-    check_ground_truth_options(scene.root, folder, prompt_list)
-    ground_truth = _read_truth(scene, folder)
-    return _in_words_of(ground_truth, scene.root, prompt_list) if prompt_list else ground_truth
+    check_ground_truth_options(capture.root, folder, prompt_list)
+    ground_truth = _read_truth(capture, folder)
+    return _in_words_of(ground_truth, capture.root, prompt_list) if prompt_list else ground_truth
 
 
 def _in_words_of(ground_truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
@@ -172,34 +172,34 @@ def _in_words_of(ground_truth: Annotations, root: Path, prompt_list: PromptList)
     return found
 
 
-def _read_truth(scene: Capture, folder: Path | None) -> Annotations:
+def _read_truth(capture: Capture, folder: Path | None) -> Annotations:
     if folder is None:
-        found = find_annotations(scene.root)
-        if scene.segmentations is not None:
-            found = layout_of(scene.segmentations), scene.segmentations
+        found = find_annotations(capture.root)
+        if capture.segmentations is not None:
+            found = layout_of(capture.segmentations), capture.segmentations
         if found is None:
-            return Annotations("segmentations", scene.root / "segmentations", {})
+            return Annotations("segmentations", capture.root / "segmentations", {})
         layout, folder = found
     else:
         layout = layout_of(folder)
     if layout == "lerf-ovs":
-        return _read_lerf_ovs(scene, folder)
+        return _read_lerf_ovs(capture, folder)
     if layout == "3d-ovs":
-        return _read_3d_ovs(scene, folder)
-    if folder != scene.segmentations:
-        scene = replace(scene, segmentations=folder)
-    return Annotations(layout, folder, load_masks(scene))
+        return _read_3d_ovs(capture, folder)
+    if folder != capture.segmentations:
+        capture = replace(capture, segmentations=folder)
+    return Annotations(layout, folder, load_masks(capture))
 
 
 # 3D-OVS
 
 
-def _read_3d_ovs(scene: Capture, folder: Path) -> Annotations:
+def _read_3d_ovs(capture: Capture, folder: Path) -> Annotations:
     classes = _read_classes(folder / CLASSES_FILE)
     masks: dict[str, dict[str, Path]] = {}
     for view_folder in mask_folders(folder):
         stem = view_folder.relative_to(folder).as_posix()
-        view = scene.views[_the_image(stem, "3d-ovs", scene, view_folder)]
+        view = capture.views[_the_image(stem, "3d-ovs", capture, view_folder)]
         prompts = masks.setdefault(view.name, {})
         for name in classes:
             path = view_folder / f"{name}.png"
@@ -245,8 +245,8 @@ def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: 
     return matches if counted == matches else sorted({*matches, *counted})
 
 
-def _the_image(stem: str, layout: str, scene: Capture, subject: Path) -> str:
-    matches = _images_meant(stem, layout, scene.views, scene.root / "images")
+def _the_image(stem: str, layout: str, capture: Capture, subject: Path) -> str:
+    matches = _images_meant(stem, layout, capture.views, capture.root / "images")
     if len(matches) != 1:
         found = "no view of that name" if not matches else f"views {' and '.join(matches[:3])}"
         raise CaptureError(
@@ -261,12 +261,12 @@ def _the_image(stem: str, layout: str, scene: Capture, subject: Path) -> str:
 # LERF-OVS
 
 
-def _read_lerf_ovs(scene: Capture, folder: Path) -> Annotations:
+def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
     masks: dict[str, dict[str, NDArray[np.bool_]]] = {}
     boxes: dict[str, dict[str, NDArray[np.float64]]] = {}
     for path in sorted(folder.glob("frame_*.json")):
         name, size, objects = _read_labels(path)
-        view = scene.views[_the_image(stem_of(name), "lerf-ovs", scene, path)]
+        view = capture.views[_the_image(stem_of(name), "lerf-ovs", capture, path)]
         parts: dict[str, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {}
         for category, box, polygon in objects:
             mask = polygon_mask(polygon, *size)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFi
             images_file, expected="the model's images", found="no such file", remedy=_COPY_AGAIN
         )
     entries = list(_read_images(images_file))
-    names = [checked_name(name, images_file) for name, *_ in entries]
+    names = [checked_name(entry.name, images_file) for entry in entries]
     doubled = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else set()
     if doubled:
         raise CaptureError(
@@ -77,17 +78,17 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFi
         )
     folder = _image_folder(root, names) if images is None else images
     photos, missing = [], []
-    for name, (_, camera_id, quaternion, translation) in zip(names, entries):
-        if camera_id not in lenses:
+    for name, entry in zip(names, entries):
+        if entry.camera_id not in lenses:
             raise FileFormatError(
                 images_file,
-                expected=f"camera {camera_id} of image {name} in cameras{suffix}",
+                expected=f"camera {entry.camera_id} of image {name} in cameras{suffix}",
                 found=f"cameras {sorted(lenses)[:8]}",
                 remedy=_COPY_AGAIN,
             )
-        viewmat = _viewmat(quaternion, translation, name, images_file)
+        viewmat = _viewmat(entry.quaternion, entry.translation, name, images_file)
         if (folder / name).is_file():
-            photos.append(Photo(name, folder / name, lenses[camera_id], viewmat))
+            photos.append(Photo(name, folder / name, lenses[entry.camera_id], viewmat))
         else:
             missing.append(name)
     points_file = model / f"points3D{suffix}"
@@ -219,8 +220,15 @@ _POINT = struct.Struct("<Q3d3BdQ")
 _OBSERVATION_BYTES = 24  # x, y, point id
 _TRACK_BYTES = 8  # image id, observation index
 
-ImageEntry = tuple[str, int, tuple[float, ...], tuple[float, ...]]
-"""Name, camera id, quaternion wxyz, translation."""
+
+@dataclass(frozen=True)
+class _ImageEntry:
+    """An image of a model: its name, its camera, and its pose, world to camera."""
+
+    name: str
+    camera_id: int
+    quaternion: tuple[float, ...]  # wxyz
+    translation: tuple[float, ...]
 
 
 def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
@@ -257,7 +265,7 @@ def _example_params(model: str) -> list[float]:
     return list(pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height).params)
 
 
-def _read_images(file: Path) -> Iterator[ImageEntry]:
+def _read_images(file: Path) -> Iterator[_ImageEntry]:
     if file.suffix == ".txt":
         yield from _read_images_text(file)
         return
@@ -267,11 +275,11 @@ def _read_images(file: Path) -> Iterator[ImageEntry]:
         name = content.text("an image name")
         observations = content.count(_OBSERVATION_BYTES, f"observations of {name[:60]}")
         content.skip(observations * _OBSERVATION_BYTES, f"observations of {name[:60]}")
-        yield name, camera_id, tuple(pose[:4]), tuple(pose[4:])
+        yield _ImageEntry(name, camera_id, tuple(pose[:4]), tuple(pose[4:]))
     content.finish()
 
 
-def _read_images_text(file: Path) -> Iterator[ImageEntry]:
+def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
     lines = _lines(file)
     found = 0
     promised = None
@@ -291,7 +299,7 @@ def _read_images_text(file: Path) -> Iterator[ImageEntry]:
             instead = "the end of the file" if observations is None else repr(observations[:60])
             raise _damaged(file, f"a line of observations after image {name}", instead)
         found += 1
-        yield name, camera_id, pose[:4], pose[4:]
+        yield _ImageEntry(name, camera_id, pose[:4], pose[4:])
     _check_promise(file, promised, found, "images")
 
 

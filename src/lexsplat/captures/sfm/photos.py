@@ -22,7 +22,7 @@ from PIL import Image
 
 from lexsplat.captures.images.reading import image_size
 from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
-from lexsplat.captures.sfm.pose_agreement import misregistered, place_again
+from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
 from lexsplat.captures.sfm.triangulation import quiet_pycolmap
 from lexsplat.runtime import memory as budget
@@ -43,7 +43,7 @@ SEQUENTIAL_OVERLAP = 12
 BATCH = 8
 """Photos whose features are sought in one go: what is lost at most when it is stopped."""
 
-MAX_FURTHER_PAIRS = 20_000
+MAX_LEFTOVER_PAIRS = 20_000
 """Pairs that are matched at most to place photos which follow no other."""
 
 _WORK = ".poses"
@@ -110,7 +110,7 @@ class PhotoPoses:
     def note(self) -> str:
         """One line for people."""
         total = len(self.registered) + len(self.unregistered)
-        line = f"{len(self.registered)} of {total} photos placed, {self.points:,} points"
+        line = f"{len(self.registered)} of {total} photos registered, {self.points:,} points"
         if self.models > 1:
             line = f"{line}, the largest of {self.models} models"
         return line if not self.unregistered else f"{line}; left out: {', '.join(self.unregistered)}"
@@ -155,9 +155,9 @@ def poses_from_photos(
         check_mapping(database, memory)
         models = _map(database, photos, work / "models", config, seed, listener)
         best = _best(models)
-        outsiders = _not_placed(names, best)
-        if outsiders and config.pairs == "auto" and not config.compares_all(len(names)):
-            _match_further(database, names, outsiders, work, seed, memory)
+        leftover = _unregistered(names, best)
+        if leftover and config.pairs == "auto" and not config.compares_all(len(names)):
+            _match_leftover(database, names, leftover, work, seed, memory)
             check_mapping(database, memory)
             models = _map(database, photos, work / "models", config, seed, listener) or models
             best = _best(models)
@@ -169,8 +169,8 @@ def poses_from_photos(
                 found=f"{len(names)} photos of which none could be placed",
                 remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
             )
-        best = _without_misplaced(best, database, photos, work / "again", seed)
-        unregistered = _not_placed(names, best)
+        best = _without_misregistered(best, database, photos, work / "again", seed)
+        unregistered = _unregistered(names, best)
         _write_model(best, output)
     _discard(work, output)
     registered = tuple(sorted(set(names) - set(unregistered)))
@@ -197,7 +197,7 @@ def _best(models: list[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | No
     return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
 
-def _not_placed(names: tuple[str, ...] | list[str], model: pycolmap.Reconstruction | None) -> tuple[str, ...]:
+def _unregistered(names: tuple[str, ...] | list[str], model: pycolmap.Reconstruction | None) -> tuple[str, ...]:
     registered = set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
     return tuple(sorted(set(names) - registered))
 
@@ -307,15 +307,15 @@ def _match(database: Path, count: int, config: PoseConfig, seed: int, memory: in
     )
 
 
-def _match_further(
-    database: Path, names: tuple[str, ...], outsiders: tuple[str, ...], work: Path, seed: int, memory: int
+def _match_leftover(
+    database: Path, names: tuple[str, ...], leftover: tuple[str, ...], work: Path, seed: int, memory: int
 ) -> None:
     """Compare photos that follow no other with all, or with as many, evenly spread, as is affordable."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
-    step = max(1, -(-len(outsiders) * len(names) // MAX_FURTHER_PAIRS))
+    step = max(1, -(-len(leftover) * len(names) // MAX_LEFTOVER_PAIRS))
     others = names[::step]
-    pairs = {tuple(sorted((name, other))) for name in outsiders for other in others if name != other}
+    pairs = {tuple(sorted((name, other))) for name in leftover for other in others if name != other}
     listed = work / "pairs.txt"
     listed.write_text("".join(f"{first} {second}\n" for first, second in sorted(pairs)), encoding="utf-8")
     verification = pycolmap.TwoViewGeometryOptions()
@@ -372,17 +372,17 @@ def _mapper_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     return pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3)
 
 
-def _without_misplaced(
+def _without_misregistered(
     model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, folder: Path, seed: int
 ) -> pycolmap.Reconstruction:
-    """The model with photos placed again, or left out, whose matches contradict their place."""
+    """The model with photos registered again, or left out, whose matches contradict their place."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         wrong = misregistered(model, opened)
     if not wrong:
         return model
-    return place_again(model, wrong, database, photos.images, folder, _mapper_options(seed))
+    return register_again(model, wrong, database, photos.images, folder, _mapper_options(seed))
 
 
 def _write_model(model: pycolmap.Reconstruction, output: Path) -> None:

@@ -89,7 +89,7 @@ def misregistered(model: pycolmap.Reconstruction, database: pycolmap.Database) -
     return sorted(number for number, share in shares.items() if share < MIN_AGREEMENT)
 
 
-def take_out(model: pycolmap.Reconstruction, images: list[int]) -> None:
+def deregister(model: pycolmap.Reconstruction, images: list[int]) -> None:
     """Take photos, and what they say of points, out of a model."""
     for number in images:
         frame = model.image(number).frame_id
@@ -97,7 +97,7 @@ def take_out(model: pycolmap.Reconstruction, images: list[int]) -> None:
             model.deregister_frame(frame)
 
 
-def place_again(
+def register_again(
     model: pycolmap.Reconstruction,
     images: list[int],
     database: Path,
@@ -120,7 +120,7 @@ def place_again(
     """
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
-    take_out(model, images)
+    deregister(model, images)
     shutil.rmtree(folder, ignore_errors=True)
     trusted = folder / "trusted"
     trusted.mkdir(parents=True)
@@ -130,7 +130,7 @@ def place_again(
     if again.num_reg_images() < model.num_reg_images():
         return model
     with pycolmap.Database.open(database) as opened:
-        take_out(again, misregistered(again, opened))
+        deregister(again, misregistered(again, opened))
     return again
 
 

@@ -61,7 +61,7 @@ class InitialPoints:
 
 
 def initial_points(
-    scene: Capture,
+    capture: Capture,
     *,
     count: int = 20_000,
     seed: int = 0,
@@ -75,7 +75,7 @@ def initial_points(
     resort ``count`` random points that several cameras see.
 
     Args:
-        scene: The capture.
+        capture: The capture.
         count: How many random points.
         seed: Seed of all that is random here.
         cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
@@ -85,20 +85,20 @@ def initial_points(
     Raises:
         CaptureError: If an image cannot be read.
     """
-    if len(scene.points) >= ENOUGH_POINTS:
-        note = f"{len(scene.points):,} points of the capture"
-        return InitialPoints(scene.points, scene.point_colors, "capture", note)
-    points, colors = triangulate(scene, cache_dir=cache_dir, seed=seed, memory=memory, listener=listener)
+    if len(capture.points) >= ENOUGH_POINTS:
+        note = f"{len(capture.points):,} points of the capture"
+        return InitialPoints(capture.points, capture.point_colors, "capture", note)
+    points, colors = triangulate(capture, cache_dir=cache_dir, seed=seed, memory=memory, listener=listener)
     if len(points) >= ENOUGH_POINTS:
         return InitialPoints(points, colors, "triangulated", f"{len(points):,} points triangulated")
     found = len(points)
-    points, colors = random_points_in_frusta(scene, count, np.random.default_rng(seed))
+    points, colors = random_points_in_frusta(capture, count, np.random.default_rng(seed))
     note = f"{len(points):,} random points (only {found} could be triangulated)"
     return InitialPoints(points, colors, "random", note)
 
 
 def triangulate(
-    scene: Capture,
+    capture: Capture,
     *,
     cache_dir: Path | None = None,
     seed: int = 0,
@@ -110,7 +110,7 @@ def triangulate(
     Held-out views take no part.
 
     Args:
-        scene: The capture.
+        capture: The capture.
         cache_dir: Folder for the result, keyed by photos, cameras and settings; None keeps nothing.
         seed: Seed for pycolmap.
         memory: Bytes of host memory that may be taken: decides how much is done at once, and no result.
@@ -122,7 +122,7 @@ def triangulate(
     Raises:
         CaptureError: If an image cannot be read.
     """
-    views = scene.train_views
+    views = capture.train_views
     empty = np.zeros((0, 3), np.float32)
     if len(views) < 2:
         return empty, empty
@@ -147,7 +147,7 @@ def triangulate(
 
 
 def random_points_in_frusta(
-    scene: Capture, count: int, rng: np.random.Generator
+    capture: Capture, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Random points where the cameras look, with the colors of the photos.
 
@@ -156,7 +156,7 @@ def random_points_in_frusta(
     points gather where the views overlap.
 
     Args:
-        scene: The capture.
+        capture: The capture.
         count: How many points.
         rng: The source of randomness.
 
@@ -169,11 +169,11 @@ def random_points_in_frusta(
     """
     if count < 0:
         raise ValueError(f"count must not be negative, got {count}")
-    views = scene.train_views
+    views = capture.train_views
     owners = np.sort(rng.integers(0, len(views), count))
     pixels = rng.random((count, 10, 2))
     fractions = rng.uniform(0.2, 2.0, (count, 10))
-    distance = _focus_distance(views, scene.extent)
+    distance = _focus_distance(views, capture.extent)
     points = np.zeros((count, 3))
     colors = np.zeros((count, 3))
     for index, view in enumerate(views):
