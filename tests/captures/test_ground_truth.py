@@ -17,7 +17,6 @@ from lexsplat.captures import load_annotations, load_capture
 from lexsplat.captures.ground_truth.layouts import layout_of, load_ground_truth, polygon_mask
 from lexsplat.captures.ground_truth.prompt_lists import (
     SCENES,
-    evaluation_views,
     prompt_names,
     prompts_of,
 )
@@ -99,7 +98,7 @@ def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors,
     for folder in ("DSCF4670", "DSCF4690"):
         for path in (authors / "segmentations" / folder).iterdir():
             path.rename(path.with_name(f"tea {path.name}"))
-    with pytest.raises(CaptureError, match="words of the list 'paper'"):
+    with pytest.raises(CaptureError, match="prompts of the list 'paper'"):
         load_annotations(capture, prompt_list="paper")
 
 
@@ -119,13 +118,9 @@ def test_the_papers_list_is_the_table_of_its_supplement():
         assert tuple(words) == prompts_of(scene, "paper"), scene
 
 
-def test_the_released_lists_have_as_many_prompts_and_the_evaluation_views_the_authors():
-    assert {scene: len(evaluation_views(scene)) for scene in SCENES} == {
-        "bicycle": 19, "bonsai": 29, "counter": 24, "garden": 18, "kitchen": 28, "room": 19,
-    }  # fmt: skip
+def test_the_released_lists_have_as_many_prompts_as_the_papers():
     for scene in SCENES:
         assert len(set(prompts_of(scene))) == len(prompts_of(scene, "paper"))
-        assert len(set(evaluation_views(scene))) == len(evaluation_views(scene))
     assert "stale bread" in prompts_of("counter")
     assert "stable bread" in prompts_of("counter", "paper")
     with pytest.raises(ValueError, match="stump"):
@@ -281,6 +276,27 @@ def test_labels_can_be_given_by_folder(lerf_ovs, tmp_path):
     assert load_annotations(capture).masks == {}
     assert layout_of(moved) == "lerf-ovs"
     assert set(load_annotations(capture, moved).masks) == {FRAMES[1], FRAMES[4]}
+
+
+def test_a_given_folder_without_ground_truth_is_refused(lerf_ovs, tmp_path):
+    capture = load_capture(lerf_ovs)
+    with pytest.raises(CaptureError, match="no masks and no labels"):
+        load_annotations(capture, lerf_ovs / "images")
+    with pytest.raises(CaptureError, match=r"labels in teatime/.*give .*label/teatime"):
+        load_annotations(capture, tmp_path / "label")
+    for number, path in enumerate(sorted((tmp_path / "label" / "teatime").iterdir())):
+        path.rename(path.with_name(f"image_{number}.json"))
+    with pytest.raises(CaptureError, match=r"2 JSON files.*name labels frame_\*\.json"):
+        load_annotations(capture, tmp_path / "label" / "teatime")
+    assert load_annotations(capture).masks == {}  # nothing was promised
+
+
+def test_a_given_folder_whose_labels_hold_no_objects_is_refused(lerf_ovs, tmp_path):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    (folder / "frame_00002.json").write_text(json.dumps(label(FRAMES[1], [])))
+    with pytest.raises(CaptureError, match="labels without objects"):
+        load_annotations(load_capture(lerf_ovs), folder)
 
 
 @given(st.lists(st.tuples(st.integers(-5, 45), st.integers(-5, 35)), min_size=3, max_size=9))

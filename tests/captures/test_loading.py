@@ -35,7 +35,9 @@ class TestTransforms:
         assert capture.source == "transforms"
         assert capture.points.shape == (0, 3)
         positions = np.array([view.camera.position for view in capture.train_views])
-        assert capture.extent == pytest.approx(1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1)))
+        assert capture.extent == pytest.approx(
+            1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1))
+        )
 
     def test_the_json_file_itself_may_be_given(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3])

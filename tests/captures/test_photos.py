@@ -91,7 +91,7 @@ def test_photos_that_do_not_overlap_leave_no_output(tmp_path):
         save(tmp_path / "photos" / f"{index}.png", np.full((60, 80, 3), 0.3 * index))
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "out")
-    assert_tells(caught.value, "3 photos of which none")
+    assert_tells(caught.value, "3 photos, none of which")
     assert not (tmp_path / "out").exists()
     (tmp_path / "photos" / "1.png").write_bytes(b"no image")
     with pytest.raises(CaptureError) as caught:
@@ -232,7 +232,7 @@ def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch
     for index, camera in enumerate(cameras):
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera, textures))
         save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
-    with pytest.raises(CaptureError, match="none could be placed"):
+    with pytest.raises(CaptureError, match="none of which could be registered"):
         poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
     poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))

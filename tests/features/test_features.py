@@ -449,7 +449,9 @@ def test_segments_with_features_are_painted_and_levels_averaged(capture, tmp_pat
     ],
 )
 def test_wrong_arrays_from_elsewhere_are_told(array, message, capture, tmp_path):
-    folder = _external(capture, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True))
+    folder = _external(
+        capture, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True)
+    )
     with pytest.raises(FileFormatError, match=message):
         load_external_features(folder, capture)["left/0.png"]
 

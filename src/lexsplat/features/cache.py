@@ -25,6 +25,7 @@ from torch import Tensor
 from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import file_hash
 
 FORMAT_VERSION = "1"
 
@@ -118,12 +119,8 @@ def hash_of(*parts: Any) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """Hash of a file's bytes, 32 hex digits."""
-    digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    """Hash of a file's bytes, 32 hex digits: part of cache keys."""
+    return file_hash(path, digest_size=16)
 
 
 def write_crops(

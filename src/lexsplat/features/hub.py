@@ -7,13 +7,13 @@ builds an encoder is the same with and without internet.
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import re
 from pathlib import Path
 from typing import Any
 
-from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.runtime.files import read_json
 
 log = logging.getLogger("lexsplat")
 
@@ -60,7 +60,7 @@ def is_model_folder(folder: Path) -> bool:
         return False
     index = folder / "model.safetensors.index.json"
     if index.is_file():
-        table = read_json(index).get("weight_map")
+        table = read_config(index).get("weight_map")
         shards = list(table.values()) if isinstance(table, dict) else []
         # Only files of the folder itself: a name that leads elsewhere is no shard.
         plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in shards)
@@ -68,17 +68,17 @@ def is_model_folder(folder: Path) -> bool:
     return (folder / "model.safetensors").is_file()
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a model folder.
+def read_config(path: Path) -> dict[str, Any]:
+    """A JSON object of a model folder.
 
     Raises:
         ModelError: If the file is not a JSON object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        content = read_json(path)
+    except FileFormatError as error:
         raise ModelError(
-            path, expected="JSON", found=str(error)[:200], remedy="fetch the model again"
+            path, expected=error.expected, found=error.found[:200], remedy="fetch the model again"
         ) from error
     if not isinstance(content, dict):
         raise ModelError(path, expected="a JSON object", found=type(content).__name__)

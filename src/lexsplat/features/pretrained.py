@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash, read_json
+from lexsplat.features.hub import content_hash, read_config
 from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
@@ -94,7 +94,7 @@ def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[T
     for file in ("preprocessor_config.json", "processor_config.json"):
         if not (folder / file).is_file():
             continue
-        content = read_json(folder / file)
+        content = read_config(folder / file)
         content = content.get("image_processor", content)
         if "image_mean" in content and "image_std" in content:
             mean, std = content["image_mean"], content["image_std"]

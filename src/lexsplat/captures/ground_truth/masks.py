@@ -1,4 +1,4 @@
-"""Ground-truth masks of views."""
+"""Ground-truth masks in ``segmentations/STEM/PROMPT.png``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lexsplat.runtime.errors import CaptureError
 
 
 def load_mask(path: Path) -> NDArray[np.bool_]:
-    """A mask as ``[H, W]`` bool as it lies on disk: true where the picture is brighter than half.
+    """A mask as ``[H, W]`` bool as stored: true where the image is brighter than half.
 
     Raises:
         CaptureError: If the file is missing or damaged.
@@ -23,9 +23,9 @@ def load_mask(path: Path) -> NDArray[np.bool_]:
 
 
 def load_masks(capture: Capture) -> dict[str, dict[str, Path]]:
-    """Where the masks of each view are: view name to prompt to file, both sorted.
+    """The mask files by view name and prompt, both sorted.
 
-    "_" in a file name means a space: ``plastic_box.png`` answers "plastic box". Sizes are checked from
+    "_" in a file name stands for a space: ``plastic_box.png`` is the mask of "plastic box". Sizes are checked from
     headers; read a mask with ``capture.views[name].load_mask(path)``, which also undistorts it.
 
     Raises:
