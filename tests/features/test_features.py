@@ -22,7 +22,6 @@ from lexsplat.features import (
     TextCache,
     extract_features,
     load_external_features,
-    pca_image,
 )
 from lexsplat.features.cache import resize_grid
 from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
@@ -140,11 +139,12 @@ def test_patches_that_do_not_fit_are_refused_with_a_budget_that_does(capture, tm
     class Fine(ColorEncoder):
         patches = 100
 
-    config = dataclasses.replace(CONFIG, crop_tokens="both", memory=4 << 20)
+    memory, patches = 4 << 20, dataclasses.replace(CONFIG, crop_tokens="both")
     with pytest.raises(MemoryBudgetError, match=r"features\.crop-tokens class"):
-        extract_features(capture, Fine(), None, config, cache_dir=tmp_path)
-    whole = dataclasses.replace(config, crop_tokens="class")
-    assert len(extract_features(capture, Fine(), None, whole, cache_dir=tmp_path)) == 5
+        extract_features(capture, Fine(), None, patches, cache_dir=tmp_path, memory=memory)
+    assert len(extract_features(capture, Fine(), None, CONFIG, cache_dir=tmp_path, memory=memory)) == 5
+    with pytest.raises(ValueError, match="memory"):
+        extract_features(capture, Fine(), None, CONFIG, cache_dir=tmp_path, memory=0)
 
 
 def test_what_patches_say_is_stored_for_one_size_of_the_maps(capture, tmp_path):
@@ -237,15 +237,15 @@ def test_a_killed_run_goes_on_with_what_is_missing(capture, tmp_path):
     try:
         whole = ColorEncoder()
         extract_features(capture, whole, None, CONFIG, cache_dir=tmp_path / "whole")
-        small = dataclasses.replace(CONFIG, memory=4 * 24 * 12 * 64 * 8)  # batches of eight crops
+        cache, small = tmp_path / "cache", 4 * 24 * 12 * 64 * 8  # batches of eight crops
         broken = ColorEncoder(fail_after=whole.crops // 2)
         with pytest.raises(RuntimeError, match="stopped in the middle"):
-            extract_features(capture, broken, None, small, cache_dir=tmp_path / "cache")
+            extract_features(capture, broken, None, CONFIG, cache_dir=cache, memory=small)
         assert not list((tmp_path / "cache").glob(".*"))  # no half-written file stays
         stored = len(list((tmp_path / "cache").glob("*.safetensors")))
         assert 0 < stored < 5
         rest, events = ColorEncoder(), []
-        extract_features(capture, rest, None, small, cache_dir=tmp_path / "cache", listener=events.append)
+        extract_features(capture, rest, None, CONFIG, cache_dir=cache, memory=small, listener=events.append)
         assert rest.crops == whole.crops * (5 - stored) // 5
         assert [event.done for event in events] == list(range(stored, 6))
     finally:
@@ -281,7 +281,7 @@ def _work(capture, tmp_path, config=CONFIG, clip_hash="color"):
 def test_the_cache_follows_everything_that_changes_features_and_nothing_else(capture, tmp_path):
     assert _work(capture, tmp_path) == (True, 5)
     assert _work(capture, tmp_path) == (False, 0)
-    assert _work(capture, tmp_path, dataclasses.replace(CONFIG, map_cells=5, memory=1 << 25, seed=3)) == (
+    assert _work(capture, tmp_path, dataclasses.replace(CONFIG, map_cells=5, seed=3)) == (
         False,
         0,
     )
@@ -389,7 +389,7 @@ def test_resizing_a_grid_keeps_cell_centers():
 @pytest.mark.parametrize(
     "bad",
     [
-        {"mode": "spiral"}, {"crop_sizes": ()}, {"crop_sizes": (0.1,)}, {"map_cells": 0}, {"memory": 0},
+        {"mode": "spiral"}, {"crop_sizes": ()}, {"crop_sizes": (0.1,)}, {"map_cells": 0},
         {"dino_stride": 0}, {"crop_sizes": (0.0,) * 7}, {"random_sizes": (0.4, 0.2)}, {"random_crops": 0},
         {"dino_facet": "query"}, {"crop_tokens": "words"}, {"crop_tokens": "both", "mode": "random"},
     ],
@@ -556,33 +556,6 @@ def test_a_damaged_text_cache_is_made_anew_and_empty_prompts_are_refused(tmp_pat
     for prompts in ([], [" "]):
         with pytest.raises(ValueError, match="not empty"):
             TextCache(tmp_path).encode("color", prompts, ColorEncoder)
-
-
-def test_the_pca_picture_equals_sklearns_components():
-    from sklearn.decomposition import PCA
-
-    features = torch.from_numpy(np.random.default_rng(0).normal(size=(12, 9, 6)) * [5, 4, 3, 0.5, 0.2, 0.1])
-    picture = pca_image(features)
-    assert picture.dtype == np.uint8
-    assert picture.shape == (12, 9, 3)
-    parts = PCA(3).fit_transform(features.reshape(-1, 6).numpy())
-    low, high = np.percentile(parts, [2, 98], axis=0)
-    expected = np.round(np.clip((parts - low) / (high - low), 0, 1) * 255).reshape(12, 9, 3)
-    for channel in range(3):  # the sign of a component is arbitrary
-        found = picture[..., channel].astype(float)
-        off = min(
-            np.abs(found - expected[..., channel]).max(), np.abs(255 - found - expected[..., channel]).max()
-        )
-        assert off <= 1
-
-
-def test_the_pca_picture_of_equal_or_few_features_is_calm():
-    assert (pca_image(torch.ones(3, 4, 8)) == 128).all()
-    picture = pca_image(torch.rand(5, 5, 1))
-    assert picture.shape == (5, 5, 3)
-    assert (picture[..., 1:] == 128).all()
-    with pytest.raises(ValueError):
-        pca_image(torch.ones(3, 4))
 
 
 def test_the_sparse_settings_take_a_sixth_of_the_crops():

@@ -161,7 +161,7 @@ def test_names_in_other_alphabets_are_names(tmp_path):
 
 def test_two_photos_that_would_share_their_files_are_refused(tmp_path):
     write_colmap(tmp_path, ["a.png", "a.jpg"])
-    with pytest.raises(CaptureError, match="differ in more than their endings"):
+    with pytest.raises(CaptureError, match="differ in more than their suffix"):
         load_capture(tmp_path)
 
 

@@ -114,7 +114,6 @@ def test_memory_bounds_the_store_of_every_stage_and_no_setting_that_decides_a_re
     assert bounded.trained.memory_bytes == quarter
     assert bounded.lifted.memory_bytes == quarter
     assert bounded.averaged.memory_bytes == quarter
-    assert bounded.features.memory == 4 * quarter
     again = replace(
         bounded,
         reconstruction=config.reconstruction,

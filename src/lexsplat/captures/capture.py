@@ -1,4 +1,4 @@
-"""`Capture` and `View`, the input of every other stage: views with pinhole cameras, keyed by image name, and points."""
+"""`Capture` and `View`, the input of every stage: views with pinhole cameras, keyed by image name, and points."""
 
 from __future__ import annotations
 

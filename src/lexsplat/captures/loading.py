@@ -56,7 +56,7 @@ def load_capture(
     files = _read_camera_files(Path(path), None if images is None else Path(images))
     warnings = [*files.warnings, *_missing_files(files)]
     masked, strays = find_ignore_masks([files.root / IGNORE_FOLDER], [p.name for p in files.photos])
-    # With estimated cameras, `prepare_photos` has reported masks without a photo, and unregistered photos may have one.
+    # With estimated cameras, `prepare_photos` has reported them; masks of unregistered photos are no mistake.
     warnings += strays if beside is None else []
     views = {
         photo.name: _make_view(photo, files, downscale, masked.get(photo.name))

@@ -141,7 +141,7 @@ class _Reader:
         if not isinstance(names, list) or not names:
             return None
         if not all(isinstance(name, str) for name in names):
-            raise self._wrong('"test_filenames" to be strings', "something else")
+            raise self._wrong('"test_filenames" to be strings', "other types")
         return [checked_name(name, self.file) for name in names]
 
     def photo(self, frame: Mapping[str, Any]) -> tuple[Photo | None, str]:
@@ -245,7 +245,7 @@ class _Reader:
         except (TypeError, ValueError, OverflowError):
             pose = np.zeros(0)
         if pose.shape not in ((4, 4), (3, 4)):
-            raise self._wrong(f"a 4x4 transform_matrix for image {name}", "something else")
+            raise self._wrong(f"a 4x4 transform_matrix for image {name}", "another shape")
         checked_pose(pose, name, self.file)
         U, singular, Vt = np.linalg.svd(pose[:3, :3])
         rotation = U @ Vt
