@@ -1,8 +1,7 @@
-"""Whatever lies in a file, a reader ends in a right result or in one typed line: never in anything else.
+"""Whatever a file contains, a reader returns a valid result or raises a typed error of one line.
 
-`hostile_readers.py` has every reader with a sound input and what is done to it (`hostile_mutations.py`). It runs in
-two processes beside each other, each with a gigabyte of memory to spare and seconds for each input; a crash, a hang
-or a traceback fails the test that belongs to the reader.
+`support.hostile` registers every reader with a valid input and its mutations. They run in two processes with one
+gigabyte of spare memory and a few seconds per input; a crash, a hang or another exception fails the reader's test.
 """
 
 from __future__ import annotations
@@ -17,7 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support import TESTS_ON_PATH, hostile_mutations, hostile_readers
+from support import TESTS_ON_PATH
+from support.hostile import READERS, mutations
+from support.hostile.running import BASE_BYTES, GIGABYTE
+from support.hostile.scenes import check_open_scene
 from support.tiny_capture import write_capture
 from support.written_captures import write_colmap, write_transforms
 
@@ -32,37 +34,25 @@ pytestmark = [
 ]
 
 LEAST_INPUTS = 10_000
-GIGABYTE = 1 << 30
-HALVES = (
-    (
-        "colmap_binary", "transforms", "feature_cache", "journal", "spz", "text_cache", "phrases", "masks", "jpeg",
-        "splat", "viewer_memory", "segment_features", "checkpoints", "points_cache", "lerf_ovs", "webp",
-        "trained_scene_folder",
-    ),
-    (
-        "colmap_text", "scene_folder", "splat_ply", "codebook", "code_maps", "compressed_ply", "ksplat", "png",
-        "tiff", "bmp", "ovs3d", "npy_features", "safetensors_features", "split_file", "model_folder",
-        "reconstruction_checkpoints",
-    ),
-)  # fmt: skip
-"""About as much work each."""
+PROCESSES = 2
 
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory):
-    """What came of all inputs, by reader."""
+    """The report of every reader. The processes share the readers: each takes the next one that is left."""
     shared = Path("/dev/shm")
     base = tmp_path_factory.mktemp("hostile")
-    script = Path(hostile_readers.__file__)
+    claims = base / "claims"
+    claims.mkdir()
+    environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     runs = []
-    for number, names in enumerate(HALVES):
+    for number in range(PROCESSES):
         # A folder in memory: ten thousand small files would otherwise wait for a disk.
         work = (shared if os.access(shared, os.W_OK) else base) / f"lexsplat-hostile-{os.getpid()}-{number}"
         output = base / f"{number}.json"
-        environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-        command = [sys.executable, str(script), str(work), str(output), *names]
-        with open(output.with_suffix(".log"), "w") as complaints:
-            process = subprocess.Popen(command, stdout=complaints, stderr=complaints, env=environment)
+        command = [sys.executable, "-m", "support.hostile.running", *map(str, (work, output, claims))]
+        with open(output.with_suffix(".log"), "w") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         runs.append((process, work, output))
     reports = {}
     for process, work, output in runs:
@@ -76,23 +66,18 @@ def corpus(tmp_path_factory):
         if process.returncode:
             current = output.with_suffix(".current")
             tried = current.read_text() if current.exists() else "the start"
-            reports[tried.split()[0]] = {
-                "crash": f"ended with {process.returncode} at {tried}: {complaints[-2000:]}"
-            }
+            last = output.with_suffix(".log").read_text(errors="replace")[-2000:]
+            reports[tried.split()[0]] = {"crash": f"ended with {process.returncode} at {tried}: {last}"}
     return reports
 
 
-def test_every_reader_is_in_the_corpus():
-    assert sorted(name for names in HALVES for name in names) == sorted(hostile_readers.READERS)
-
-
-@pytest.mark.parametrize("name", sorted(hostile_readers.READERS))
+@pytest.mark.parametrize("name", sorted(READERS))
 def test_every_input_is_read_rightly_or_refused_in_one_typed_line(corpus, name):
     assert name in corpus, "its process ended before it came to this reader"
     report = corpus[name]
     assert "crash" not in report, report.get("crash")
     assert not report["failures"], "\n".join(report["failures"][:20])
-    assert report["peak"] < hostile_readers.BASE_BYTES + GIGABYTE
+    assert report["peak"] < BASE_BYTES + GIGABYTE
 
 
 def test_there_are_more_than_ten_thousand_inputs_of_every_kind(corpus):
@@ -108,7 +93,7 @@ def test_there_are_more_than_ten_thousand_inputs_of_every_kind(corpus):
 
 def test_the_corpus_is_the_same_every_time():
     content = bytes(range(200))
-    first, second = (list(hostile_mutations.binary(content, np.random.default_rng(1))) for _ in range(2))
+    first, second = (list(mutations.binary(content, np.random.default_rng(1))) for _ in range(2))
     assert first == second
 
 
@@ -223,4 +208,4 @@ def test_captures_that_make_no_scene_end_well_or_in_one_line(tmp_path, kind):
         told = str(error)
     assert "\n" not in told
     if not told:
-        hostile_readers.check_open_scene(open_scene(tmp_path / "scene", device="cpu"))
+        check_open_scene(open_scene(tmp_path / "scene", device="cpu"))
