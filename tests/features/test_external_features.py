@@ -80,7 +80,7 @@ def test_an_array_has_the_photos_shape_but_for_a_cell(capture, tmp_path, shape, 
 def test_features_that_words_cannot_be_compared_with_are_refused(capture, tmp_path):
     maps = load_external_features(write_arrays(tmp_path, numbered(4, 6)), capture, dimension=512)
     with pytest.raises(
-        FileFormatError, match=r"depth 512, as the encoder of the words.*found 3; name with --clip"
+        FileFormatError, match=r"depth 512, like the embeddings of the text.*found 3; give the encoder"
     ):
         maps["left/0.png"]
 

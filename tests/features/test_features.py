@@ -476,7 +476,7 @@ def test_missing_and_mismatched_arrays_from_elsewhere_are_told(capture, tmp_path
     np.save(folder / "left/0_s.npy", np.full((2, 2), 4))
     np.save(folder / "left/0_f.npy", np.ones((4, 3)))
     (folder / "left/0.npy").unlink()
-    with pytest.raises(FileFormatError, match="whole numbers from -1 to 3"):
+    with pytest.raises(FileFormatError, match="integers from -1 to 3"):
         load_external_features(folder, capture)["left/0.png"]
 
 
@@ -536,7 +536,7 @@ def test_a_prompt_whose_end_is_not_heard_is_told(caplog):
     clip.encode_text(["something that one could drink from"])
     assert not caplog.records
     clip.encode_text(["a very " * 200 + "red apple"])
-    assert "too long: the model hears 24 of its 804 tokens" in caplog.text
+    assert "prompt truncated: 804 tokens, the model's limit is 24" in caplog.text
 
 
 def test_text_of_another_model_is_never_used(tmp_path):

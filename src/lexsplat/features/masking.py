@@ -1,7 +1,6 @@
-"""What masked pixels leave of feature maps: cells without any pixel that counts are zero.
+"""Masking of feature maps: cells that are masked entirely are zero.
 
-A pixel that is black in ``masks/`` is filled with the photo's mean color before anything looks at the photo
-(`lexsplat.captures.View.load_image`).
+Encoders see masked pixels in the photo's mean color (`lexsplat.captures.View.load_image`).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from lexsplat.features.cache import FeatureMap, FeatureMaps
 
 
 def without_masked_cells(maps: FeatureMaps, capture: Capture) -> FeatureMaps:
-    """Feature maps whose cells without any pixel that counts are zero, which the codebook passes over.
+    """Feature maps in which cells without an unmasked pixel are zero; the codebook skips zero cells.
 
     Args:
         maps: Maps by view name.
