@@ -65,7 +65,7 @@ def test_models_are_read_as_pycolmap_reads_them(tmp_path, binary, options):
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_models_are_found_where_tools_leave_them(tmp_path, place):
+def test_models_are_found_in_the_folders_of_common_tools(tmp_path, place):
     folder = tmp_path / place
     folder.mkdir(parents=True, exist_ok=True)
     for file, content in colmap_bytes(NAMES).items():
@@ -90,7 +90,7 @@ def test_distorted_cameras_of_mixed_sizes_become_pinholes(tmp_path):
     assert views[0].load_image().shape == (big.height, big.width, 3)
 
 
-def test_images_are_looked_for_in_the_folder_that_has_them(tmp_path):
+def test_images_are_found_in_the_folder_that_has_most_of_them(tmp_path):
     write_colmap(tmp_path, NAMES, images=False)
     (tmp_path / "images").mkdir()
     write_images(tmp_path / "images_4", NAMES, (16, 12))
@@ -145,7 +145,7 @@ def test_a_missing_images_file_and_an_unknown_camera(tmp_path):
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_a_binary_file_cut_anywhere_is_told(tmp_path, file):
+def test_a_binary_file_truncated_anywhere_is_refused(tmp_path, file):
     model = write_colmap(tmp_path, NAMES[:2])
     whole = (model / file).read_bytes()
     for size in range(len(whole)):
@@ -188,7 +188,7 @@ def text_model(root):
 @pytest.mark.parametrize(
     ("file", "cut"), [("cameras.txt", 0.7), ("images.txt", 0.5), ("images.txt", 0.7), ("points3D.txt", 0.6)]
 )
-def test_a_truncated_text_file_is_told(tmp_path, file, cut):
+def test_a_truncated_text_file_is_refused(tmp_path, file, cut):
     folder = text_model(tmp_path)
     load_capture(tmp_path)
     whole = (folder / file).read_text()
@@ -215,7 +215,7 @@ def test_a_text_model_may_leave_out_observations_and_the_last_empty_line(tmp_pat
 
 
 @pytest.mark.parametrize("observations", ["", "1.5 2.5 -1 3 4 7"])
-def test_images_whose_observation_lines_are_gone_are_told_not_every_second_one_taken(tmp_path, observations):
+def test_missing_observation_lines_are_reported(tmp_path, observations):
     folder = text_model(tmp_path)
     poses = [f"{number} 1 0 0 0 {number} 0 3 1 {number}.png" for number in range(1, 5)]
     write_images(tmp_path / "images", [f"{number}.png" for number in range(1, 5)])
@@ -227,8 +227,8 @@ def test_images_whose_observation_lines_are_gone_are_told_not_every_second_one_t
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_a_camera_that_is_there_twice_is_told(tmp_path, binary):
-    """Nobody can say which of the two an image means."""
+def test_a_duplicate_camera_is_refused(tmp_path, binary):
+    """The camera of its images is ambiguous."""
     if binary:
         model = write_colmap(tmp_path, ["a.png", "b.png"])
         content = (model / "cameras.bin").read_bytes()
@@ -239,13 +239,13 @@ def test_a_camera_that_is_there_twice_is_told(tmp_path, binary):
     fails(tmp_path, "cameras.", "camera 1 twice", kind=FileFormatError)
 
 
-def test_a_principal_point_far_outside_the_picture_is_told(tmp_path):
+def test_a_principal_point_far_outside_the_image_is_refused(tmp_path):
     write_colmap(tmp_path, ["a.png"], params=(60.0, 60.0, 1e6, 24.0))
     fails(tmp_path, "cameras.bin", "principal point")
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_mutated_models_end_in_a_scene_or_a_typed_error(tmp_path, suffix):
+def test_mutated_models_yield_a_capture_or_a_typed_error(tmp_path, suffix):
     rng = np.random.default_rng(0)
     if suffix == "bin":
         model = write_colmap(tmp_path, NAMES[:3], model=2, params=(60.0, 32.0, 24.0, -0.1))
@@ -273,7 +273,7 @@ def test_mutated_models_end_in_a_scene_or_a_typed_error(tmp_path, suffix):
     assert 30 < failed < 300
 
 
-def test_panoramas_are_refused_with_a_way_out(tmp_path):
+def test_panoramas_are_refused_with_a_remedy(tmp_path):
     write_colmap(tmp_path, NAMES, model=17, params=(64.0, 48.0))
     fails(tmp_path, "cameras.bin", "EQUIRECTANGULAR", kind=CaptureError)
 

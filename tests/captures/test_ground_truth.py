@@ -1,6 +1,4 @@
-"""Readers of other data sets' ground truth, each on a small fixture in its layout, written here by its
-description.
-"""
+"""Readers of the ground truth of public data sets, on small fixtures written by the descriptions of their layouts."""
 
 import json
 import re
@@ -65,20 +63,20 @@ def test_the_authors_folders_are_read_as_they_are(authors):
     np.testing.assert_array_equal(ground_truth, disk(20, 20, 8))
 
 
-def test_the_papers_words_can_be_asked_of_masks_named_by_the_released_code(authors):
+def test_masks_of_the_released_code_can_be_renamed_to_the_papers_prompts(authors):
     found = load_annotations(load_capture(authors)).renamed(prompt_names("room", "paper"))
     assert found.prompts() == ("curtain", "windows", "yucca plant")
     released = load_annotations(load_capture(authors)).renamed(prompt_names("room", "released"))
     assert released.prompts() == ("green Yucca plant", "silver gray curtain", "windows")
 
 
-def test_prompts_that_a_list_does_not_name_are_left_out(authors):
+def test_prompts_outside_a_list_are_dropped(authors):
     save_mask(authors / "segmentations" / "DSCF4680" / "teapot.png", disk(20, 20, 8))
     found = load_annotations(load_capture(authors)).renamed(prompt_names("room", "released"))
     assert "DSCF4680.JPG" not in found.masks
 
 
-def test_masks_called_in_the_words_of_the_paper_answer_to_either_list(authors):
+def test_masks_named_after_the_papers_list_match_either_list(authors):
     folder = authors / "segmentations" / "DSCF4690"
     (folder / "green Yucca plant.png").rename(folder / "yucca plant.png")
     capture = load_capture(authors)
@@ -88,7 +86,7 @@ def test_masks_called_in_the_words_of_the_paper_answer_to_either_list(authors):
     assert load_annotations(capture, prompt_list="paper").prompts() == ("curtain", "windows", "yucca plant")
 
 
-def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors, caplog):
+def test_masks_outside_a_list_are_reported_and_none_inside_is_refused(authors, caplog):
     save_mask(authors / "segmentations" / "DSCF4690" / "teapot.png", disk(20, 20, 8))
     capture = load_capture(authors)
     assert "teapot" not in load_annotations(capture, prompt_list="paper").prompts()
@@ -103,7 +101,7 @@ def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors,
 
 
 def test_the_papers_list_is_the_table_of_its_supplement():
-    """Counted by hand in the supplement's table, and compared with it where the paper is at hand."""
+    """Counted by hand in the supplement's table, and compared with it where the paper is available."""
     assert {scene: len(prompts_of(scene, "paper")) for scene in SCENES} == {
         "bicycle": 6, "bonsai": 6, "counter": 11, "garden": 9, "kitchen": 5, "room": 11,
     }  # fmt: skip
@@ -153,7 +151,7 @@ def test_3d_ovs_is_read_with_its_class_list(ovs3d):
     np.testing.assert_array_equal(total, 1)
 
 
-def test_3d_ovs_numbers_count_the_images_where_names_say_nothing_else(ovs3d):
+def test_3d_ovs_numbers_are_indices_unless_an_image_has_that_name(ovs3d):
     for number, name in enumerate(NAMES):
         (ovs3d / "images" / name).rename(ovs3d / "images" / f"DSC{number:03d}.jpg")
     write_colmap(ovs3d, [f"DSC{number:03d}.jpg" for number in range(6)], images=False)
@@ -162,7 +160,7 @@ def test_3d_ovs_numbers_count_the_images_where_names_say_nothing_else(ovs3d):
     assert list(load_annotations(capture).masks) == ["DSC000.jpg", "DSC003.jpg"]
 
 
-def test_3d_ovs_numbers_that_mean_one_image_by_name_and_another_by_count_are_refused(ovs3d):
+def test_3d_ovs_numbers_that_are_ambiguous_are_refused(ovs3d):
     (ovs3d / "images" / "00.jpg").unlink()  # now 03.jpg is the image of that name, 04.jpg the third counted
     with pytest.raises(CaptureError, match=r"03\.jpg and 04\.jpg"):
         load_annotations(load_capture(ovs3d), ovs3d / "segmentations")
@@ -219,12 +217,12 @@ def test_lerf_ovs_labels_beside_the_capture_are_found_and_their_views_held_out(l
 def test_lerf_ovs_objects_of_one_name_are_one_mask_with_several_boxes(lerf_ovs):
     found = load_annotations(load_capture(lerf_ovs))
     sheep = np.zeros((HEIGHT, WIDTH), bool)
-    sheep[5:16, 10:21] = sheep[30:41, 40:51] = True  # corners cut to whole pixels, edges included
+    sheep[5:16, 10:21] = sheep[30:41, 40:51] = True  # corners truncated to whole pixels, edges included
     np.testing.assert_array_equal(found.masks[FRAMES[1]]["sheep"], sheep)
     np.testing.assert_array_equal(found.boxes[FRAMES[1]]["sheep"], [[10, 5, 21, 16], [50, 40, 40, 30]])
 
 
-def test_lerf_ovs_masks_are_undistorted_with_their_photo_and_boxes_drawn_anew(lerf_ovs):
+def test_lerf_ovs_masks_and_boxes_are_undistorted_with_their_photo(lerf_ovs):
     params = (60.0, 60.0, 32.0, 24.0, 0.15, 0.0, 0.0, 0.0)
     write_colmap(lerf_ovs, FRAMES, model=4, params=params, images=False)
     capture = load_capture(lerf_ovs)
@@ -288,7 +286,7 @@ def test_a_given_folder_without_ground_truth_is_refused(lerf_ovs, tmp_path):
         path.rename(path.with_name(f"image_{number}.json"))
     with pytest.raises(CaptureError, match=r"2 JSON files.*name labels frame_\*\.json"):
         load_annotations(capture, tmp_path / "label" / "teatime")
-    assert load_annotations(capture).masks == {}  # nothing was promised
+    assert load_annotations(capture).masks == {}  # automatic search may find nothing
 
 
 def test_a_given_folder_whose_labels_hold_no_objects_is_refused(lerf_ovs, tmp_path):
@@ -300,7 +298,7 @@ def test_a_given_folder_whose_labels_hold_no_objects_is_refused(lerf_ovs, tmp_pa
 
 
 @given(st.lists(st.tuples(st.integers(-5, 45), st.integers(-5, 35)), min_size=3, max_size=9))
-def test_a_polygon_covers_what_lies_inside_and_little_beside(points):
+def test_a_polygon_mask_covers_its_inside_and_stays_in_its_bounding_box(points):
     found = polygon_mask(points, 40, 30)
     corners = np.array(points)
     inside = polygon2mask((30, 40), corners[:, ::-1])

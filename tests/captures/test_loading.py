@@ -92,7 +92,7 @@ class TestTransforms:
         write_transforms(tmp_path, NAMES, test_filenames=[f"images/{NAMES[3]}", f"images/{NAMES[5]}"])
         assert load_capture(tmp_path).test_names == (NAMES[3], NAMES[5])
 
-    def test_nerf_synthetic_has_its_split_sizes_from_the_images_and_white_behind_alpha(self, tmp_path):
+    def test_nerf_synthetic_has_its_split_image_sizes_and_white_background(self, tmp_path):
         rgba = np.zeros((20, 20, 4), np.uint8)
         rgba[:10] = [255, 0, 0, 255]
         rgba[10:, :10] = [0, 0, 255, 51]
@@ -116,7 +116,7 @@ class TestTransforms:
         np.testing.assert_allclose(image[15, 5], [0.8, 0.8, 1.0], atol=1e-6)
         np.testing.assert_allclose(image[15, 15], [1, 1, 1])
 
-    def test_only_nerf_synthetic_has_white_behind_alpha(self, tmp_path):
+    def test_only_nerf_synthetic_has_a_white_background(self, tmp_path):
         document = write_transforms(tmp_path, NAMES[:2])
         rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
         for name in NAMES[:2]:
@@ -171,7 +171,7 @@ class TestSplit:
     def test_unknown_and_exhaustive_splits_are_refused(self, tmp_path):
         write_transforms(tmp_path, NAMES)
         fails(tmp_path, "'0099'", "no view", test_names=["0099"])
-        fails(tmp_path, "learn from", test_names=NAMES)
+        fails(tmp_path, "training view", test_names=NAMES)
         write_json(tmp_path, {"test": ["0001"]}, "test_views.json")
         fails(tmp_path, "test_views.json", "list of image stems", kind=FileFormatError)
         write_json(tmp_path, ["nowhere"], "test_views.json")
@@ -179,7 +179,7 @@ class TestSplit:
         with pytest.raises(ValueError, match="test_every"):
             load_capture(tmp_path, test_every=1)
 
-    def test_a_single_view_is_learned_from(self, tmp_path):
+    def test_a_single_view_is_a_training_view(self, tmp_path):
         write_transforms(tmp_path, NAMES[:1])
         assert load_capture(tmp_path).train_names == (NAMES[0],)
 
@@ -215,7 +215,7 @@ class TestImages:
         assert loaded.dtype == np.float32
         np.testing.assert_allclose(loaded, expected, atol=0.003)
 
-    def test_exif_orientation_is_left_alone_because_poses_belong_to_stored_pixels(self, tmp_path):
+    def test_exif_orientation_is_ignored_because_poses_refer_to_stored_pixels(self, tmp_path):
         path = self.one(tmp_path, "a.jpg")
         pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         pixels[: HEIGHT // 2] = 255
@@ -250,18 +250,18 @@ class TestImages:
     def test_a_photo_of_another_aspect_is_refused(self, tmp_path):
         path = self.one(tmp_path)
         save(path, np.zeros((WIDTH, HEIGHT, 3)))
-        fails(tmp_path, str(path), "64x48", "48x64", "on its side")
+        fails(tmp_path, str(path), "64x48", "48x64", "rotated")
         save(path, np.zeros((HEIGHT, WIDTH - 4, 3)))
         fails(tmp_path, str(path), "64x48", "60x48")
 
-    def test_an_unreadable_photo_is_told_when_the_scene_is_loaded(self, tmp_path):
+    def test_an_unreadable_photo_is_reported_when_the_capture_is_loaded(self, tmp_path):
         path = self.one(tmp_path)
         for content in (b"", b"no image", b"\x89PNG\r\n\x1a\n"):
             path.write_bytes(content)
             fails(tmp_path, str(path), "image")
 
     @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif", "bmp"])
-    def test_a_truncated_photo_is_told_when_it_is_read(self, tmp_path, suffix):
+    def test_a_truncated_photo_is_reported_when_it_is_read(self, tmp_path, suffix):
         path = self.one(tmp_path, f"a.{suffix}")
         noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         Image.fromarray(noise).save(path)
@@ -272,7 +272,7 @@ class TestImages:
             view.load_image()
         assert_tells(caught.value, str(path))
 
-    def test_a_photo_that_changed_or_went_since_loading_is_told(self, tmp_path):
+    def test_a_photo_that_changed_or_vanished_after_loading_is_reported(self, tmp_path):
         path = self.one(tmp_path)
         view = load_capture(tmp_path).views["a.png"]
         save(path, np.zeros((10, 10, 3)))
@@ -289,7 +289,7 @@ class TestImages:
         monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
         fails(tmp_path, str(path), "pixels")
 
-    def test_pixels_can_be_left_out_by_masks(self, tmp_path):
+    def test_masked_pixels_are_ignored(self, tmp_path):
         self.one(tmp_path)
         mask = np.zeros((HEIGHT, WIDTH))
         mask[:, :32] = 1
@@ -313,7 +313,7 @@ class TestBadCaptures:
 
     def test_no_photo_at_all(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3], images=False)
-        fails(tmp_path, "3 images, none of which")
+        fails(tmp_path, "3 images without a file")
         write_json(tmp_path, {"frames": []})
         fails(tmp_path, "0 images")
 
@@ -358,7 +358,7 @@ class TestBadCaptures:
             {"ftheta_p0": 0.1},
         ],
     )
-    def test_intrinsics_that_cannot_be(self, tmp_path, change):
+    def test_invalid_intrinsics_are_refused(self, tmp_path, change):
         write_transforms(tmp_path, NAMES[:2], **change)
         fails(tmp_path, "transforms.json")
 
@@ -421,13 +421,13 @@ class TestMasks:
             load_masks(load_capture(tmp_path))
         assert_tells(caught.value, "2 views")
 
-    def test_a_mask_whose_stem_matches_no_view_is_told(self, tmp_path):
+    def test_a_mask_whose_stem_matches_no_view_is_reported(self, tmp_path):
         capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
         with pytest.raises(CaptureError) as caught:
             load_masks(capture)
         assert_tells(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
 
-    def test_a_mask_of_another_aspect_is_told_and_a_scaled_one_taken(self, tmp_path):
+    def test_a_mask_of_another_aspect_is_refused_and_a_scaled_one_accepted(self, tmp_path):
         capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
         assert list(load_masks(capture)) == ["0004.png"]
         save(tmp_path / "segmentations" / "0004" / "bad.png", np.ones((48, 48)))

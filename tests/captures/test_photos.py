@@ -37,7 +37,7 @@ def room(tmp_path_factory):
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), listener=events.append), events
 
 
-def test_photos_are_placed_and_the_one_that_cannot_be_is_named(room):
+def test_photos_are_registered_and_the_unregistered_one_is_named(room):
     _, poses, events = room
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
     assert poses.unregistered == ("unrelated.png",)
@@ -57,7 +57,7 @@ def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
     assert not (poses.root / ".poses").exists(), "what was worked with is gone"
 
 
-def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_path, monkeypatch):
+def test_a_mis_registered_photo_is_registered_again(room, tmp_path, monkeypatch):
     folder, _, _ = room
     mapping, moved = pycolmap.incremental_mapping, []
 
@@ -79,7 +79,7 @@ def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_pat
     )
 
 
-def test_folders_that_are_no_capture_are_told(tmp_path):
+def test_folders_that_are_not_captures_are_refused(tmp_path):
     for folder, found in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "found 0")):
         with pytest.raises(CaptureError) as caught:
             poses_from_photos(folder, tmp_path / "out")
@@ -106,7 +106,7 @@ def smooth(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pixels_are_turned_as_pillow_turns_them(tmp_path, orientation):
+def test_pixels_are_rotated_as_by_pillow(tmp_path, orientation):
     save_as_phone(tmp_path / "a.jpg", smooth(30, 50), orientation)
     with Image.open(tmp_path / "a.jpg") as image:
         expected = np.asarray(ImageOps.exif_transpose(image))
@@ -114,7 +114,7 @@ def test_pixels_are_turned_as_pillow_turns_them(tmp_path, orientation):
     assert expected.shape == (30, 50, 3)
 
 
-def test_photos_stored_turned_are_copied_upright_and_keep_their_focal_length(tmp_path):
+def test_rotated_photos_are_copied_upright_and_keep_their_focal_length(tmp_path):
     """COLMAP's rule for a focal length on 35 mm film: the diagonals of film (43.27 mm) and picture correspond."""
     folder = tmp_path / "photos"
     for index, orientation in enumerate((1, 6, 3, 8)):
@@ -240,7 +240,7 @@ def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch
     assert_same_up_to_a_similarity([views[f"{index}.png"].camera for index in range(COUNT)], cameras)
 
 
-def test_a_mask_of_another_shape_is_told_before_anything_is_done(tmp_path):
+def test_a_mask_of_another_shape_is_reported_before_anything_is_done(tmp_path):
     for index in range(3):
         save(tmp_path / "photos" / f"{index}.png", smooth(40, 60))
     save(tmp_path / "photos" / "masks" / "1.png", np.ones((60, 40)))
@@ -257,7 +257,7 @@ def three_photos(folder, suffix: str = ".jpg") -> None:
         save(folder / f"{index}{suffix}", np.random.default_rng(index).random((96, 128, 3)))
 
 
-def test_a_photo_that_is_cut_off_is_told_before_anything_is_done(tmp_path):
+def test_a_photo_that_is_cut_off_is_reported_before_anything_is_done(tmp_path):
     """pycolmap would take the gray half for a part of the place, and the training would stumble over it later."""
     three_photos(tmp_path / "photos")
     path = tmp_path / "photos" / "1.jpg"
@@ -269,7 +269,7 @@ def test_a_photo_that_is_cut_off_is_told_before_anything_is_done(tmp_path):
 
 
 @pytest.mark.parametrize("name", [b"a\nb.jpg", b"a\\b.jpg", b"\xff\xfe.jpg", b"sub\x7f/a.jpg"])
-def test_photos_with_names_that_no_camera_file_can_hold_are_told_before_anything_is_done(tmp_path, name):
+def test_photos_with_names_that_no_camera_file_can_hold_are_reported_before_anything_is_done(tmp_path, name):
     three_photos(tmp_path / "photos")
     path = Path(os.fsdecode(os.fsencode(tmp_path / "photos") + b"/" + name))
     path.parent.mkdir(exist_ok=True)

@@ -131,7 +131,7 @@ def test_a_video_that_was_held_upright_comes_out_upright(video, tmp_path):
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.9])
 @pytest.mark.parametrize("faststart", [False, True])
-def test_cut_off_videos_are_told(tmp_path, share, faststart):
+def test_cut_off_videos_are_reported(tmp_path, share, faststart):
     whole = write_video(tmp_path / "whole.mp4", faststart=faststart).read_bytes()
     path = tmp_path / "cut.mp4"
     path.write_bytes(whole[: int(len(whole) * share)])
@@ -141,7 +141,7 @@ def test_cut_off_videos_are_told(tmp_path, share, faststart):
     assert not list(tmp_path.rglob("frame_*"))
 
 
-def test_what_is_no_video_is_told(tmp_path):
+def test_what_is_no_video_is_reported(tmp_path):
     (tmp_path / "words.mp4").write_text("not a video")
     for name, found in (("words.mp4", "damaged"), ("nowhere.mov", "no such file")):
         with pytest.raises(CaptureError) as caught:

@@ -347,7 +347,7 @@ def test_fine_features_lie_where_the_image_content_is(tmp_path):
         found = encoder.encode_dense(image, short_side=32, stride=stride, facet="token")
         red = found[..., 0] / found[..., 2]
         centers = (torch.arange(64 // stride) + 0.5) * stride / 64
-        inner = slice(4 // stride + 1, -4 // stride - 1)  # at the border a patch sees repeated pixels
+        inner = slice(4 // stride + 1, -4 // stride - 1)  # border patches see replicated pixels
         assert (red[:, inner] - centers[inner]).abs().max() < tolerance
 
 
@@ -448,13 +448,13 @@ def test_normalization_falls_back_to_the_family_with_a_warning(siglip_folder, tm
     assert encoder._mean.flatten().tolist() == [0.5, 0.5, 0.5]
 
 
-# -- where models come from
+# -- finding models
 
 
 @pytest.mark.parametrize(
     ("load", "name"), [(load_clip, "lexsplat/no-such-clip"), (load_dino, "lexsplat/no-such-dino")]
 )
-def test_a_missing_model_ends_in_one_line_with_three_ways_out(load, name, monkeypatch, tmp_path):
+def test_a_missing_model_raises_one_line_with_three_remedies(load, name, monkeypatch, tmp_path):
     import huggingface_hub
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
@@ -475,13 +475,13 @@ def test_a_missing_model_ends_in_one_line_with_three_ways_out(load, name, monkey
     assert "\n" not in message
     for part in (name, "internet", f"--{kind} FOLDER", f"--{kind} bundled"):
         assert part in message
-    assert calls[0]["local_files_only"]  # the cache comes first
+    assert calls[0]["local_files_only"]  # the cache is searched first
     assert calls[-1]["etag_timeout"] <= 10
     assert all("safetensors" in " ".join(c["allow_patterns"]) for c in calls if "allow_patterns" in c)
     assert time.perf_counter() - start < 5
 
 
-def test_an_invalid_name_and_a_wrong_folder_are_told(tmp_path, clip_folder, siglip_folder):
+def test_an_invalid_name_and_a_wrong_folder_are_reported(tmp_path, clip_folder, siglip_folder):
     with pytest.raises(ModelError, match="neither a folder nor a valid model name"):
         load_clip("not a//name")
     with pytest.raises(ModelError, match="an empty folder"):
@@ -495,7 +495,7 @@ def test_an_invalid_name_and_a_wrong_folder_are_told(tmp_path, clip_folder, sigl
         load_dino(str(clip_folder))
 
 
-def test_truncated_weights_are_told(clip_folder, tmp_path):
+def test_truncated_weights_are_reported(clip_folder, tmp_path):
     import shutil
 
     copy = tmp_path / "copy"
@@ -542,7 +542,7 @@ def test_safetensors_come_from_the_conversion_request_where_main_has_none(clip_f
 
 
 def test_a_cached_model_is_found_without_network_even_under_a_request(clip_folder, monkeypatch, tmp_path):
-    """The cache's own layout: models--A--B/{refs,snapshots}; nothing is mocked but the place."""
+    """The cache's own layout: models--A--B/{refs,snapshots}; only its location is mocked."""
     import shutil
 
     import huggingface_hub
@@ -578,10 +578,10 @@ def test_sharded_weights_need_every_shard(clip_folder, tmp_path):
     assert hub.is_model_folder(folder)
 
 
-# -- the encoders that ship with the package
+# -- the bundled encoders
 
 
-def test_the_embedded_encoders_know_sizes_from_their_configuration():
+def test_the_bundled_encoders_read_sizes_from_their_configuration():
     clip, dino = load_clip("bundled"), load_dino("bundled")
     assert (clip.image_size, clip.dim) == (48, 128)
     assert (dino.patch_size, dino.dim) == (8, 128)
@@ -589,8 +589,8 @@ def test_the_embedded_encoders_know_sizes_from_their_configuration():
     assert dino.encode_dense(torch.rand(3, 60, 80), short_side=48, stride=4).shape == (12, 16, 128)
 
 
-def test_the_embedded_clip_tells_colors_apart():
-    """Its captions name colors: flat pictures of a color must lie nearest to that color's words."""
+def test_the_bundled_clip_distinguishes_colors():
+    """Its captions name colors: uniform images of a color are most similar to that color's prompt."""
     encoder = load_clip("bundled")
     colors = {
         "red": (0.8, 0.1, 0.1),

@@ -1,4 +1,4 @@
-"""Features of other programs, from a folder of arrays through ``build`` to an answer."""
+"""Features of other programs: from a folder of arrays through ``build`` to an answer."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_arrays(folder: Path, array: np.ndarray) -> Path:
 
 
 def numbered(height: int, width: int) -> np.ndarray:
-    """Unit vectors that tell row and column."""
+    """Unit vectors that encode row and column."""
     row, column = np.mgrid[:height, :width] + 0.5
     angle, tilt = 0.5 + row / height, 0.5 + column / width
     parts = [np.cos(angle) * np.cos(tilt), np.cos(angle) * np.sin(tilt), np.sin(angle)]
@@ -44,7 +44,7 @@ def numbered(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ending", ["npy", "safetensors", "pair"])
-def test_what_is_finer_than_the_pictures_is_read_at_their_pixels(capture, tmp_path, ending):
+def test_arrays_finer_than_the_working_images_are_read_at_their_pixels(capture, tmp_path, ending):
     for name, view in capture.views.items():
         capture.views[name] = dataclasses.replace(view, camera=view.camera.downscaled(4))
     large = numbered(HEIGHT * 2, WIDTH * 2)
@@ -67,7 +67,7 @@ def test_what_is_finer_than_the_pictures_is_read_at_their_pixels(capture, tmp_pa
     ("shape", "fits"),
     [((16, 24), True), ((15, 24), True), ((16, 25), True), ((24, 16), False), ((3, 24), False)],
 )
-def test_an_array_has_the_photos_shape_but_for_a_cell(capture, tmp_path, shape, fits):
+def test_an_array_has_the_photos_aspect_up_to_one_cell(capture, tmp_path, shape, fits):
     folder = write_arrays(tmp_path / "arrays", numbered(*shape))
     maps = load_external_features(folder, capture)
     if fits:
@@ -77,7 +77,7 @@ def test_an_array_has_the_photos_shape_but_for_a_cell(capture, tmp_path, shape, 
             maps["left/0.png"]
 
 
-def test_features_that_words_cannot_be_compared_with_are_refused(capture, tmp_path):
+def test_features_of_another_depth_than_the_text_embeddings_are_refused(capture, tmp_path):
     maps = load_external_features(write_arrays(tmp_path, numbered(4, 6)), capture, dimension=512)
     with pytest.raises(
         FileFormatError, match=r"depth 512, like the embeddings of the text.*found 3; give the encoder"
@@ -101,11 +101,11 @@ def test_pixels_without_a_feature_have_no_code(capture, tmp_path):
     assert (codes[:, 10:] < 3).all()
     with pytest.raises(FileFormatError, match=r"num-codes 255"):
         load_external_features(folder, capture, allow_holes=False)["left/0.png"]
-    # Where 255 is a code, masks say what does not count; the map itself has no number for it.
+    # With 256 codes, index maps have no value for pixels without a feature.
     assert Codebook(torch.eye(256)).assign(FeatureMap(torch.zeros(1, 1, 256))).item() == 0
 
 
-def test_numbers_too_large_for_a_length_are_refused(capture, tmp_path):
+def test_values_whose_norm_overflows_are_refused(capture, tmp_path):
     folder = write_arrays(tmp_path, np.full((4, 6, 3), 1e30, np.float32))
     with pytest.raises(FileFormatError, match="beyond 1e19"):
         load_external_features(folder, capture)["left/0.png"]
@@ -149,7 +149,7 @@ def embed(capture: Path, output: Path, built: Path, features: Path, *options: st
     ])  # fmt: skip
 
 
-def test_masks_of_another_program_become_answers(tiny_capture, built, segments, tmp_path, capsys):
+def test_segments_of_another_program_answer_queries(tiny_capture, built, segments, tmp_path, capsys):
     output = tmp_path / "scene"
     assert embed(tiny_capture, output, built, segments, "--method", "lifted") == 0
     with Image.open(output / "codes" / "view_01.png") as image:
@@ -169,14 +169,16 @@ def test_masks_of_another_program_become_answers(tiny_capture, built, segments, 
 
 
 def measure(output: Path) -> None:
-    """Most of every thing is found."""
+    """Most of every object is found."""
     assert cli.main(["evaluate", str(output)]) == 0
     metrics = json.loads((output / "metrics.json").read_text())
     assert metrics["language"]["strict"]["auto"]["mIoU"] > 0.7
     assert metrics["language"]["strict"]["mAP"] > 0.9
 
 
-def test_a_view_without_an_array_is_told_before_anything_is_made(tiny_capture, built, tmp_path, capsys):
+def test_a_view_without_an_array_is_reported_before_anything_is_written(
+    tiny_capture, built, tmp_path, capsys
+):
     (tmp_path / "empty").mkdir()
     assert embed(tiny_capture, tmp_path / "scene", built, tmp_path / "empty") == 1
     assert "expected view_01.npy, view_01.safetensors or view_01_f.npy" in capsys.readouterr().err

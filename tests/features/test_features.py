@@ -31,7 +31,7 @@ from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetE
 
 @pytest.fixture(scope="module", autouse=True)
 def two_threads():
-    """So that two workers run, whatever the machine."""
+    """Two workers run on every machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -39,7 +39,7 @@ def two_threads():
 
 
 class ColorEncoder:
-    """Embeds the mean color; counts its work."""
+    """Embeds the mean color; counts its calls."""
 
     name, image_size, dim, patches = "color", 8, 4, 2
     device = torch.device("cpu")
@@ -120,7 +120,7 @@ def test_the_maps_are_those_of_crops_embedded_one_by_one(capture, tmp_path):
 
 
 @pytest.mark.parametrize("tokens", ["patch", "both"])
-def test_patches_speak_beside_or_instead_of_the_whole_crops(tokens, capture, tmp_path):
+def test_patch_embeddings_are_used_beside_or_instead_of_image_embeddings(tokens, capture, tmp_path):
     config = dataclasses.replace(CONFIG, crop_tokens=tokens)
     maps = extract_features(capture, ColorEncoder(), None, config, cache_dir=tmp_path / "cache")
     levels = grid_levels(WIDTH, HEIGHT, CONFIG.crop_sizes, CONFIG.crop_strides)
@@ -147,7 +147,7 @@ def test_patches_that_do_not_fit_are_refused_with_a_budget_that_does(capture, tm
         extract_features(capture, Fine(), None, CONFIG, cache_dir=tmp_path, memory=0)
 
 
-def test_what_patches_say_is_stored_for_one_size_of_the_maps(capture, tmp_path):
+def test_patch_embeddings_are_stored_for_one_map_size(capture, tmp_path):
     config = dataclasses.replace(CONFIG, crop_tokens="both")
     assert _work(capture, tmp_path) == (True, 5)
     assert _work(capture, tmp_path, config) == (True, 0)
@@ -155,7 +155,7 @@ def test_what_patches_say_is_stored_for_one_size_of_the_maps(capture, tmp_path):
     assert _work(capture, tmp_path, dataclasses.replace(config, map_cells=5)) == (True, 0)
 
 
-def test_a_cached_map_of_patches_that_does_not_fit_is_told(capture, tmp_path):
+def test_a_cached_patch_map_of_another_size_is_refused(capture, tmp_path):
     config = dataclasses.replace(CONFIG, crop_tokens="patch")
     maps = extract_features(capture, ColorEncoder(), None, config, cache_dir=tmp_path)
     path = sorted(tmp_path.glob("*.clip.safetensors"))[0]
@@ -184,7 +184,7 @@ def test_maps_are_unit_length_and_without_dino_have_none(capture, tmp_path):
 
 
 @pytest.mark.parametrize("size", [(4000, 8), (8, 4000)])
-def test_the_maps_of_a_long_strip_have_no_more_cells_than_those_of_a_picture_of_16_by_1(size, tmp_path):
+def test_the_maps_of_long_images_have_a_bounded_number_of_cells(size, tmp_path):
     capture = make_capture(tmp_path, count=1)
     (view,) = capture.views.values()
     Image.new("RGB", size, (90, 20, 60)).save(view.image_path)
@@ -232,7 +232,7 @@ def test_the_number_of_threads_changes_nothing(mode, capture, tmp_path):
         torch.testing.assert_close(found[0][name], found[1][name], atol=1e-3, rtol=0)
 
 
-def test_a_killed_run_goes_on_with_what_is_missing(capture, tmp_path):
+def test_an_interrupted_run_resumes_with_the_missing_views(capture, tmp_path):
     torch.set_num_threads(1)
     try:
         whole = ColorEncoder()
@@ -241,7 +241,7 @@ def test_a_killed_run_goes_on_with_what_is_missing(capture, tmp_path):
         broken = ColorEncoder(fail_after=whole.crops // 2)
         with pytest.raises(RuntimeError, match="stopped in the middle"):
             extract_features(capture, broken, None, CONFIG, cache_dir=cache, memory=small)
-        assert not list((tmp_path / "cache").glob(".*"))  # no half-written file stays
+        assert not list((tmp_path / "cache").glob(".*"))  # no partial file remains
         stored = len(list((tmp_path / "cache").glob("*.safetensors")))
         assert 0 < stored < 5
         rest, events = ColorEncoder(), []
@@ -259,7 +259,7 @@ def test_an_error_in_one_worker_stops_all_and_restores_the_threads(capture, tmp_
     assert threading.active_count() < 10
 
 
-def test_an_unreadable_image_is_told(capture, tmp_path):
+def test_an_unreadable_image_is_reported(capture, tmp_path):
     name = "left/3.png"
 
     class Broken(FakeView):
@@ -298,10 +298,10 @@ def test_the_cache_follows_everything_that_changes_features_and_nothing_else(cap
     capture.views["left/1.png"] = dataclasses.replace(view, background=(1.0, 1.0, 1.0))
     assert _work(capture, tmp_path) == (True, 1)
     capture.views["left/1.png"] = dataclasses.replace(view, camera=view.camera.downscaled(2))
-    assert _work(capture, tmp_path) == (False, 0)  # the working resolution is not what features are made from
+    assert _work(capture, tmp_path) == (False, 0)  # features do not depend on the working resolution
 
 
-def test_a_damaged_cache_file_is_made_anew(capture, tmp_path):
+def test_a_damaged_cache_file_is_replaced(capture, tmp_path):
     extract_features(capture, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
     files = sorted(tmp_path.glob("*.clip.safetensors"))
     files[0].write_bytes(files[0].read_bytes()[:-10])
@@ -317,7 +317,7 @@ def test_a_damaged_cache_file_is_made_anew(capture, tmp_path):
         [fresh[name] for name in fresh]
 
 
-def test_the_same_picture_under_two_names_is_encoded_once(capture, tmp_path):
+def test_the_same_photo_under_two_names_is_encoded_once(capture, tmp_path):
     torch.set_num_threads(1)
     twin = dataclasses.replace(capture.views["left/0.png"], name="right/0.png")
     single = ColorEncoder()
@@ -332,7 +332,7 @@ def test_the_same_picture_under_two_names_is_encoded_once(capture, tmp_path):
     assert torch.equal(maps["left/0.png"].clip, maps["right/0.png"].clip)
 
 
-def test_what_lies_on_disk_is_small_and_half_precision(capture, tmp_path):
+def test_cache_files_are_small_and_in_half_precision(capture, tmp_path):
     extract_features(capture, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
     for path in tmp_path.glob("*.safetensors"):
         tensors = load_file(path)
@@ -352,7 +352,7 @@ def test_views_draw_different_random_crops_that_do_not_depend_on_each_other(capt
     assert len({tuple(lefts.tolist()) for lefts in stored.values()}) == 5
 
 
-def test_maps_in_memory_never_exceed_their_bound_and_the_latest_stay():
+def test_maps_in_memory_never_exceed_their_bound_and_the_latest_are_kept():
     loads = []
 
     def load(name):
@@ -363,7 +363,7 @@ def test_maps_in_memory_never_exceed_their_bound_and_the_latest_stay():
     for name in "abacad":
         _ = maps[name]
         assert maps.cached_bytes <= 8000
-    assert loads == ["a", "b", "c", "d"]  # a was asked for often enough to stay
+    assert loads == ["a", "b", "c", "d"]  # a was used recently enough to be kept
     _ = maps["b"]
     assert loads[-1] == "b"
     with pytest.raises(KeyError):
@@ -399,7 +399,7 @@ def test_bad_settings_are_refused_at_once(bad):
         FeatureConfig(**bad)
 
 
-# -- features from elsewhere
+# -- external features
 
 
 def _external(capture, folder, write):
@@ -410,7 +410,7 @@ def _external(capture, folder, write):
     return folder
 
 
-def test_arrays_from_elsewhere_are_read_by_stem_and_normalized(capture, tmp_path):
+def test_external_arrays_are_read_by_stem_and_normalized(capture, tmp_path):
     array = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float16)
     folder = _external(capture, tmp_path / "npy", lambda path: np.save(f"{path}.npy", array))
     maps = load_external_features(folder, capture)
@@ -425,7 +425,7 @@ def test_arrays_from_elsewhere_are_read_by_stem_and_normalized(capture, tmp_path
     torch.testing.assert_close(found.dino, torch.full((5, 7, 2), 0.5**0.5))
 
 
-def test_segments_with_features_are_painted_and_levels_averaged(capture, tmp_path):
+def test_segment_features_become_maps_and_levels_are_averaged(capture, tmp_path):
     features = np.array([[2.0, 0], [0, 3.0]], np.float32)
     segments = np.array([[[0, 1], [-1, 0]], [[1, 1], [-1, -1]]], np.float32)
 
@@ -448,7 +448,7 @@ def test_segments_with_features_are_painted_and_levels_averaged(capture, tmp_pat
         (np.array([[["a", {}]]], dtype=object), "without pickled objects"),
     ],
 )
-def test_wrong_arrays_from_elsewhere_are_told(array, message, capture, tmp_path):
+def test_invalid_external_arrays_are_refused(array, message, capture, tmp_path):
     folder = _external(
         capture, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True)
     )
@@ -456,7 +456,7 @@ def test_wrong_arrays_from_elsewhere_are_told(array, message, capture, tmp_path)
         load_external_features(folder, capture)["left/0.png"]
 
 
-def test_missing_and_mismatched_arrays_from_elsewhere_are_told(capture, tmp_path):
+def test_missing_and_mismatched_external_arrays_are_refused(capture, tmp_path):
     with pytest.raises(FileFormatError, match="no folder"):
         load_external_features(tmp_path / "nowhere", capture)
     folder = _external(
@@ -480,10 +480,10 @@ def test_missing_and_mismatched_arrays_from_elsewhere_are_told(capture, tmp_path
         load_external_features(folder, capture)["left/0.png"]
 
 
-# -- text and pictures
+# -- texts
 
 
-def test_a_prompt_is_embedded_once_and_kept_on_disk(tmp_path):
+def test_a_prompt_is_embedded_once_and_cached_on_disk(tmp_path):
     encoder = ColorEncoder()
     cache = TextCache(tmp_path)
     prompts = ["red apple", 'äpfel\n"quoted"', "red apple", "__metadata__"]
@@ -502,7 +502,7 @@ def test_a_prompt_is_embedded_once_and_kept_on_disk(tmp_path):
 
 
 def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkeypatch):
-    """In a batch the last bits of an embedding depend on what else is in it."""
+    """In a batch, the last bits of an embedding depend on the other texts."""
     batches, written = [], []
 
     class Watched(ColorEncoder):
@@ -521,7 +521,7 @@ def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkey
     assert written == [2]
 
 
-def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path, caplog):
+def test_a_cache_that_cannot_be_written_is_reported_and_the_embedding_returned(tmp_path, caplog):
     in_the_way = tmp_path / "texts"
     in_the_way.write_text("no folder")
     found = TextCache(in_the_way).encode("color", ["apple"], ColorEncoder)
@@ -529,7 +529,7 @@ def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path
     assert "not kept" in caplog.text
 
 
-def test_a_prompt_whose_end_is_not_heard_is_told(caplog):
+def test_a_truncated_prompt_is_reported(caplog):
     from lexsplat.features.encoders import load_clip
 
     clip = load_clip("bundled")
@@ -548,7 +548,7 @@ def test_text_of_another_model_is_never_used(tmp_path):
         TextCache(tmp_path).encode("third", ["apple"], ColorEncoder)
 
 
-def test_a_damaged_text_cache_is_made_anew_and_empty_prompts_are_refused(tmp_path):
+def test_a_damaged_text_cache_is_replaced_and_empty_prompts_are_refused(tmp_path):
     TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
     (file,) = tmp_path.iterdir()
     file.write_bytes(b"nonsense")
@@ -565,8 +565,8 @@ def test_the_sparse_settings_take_a_sixth_of_the_crops():
     assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
 
 
-def test_embedded_settings_with_the_embedded_encoders_find_the_red_half(tmp_path):
-    """The whole way, photo to answer: relevancy for a color is higher where the color is."""
+def test_the_bundled_settings_and_encoders_find_the_red_half(tmp_path):
+    """From photo to answer: the relevancy of a color is higher where the color is."""
     from lexsplat.features.encoders import load_clip, load_dino
 
     picture = np.zeros((240, 320, 3), np.uint8)

@@ -29,7 +29,7 @@ from lexsplat.runtime.files import PICKLES, read_tensors
 from lexsplat.scenes.formats.reading import read_splats
 
 pytestmark = [
-    pytest.mark.xdist_group("hostile"),  # the corpus runs once, for all tests of this file
+    pytest.mark.xdist_group("hostile"),  # the corpus runs once for all tests of this file
     pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux"),
 ]
 
@@ -72,36 +72,36 @@ def corpus(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", sorted(READERS))
-def test_every_input_is_read_rightly_or_refused_in_one_typed_line(corpus, name):
-    assert name in corpus, "its process ended before it came to this reader"
+def test_every_input_is_read_correctly_or_refused_with_a_typed_error_of_one_line(corpus, name):
+    assert name in corpus, "all processes ended before this reader"
     report = corpus[name]
     assert "crash" not in report, report.get("crash")
     assert not report["failures"], "\n".join(report["failures"][:20])
     assert report["peak"] < BASE_BYTES + GIGABYTE
 
 
-def test_there_are_more_than_ten_thousand_inputs_of_every_kind(corpus):
+def test_the_corpus_has_ten_thousand_inputs_of_all_kinds(corpus):
     assert sum(report["inputs"] for report in corpus.values()) >= LEAST_INPUTS
     kinds = {kind for report in corpus.values() for kind in report["kinds"]}
     assert {"truncated", "flipped", "numbers", "moved", "foreign", "structure", "names", "counts"} <= kinds
-    # A corpus that is only refused, or only taken, tests half of the readers' work.
+    # The corpus must exercise both acceptance and refusal.
     refused = sum(sum(report["errors"].values()) for report in corpus.values())
     right = sum(report["right"] for report in corpus.values())
     assert refused > 4000
     assert right > 1000
 
 
-def test_the_corpus_is_the_same_every_time():
+def test_the_corpus_is_deterministic():
     content = bytes(range(200))
     first, second = (list(mutations.binary(content, np.random.default_rng(1))) for _ in range(2))
     assert first == second
 
 
-# -- what cannot be made by changing bytes
+# -- inputs that are not mutations of bytes
 
 
 @pytest.mark.parametrize("ending", PICKLES)
-def test_pickles_are_refused_with_the_way_out(tmp_path, ending):
+def test_pickles_are_refused_with_a_remedy(tmp_path, ending):
     path = tmp_path / f"model{ending}"
     path.write_bytes(b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x93\x94.")
     for read in (read_splats, read_tensors):
@@ -109,7 +109,7 @@ def test_pickles_are_refused_with_the_way_out(tmp_path, ending):
             read(path)
 
 
-def test_a_pickle_among_features_is_refused_with_the_way_out(tmp_path):
+def test_a_pickle_among_features_is_refused_with_a_remedy(tmp_path):
     from lexsplat.features import load_external_features
 
     write_transforms(tmp_path / "capture", ["a.png", "b.png"])
@@ -119,7 +119,7 @@ def test_a_pickle_among_features_is_refused_with_the_way_out(tmp_path):
         load_external_features(tmp_path / "features", load_capture(tmp_path / "capture"))
 
 
-def test_symlinks_that_lead_nowhere_or_in_circles_are_missing_photos(tmp_path):
+def test_broken_and_circular_symlinks_are_missing_photos(tmp_path):
     write_colmap(tmp_path, ["a.png", "b.png", "c.png", "d.png"])
     for name, target in (("b.png", "nowhere.png"), ("c.png", "c.png"), ("d.png", "../images")):
         (tmp_path / "images" / name).unlink()
@@ -129,10 +129,10 @@ def test_symlinks_that_lead_nowhere_or_in_circles_are_missing_photos(tmp_path):
     assert "3 of 4 images have no file" in capture.warnings[0]
 
 
-def test_photos_that_are_no_files_are_not_waited_for(tmp_path):
+def test_photos_that_are_not_regular_files_are_skipped(tmp_path):
     write_colmap(tmp_path, ["a.png", "b.png"])
     (tmp_path / "images" / "b.png").unlink()
-    os.mkfifo(tmp_path / "images" / "b.png")  # whoever opens it waits for ever
+    os.mkfifo(tmp_path / "images" / "b.png")  # opening it blocks forever
     assert list(load_capture(tmp_path).views) == ["a.png"]
 
 
@@ -144,14 +144,14 @@ def test_names_in_other_alphabets_are_names(tmp_path):
     assert set(load_capture(tmp_path / "json").views) == set(names)
 
 
-def test_two_photos_that_would_share_their_files_are_refused(tmp_path):
+def test_photos_that_differ_only_in_their_suffix_are_refused(tmp_path):
     write_colmap(tmp_path, ["a.png", "a.jpg"])
     with pytest.raises(CaptureError, match="differ in more than their suffix"):
         load_capture(tmp_path)
 
 
 def turn_around(model: Path) -> None:
-    """All cameras look the other way: everything is behind them."""
+    """Turn all cameras around: everything is behind them."""
     lines = []
     for line in (model / "images.txt").read_text().split("\n"):
         words = line.split()
@@ -176,8 +176,8 @@ def same_pose(model: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["behind", "one view", "identical views", "identical photos"])
-def test_captures_that_make_no_scene_end_well_or_in_one_line(tmp_path, kind):
-    """Cameras that see nothing, one view only, views at one place: a scene of finite numbers, or a typed error."""
+def test_degenerate_captures_yield_a_finite_scene_or_a_typed_error(tmp_path, kind):
+    """Cameras that see nothing, a single view, views at one position: a finite scene, or a typed error."""
     from lexsplat.codebook import CodebookConfig
     from lexsplat.features import FeatureConfig
     from lexsplat.pipeline.build import build

@@ -96,8 +96,8 @@ class ClipEncoder(PretrainedModel):
             images: ``[B, 3, h, w]`` in 0..1, of any size.
 
         Returns:
-            The embeddings of `encode_images` ``[B, D]``, and those of the patches ``[B, P, P, D]``, row-major; float32
-            on the CPU, unit length.
+            The embeddings of `encode_images` ``[B, D]``, and those of the patches ``[B, P, P, D]``, row-major;
+            float32 on the CPU, unit length.
 
         Raises:
             ModelError: If the model is not of CLIP's own architecture.
@@ -116,7 +116,7 @@ class ClipEncoder(PretrainedModel):
 
     @torch.inference_mode()
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
-        """Prompts to ``[B, D]``, float32 on the CPU, unit length; prompts beyond the limit are truncated.
+        """Prompts to ``[B, D]``, float32 on the CPU, unit length; long prompts are truncated.
 
         Raises:
             ValueError: If there is no prompt, or one is empty.

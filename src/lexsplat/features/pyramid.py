@@ -366,7 +366,7 @@ def encode_stream(
 def batch_size_for(memory: int, image_size: int) -> int:
     """Number of crops to encode at once within ``memory`` bytes.
 
-    A transformer layer holds about 24 float32 tensors of the input's size (in ViT-B/16, a token has as many numbers as
-    a patch has values); it gets a quarter of the memory.
+    A transformer layer holds about 24 float32 tensors of the input's size (in ViT-B/16, a token has as many numbers
+    as a patch has values); it gets a quarter of the memory.
     """
     return int(min(256, max(1, memory // 4 // (24 * 12 * image_size**2))))
