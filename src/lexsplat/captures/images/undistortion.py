@@ -1,9 +1,9 @@
 """Undistortion: from any perspective COLMAP camera model to a pinhole image without invalid borders.
 
 pycolmap implements the models: it chooses the pinhole camera (the largest one whose pixels all lie inside the photo,
-COLMAP's ``blank_pixels = 0``) and projects its rays into the distorted photo. This module resamples the pixels by bicubic interpolation, in bands for
-large photos. `pycolmap.undistort_image` is bilinear and blurs fine detail: it differs by up to 79/255 on noise, and
-by 1/255 on a smooth image.
+COLMAP's ``blank_pixels = 0``) and projects its rays into the distorted photo. This module resamples the pixels by
+bicubic interpolation, in bands for large photos. `pycolmap.undistort_image` is bilinear and blurs fine detail: it
+differs by up to 79/255 on noise, and by 1/255 on a smooth image.
 """
 
 from __future__ import annotations
