@@ -188,7 +188,7 @@ def phone(tmp_path_factory):
         save_as_phone(folder / "images" / f"{index}.jpg", photo, (6, 8, 3)[index % 3])
         mask = np.ones((SIZE[1], SIZE[0]))
         mask[-90:, -70:] = 0
-        # Half of the masks have COLMAP's names and are nearly black; the others have stems as names and half the size.
+        # Half of the masks have COLMAP's names and are nearly black; others have stems as names and half the size.
         if index % 2:
             save(folder / "masks" / f"{index}.jpg.png", mask * 3 / 255)
         else:

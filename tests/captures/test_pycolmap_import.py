@@ -27,14 +27,14 @@ def test_the_import_restores_the_sigterm_handler():
     script = """
 import os, signal, sys
 if sys.argv[1] == "own":
-    signal.signal(signal.SIGTERM, lambda number, frame: (print("told", flush=True), sys.exit(7)))
+    signal.signal(signal.SIGTERM, lambda number, frame: (print("handled", flush=True), sys.exit(7)))
 from lexsplat.captures.sfm.pycolmap_import import pycolmap
 pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2])
 os.kill(os.getpid(), signal.SIGTERM)
 import time
 time.sleep(20)
 """
-    for kind, code, said in (("none", -signal.SIGTERM, ""), ("own", 7, "told\n")):
+    for kind, code, said in (("none", -signal.SIGTERM, ""), ("own", 7, "handled\n")):
         done = subprocess.run(
             [sys.executable, "-c", script, kind], capture_output=True, text=True, timeout=120, check=False
         )

@@ -201,11 +201,11 @@ def test_degenerate_captures_yield_a_finite_scene_or_a_typed_error(tmp_path, kin
         features=FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24),
         codebook=CodebookConfig(num_codes=4, steps=5),
     )  # fmt: skip
-    told = ""
+    message = ""
     try:
         build(capture, tmp_path / "scene", config)
     except LexsplatError as error:
-        told = str(error)
-    assert "\n" not in told
-    if not told:
+        message = str(error)
+    assert "\n" not in message
+    if not message:
         check_open_scene(open_scene(tmp_path / "scene", device="cpu"))
