@@ -17,7 +17,8 @@ from support.written_captures import (
     write_transforms,
 )
 
-from lexsplat.captures import load_capture, load_mask, load_masks, stem_of
+from lexsplat.captures import load_capture, load_masks, stem_of
+from lexsplat.captures.images.reading import read_mask
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 NAMES = [f"{index:04d}.png" for index in range(1, 18)]
@@ -403,8 +404,8 @@ class TestMasks:
         save(tmp_path / "segmentations" / "0004" / "pot.png", np.zeros((48, 64)))
         masks = load_masks(load_capture(tmp_path))
         assert {name: list(prompts) for name, prompts in masks.items()} == {"0004.png": ["pot", "red apple"]}
-        assert load_mask(masks["0004.png"]["red apple"]).all()
-        assert not load_mask(masks["0004.png"]["pot"]).any()
+        assert read_mask(masks["0004.png"]["red apple"]).all()
+        assert not read_mask(masks["0004.png"]["pot"]).any()
 
     def test_a_capture_without_masks_has_none(self, tmp_path):
         write_transforms(tmp_path, NAMES)
@@ -439,7 +440,7 @@ class TestMasks:
     def test_masks_of_any_depth(self, tmp_path, high, dtype):
         ground_truth = np.random.default_rng(0).random((9, 7)) > 0.5
         Image.fromarray((ground_truth * high).astype(dtype)).save(tmp_path / "m.png")
-        np.testing.assert_array_equal(load_mask(tmp_path / "m.png"), ground_truth)
+        np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), ground_truth)
 
     def test_masks_drawn_on_distorted_photos_are_undistorted_like_them(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3], k1=-0.2)

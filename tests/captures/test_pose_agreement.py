@@ -10,7 +10,7 @@ import pytest
 from support.poses import move
 
 from lexsplat.captures.sfm.pose_agreement import agreements, misregistered, register_again, sampson_errors
-from lexsplat.captures.sfm.triangulation import quiet_pycolmap
+from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 
 WRONG = 4
 

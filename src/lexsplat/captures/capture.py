@@ -17,6 +17,7 @@ from lexsplat.captures.images.reading import (
     read_mask,
     read_rows,
     resize_image,
+    resize_nearest,
     sizes_agree,
 )
 from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_large
@@ -91,7 +92,7 @@ class View:
             return resize_image(filled(image, mask), size)
         if mask is not None:
             self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-            image = filled(image, _resize_nearest(mask, found))
+            image = filled(image, resize_nearest(mask, found))
         if self.lens.distorts:
             return undistort(image, self.lens, size)
         return resize_image(image, size)
@@ -105,7 +106,7 @@ class View:
         else:
             if mask is not None:
                 self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-                source = FilledRows(source, _resize_nearest(mask, (source.width, source.height)))
+                source = FilledRows(source, resize_nearest(mask, (source.width, source.height)))
             if self.lens.distorts:
                 return undistort_large(source, self.lens, size)
         if size[0] <= source.width and size[1] <= source.height:
@@ -141,7 +142,7 @@ class View:
         height, width = mask.shape
         self._check_aspect(subject, (width, height))
         if self._is_undistorted(mask) or not self.lens.distorts:
-            return mask if size is None else _resize_nearest(mask, self._checked_size(size))
+            return mask if size is None else resize_nearest(mask, self._checked_size(size))
         if size is None:
             full = self.capture_size
             size = (
@@ -176,7 +177,7 @@ class View:
         mask = read_mask(self.ignore_path, nonzero=True)
         self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
         undistorted = self._is_undistorted(mask)
-        masked = ~_resize_nearest(
+        masked = ~resize_nearest(
             mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
         )
         large = is_large(masked.shape[1], masked.shape[0])
@@ -228,12 +229,6 @@ def filled(image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.f
     kept = image[valid]
     mean = kept.mean(0, dtype=np.float64) if len(kept) else np.zeros(image.shape[2])
     return np.where(valid[..., None], image, mean.astype(np.float32))
-
-
-def _resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
-    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
-    return mask[rows[:, None], columns[None, :]]
 
 
 def _no_points() -> NDArray[np.float32]:

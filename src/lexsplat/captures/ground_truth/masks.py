@@ -4,22 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lexsplat.captures.capture import Capture
-from lexsplat.captures.images.reading import read_mask
 from lexsplat.captures.splits import mask_folders, match_stem
 from lexsplat.runtime.errors import CaptureError
-
-
-def load_mask(path: Path) -> NDArray[np.bool_]:
-    """A mask as ``[H, W]`` bool as stored: true where the image is brighter than half.
-
-    Raises:
-        CaptureError: If the file is missing or damaged.
-    """
-    return read_mask(path)
 
 
 def load_masks(capture: Capture) -> dict[str, dict[str, Path]]:

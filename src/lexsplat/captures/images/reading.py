@@ -267,6 +267,13 @@ def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[n
     return np.stack(channels, axis=-1)
 
 
+def resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask ``[H, W]`` at another ``(width, height)``, by nearest pixel."""
+    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
+    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
+    return mask[rows[:, None], columns[None, :]]
+
+
 def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
     """Whether one size is the other scaled uniformly, up to rounding of each side by less than a pixel."""
     low, high = 0.0, np.inf

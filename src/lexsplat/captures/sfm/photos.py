@@ -22,7 +22,6 @@ from lexsplat.captures.images.reading import image_size
 from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
 from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
-from lexsplat.captures.sfm.triangulation import quiet_pycolmap
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
 from lexsplat.runtime.files import atomic_path
@@ -145,6 +144,8 @@ def poses_from_photos(
         BackendError: If the global mapper is requested and this pycolmap has none.
         MemoryBudgetError: If ``memory`` is too little for photos of this size and number.
     """
+    from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
+
     folder, output, config = photo_folder(Path(folder)), Path(output), config or PoseConfig()
     _check_mapper(config)
     photos = prepare_photos(folder, output, memory=memory, listener=listener)

@@ -25,6 +25,7 @@ from lexsplat.captures.images.reading import (
     open_image,
     read_bytes,
     read_mask,
+    resize_nearest,
     sizes_agree,
 )
 from lexsplat.captures.readers.camera_files import checked_name
@@ -337,9 +338,7 @@ def _fitted_mask(mask: NDArray[np.bool_], photo: _Photo, subject: Path) -> NDArr
             found=f"{size[0]}x{size[1]}",
             remedy="draw the mask on this photo, or remove it",
         )
-    rows = ((np.arange(photo.size[1]) + 0.5) * mask.shape[0] / photo.size[1]).astype(np.int64)
-    columns = ((np.arange(photo.size[0]) + 0.5) * mask.shape[1] / photo.size[0]).astype(np.int64)
-    return mask[rows[:, None], columns[None, :]]
+    return resize_nearest(mask, photo.size)
 
 
 def _refuse_output_among_photos(folder: Path, output: Path) -> None:

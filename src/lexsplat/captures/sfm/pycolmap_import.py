@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Only the main thread may set handlers. None is a handler that Python did not install and cannot restore.
 _is_main = threading.current_thread() is threading.main_thread()
@@ -30,4 +32,16 @@ if _is_main and _before is not None:
 if _waiting:
     signal.raise_signal(signal.SIGINT)
 
-__all__ = ["pycolmap"]
+__all__ = ["pycolmap", "quiet_pycolmap"]
+
+
+@contextmanager
+def quiet_pycolmap(seed: int) -> Iterator[None]:
+    """pycolmap with a fixed seed and without its log; failures are raised as typed errors."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

@@ -8,8 +8,6 @@ of the known poses are dropped, and the rest is triangulated with fixed poses.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,6 +126,8 @@ def triangulate(
     cached = None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.npz"
     if cached is not None and (known := _read_cache(cached)) is not None:
         return known
+    from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
+
     total = len(views) + 3
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
         folder = Path(temporary)
@@ -365,20 +365,6 @@ def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     colors = np.array([point.color for point in ordered], dtype=np.float64).reshape(-1, 3) / 255.0
     keep = np.isfinite(points).all(1) & (np.abs(points) < MAX_COORDINATE).all(1)
     return points[keep].astype(np.float32), colors[keep].astype(np.float32)
-
-
-@contextmanager
-def quiet_pycolmap(seed: int) -> Iterator[None]:
-    """pycolmap with a fixed seed and without its log; failures are raised as typed errors."""
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
-    pycolmap.set_random_seed(seed)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
 
 
 def _cache_key(views: tuple[View, ...], seed: int) -> str:
