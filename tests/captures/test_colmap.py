@@ -65,18 +65,18 @@ def test_models_are_read_as_pycolmap_reads_them(tmp_path, binary, options):
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_models_are_found_where_tools_leave_them(tmp_path, place):
+def test_models_are_found_in_the_folders_of_common_tools(tmp_path, place):
     folder = tmp_path / place
     folder.mkdir(parents=True, exist_ok=True)
     for file, content in colmap_bytes(NAMES).items():
         (folder / file).write_bytes(content)
     write_images(tmp_path / "images", NAMES)
-    scene = load_capture(tmp_path)
-    assert list(scene.views) == NAMES
-    for view, camera in zip(scene.views.values(), cameras_around(len(NAMES))):
+    capture = load_capture(tmp_path)
+    assert list(capture.views) == NAMES
+    for view, camera in zip(capture.views.values(), cameras_around(len(NAMES))):
         np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
-    np.testing.assert_allclose(scene.points[1], [0.1, 0.2, -0.3], rtol=1e-6)
-    np.testing.assert_allclose(scene.point_colors[1], [1, 128 / 255, 0], rtol=1e-6)
+    np.testing.assert_allclose(capture.points[1], [0.1, 0.2, -0.3], rtol=1e-6)
+    np.testing.assert_allclose(capture.point_colors[1], [1, 128 / 255, 0], rtol=1e-6)
 
 
 def test_distorted_cameras_of_mixed_sizes_become_pinholes(tmp_path):
@@ -90,7 +90,7 @@ def test_distorted_cameras_of_mixed_sizes_become_pinholes(tmp_path):
     assert views[0].load_image().shape == (big.height, big.width, 3)
 
 
-def test_images_are_looked_for_in_the_folder_that_has_them(tmp_path):
+def test_images_are_found_in_the_folder_that_has_most_of_them(tmp_path):
     write_colmap(tmp_path, NAMES, images=False)
     (tmp_path / "images").mkdir()
     write_images(tmp_path / "images_4", NAMES, (16, 12))
@@ -107,9 +107,9 @@ def test_points_that_are_not_finite_are_dropped_with_a_warning(tmp_path):
     content = bytearray(file.read_bytes())
     struct.pack_into("<d", content, 16, np.nan)
     file.write_bytes(content)
-    scene = load_capture(tmp_path)
-    assert len(scene.points) == 2
-    assert "1 points" in scene.warnings[0]
+    capture = load_capture(tmp_path)
+    assert len(capture.points) == 2
+    assert "1 points" in capture.warnings[0]
 
 
 def test_nan_in_a_pose_names_the_image(tmp_path):
@@ -145,7 +145,7 @@ def test_a_missing_images_file_and_an_unknown_camera(tmp_path):
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_a_binary_file_cut_anywhere_is_told(tmp_path, file):
+def test_a_binary_file_truncated_anywhere_is_refused(tmp_path, file):
     model = write_colmap(tmp_path, NAMES[:2])
     whole = (model / file).read_bytes()
     for size in range(len(whole)):
@@ -188,7 +188,7 @@ def text_model(root):
 @pytest.mark.parametrize(
     ("file", "cut"), [("cameras.txt", 0.7), ("images.txt", 0.5), ("images.txt", 0.7), ("points3D.txt", 0.6)]
 )
-def test_a_truncated_text_file_is_told(tmp_path, file, cut):
+def test_a_truncated_text_file_is_refused(tmp_path, file, cut):
     folder = text_model(tmp_path)
     load_capture(tmp_path)
     whole = (folder / file).read_text()
@@ -209,13 +209,13 @@ def test_a_text_model_may_leave_out_observations_and_the_last_empty_line(tmp_pat
     (folder / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
     (folder / "images.txt").write_text("1 1 0 0 0 0 0 0 1 my photo.png\n\n2 1 0 0 0 1 0 0 1 b.png\n")
     write_images(tmp_path / "images", ["my photo.png", "b.png"])
-    scene = load_capture(tmp_path)
-    assert list(scene.views) == ["b.png", "my photo.png"]
-    np.testing.assert_allclose(scene.views["b.png"].camera.position, [-1, 0, 0])
+    capture = load_capture(tmp_path)
+    assert list(capture.views) == ["b.png", "my photo.png"]
+    np.testing.assert_allclose(capture.views["b.png"].camera.position, [-1, 0, 0])
 
 
 @pytest.mark.parametrize("observations", ["", "1.5 2.5 -1 3 4 7"])
-def test_images_whose_observation_lines_are_gone_are_told_not_every_second_one_taken(tmp_path, observations):
+def test_missing_observation_lines_are_reported(tmp_path, observations):
     folder = text_model(tmp_path)
     poses = [f"{number} 1 0 0 0 {number} 0 3 1 {number}.png" for number in range(1, 5)]
     write_images(tmp_path / "images", [f"{number}.png" for number in range(1, 5)])
@@ -227,8 +227,8 @@ def test_images_whose_observation_lines_are_gone_are_told_not_every_second_one_t
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_a_camera_that_is_there_twice_is_told(tmp_path, binary):
-    """Nobody can say which of the two an image means."""
+def test_a_duplicate_camera_is_refused(tmp_path, binary):
+    """The camera of its images is ambiguous."""
     if binary:
         model = write_colmap(tmp_path, ["a.png", "b.png"])
         content = (model / "cameras.bin").read_bytes()
@@ -239,13 +239,13 @@ def test_a_camera_that_is_there_twice_is_told(tmp_path, binary):
     fails(tmp_path, "cameras.", "camera 1 twice", kind=FileFormatError)
 
 
-def test_a_principal_point_far_outside_the_picture_is_told(tmp_path):
+def test_a_principal_point_far_outside_the_image_is_refused(tmp_path):
     write_colmap(tmp_path, ["a.png"], params=(60.0, 60.0, 1e6, 24.0))
     fails(tmp_path, "cameras.bin", "principal point")
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_mutated_models_end_in_a_scene_or_a_typed_error(tmp_path, suffix):
+def test_mutated_models_yield_a_capture_or_a_typed_error(tmp_path, suffix):
     rng = np.random.default_rng(0)
     if suffix == "bin":
         model = write_colmap(tmp_path, NAMES[:3], model=2, params=(60.0, 32.0, 24.0, -0.1))
@@ -260,40 +260,40 @@ def test_mutated_models_end_in_a_scene_or_a_typed_error(tmp_path, suffix):
             content[position] ^= 1 << rng.integers(0, 8)
         (model / f"{name}.{suffix}").write_bytes(content)
         try:
-            scene = load_capture(tmp_path)
+            capture = load_capture(tmp_path)
         except LexsplatError as error:
             failed += 1
             assert_tells(error)
         else:
-            assert np.isfinite(scene.points).all()
-            for view in scene.views.values():
+            assert np.isfinite(capture.points).all()
+            for view in capture.views.values():
                 rotation = view.camera.viewmat[:3, :3]
                 np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         (model / f"{name}.{suffix}").write_bytes(files[name])
     assert 30 < failed < 300
 
 
-def test_panoramas_are_refused_with_a_way_out(tmp_path):
+def test_panoramas_are_refused_with_a_remedy(tmp_path):
     write_colmap(tmp_path, NAMES, model=17, params=(64.0, 48.0))
     fails(tmp_path, "cameras.bin", "EQUIRECTANGULAR", kind=CaptureError)
 
 
 def test_bonsai_is_loaded_with_points_and_masks():
-    scene = load_capture(shared_data("bonsai"), downscale=4)
-    assert len(scene.views) == 292
-    assert scene.points.shape == (68290, 3)
-    assert scene.test_names == ("DSCF5653.JPG", "DSCF5805.JPG")
-    assert scene.warnings == ()
-    masks = load_masks(scene)
-    assert sorted(masks) == sorted(scene.test_names)
+    capture = load_capture(shared_data("bonsai"), downscale=4)
+    assert len(capture.views) == 292
+    assert capture.points.shape == (68290, 3)
+    assert capture.test_names == ("DSCF5653.JPG", "DSCF5805.JPG")
+    assert capture.warnings == ()
+    masks = load_masks(capture)
+    assert sorted(masks) == sorted(capture.test_names)
     assert "plastic box" in masks["DSCF5805.JPG"]
-    assert scene.views["DSCF5805.JPG"].load_image().shape == (133, 200, 3)
+    assert capture.views["DSCF5805.JPG"].load_image().shape == (133, 200, 3)
 
 
 def test_points_of_bonsai_fall_on_pixels_of_their_color():
-    scene = load_capture(shared_data("bonsai"))
-    view = scene.views["DSCF5600.JPG"]
-    local = scene.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+    capture = load_capture(shared_data("bonsai"))
+    view = capture.views["DSCF5600.JPG"]
+    local = capture.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
     uv = local[:, :2] / local[:, 2:] * np.diag(view.camera.K)[:2] + view.camera.K[:2, 2]
     size = np.array([view.camera.width, view.camera.height])
     nearest: dict[tuple, int] = {}  # a point hides those behind it in a cell of 16 pixels
@@ -305,7 +305,7 @@ def test_points_of_bonsai_fall_on_pixels_of_their_color():
     image = view.load_image()
     column, row = uv[seen].astype(int).T
     shifts = [(0, 0), (-2, 0), (2, 0), (0, -2), (0, 2)]
-    errors = [np.abs(image[row + dy, column + dx] - scene.point_colors[seen]).mean() for dx, dy in shifts]
+    errors = [np.abs(image[row + dy, column + dx] - capture.point_colors[seen]).mean() for dx, dy in shifts]
     assert len(seen) > 1000
     # Right to the pixel: two pixels aside in any direction the colors agree less.
     assert errors[0] < 0.9 * min(errors[1:])

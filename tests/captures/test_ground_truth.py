@@ -1,6 +1,4 @@
-"""Readers of other data sets' ground truth, each on a small fixture in its layout, written here by its
-description.
-"""
+"""Readers of the ground truth of public data sets, on small fixtures written by the descriptions of their layouts."""
 
 import json
 import re
@@ -17,7 +15,6 @@ from lexsplat.captures import load_annotations, load_capture
 from lexsplat.captures.ground_truth.layouts import layout_of, load_ground_truth, polygon_mask
 from lexsplat.captures.ground_truth.prompt_lists import (
     SCENES,
-    evaluation_views,
     prompt_names,
     prompts_of,
 )
@@ -54,57 +51,57 @@ def authors(tmp_path):
 
 
 def test_the_authors_folders_are_read_as_they_are(authors):
-    scene = load_capture(authors)
-    assert scene.test_names == ("DSCF4670.JPG", "DSCF4690.JPG"), "views with masks are held out"
-    found = load_annotations(scene)
+    capture = load_capture(authors)
+    assert capture.test_names == ("DSCF4670.JPG", "DSCF4690.JPG"), "views with masks are held out"
+    found = load_annotations(capture)
     assert found.layout == "segmentations"
     assert {view: list(prompts) for view, prompts in found.masks.items()} == {
         "DSCF4670.JPG": ["silver gray curtain", "windows"],
         "DSCF4690.JPG": ["green Yucca plant", "windows"],
     }
-    ground_truth = load_ground_truth(scene.views["DSCF4690.JPG"], found.masks["DSCF4690.JPG"]["windows"])
+    ground_truth = load_ground_truth(capture.views["DSCF4690.JPG"], found.masks["DSCF4690.JPG"]["windows"])
     np.testing.assert_array_equal(ground_truth, disk(20, 20, 8))
 
 
-def test_the_papers_words_can_be_asked_of_masks_named_by_the_released_code(authors):
+def test_masks_of_the_released_code_can_be_renamed_to_the_papers_prompts(authors):
     found = load_annotations(load_capture(authors)).renamed(prompt_names("room", "paper"))
     assert found.prompts() == ("curtain", "windows", "yucca plant")
     released = load_annotations(load_capture(authors)).renamed(prompt_names("room", "released"))
     assert released.prompts() == ("green Yucca plant", "silver gray curtain", "windows")
 
 
-def test_prompts_that_a_list_does_not_name_are_left_out(authors):
+def test_prompts_outside_a_list_are_dropped(authors):
     save_mask(authors / "segmentations" / "DSCF4680" / "teapot.png", disk(20, 20, 8))
     found = load_annotations(load_capture(authors)).renamed(prompt_names("room", "released"))
     assert "DSCF4680.JPG" not in found.masks
 
 
-def test_masks_called_in_the_words_of_the_paper_answer_to_either_list(authors):
+def test_masks_named_after_the_papers_list_match_either_list(authors):
     folder = authors / "segmentations" / "DSCF4690"
     (folder / "green Yucca plant.png").rename(folder / "yucca plant.png")
-    scene = load_capture(authors)
-    assert load_annotations(scene, prompt_list="released").prompts() == (
+    capture = load_capture(authors)
+    assert load_annotations(capture, prompt_list="released").prompts() == (
         "green Yucca plant", "silver gray curtain", "windows",
     )  # fmt: skip
-    assert load_annotations(scene, prompt_list="paper").prompts() == ("curtain", "windows", "yucca plant")
+    assert load_annotations(capture, prompt_list="paper").prompts() == ("curtain", "windows", "yucca plant")
 
 
-def test_masks_that_a_list_leaves_out_are_told_and_none_left_is_refused(authors, caplog):
+def test_masks_outside_a_list_are_reported_and_none_inside_is_refused(authors, caplog):
     save_mask(authors / "segmentations" / "DSCF4690" / "teapot.png", disk(20, 20, 8))
-    scene = load_capture(authors)
-    assert "teapot" not in load_annotations(scene, prompt_list="paper").prompts()
+    capture = load_capture(authors)
+    assert "teapot" not in load_annotations(capture, prompt_list="paper").prompts()
     (message,) = [record.getMessage() for record in caplog.records]
     assert "teapot" in message
     assert "windows" not in message
     for folder in ("DSCF4670", "DSCF4690"):
         for path in (authors / "segmentations" / folder).iterdir():
             path.rename(path.with_name(f"tea {path.name}"))
-    with pytest.raises(CaptureError, match="words of the list 'paper'"):
-        load_annotations(scene, prompt_list="paper")
+    with pytest.raises(CaptureError, match="prompts of the list 'paper'"):
+        load_annotations(capture, prompt_list="paper")
 
 
 def test_the_papers_list_is_the_table_of_its_supplement():
-    """Counted by hand in the supplement's table, and compared with it where the paper is at hand."""
+    """Counted by hand in the supplement's table, and compared with it where the paper is available."""
     assert {scene: len(prompts_of(scene, "paper")) for scene in SCENES} == {
         "bicycle": 6, "bonsai": 6, "counter": 11, "garden": 9, "kitchen": 5, "room": 11,
     }  # fmt: skip
@@ -119,13 +116,9 @@ def test_the_papers_list_is_the_table_of_its_supplement():
         assert tuple(words) == prompts_of(scene, "paper"), scene
 
 
-def test_the_released_lists_have_as_many_prompts_and_the_evaluation_views_the_authors():
-    assert {scene: len(evaluation_views(scene)) for scene in SCENES} == {
-        "bicycle": 19, "bonsai": 29, "counter": 24, "garden": 18, "kitchen": 28, "room": 19,
-    }  # fmt: skip
+def test_the_released_lists_have_as_many_prompts_as_the_papers():
     for scene in SCENES:
         assert len(set(prompts_of(scene))) == len(prompts_of(scene, "paper"))
-        assert len(set(evaluation_views(scene))) == len(evaluation_views(scene))
     assert "stale bread" in prompts_of("counter")
     assert "stable bread" in prompts_of("counter", "paper")
     with pytest.raises(ValueError, match="stump"):
@@ -148,26 +141,26 @@ def ovs3d(tmp_path):
 
 
 def test_3d_ovs_is_read_with_its_class_list(ovs3d):
-    scene = load_capture(ovs3d)
-    assert scene.test_names == ("00.jpg", "03.jpg")
-    found = load_annotations(scene)
+    capture = load_capture(ovs3d)
+    assert capture.test_names == ("00.jpg", "03.jpg")
+    found = load_annotations(capture)
     assert found.layout == "3d-ovs"
     assert found.classes == ("mini offroad car", "wall")
     assert list(found.masks) == ["00.jpg", "03.jpg"]
-    total = sum(load_ground_truth(scene.views["03.jpg"], mask) for mask in found.masks["03.jpg"].values())
+    total = sum(load_ground_truth(capture.views["03.jpg"], mask) for mask in found.masks["03.jpg"].values())
     np.testing.assert_array_equal(total, 1)
 
 
-def test_3d_ovs_numbers_count_the_images_where_names_say_nothing_else(ovs3d):
+def test_3d_ovs_numbers_are_indices_unless_an_image_has_that_name(ovs3d):
     for number, name in enumerate(NAMES):
         (ovs3d / "images" / name).rename(ovs3d / "images" / f"DSC{number:03d}.jpg")
     write_colmap(ovs3d, [f"DSC{number:03d}.jpg" for number in range(6)], images=False)
-    scene = load_capture(ovs3d)
-    assert scene.test_names == ("DSC000.jpg", "DSC003.jpg")
-    assert list(load_annotations(scene).masks) == ["DSC000.jpg", "DSC003.jpg"]
+    capture = load_capture(ovs3d)
+    assert capture.test_names == ("DSC000.jpg", "DSC003.jpg")
+    assert list(load_annotations(capture).masks) == ["DSC000.jpg", "DSC003.jpg"]
 
 
-def test_3d_ovs_numbers_that_mean_one_image_by_name_and_another_by_count_are_refused(ovs3d):
+def test_3d_ovs_numbers_that_are_ambiguous_are_refused(ovs3d):
     (ovs3d / "images" / "00.jpg").unlink()  # now 03.jpg is the image of that name, 04.jpg the third counted
     with pytest.raises(CaptureError, match=r"03\.jpg and 04\.jpg"):
         load_annotations(load_capture(ovs3d), ovs3d / "segmentations")
@@ -211,9 +204,9 @@ def lerf_ovs(tmp_path):
 
 
 def test_lerf_ovs_labels_beside_the_capture_are_found_and_their_views_held_out(lerf_ovs):
-    scene = load_capture(lerf_ovs)
-    assert scene.test_names == (FRAMES[1], FRAMES[4])
-    found = load_annotations(scene)
+    capture = load_capture(lerf_ovs)
+    assert capture.test_names == (FRAMES[1], FRAMES[4])
+    found = load_annotations(capture)
     assert found.layout == "lerf-ovs"
     assert {view: list(prompts) for view, prompts in found.masks.items()} == {
         FRAMES[1]: ["apple", "sheep"],
@@ -224,18 +217,18 @@ def test_lerf_ovs_labels_beside_the_capture_are_found_and_their_views_held_out(l
 def test_lerf_ovs_objects_of_one_name_are_one_mask_with_several_boxes(lerf_ovs):
     found = load_annotations(load_capture(lerf_ovs))
     sheep = np.zeros((HEIGHT, WIDTH), bool)
-    sheep[5:16, 10:21] = sheep[30:41, 40:51] = True  # corners cut to whole pixels, edges included
+    sheep[5:16, 10:21] = sheep[30:41, 40:51] = True  # corners truncated to whole pixels, edges included
     np.testing.assert_array_equal(found.masks[FRAMES[1]]["sheep"], sheep)
     np.testing.assert_array_equal(found.boxes[FRAMES[1]]["sheep"], [[10, 5, 21, 16], [50, 40, 40, 30]])
 
 
-def test_lerf_ovs_masks_are_undistorted_with_their_photo_and_boxes_drawn_anew(lerf_ovs):
+def test_lerf_ovs_masks_and_boxes_are_undistorted_with_their_photo(lerf_ovs):
     params = (60.0, 60.0, 32.0, 24.0, 0.15, 0.0, 0.0, 0.0)
     write_colmap(lerf_ovs, FRAMES, model=4, params=params, images=False)
-    scene = load_capture(lerf_ovs)
-    found = load_annotations(scene)
+    capture = load_capture(lerf_ovs)
+    found = load_annotations(capture)
     mask, box = found.masks[FRAMES[4]]["apple"], found.boxes[FRAMES[4]]["apple"][0]
-    width, height = scene.views[FRAMES[4]].capture_size
+    width, height = capture.views[FRAMES[4]].capture_size
     assert mask.shape == (height, width) != (HEIGHT, WIDTH)
     rows, columns = np.nonzero(mask)
     assert box.tolist() == [columns.min(), rows.min(), columns.max(), rows.max()]
@@ -277,14 +270,35 @@ def test_labels_of_no_view_or_of_another_aspect_are_refused(lerf_ovs):
 def test_labels_can_be_given_by_folder(lerf_ovs, tmp_path):
     moved = tmp_path / "elsewhere"
     (lerf_ovs.parent / "label" / "teatime").rename(moved)
-    scene = load_capture(lerf_ovs)
-    assert load_annotations(scene).masks == {}
+    capture = load_capture(lerf_ovs)
+    assert load_annotations(capture).masks == {}
     assert layout_of(moved) == "lerf-ovs"
-    assert set(load_annotations(scene, moved).masks) == {FRAMES[1], FRAMES[4]}
+    assert set(load_annotations(capture, moved).masks) == {FRAMES[1], FRAMES[4]}
+
+
+def test_a_given_folder_without_ground_truth_is_refused(lerf_ovs, tmp_path):
+    capture = load_capture(lerf_ovs)
+    with pytest.raises(CaptureError, match="no masks and no labels"):
+        load_annotations(capture, lerf_ovs / "images")
+    with pytest.raises(CaptureError, match=r"labels in teatime/.*give .*label/teatime"):
+        load_annotations(capture, tmp_path / "label")
+    for number, path in enumerate(sorted((tmp_path / "label" / "teatime").iterdir())):
+        path.rename(path.with_name(f"image_{number}.json"))
+    with pytest.raises(CaptureError, match=r"2 JSON files.*name labels frame_\*\.json"):
+        load_annotations(capture, tmp_path / "label" / "teatime")
+    assert load_annotations(capture).masks == {}  # automatic search may find nothing
+
+
+def test_a_given_folder_whose_labels_hold_no_objects_is_refused(lerf_ovs, tmp_path):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    (folder / "frame_00002.json").write_text(json.dumps(label(FRAMES[1], [])))
+    with pytest.raises(CaptureError, match="labels without objects"):
+        load_annotations(load_capture(lerf_ovs), folder)
 
 
 @given(st.lists(st.tuples(st.integers(-5, 45), st.integers(-5, 35)), min_size=3, max_size=9))
-def test_a_polygon_covers_what_lies_inside_and_little_beside(points):
+def test_a_polygon_mask_covers_its_inside_and_stays_in_its_bounding_box(points):
     found = polygon_mask(points, 40, 30)
     corners = np.array(points)
     inside = polygon2mask((30, 40), corners[:, ::-1])

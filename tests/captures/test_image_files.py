@@ -1,4 +1,4 @@
-"""Photos of every kind as cameras, phones and programs write them: what is read is what was painted."""
+"""Images of all formats that cameras, phones and programs write: their pixels are read correctly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 24, 16
 
 
 def painted() -> np.ndarray:
-    """A smooth picture ``[H, W, 3]`` uint8 without symmetry: a turn, a mirror or a channel exchanged would show."""
+    """A smooth image ``[H, W, 3]`` uint8 without symmetry, to reveal rotations, reflections and swapped channels."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([x * 10, y * 15, 255 - x * 5 - y * 5], -1).astype(np.uint8)
 
@@ -29,7 +29,7 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def png16(pixels: np.ndarray) -> bytes:
-    """A PNG of 16 bits a channel ``[H, W]`` or ``[H, W, 3]`` or ``[H, W, 4]``, by the specification: Pillow writes
+    """A PNG of 16 bits per channel ``[H, W]`` or ``[H, W, 3]`` or ``[H, W, 4]``, by the specification: Pillow writes
     none in color."""
     height, width = pixels.shape[:2]
     kind = {2: 0, 3: {3: 2, 4: 6}.get(pixels.shape[-1])}[pixels.ndim]
@@ -173,7 +173,7 @@ def test_heic_without_the_library_says_which_extra_to_install(tmp_path, monkeypa
         image_size(tmp_path / "a.heic")
 
 
-def test_a_damaged_heic_is_told(tmp_path):
+def test_a_damaged_heic_is_reported(tmp_path):
     pytest.importorskip("pi_heif", reason="HEIC needs pi-heif")
     for content in (b"", b"\0\0\0\x18ftypheic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\xff" * 200):
         (tmp_path / "a.heic").write_bytes(content)
@@ -183,7 +183,7 @@ def test_a_damaged_heic_is_told(tmp_path):
 
 @pytest.mark.parametrize("size", [(24, 16), (12, 8), (7, 5), (23, 15), (1, 1), (24, 3)])
 @pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "P", "CMYK", "I;16"])
-def test_large_photos_made_smaller_in_bands_are_as_if_made_smaller_at_once(tmp_path, monkeypatch, size, mode):
+def test_reducing_large_photos_in_bands_equals_reducing_them_whole(tmp_path, monkeypatch, size, mode):
     image = Image.fromarray(painted())
     if mode == "I;16":
         image = Image.fromarray(painted()[..., 0].astype(np.uint16) * 257)
@@ -198,7 +198,7 @@ def test_large_photos_made_smaller_in_bands_are_as_if_made_smaller_at_once(tmp_p
     np.testing.assert_allclose(read_image(tmp_path / name, size=size), whole, atol=1e-6)
 
 
-# -- pictures that are larger than they look
+# -- images that claim to be larger than they are
 
 
 def bomb(width: int, height: int) -> bytes:
@@ -213,13 +213,13 @@ def bomb(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(60_000, 60_000), (2**31 - 1, 1), (2**31 - 1, 2**31 - 1), (0, 5), (5, 0)])
-def test_gigantic_and_empty_pictures_are_refused_by_their_headers(tmp_path, size):
+def test_gigantic_and_empty_images_are_refused_by_their_headers(tmp_path, size):
     (tmp_path / "a.png").write_bytes(bomb(*size))
     with pytest.raises(CaptureError, match=r"a\.png"):
         read_image(tmp_path / "a.png")
 
 
-def test_a_damaged_length_does_not_become_memory(tmp_path):
+def test_a_damaged_length_allocates_no_memory(tmp_path):
     import tracemalloc
 
     Image.fromarray(painted()).save(tmp_path / "a.png")
@@ -235,8 +235,8 @@ def test_a_damaged_length_does_not_become_memory(tmp_path):
     assert peak < 10_000_000
 
 
-def test_a_mask_in_dark_colors_is_told_and_not_taken_for_empty(tmp_path):
-    """Label tools write classes as colors of a palette: the first is a dark red."""
+def test_a_mask_in_dark_colors_is_refused(tmp_path):
+    """Labeling tools save classes as palette colors; the first is a dark red."""
     mask = Image.new("P", (8, 8))
     mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
     mask.paste(1, (0, 0, 4, 8))
@@ -252,8 +252,8 @@ def test_a_mask_in_dark_colors_is_told_and_not_taken_for_empty(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "PA"])
-def test_what_is_transparent_is_outside_a_mask(tmp_path, mode):
-    """Programs that cut things out save white pictures whose shape is in the alpha channel."""
+def test_transparent_pixels_are_outside_a_mask(tmp_path, mode):
+    """Matting programs save white images whose shape is in the alpha channel."""
     pixels = np.full((4, 6, 4), 255, np.uint8)
     pixels[:, 2:, 3] = 0
     Image.fromarray(pixels).convert(mode).save(

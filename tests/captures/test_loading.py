@@ -17,7 +17,8 @@ from support.written_captures import (
     write_transforms,
 )
 
-from lexsplat.captures import load_capture, load_mask, load_masks, stem_of
+from lexsplat.captures import load_capture, load_masks, stem_of
+from lexsplat.captures.images.reading import read_mask
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 NAMES = [f"{index:04d}.png" for index in range(1, 18)]
@@ -26,16 +27,18 @@ NAMES = [f"{index:04d}.png" for index in range(1, 18)]
 class TestTransforms:
     def test_views_have_the_cameras_that_were_written(self, tmp_path):
         write_transforms(tmp_path, NAMES)
-        scene = load_capture(tmp_path)
-        assert list(scene.views) == NAMES
-        for view, camera in zip(scene.views.values(), cameras_around(len(NAMES))):
+        capture = load_capture(tmp_path)
+        assert list(capture.views) == NAMES
+        for view, camera in zip(capture.views.values(), cameras_around(len(NAMES))):
             np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
             np.testing.assert_allclose(view.camera.K, [[FOCAL, 0, 32], [0, FOCAL, 24], [0, 0, 1]])
             assert view.capture_size == (WIDTH, HEIGHT)
-        assert scene.source == "transforms"
-        assert scene.points.shape == (0, 3)
-        positions = np.array([view.camera.position for view in scene.train_views])
-        assert scene.extent == pytest.approx(1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1)))
+        assert capture.source == "transforms"
+        assert capture.points.shape == (0, 3)
+        positions = np.array([view.camera.position for view in capture.train_views])
+        assert capture.extent == pytest.approx(
+            1.1 * max(np.linalg.norm(positions - positions.mean(0), axis=1))
+        )
 
     def test_the_json_file_itself_may_be_given(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3])
@@ -46,10 +49,10 @@ class TestTransforms:
         document["frames"][1] |= {"fl_x": 70.0, "fl_y": 71.0, "cx": 20.0, "cy": 22.0, "w": 40, "h": 44}
         write_images(tmp_path / "images", NAMES[1:2], (40, 44))
         write_json(tmp_path, document)
-        scene = load_capture(tmp_path)
-        sizes = [(view.camera.width, view.camera.height) for view in scene.views.values()]
+        capture = load_capture(tmp_path)
+        sizes = [(view.camera.width, view.camera.height) for view in capture.views.values()]
         assert sizes == [(64, 48), (40, 44), (64, 48)]
-        np.testing.assert_allclose(scene.views[NAMES[1]].camera.K, [[70, 0, 20], [0, 71, 22], [0, 0, 1]])
+        np.testing.assert_allclose(capture.views[NAMES[1]].camera.K, [[70, 0, 20], [0, 71, 22], [0, 0, 1]])
 
     @pytest.mark.parametrize("fisheye", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
     def test_fisheye_cameras_are_undistorted_as_such(self, tmp_path, fisheye):
@@ -79,9 +82,9 @@ class TestTransforms:
         write_transforms(tmp_path, NAMES)
         for name in (NAMES[2], NAMES[9]):
             (tmp_path / "images" / name).unlink()
-        scene = load_capture(tmp_path)
-        assert len(scene.views) == len(NAMES) - 2
-        (warning,) = scene.warnings
+        capture = load_capture(tmp_path)
+        assert len(capture.views) == len(NAMES) - 2
+        (warning,) = capture.warnings
         assert "2 of 17" in warning
         assert NAMES[2] in warning
         assert NAMES[9] in warning
@@ -90,7 +93,7 @@ class TestTransforms:
         write_transforms(tmp_path, NAMES, test_filenames=[f"images/{NAMES[3]}", f"images/{NAMES[5]}"])
         assert load_capture(tmp_path).test_names == (NAMES[3], NAMES[5])
 
-    def test_nerf_synthetic_has_its_split_sizes_from_the_images_and_white_behind_alpha(self, tmp_path):
+    def test_nerf_synthetic_has_its_split_image_sizes_and_white_background(self, tmp_path):
         rgba = np.zeros((20, 20, 4), np.uint8)
         rgba[:10] = [255, 0, 0, 255]
         rgba[10:, :10] = [0, 0, 255, 51]
@@ -102,11 +105,11 @@ class TestTransforms:
             for i in (0, 1):
                 save(tmp_path / part / f"r_{i}.png", np.zeros((20, 20, 3)))
                 Image.fromarray(rgba).save(tmp_path / part / f"r_{i}.png")
-        scene = load_capture(tmp_path)
-        assert scene.train_names == ("train/r_0.png", "train/r_1.png")
-        assert scene.test_names == ("test/r_0.png", "test/r_1.png")
-        assert scene.background == (1.0, 1.0, 1.0)
-        view = scene.views["test/r_0.png"]
+        capture = load_capture(tmp_path)
+        assert capture.train_names == ("train/r_0.png", "train/r_1.png")
+        assert capture.test_names == ("test/r_0.png", "test/r_1.png")
+        assert capture.background == (1.0, 1.0, 1.0)
+        view = capture.views["test/r_0.png"]
         assert view.stem == "test/r_0"
         np.testing.assert_allclose(view.camera.K, [[10, 0, 10], [0, 10, 10], [0, 0, 1]])
         image = view.load_image()
@@ -114,7 +117,7 @@ class TestTransforms:
         np.testing.assert_allclose(image[15, 5], [0.8, 0.8, 1.0], atol=1e-6)
         np.testing.assert_allclose(image[15, 15], [1, 1, 1])
 
-    def test_only_nerf_synthetic_has_white_behind_alpha(self, tmp_path):
+    def test_only_nerf_synthetic_has_a_white_background(self, tmp_path):
         document = write_transforms(tmp_path, NAMES[:2])
         rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
         for name in NAMES[:2]:
@@ -124,16 +127,16 @@ class TestTransforms:
         for frame in document["frames"]:
             frame |= intrinsics
         write_json(tmp_path, document)
-        scene = load_capture(tmp_path)
-        assert scene.background == (0.0, 0.0, 0.0), "intrinsics of each frame are no reason for white"
-        assert scene.views[NAMES[0]].load_image().max() == 0
+        capture = load_capture(tmp_path)
+        assert capture.background == (0.0, 0.0, 0.0), "intrinsics of each frame are no reason for white"
+        assert capture.views[NAMES[0]].load_image().max() == 0
 
     def test_fox_is_loaded_without_its_17_missing_frames(self):
-        scene = load_capture(shared_data("fox"), downscale=8)
-        assert len(scene.views) == 50
-        assert len(scene.warnings) == 1
-        assert scene.warnings[0].count(".jpg") == 17
-        view = scene.views["0001.jpg"]
+        capture = load_capture(shared_data("fox"), downscale=8)
+        assert len(capture.views) == 50
+        assert len(capture.warnings) == 1
+        assert capture.warnings[0].count(".jpg") == 17
+        view = capture.views["0001.jpg"]
         image = view.load_image()
         assert image.shape == (view.camera.height, view.camera.width, 3) == (237, 133, 3)
         assert 0.4 < image.mean() < 0.7
@@ -142,10 +145,10 @@ class TestTransforms:
 class TestSplit:
     def test_every_eighth_view_counts_from_the_first(self, tmp_path):
         write_transforms(tmp_path, NAMES)
-        scene = load_capture(tmp_path)
-        assert scene.test_names == (NAMES[0], NAMES[8], NAMES[16])
-        assert sorted(scene.train_names + scene.test_names) == NAMES
-        assert [view.name for view in scene.test_views] == list(scene.test_names)
+        capture = load_capture(tmp_path)
+        assert capture.test_names == (NAMES[0], NAMES[8], NAMES[16])
+        assert sorted(capture.train_names + capture.test_names) == NAMES
+        assert [view.name for view in capture.test_views] == list(capture.test_names)
         assert load_capture(tmp_path, test_every=5).test_names == tuple(NAMES[::5])
         assert load_capture(tmp_path, test_every=0).test_names == ()
 
@@ -169,7 +172,7 @@ class TestSplit:
     def test_unknown_and_exhaustive_splits_are_refused(self, tmp_path):
         write_transforms(tmp_path, NAMES)
         fails(tmp_path, "'0099'", "no view", test_names=["0099"])
-        fails(tmp_path, "learn from", test_names=NAMES)
+        fails(tmp_path, "training view", test_names=NAMES)
         write_json(tmp_path, {"test": ["0001"]}, "test_views.json")
         fails(tmp_path, "test_views.json", "list of image stems", kind=FileFormatError)
         write_json(tmp_path, ["nowhere"], "test_views.json")
@@ -177,7 +180,7 @@ class TestSplit:
         with pytest.raises(ValueError, match="test_every"):
             load_capture(tmp_path, test_every=1)
 
-    def test_a_single_view_is_learned_from(self, tmp_path):
+    def test_a_single_view_is_a_training_view(self, tmp_path):
         write_transforms(tmp_path, NAMES[:1])
         assert load_capture(tmp_path).train_names == (NAMES[0],)
 
@@ -213,7 +216,7 @@ class TestImages:
         assert loaded.dtype == np.float32
         np.testing.assert_allclose(loaded, expected, atol=0.003)
 
-    def test_exif_orientation_is_left_alone_because_poses_belong_to_stored_pixels(self, tmp_path):
+    def test_exif_orientation_is_ignored_because_poses_refer_to_stored_pixels(self, tmp_path):
         path = self.one(tmp_path, "a.jpg")
         pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         pixels[: HEIGHT // 2] = 255
@@ -248,18 +251,18 @@ class TestImages:
     def test_a_photo_of_another_aspect_is_refused(self, tmp_path):
         path = self.one(tmp_path)
         save(path, np.zeros((WIDTH, HEIGHT, 3)))
-        fails(tmp_path, str(path), "64x48", "48x64", "on its side")
+        fails(tmp_path, str(path), "64x48", "48x64", "rotated")
         save(path, np.zeros((HEIGHT, WIDTH - 4, 3)))
         fails(tmp_path, str(path), "64x48", "60x48")
 
-    def test_an_unreadable_photo_is_told_when_the_scene_is_loaded(self, tmp_path):
+    def test_an_unreadable_photo_is_reported_when_the_capture_is_loaded(self, tmp_path):
         path = self.one(tmp_path)
         for content in (b"", b"no image", b"\x89PNG\r\n\x1a\n"):
             path.write_bytes(content)
             fails(tmp_path, str(path), "image")
 
     @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif", "bmp"])
-    def test_a_truncated_photo_is_told_when_it_is_read(self, tmp_path, suffix):
+    def test_a_truncated_photo_is_reported_when_it_is_read(self, tmp_path, suffix):
         path = self.one(tmp_path, f"a.{suffix}")
         noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         Image.fromarray(noise).save(path)
@@ -270,7 +273,7 @@ class TestImages:
             view.load_image()
         assert_tells(caught.value, str(path))
 
-    def test_a_photo_that_changed_or_went_since_loading_is_told(self, tmp_path):
+    def test_a_photo_that_changed_or_vanished_after_loading_is_reported(self, tmp_path):
         path = self.one(tmp_path)
         view = load_capture(tmp_path).views["a.png"]
         save(path, np.zeros((10, 10, 3)))
@@ -287,7 +290,7 @@ class TestImages:
         monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
         fails(tmp_path, str(path), "pixels")
 
-    def test_pixels_can_be_left_out_by_masks(self, tmp_path):
+    def test_masked_pixels_are_ignored(self, tmp_path):
         self.one(tmp_path)
         mask = np.zeros((HEIGHT, WIDTH))
         mask[:, :32] = 1
@@ -311,7 +314,7 @@ class TestBadCaptures:
 
     def test_no_photo_at_all(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3], images=False)
-        fails(tmp_path, "3 images, none of which")
+        fails(tmp_path, "3 images without a file")
         write_json(tmp_path, {"frames": []})
         fails(tmp_path, "0 images")
 
@@ -356,7 +359,7 @@ class TestBadCaptures:
             {"ftheta_p0": 0.1},
         ],
     )
-    def test_intrinsics_that_cannot_be(self, tmp_path, change):
+    def test_invalid_intrinsics_are_refused(self, tmp_path, change):
         write_transforms(tmp_path, NAMES[:2], **change)
         fails(tmp_path, "transforms.json")
 
@@ -401,14 +404,14 @@ class TestMasks:
         save(tmp_path / "segmentations" / "0004" / "pot.png", np.zeros((48, 64)))
         masks = load_masks(load_capture(tmp_path))
         assert {name: list(prompts) for name, prompts in masks.items()} == {"0004.png": ["pot", "red apple"]}
-        assert load_mask(masks["0004.png"]["red apple"]).all()
-        assert not load_mask(masks["0004.png"]["pot"]).any()
+        assert read_mask(masks["0004.png"]["red apple"]).all()
+        assert not read_mask(masks["0004.png"]["pot"]).any()
 
     def test_a_capture_without_masks_has_none(self, tmp_path):
         write_transforms(tmp_path, NAMES)
-        scene = load_capture(tmp_path)
-        assert scene.segmentations is None
-        assert load_masks(scene) == {}
+        capture = load_capture(tmp_path)
+        assert capture.segmentations is None
+        assert load_masks(capture) == {}
 
     def test_equal_stems_in_subfolders_need_the_subfolder(self, tmp_path):
         names = ["left/0001.png", "right/0001.png", "right/0002.png"]
@@ -419,25 +422,25 @@ class TestMasks:
             load_masks(load_capture(tmp_path))
         assert_tells(caught.value, "2 views")
 
-    def test_a_mask_whose_stem_matches_no_view_is_told(self, tmp_path):
-        scene = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
+    def test_a_mask_whose_stem_matches_no_view_is_reported(self, tmp_path):
+        capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
         with pytest.raises(CaptureError) as caught:
-            load_masks(scene)
+            load_masks(capture)
         assert_tells(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
 
-    def test_a_mask_of_another_aspect_is_told_and_a_scaled_one_taken(self, tmp_path):
-        scene = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
-        assert list(load_masks(scene)) == ["0004.png"]
+    def test_a_mask_of_another_aspect_is_refused_and_a_scaled_one_accepted(self, tmp_path):
+        capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
+        assert list(load_masks(capture)) == ["0004.png"]
         save(tmp_path / "segmentations" / "0004" / "bad.png", np.ones((48, 48)))
         with pytest.raises(CaptureError) as caught:
-            load_masks(scene)
+            load_masks(capture)
         assert_tells(caught.value, "bad.png", "64x48", "48x48")
 
     @pytest.mark.parametrize(("high", "dtype"), [(1, np.uint8), (255, np.uint8), (65535, np.uint16)])
     def test_masks_of_any_depth(self, tmp_path, high, dtype):
         ground_truth = np.random.default_rng(0).random((9, 7)) > 0.5
         Image.fromarray((ground_truth * high).astype(dtype)).save(tmp_path / "m.png")
-        np.testing.assert_array_equal(load_mask(tmp_path / "m.png"), ground_truth)
+        np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), ground_truth)
 
     def test_masks_drawn_on_distorted_photos_are_undistorted_like_them(self, tmp_path):
         write_transforms(tmp_path, NAMES[:3], k1=-0.2)
@@ -445,9 +448,9 @@ class TestMasks:
         disk = ((x - 12) ** 2 + (y - 12) ** 2 < 64).astype(float)
         save(tmp_path / "images" / NAMES[0], np.repeat(disk[..., None], 3, 2))
         save(tmp_path / "segmentations" / "0001" / "disk.png", disk)
-        scene = load_capture(tmp_path)
-        view = scene.views[NAMES[0]]
-        mask = view.load_mask(load_masks(scene)[NAMES[0]]["disk"])
+        capture = load_capture(tmp_path)
+        view = capture.views[NAMES[0]]
+        mask = view.load_mask(load_masks(capture)[NAMES[0]]["disk"])
         assert mask.shape == view.capture_size[::-1]
         seen = view.load_image(view.capture_size)[..., 0] > 0.5
         assert (mask != seen).mean() < 0.01

@@ -37,27 +37,27 @@ def room(tmp_path_factory):
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), listener=events.append), events
 
 
-def test_photos_are_placed_and_the_one_that_cannot_be_is_named(room):
+def test_photos_are_registered_and_the_unregistered_one_is_named(room):
     _, poses, events = room
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
     assert poses.unregistered == ("unrelated.png",)
-    assert "9 of 10 photos placed" in poses.note
+    assert "9 of 10 photos registered" in poses.note
     assert events[-1].done == events[-1].total
     assert events[-1].metrics == {"registered": 9, "photos": 10}
 
 
 def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
     folder, poses, _ = room
-    scene = load_capture(poses.root, images=folder, test_every=0)
-    found = [scene.views[f"{index}.png"].camera for index in range(COUNT)]
+    capture = load_capture(poses.root, images=folder, test_every=0)
+    found = [capture.views[f"{index}.png"].camera for index in range(COUNT)]
     assert_same_up_to_a_similarity(found, room_cameras())
-    assert len(scene.points) == poses.points > 200
+    assert len(capture.points) == poses.points > 200
     assert poses.images == folder, "photos that need nothing are not copied"
     assert not (poses.root / "images").exists()
     assert not (poses.root / ".poses").exists(), "what was worked with is gone"
 
 
-def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_path, monkeypatch):
+def test_a_mis_registered_photo_is_registered_again(room, tmp_path, monkeypatch):
     folder, _, _ = room
     mapping, moved = pycolmap.incremental_mapping, []
 
@@ -73,13 +73,13 @@ def test_a_photo_that_the_mapper_misplaced_stands_right_in_the_end(room, tmp_pat
     monkeypatch.setattr(pycolmap, "incremental_mapping", misled_once)
     poses = poses_from_photos(folder, tmp_path / "poses")
     assert moved, "there was something to put right"
-    scene = load_capture(poses.root, images=folder, test_every=0)
+    capture = load_capture(poses.root, images=folder, test_every=0)
     assert_same_up_to_a_similarity(
-        [scene.views[f"{index}.png"].camera for index in range(COUNT)], room_cameras()
+        [capture.views[f"{index}.png"].camera for index in range(COUNT)], room_cameras()
     )
 
 
-def test_folders_that_are_no_capture_are_told(tmp_path):
+def test_folders_that_are_not_captures_are_refused(tmp_path):
     for folder, found in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "found 0")):
         with pytest.raises(CaptureError) as caught:
             poses_from_photos(folder, tmp_path / "out")
@@ -91,7 +91,7 @@ def test_photos_that_do_not_overlap_leave_no_output(tmp_path):
         save(tmp_path / "photos" / f"{index}.png", np.full((60, 80, 3), 0.3 * index))
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "out")
-    assert_tells(caught.value, "3 photos of which none")
+    assert_tells(caught.value, "3 photos, none of which")
     assert not (tmp_path / "out").exists()
     (tmp_path / "photos" / "1.png").write_bytes(b"no image")
     with pytest.raises(CaptureError) as caught:
@@ -106,7 +106,7 @@ def smooth(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pixels_are_turned_as_pillow_turns_them(tmp_path, orientation):
+def test_pixels_are_rotated_as_by_pillow(tmp_path, orientation):
     save_as_phone(tmp_path / "a.jpg", smooth(30, 50), orientation)
     with Image.open(tmp_path / "a.jpg") as image:
         expected = np.asarray(ImageOps.exif_transpose(image))
@@ -114,8 +114,8 @@ def test_pixels_are_turned_as_pillow_turns_them(tmp_path, orientation):
     assert expected.shape == (30, 50, 3)
 
 
-def test_photos_stored_turned_are_copied_upright_and_keep_their_focal_length(tmp_path):
-    """COLMAP's rule for a focal length on 35 mm film: the diagonals of film (43.27 mm) and picture correspond."""
+def test_rotated_photos_are_copied_upright_and_keep_their_focal_length(tmp_path):
+    """COLMAP's rule for a focal length on 35 mm film: the diagonals of film (43.27 mm) and image correspond."""
     folder = tmp_path / "photos"
     for index, orientation in enumerate((1, 6, 3, 8)):
         save_as_phone(folder / "day" / f"{index}.jpg", smooth(120, 160), orientation, 28)
@@ -152,7 +152,7 @@ def test_photos_stored_turned_are_copied_upright_and_keep_their_focal_length(tmp
     assert before == {name: (prepared.images / name).stat().st_mtime_ns for name in prepared.names}
 
 
-def test_photos_of_other_kinds_are_converted_under_names_of_their_own(tmp_path):
+def test_photos_of_other_formats_are_converted_under_unique_names(tmp_path):
     folder = tmp_path / "photos"
     save(folder / "a.png", smooth(40, 60))
     pixels = (smooth(40, 60) * 255).astype(np.uint8)
@@ -167,7 +167,7 @@ def test_photos_of_other_kinds_are_converted_under_names_of_their_own(tmp_path):
             assert np.abs(np.asarray(image) / 255 - smooth(40, 60)).mean() < 0.03, name
 
 
-def test_photos_are_sought_apart_from_masks_truth_and_the_output(tmp_path):
+def test_masks_ground_truth_and_the_output_are_not_photos(tmp_path):
     for name in ("1.png", "walk/2.png", "masks/1.png", "segmentations/1/mug.png", "out/heatmaps/mug/1.png"):
         save(tmp_path / name, np.zeros((8, 8, 3)))
     assert find_photos(tmp_path, tmp_path / "out") == ["1.png", "walk/2.png"]
@@ -175,20 +175,20 @@ def test_photos_are_sought_apart_from_masks_truth_and_the_output(tmp_path):
 
 @pytest.fixture(scope="module")
 def phone(tmp_path_factory):
-    """The room as a phone shows it: stored turned, with a sticker on the lens that is masked; the global mapper."""
+    """The room as photographed by a phone: rotated, with a masked sticker on the lens; uses the global mapper."""
     folder = tmp_path_factory.mktemp("phone")
     textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     sticker = np.random.default_rng(5).random((90, 70, 3)).repeat(2, 0)[:90].repeat(2, 1)[:, :70]
     for index, camera in enumerate(room_cameras()):
         photo = room_photo(camera, textures)
-        if index == 4:  # the sticker was off
+        if index == 4:  # without the sticker
             save_as_phone(folder / "images" / f"{index}.jpg", photo, 6)
             continue
         photo[-90:, -70:] = sticker
         save_as_phone(folder / "images" / f"{index}.jpg", photo, (6, 8, 3)[index % 3])
         mask = np.ones((SIZE[1], SIZE[0]))
         mask[-90:, -70:] = 0
-        # Half of them as COLMAP calls them and barely not black, the others by stem, at half the size.
+        # Half of the masks have COLMAP's names and are nearly black; others have stems as names and half the size.
         if index % 2:
             save(folder / "masks" / f"{index}.jpg.png", mask * 3 / 255)
         else:
@@ -198,16 +198,16 @@ def phone(tmp_path_factory):
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), config)
 
 
-def test_turned_photos_get_upright_cameras_that_are_the_true_ones(phone):
+def test_rotated_photos_get_the_true_upright_cameras(phone):
     _, poses = phone
     assert len(poses.registered) == COUNT, poses.note
-    scene = load_capture(poses.root, images=poses.images, test_every=0)
-    found = [scene.views[f"{index}.jpg"].camera for index in range(COUNT)]
-    assert {(view.lens.width, view.lens.height) for view in scene.views.values()} == {SIZE}
+    capture = load_capture(poses.root, images=poses.images, test_every=0)
+    found = [capture.views[f"{index}.jpg"].camera for index in range(COUNT)]
+    assert {(view.lens.width, view.lens.height) for view in capture.views.values()} == {SIZE}
     assert_same_up_to_a_similarity(found, room_cameras())
 
 
-def test_masked_pixels_give_no_features(phone):
+def test_masked_pixels_yield_no_features(phone):
     _, poses = phone
     model = pycolmap.Reconstruction(poses.root / "sparse" / "0")
     for image in model.images.values():
@@ -223,8 +223,8 @@ def test_masked_pixels_give_no_features(phone):
     assert valid[:80].all()
 
 
-def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch):
-    """Each photo is compared with the next one alone, and that shows nothing: every second one is blank."""
+def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, monkeypatch):
+    """Each photo is matched with the next one only, which has no features: every second photo is blank."""
     monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
     monkeypatch.setattr(photos, "SEQUENTIAL_OVERLAP", 1)
     textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
@@ -232,7 +232,7 @@ def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch
     for index, camera in enumerate(cameras):
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera, textures))
         save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
-    with pytest.raises(CaptureError, match="none could be placed"):
+    with pytest.raises(CaptureError, match="none of which could be registered"):
         poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
     poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
@@ -240,7 +240,7 @@ def test_photos_that_follow_no_other_are_compared_with_all(tmp_path, monkeypatch
     assert_same_up_to_a_similarity([views[f"{index}.png"].camera for index in range(COUNT)], cameras)
 
 
-def test_a_mask_of_another_shape_is_told_before_anything_is_done(tmp_path):
+def test_a_mask_of_another_aspect_is_refused_before_any_work(tmp_path):
     for index in range(3):
         save(tmp_path / "photos" / f"{index}.png", smooth(40, 60))
     save(tmp_path / "photos" / "masks" / "1.png", np.ones((60, 40)))
@@ -257,8 +257,8 @@ def three_photos(folder, suffix: str = ".jpg") -> None:
         save(folder / f"{index}{suffix}", np.random.default_rng(index).random((96, 128, 3)))
 
 
-def test_a_photo_that_is_cut_off_is_told_before_anything_is_done(tmp_path):
-    """pycolmap would take the gray half for a part of the place, and the training would stumble over it later."""
+def test_a_truncated_photo_is_refused_before_any_work(tmp_path):
+    """pycolmap would use the gray half as image content, and training would fail on the photo later."""
     three_photos(tmp_path / "photos")
     path = tmp_path / "photos" / "1.jpg"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -269,7 +269,7 @@ def test_a_photo_that_is_cut_off_is_told_before_anything_is_done(tmp_path):
 
 
 @pytest.mark.parametrize("name", [b"a\nb.jpg", b"a\\b.jpg", b"\xff\xfe.jpg", b"sub\x7f/a.jpg"])
-def test_photos_with_names_that_no_camera_file_can_hold_are_told_before_anything_is_done(tmp_path, name):
+def test_names_that_camera_files_cannot_hold_are_refused_before_any_work(tmp_path, name):
     three_photos(tmp_path / "photos")
     path = Path(os.fsdecode(os.fsencode(tmp_path / "photos") + b"/" + name))
     path.parent.mkdir(exist_ok=True)
@@ -283,13 +283,13 @@ def test_photos_with_names_that_no_camera_file_can_hold_are_told_before_anything
 @pytest.mark.parametrize(
     "name", ["100%.jpg", "%s.jpg", "\U0001f600.jpg", "[red]{x}.jpg", "2.JPG", "a'b \"c.jpg"]
 )
-def test_photos_may_have_odd_names(tmp_path, name):
+def test_photos_may_have_unusual_names(tmp_path, name):
     three_photos(tmp_path / "photos")
     shutil.copy(tmp_path / "photos" / "0.jpg", tmp_path / "photos" / name)
     assert name in prepare_photos(tmp_path / "photos", tmp_path / "output").names
 
 
-def test_settings_that_make_no_sense_are_refused():
+def test_invalid_settings_are_refused():
     with pytest.raises(ValueError, match="max_side"):
         PoseConfig(max_side=10)
     assert PoseConfig().compares_all(80)

@@ -1,4 +1,4 @@
-"""SIGTERM ends a build at once: pycolmap's handler, which prints a trace and may hang, is not left in place."""
+"""SIGTERM ends a build at once: pycolmap's handler, which prints a trace and may hang, is removed."""
 
 import signal
 import subprocess
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no signals like
 
 
 def test_only_one_module_imports_pycolmap():
-    """Others import it from there; for type checkers alone it may be named anywhere."""
+    """Other modules import it from there; type-checking imports may be anywhere."""
     for path in PACKAGE.rglob("*.py"):
         if path.name == "pycolmap_import.py":
             continue
@@ -23,18 +23,18 @@ def test_only_one_module_imports_pycolmap():
         assert not any(line.startswith("from pycolmap") for line in lines), path
 
 
-def test_sigterm_means_after_the_import_what_it_meant_before():
+def test_the_import_restores_the_sigterm_handler():
     script = """
 import os, signal, sys
 if sys.argv[1] == "own":
-    signal.signal(signal.SIGTERM, lambda number, frame: (print("told", flush=True), sys.exit(7)))
+    signal.signal(signal.SIGTERM, lambda number, frame: (print("handled", flush=True), sys.exit(7)))
 from lexsplat.captures.sfm.pycolmap_import import pycolmap
 pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2])
 os.kill(os.getpid(), signal.SIGTERM)
 import time
 time.sleep(20)
 """
-    for kind, code, said in (("none", -signal.SIGTERM, ""), ("own", 7, "told\n")):
+    for kind, code, said in (("none", -signal.SIGTERM, ""), ("own", 7, "handled\n")):
         done = subprocess.run(
             [sys.executable, "-c", script, kind], capture_output=True, text=True, timeout=120, check=False
         )
@@ -42,10 +42,10 @@ time.sleep(20)
         assert "***" not in done.stderr, "no stack trace"
 
 
-def test_ctrl_c_during_the_import_is_ctrl_c_and_the_import_is_whole():
+def test_ctrl_c_during_the_import_is_deferred_until_it_is_complete():
     script = """
 import os, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background is started with it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs start with it ignored
 class Interrupting:
     def find_spec(self, name, path=None, target=None):
         if name == "pycolmap._core":
@@ -64,7 +64,7 @@ print(len(pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2
     assert done.stdout == "stopped\n4\n"
 
 
-def test_sigterm_ends_a_build_at_once_with_what_is_saved(tiny_capture, tmp_path):
+def test_sigterm_ends_a_build_at_once_and_keeps_its_checkpoints(tiny_capture, tmp_path):
     from lexsplat.runtime.files import read_tensors
 
     command = [

@@ -11,14 +11,14 @@ SIZE = (160, 120)
 
 
 def on_the_wall(camera) -> np.ndarray:
-    """Where the pixels' rays hit the plane z = 0, ``[H, W, 2]``."""
+    """Intersections of the pixels' rays with the plane z = 0, ``[H, W, 2]``."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
     return (camera.position - rays * (camera.position[2] / rays[..., 2:]))[..., :2]
 
 
 def write_wall(root, pattern: np.ndarray, count: int = 6) -> None:
-    """Cameras in an arc before a wall from -1 to 1 in the plane z = 0 that shows the pattern."""
+    """Cameras in an arc in front of a textured wall from -1 to 1 in the plane z = 0."""
     frames = []
     for index, x in enumerate(np.linspace(-1, 1, count)):
         camera = look_at([x, 0.2 * x, 2.2], [0.1 * x, 0, 0], [0, 1, 0], *SIZE, 0.6)
@@ -56,7 +56,7 @@ def points(wall, tmp_path_factory):
     return *triangulate(wall, cache_dir=cache, listener=events.append), cache, events
 
 
-def test_triangulated_points_lie_on_the_wall_that_was_photographed(points):
+def test_triangulated_points_lie_on_the_wall(points):
     positions, *_ = points
     assert len(positions) > 300
     assert np.median(np.abs(positions[:, 2])) < 0.01
@@ -73,7 +73,7 @@ def test_triangulated_points_have_the_colors_of_the_wall(points):
     assert right < 0.4 * wrong
 
 
-def test_triangulation_reports_and_repeats_bit_for_bit(wall, points):
+def test_triangulation_reports_progress_and_is_deterministic(wall, points):
     positions, colors, _, events = points
     assert {event.stage for event in events} == {"triangulate"}
     assert (events[-1].done, events[-1].metrics) == (events[-1].total, {"points": len(positions)})
@@ -83,17 +83,17 @@ def test_triangulation_reports_and_repeats_bit_for_bit(wall, points):
 
 
 def test_masked_pixels_are_not_matched(tmp_path):
-    """What is left of x = 0 on the wall is masked in all photos but one, which has no mask."""
+    """The wall at x < 0 is masked in all photos but one, which has no mask."""
     write_wall(tmp_path, texture())
-    scene = load_capture(tmp_path, test_every=0)
-    for name, view in list(scene.views.items())[1:]:
+    capture = load_capture(tmp_path, test_every=0)
+    for name, view in list(capture.views.items())[1:]:
         save(tmp_path / "masks" / f"{name}.png", (on_the_wall(view.camera)[..., :1] > 0).repeat(3, 2))
     positions, _ = triangulate(load_capture(tmp_path, test_every=0))
     assert len(positions) > 100
     assert positions[:, 0].min() > -0.02
 
 
-def test_kept_points_are_used_until_a_pose_changes_or_the_file_breaks(wall, points, monkeypatch):
+def test_cached_points_are_used_until_a_pose_changes_or_the_file_is_damaged(wall, points, monkeypatch):
     from lexsplat.captures.sfm import triangulation
 
     positions, _, cache, _ = points
@@ -114,7 +114,7 @@ def test_kept_points_are_used_until_a_pose_changes_or_the_file_breaks(wall, poin
     file.write_bytes(whole)
 
 
-def test_initial_points_are_triangulated_where_that_works(wall, points):
+def test_initial_points_are_triangulated_where_possible(wall, points):
     found = initial_points(wall, cache_dir=points[2])
     assert found.origin == "triangulated"
     np.testing.assert_array_equal(found.points, points[0])
@@ -129,7 +129,7 @@ def test_initial_points_are_random_on_a_wall_without_texture(tmp_path):
     np.testing.assert_allclose(found.colors, np.tile([0.2, 0.4, 0.6], (500, 1)), atol=0.01)
 
 
-def test_random_points_are_seen_by_most_views_and_repeat_with_the_seed(wall):
+def test_random_points_are_seen_by_most_views_and_follow_the_seed(wall):
     points, colors = random_points_in_frusta(wall, 400, np.random.default_rng(7))
     seen = np.zeros(len(points))
     for view in wall.train_views:
@@ -144,13 +144,13 @@ def test_random_points_are_seen_by_most_views_and_repeat_with_the_seed(wall):
     np.testing.assert_array_equal(points, again)
 
 
-def test_held_out_views_take_no_part(tmp_path):
+def test_held_out_views_are_not_read(tmp_path):
     write_wall(tmp_path, texture(), count=4)
-    scene = load_capture(tmp_path, test_names=["1", "2"])
-    for view in scene.test_views:
+    capture = load_capture(tmp_path, test_names=["1", "2"])
+    for view in capture.test_views:
         view.image_path.write_bytes(b"never read")
-    random_points_in_frusta(scene, 50, np.random.default_rng(0))
-    triangulate(scene)  # would raise on the broken images
+    random_points_in_frusta(capture, 50, np.random.default_rng(0))
+    triangulate(capture)  # would raise on the broken images
 
 
 def test_views_are_matched_with_their_neighbors(wall):

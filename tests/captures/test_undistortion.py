@@ -29,14 +29,14 @@ LENSES = {
 
 
 def photo_through(lens: Lens) -> np.ndarray:
-    """The analytic picture as the lens sees it: color of every photo pixel from its ray."""
+    """The analytic image through the lens: the color of every photo pixel from its ray."""
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.to_pycolmap().cam_from_img(np.stack([x.ravel(), y.ravel()], 1))
     return picture(*rays.T).reshape(lens.height, lens.width, 3).astype(np.float32)
 
 
 def pinhole_picture(lens: Lens, size: tuple[int, int]) -> np.ndarray:
-    """What a pinhole camera sees of the analytic picture: the mean over 4x4 samples of each pixel."""
+    """The analytic image through a pinhole camera: the mean over 4x4 samples of each pixel."""
     width, height, K = pinhole_of(lens)
     fine = (np.arange(4) + 0.5) / 4
     u = (np.arange(size[0])[:, None] + fine).ravel() * width / size[0]
@@ -67,7 +67,7 @@ def test_smaller_undistorted_photos_average_the_area(divisor):
     assert error < 1.6 * 0.1 / divisor
 
 
-def test_every_perspective_model_of_pycolmap_is_taken():
+def test_every_perspective_model_of_pycolmap_is_supported():
     for name, model in pycolmap.CameraModelId.__members__.items():
         if name == "INVALID":
             continue
@@ -78,7 +78,7 @@ def test_every_perspective_model_of_pycolmap_is_taken():
             assert K[0, 0] == pytest.approx(500)
 
 
-def test_panoramas_are_refused_because_no_pinhole_can_replace_them():
+def test_panoramas_are_refused_because_they_have_no_pinhole_equivalent():
     with pytest.raises(ValueError, match="EQUIRECTANGULAR"):
         Lens("EQUIRECTANGULAR", 640, 320, (640.0, 320.0))
 
@@ -94,7 +94,7 @@ def test_no_pixel_of_the_result_lies_outside_the_photo():
         assert (where < np.array(SIZE) + 0.75).all(), model
 
 
-def test_without_distortion_the_camera_stays():
+def test_without_distortion_the_camera_is_unchanged():
     width, height, K = pinhole_of(Lens("RADIAL", *SIZE, (F, *CENTER, 0.0, 0.0)))
     assert (width, height) == SIZE
     np.testing.assert_array_equal(K, [[F, 0, 47], [0, F, 37], [0, 0, 1]])
@@ -150,7 +150,9 @@ def view_of(folder, lens: Lens, mask: np.ndarray | None) -> View:
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
 @pytest.mark.parametrize("masked", [None, "photo", "half", "undistorted"])
-def test_large_photos_and_masks_come_out_of_bands_as_they_come_at_once(tmp_path, monkeypatch, model, masked):
+def test_large_photos_and_masks_processed_in_bands_equal_those_processed_whole(
+    tmp_path, monkeypatch, model, masked
+):
     lens = Lens(model, *SIZE, LENSES[model])
     width, height, _ = pinhole_of(lens)
     shape = {None: None, "photo": SIZE, "half": (SIZE[0] // 2, SIZE[1] // 2), "undistorted": (width, height)}[
@@ -176,8 +178,8 @@ def test_large_photos_and_masks_come_out_of_bands_as_they_come_at_once(tmp_path,
             np.testing.assert_allclose(view.valid_share(size), share, atol=2e-5)
 
 
-def test_a_large_photo_with_a_lens_takes_a_fraction_of_its_floats(tmp_path):
-    """Traced by Python, so without what Pillow decodes into: that is four bytes a pixel."""
+def test_undistorting_a_large_photo_takes_a_fraction_of_its_size_in_floats(tmp_path):
+    """Traced by Python, which excludes Pillow's decoded image of four bytes per pixel."""
     import tracemalloc
 
     lens = Lens("SIMPLE_RADIAL", 3000, 2400, (2600.0, 1500.0, 1200.0, -0.05))

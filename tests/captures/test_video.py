@@ -24,7 +24,7 @@ BLURRED = {7, 8, 20, 21, 22, 33, 45, 46}
 
 
 def wallpaper() -> np.ndarray:
-    """A texture with detail at several scales, wider than the picture."""
+    """A texture with detail at several scales, wider than the image."""
     rng = np.random.default_rng(3)
     total = np.zeros((SIZE[1], 1600))
     for cell, weight in ((32, 60), (8, 40), (2, 25)):
@@ -34,7 +34,7 @@ def wallpaper() -> np.ndarray:
 
 
 def positions() -> np.ndarray:
-    """Where the picture begins on the wallpaper: slow for 30 frames, then five times as fast."""
+    """Position of the image on the wallpaper: slow for 30 frames, then five times as fast."""
     return np.concatenate([2.0 * np.arange(30), 58 + 10.0 * np.arange(1, 31)])
 
 
@@ -62,7 +62,7 @@ def numbers(names: list[str]) -> list[int]:
     return [int(name.removeprefix("frame_").removesuffix(".jpg")) for name in names]
 
 
-def test_blurred_frames_are_passed_over_and_the_count_is_right(video, tmp_path):
+def test_blurred_frames_are_skipped_and_the_count_is_exact(video, tmp_path):
     names = sample_video(video, tmp_path, 12)
     assert len(names) == 12
     assert BLURRED.isdisjoint(numbers(names))
@@ -81,7 +81,7 @@ def test_frames_follow_the_motion_and_not_the_time(video):
     assert steps.max() < 3 * np.median(steps)
 
 
-def test_frames_are_kept_when_nothing_changed_and_made_anew_for_another_count(video, tmp_path):
+def test_frames_are_kept_if_nothing_changed_and_rewritten_for_another_count(video, tmp_path):
     first = sample_video(video, tmp_path, 6)
     times = {name: (tmp_path / name).stat().st_mtime_ns for name in first}
     assert sample_video(video, tmp_path, 6) == first
@@ -95,7 +95,7 @@ def test_frames_are_kept_when_nothing_changed_and_made_anew_for_another_count(vi
 
 def test_a_jump_gets_no_more_frames_than_there_are_and_gaps_are_filled():
     motion = np.ones(40)
-    motion[0], motion[20] = 0, 60  # a cut: most stretches of equal motion hold no frame
+    motion[0], motion[20] = 0, 60  # a cut: most segments of equal motion have no frame
     sharpness = np.where(np.arange(40) % 2, 2.0, 1.0)
     chosen = choose_frames(FrameMeasures(sharpness, motion), 10)
     assert len(set(chosen)) == 10
@@ -107,7 +107,7 @@ def test_a_jump_gets_no_more_frames_than_there_are_and_gaps_are_filled():
     assert np.diff(still).max() <= 10, "where nothing moves, time decides"
 
 
-def test_a_video_that_was_held_upright_comes_out_upright(video, tmp_path):
+def test_rotated_videos_yield_upright_frames(video, tmp_path):
     """The matrix of the track header (ISO 14496-12, 8.3.2): x' = a p + c q, y' = b p + d q."""
     content = bytearray(video.read_bytes())
     place = (
@@ -123,7 +123,7 @@ def test_a_video_that_was_held_upright_comes_out_upright(video, tmp_path):
     names = sample_video(video, tmp_path / "a", 3)
     assert sample_video(turned, tmp_path / "b", 3) == names
     plain, upright = (np.asarray(Image.open(tmp_path / f / names[0]), float) for f in ("a", "b"))
-    # x' = H - q, y' = p: what is stored in a row from left to right is seen in a column from top to bottom.
+    # x' = H - q, y' = p: stored rows become columns.
     expected = plain.transpose(1, 0, 2)[:, ::-1]
     assert upright.shape == expected.shape
     assert np.abs(upright - expected).mean() < 3
@@ -131,7 +131,7 @@ def test_a_video_that_was_held_upright_comes_out_upright(video, tmp_path):
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.9])
 @pytest.mark.parametrize("faststart", [False, True])
-def test_cut_off_videos_are_told(tmp_path, share, faststart):
+def test_truncated_videos_are_refused(tmp_path, share, faststart):
     whole = write_video(tmp_path / "whole.mp4", faststart=faststart).read_bytes()
     path = tmp_path / "cut.mp4"
     path.write_bytes(whole[: int(len(whole) * share)])
@@ -141,7 +141,7 @@ def test_cut_off_videos_are_told(tmp_path, share, faststart):
     assert not list(tmp_path.rglob("frame_*"))
 
 
-def test_what_is_no_video_is_told(tmp_path):
+def test_files_that_are_not_videos_are_refused(tmp_path):
     (tmp_path / "words.mp4").write_text("not a video")
     for name, found in (("words.mp4", "damaged"), ("nowhere.mov", "no such file")):
         with pytest.raises(CaptureError) as caught:
@@ -153,7 +153,7 @@ def test_what_is_no_video_is_told(tmp_path):
         sample_video(tmp_path / "words.mp4", tmp_path, 2)
 
 
-def test_without_the_library_the_extra_is_named(video, tmp_path, monkeypatch):
+def test_without_the_library_the_error_names_the_extra(video, tmp_path, monkeypatch):
     real = builtins.__import__
 
     def without_av(name, *args, **kwargs):

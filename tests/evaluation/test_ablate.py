@@ -280,7 +280,7 @@ def test_truth_from_elsewhere_is_asked_in_the_words_of_either_list_and_runs_are_
     assert redrawn[2] != everything[2]
     own = measure()
     assert own[:2] == (["blue ball", "red apple"], 1)
-    with pytest.raises(CaptureError, match="words of the list 'paper'"):
+    with pytest.raises(CaptureError, match="the list 'paper'"):
         measure(prompt_list="paper")
 
 

@@ -30,12 +30,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(autouse=True)
 def full_precision(request, monkeypatch):
-    """Bfloat16 is tested by itself; everything else is compared to the last digits."""
+    """Bfloat16 is tested separately; everything else is compared at full precision."""
     if "bfloat16" not in request.node.name:
         monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda: False)
 
 
-def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatch):
+def test_crops_in_bfloat16_agree_with_float32_and_texts_do_not_change(monkeypatch):
     clip = load_clip("bundled")
     crops = torch.rand(12, 3, 24, 24, generator=torch.Generator().manual_seed(0))
     found = []
@@ -48,14 +48,14 @@ def test_crops_in_bfloat16_point_the_same_way_and_texts_do_not_change(monkeypatc
     assert torch.equal(found[0][1], found[1][1])
 
 
-def test_only_the_image_tower_of_few_patches_gets_plain_attention():
+def test_only_image_towers_of_few_patches_use_eager_attention():
     clip = load_clip("bundled")
     assert clip._model.vision_model.config._attn_implementation == "eager"
     assert clip._model.text_model.config._attn_implementation == "sdpa"
     clip._model.vision_model.config._attn_implementation = "sdpa"
     _plain_attention(clip._model, clip._model.config.vision_config, 8 * 14)
     assert clip._model.vision_model.config._attn_implementation == "sdpa", "14 x 14 patches are not few"
-    _plain_attention(torch.nn.Linear(2, 2), object(), 48)  # a model that is built otherwise is left alone
+    _plain_attention(torch.nn.Linear(2, 2), object(), 48)  # another architecture is unchanged
 
 
 def _normalized(images: torch.Tensor) -> torch.Tensor:
@@ -104,7 +104,7 @@ def test_clip_image_embeddings_equal_transformers_own(clip_folder):
     torch.testing.assert_close(encoder.encode_images(images), expected, atol=1e-5, rtol=0)
 
 
-def test_patches_are_the_values_of_the_last_attention_written_out(clip_folder):
+def test_patches_are_the_values_of_the_last_attention_layer(clip_folder):
     """Reference: the tower layer by layer, then LayerNorm, two matrices, LayerNorm and the projection by hand."""
     from transformers import CLIPModel
 
@@ -133,7 +133,7 @@ def test_patches_are_the_values_of_the_last_attention_written_out(clip_folder):
     torch.testing.assert_close(patches, _unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
 
 
-def test_nothing_of_an_evaluation_is_held_once_it_is_answered(clip_folder):
+def test_the_encoder_frees_its_activations_after_each_call(clip_folder):
     encoder = ClipEncoder(clip_folder, "tiny")
     encoder.encode_images(_images(2, 40))
     encoder.encode_patches(_images(2, 40))
@@ -144,7 +144,7 @@ def test_nothing_of_an_evaluation_is_held_once_it_is_answered(clip_folder):
     assert held == []
 
 
-def test_threads_get_their_own_patches(clip_folder):
+def test_each_thread_gets_its_own_patches(clip_folder):
     encoder = ClipEncoder(clip_folder, "tiny")
     images = _images(12, 40).split(2)
     expected = [encoder.encode_patches(pair)[1] for pair in images]
@@ -160,7 +160,7 @@ def test_threads_get_their_own_patches(clip_folder):
                 torch.testing.assert_close(tensor, reference, atol=1e-5, rtol=0)
 
 
-def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_folder, clip_folder):
+def test_patches_of_another_architecture_are_refused_in_one_line(siglip_folder, clip_folder):
     encoder = ClipEncoder(siglip_folder, "tiny siglip")
     assert encoder.patches == 0
     with pytest.raises(ModelError, match=r"--features\.crop-tokens class"):
@@ -170,7 +170,7 @@ def test_patches_of_a_model_that_is_not_clips_are_refused_in_one_line(siglip_fol
     check_patches(clip_folder, "tiny")
 
 
-def test_clip_text_embeddings_equal_transformers_own_and_long_prompts_are_cut(clip_folder):
+def test_clip_text_embeddings_equal_transformers_own_and_long_prompts_are_truncated(clip_folder):
     from transformers import AutoTokenizer, CLIPModel
 
     encoder = ClipEncoder(clip_folder, "tiny")
@@ -202,7 +202,7 @@ def test_siglip_embeddings_equal_transformers_own(siglip_folder):
     torch.testing.assert_close(found, _unit(by_text), atol=1e-5, rtol=0)
 
 
-def test_siglip2_of_free_size_gets_its_patches_as_its_own_processor_makes_them(siglip_folder, tmp_path):
+def test_siglip2_of_variable_size_gets_the_patches_of_its_own_processor(siglip_folder, tmp_path):
     transformers = pytest.importorskip("transformers")
     if not hasattr(transformers, "Siglip2Model"):
         pytest.skip("this transformers has no SigLIP 2")
@@ -313,7 +313,7 @@ def test_a_smaller_stride_evaluates_the_model_on_shifted_images(dino):
     torch.testing.assert_close(fine[2::4, 1::4], expected, atol=1e-5, rtol=0)
 
 
-def test_fine_features_lie_where_the_image_content_is(tmp_path):
+def test_fine_features_are_aligned_with_the_image(tmp_path):
     """With a model that only averages color, features of a ramp must be the ramp at the cells' centers."""
     from transformers import ViTConfig, ViTModel
 
@@ -347,11 +347,11 @@ def test_fine_features_lie_where_the_image_content_is(tmp_path):
         found = encoder.encode_dense(image, short_side=32, stride=stride, facet="token")
         red = found[..., 0] / found[..., 2]
         centers = (torch.arange(64 // stride) + 0.5) * stride / 64
-        inner = slice(4 // stride + 1, -4 // stride - 1)  # at the border a patch sees repeated pixels
+        inner = slice(4 // stride + 1, -4 // stride - 1)  # border patches see replicated pixels
         assert (red[:, inner] - centers[inner]).abs().max() < tolerance
 
 
-def test_windows_cover_a_large_image_and_agree_with_one_evaluation_for_a_local_model(dino, tmp_path):
+def test_windows_of_a_large_image_agree_with_one_pass_for_a_local_model(dino, tmp_path):
     image = torch.rand(3, 64, 120, generator=torch.Generator().manual_seed(5))
     whole = dino.encode_dense(image, short_side=64, facet="token")
     windowed = dino.encode_dense(image, short_side=64, facet="token", max_tokens=20)
@@ -399,7 +399,7 @@ def test_windows_cover_everything_and_overlap(total, window):
         assert max(np.diff(starts), default=0) <= window - window // 4 + 1
 
 
-def test_threads_get_their_own_keys(dino):
+def test_each_thread_gets_its_own_keys(dino):
     images = [torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(seed)) for seed in range(6)]
     expected = [dino.encode_dense(image, short_side=32) for image in images]
     barrier = threading.Barrier(3)
@@ -448,13 +448,13 @@ def test_normalization_falls_back_to_the_family_with_a_warning(siglip_folder, tm
     assert encoder._mean.flatten().tolist() == [0.5, 0.5, 0.5]
 
 
-# -- where models come from
+# -- finding models
 
 
 @pytest.mark.parametrize(
     ("load", "name"), [(load_clip, "lexsplat/no-such-clip"), (load_dino, "lexsplat/no-such-dino")]
 )
-def test_a_missing_model_ends_in_one_line_with_three_ways_out(load, name, monkeypatch, tmp_path):
+def test_a_missing_model_raises_one_line_with_three_remedies(load, name, monkeypatch, tmp_path):
     import huggingface_hub
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
@@ -475,13 +475,13 @@ def test_a_missing_model_ends_in_one_line_with_three_ways_out(load, name, monkey
     assert "\n" not in message
     for part in (name, "internet", f"--{kind} FOLDER", f"--{kind} bundled"):
         assert part in message
-    assert calls[0]["local_files_only"]  # the cache comes first
+    assert calls[0]["local_files_only"]  # the cache is searched first
     assert calls[-1]["etag_timeout"] <= 10
     assert all("safetensors" in " ".join(c["allow_patterns"]) for c in calls if "allow_patterns" in c)
     assert time.perf_counter() - start < 5
 
 
-def test_an_invalid_name_and_a_wrong_folder_are_told(tmp_path, clip_folder, siglip_folder):
+def test_an_invalid_name_and_a_wrong_folder_are_reported(tmp_path, clip_folder, siglip_folder):
     with pytest.raises(ModelError, match="neither a folder nor a valid model name"):
         load_clip("not a//name")
     with pytest.raises(ModelError, match="an empty folder"):
@@ -495,7 +495,7 @@ def test_an_invalid_name_and_a_wrong_folder_are_told(tmp_path, clip_folder, sigl
         load_dino(str(clip_folder))
 
 
-def test_truncated_weights_are_told(clip_folder, tmp_path):
+def test_truncated_weights_are_reported(clip_folder, tmp_path):
     import shutil
 
     copy = tmp_path / "copy"
@@ -517,7 +517,9 @@ def test_pickled_weights_are_never_loaded(clip_folder, tmp_path):
         load_clip(str(copy))
 
 
-def test_safetensors_come_from_the_conversion_request_where_main_has_none(clip_folder, monkeypatch, tmp_path):
+def test_safetensors_come_from_the_conversion_pull_request_if_main_has_none(
+    clip_folder, monkeypatch, tmp_path
+):
     import shutil
     from types import SimpleNamespace
 
@@ -541,8 +543,8 @@ def test_safetensors_come_from_the_conversion_request_where_main_has_none(clip_f
     assert hub.model_folder("someone/model", "clip") == converted
 
 
-def test_a_cached_model_is_found_without_network_even_under_a_request(clip_folder, monkeypatch, tmp_path):
-    """The cache's own layout: models--A--B/{refs,snapshots}; nothing is mocked but the place."""
+def test_a_cached_model_is_found_without_network_even_in_a_pull_request(clip_folder, monkeypatch, tmp_path):
+    """The cache's own layout: models--A--B/{refs,snapshots}; only its location is mocked."""
     import shutil
 
     import huggingface_hub
@@ -578,10 +580,10 @@ def test_sharded_weights_need_every_shard(clip_folder, tmp_path):
     assert hub.is_model_folder(folder)
 
 
-# -- the encoders that ship with the package
+# -- the bundled encoders
 
 
-def test_the_embedded_encoders_know_sizes_from_their_configuration():
+def test_the_bundled_encoders_read_sizes_from_their_configuration():
     clip, dino = load_clip("bundled"), load_dino("bundled")
     assert (clip.image_size, clip.dim) == (48, 128)
     assert (dino.patch_size, dino.dim) == (8, 128)
@@ -589,8 +591,8 @@ def test_the_embedded_encoders_know_sizes_from_their_configuration():
     assert dino.encode_dense(torch.rand(3, 60, 80), short_side=48, stride=4).shape == (12, 16, 128)
 
 
-def test_the_embedded_clip_tells_colors_apart():
-    """Its captions name colors: flat pictures of a color must lie nearest to that color's words."""
+def test_the_bundled_clip_distinguishes_colors():
+    """Its captions name colors: uniform images of a color are most similar to that color's prompt."""
     encoder = load_clip("bundled")
     colors = {
         "red": (0.8, 0.1, 0.1),

@@ -1,4 +1,4 @@
-"""Features of other programs, from a folder of arrays through ``build`` to an answer."""
+"""Features of other programs: from a folder of arrays through ``build`` to an answer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from safetensors.torch import save_file
-from support.noise_photos import HEIGHT, WIDTH, make_scene
+from support.noise_photos import HEIGHT, WIDTH, make_capture
 from support.tiny_capture import SPHERES, camera_poses, trace
 
 from lexsplat import cli
@@ -24,8 +24,8 @@ VIEWS, SIZE = 12, (96, 72)
 
 
 @pytest.fixture
-def scene(tmp_path):
-    return make_scene(tmp_path / "images", count=2)
+def capture(tmp_path):
+    return make_capture(tmp_path / "images", count=2)
 
 
 def write_arrays(folder: Path, array: np.ndarray) -> Path:
@@ -36,7 +36,7 @@ def write_arrays(folder: Path, array: np.ndarray) -> Path:
 
 
 def numbered(height: int, width: int) -> np.ndarray:
-    """Unit vectors that tell row and column."""
+    """Unit vectors that encode row and column."""
     row, column = np.mgrid[:height, :width] + 0.5
     angle, tilt = 0.5 + row / height, 0.5 + column / width
     parts = [np.cos(angle) * np.cos(tilt), np.cos(angle) * np.sin(tilt), np.sin(angle)]
@@ -44,9 +44,9 @@ def numbered(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ending", ["npy", "safetensors", "pair"])
-def test_what_is_finer_than_the_pictures_is_read_at_their_pixels(scene, tmp_path, ending):
-    for name, view in scene.views.items():
-        scene.views[name] = dataclasses.replace(view, camera=view.camera.downscaled(4))
+def test_arrays_finer_than_the_working_images_are_read_at_their_pixels(capture, tmp_path, ending):
+    for name, view in capture.views.items():
+        capture.views[name] = dataclasses.replace(view, camera=view.camera.downscaled(4))
     large = numbered(HEIGHT * 2, WIDTH * 2)
     folder = write_arrays(tmp_path / "arrays", large)
     for path in folder.rglob("*.npy"):
@@ -58,7 +58,7 @@ def test_what_is_finer_than_the_pictures_is_read_at_their_pixels(scene, tmp_path
             pixels = np.arange(large[..., 0].size).reshape(1, *large.shape[:2])
             np.save(path.with_name(path.stem + "_s.npy"), pixels)
             path.unlink()
-    found = load_external_features(folder, scene)["left/0.png"].clip
+    found = load_external_features(folder, capture)["left/0.png"].clip
     assert found.shape == (8, 12, 3)
     np.testing.assert_allclose(found, large[4::8, 4::8], atol=1e-6)
 
@@ -67,9 +67,9 @@ def test_what_is_finer_than_the_pictures_is_read_at_their_pixels(scene, tmp_path
     ("shape", "fits"),
     [((16, 24), True), ((15, 24), True), ((16, 25), True), ((24, 16), False), ((3, 24), False)],
 )
-def test_an_array_has_the_photos_shape_but_for_a_cell(scene, tmp_path, shape, fits):
+def test_an_array_has_the_photos_aspect_up_to_one_cell(capture, tmp_path, shape, fits):
     folder = write_arrays(tmp_path / "arrays", numbered(*shape))
-    maps = load_external_features(folder, scene)
+    maps = load_external_features(folder, capture)
     if fits:
         assert maps["left/0.png"].clip.shape == (*shape, 3)
     else:
@@ -77,49 +77,49 @@ def test_an_array_has_the_photos_shape_but_for_a_cell(scene, tmp_path, shape, fi
             maps["left/0.png"]
 
 
-def test_features_that_words_cannot_be_compared_with_are_refused(scene, tmp_path):
-    maps = load_external_features(write_arrays(tmp_path, numbered(4, 6)), scene, dimension=512)
+def test_features_of_another_depth_than_the_text_embeddings_are_refused(capture, tmp_path):
+    maps = load_external_features(write_arrays(tmp_path, numbered(4, 6)), capture, dimension=512)
     with pytest.raises(
-        FileFormatError, match=r"depth 512, as the encoder of the words.*found 3; name with --clip"
+        FileFormatError, match=r"depth 512, like the embeddings of the text.*found 3; give the encoder"
     ):
         maps["left/0.png"]
 
 
-def test_a_map_beyond_the_memory_is_refused_before_it_is_read(scene, tmp_path):
-    maps = load_external_features(write_arrays(tmp_path, numbered(HEIGHT, WIDTH)), scene, memory=1 << 20)
+def test_a_map_beyond_the_memory_is_refused_before_it_is_read(capture, tmp_path):
+    maps = load_external_features(write_arrays(tmp_path, numbered(HEIGHT, WIDTH)), capture, memory=1 << 20)
     with pytest.raises(MemoryBudgetError, match="features of 48x32x3 of a view"):
         maps["left/0.png"]
 
 
-def test_pixels_without_a_feature_have_no_code(scene, tmp_path):
+def test_pixels_without_a_feature_have_no_code(capture, tmp_path):
     array = numbered(HEIGHT, WIDTH)
     array[:, :10] = 0
     folder = write_arrays(tmp_path, array)
-    found = load_external_features(folder, scene)["left/0.png"]
+    found = load_external_features(folder, capture)["left/0.png"]
     codes = Codebook(torch.eye(3)).assign(found)
     assert (codes[:, :10] == 255).all()
     assert (codes[:, 10:] < 3).all()
     with pytest.raises(FileFormatError, match=r"num-codes 255"):
-        load_external_features(folder, scene, allow_holes=False)["left/0.png"]
-    # Where 255 is a code, masks say what does not count; the map itself has no number for it.
+        load_external_features(folder, capture, allow_holes=False)["left/0.png"]
+    # With 256 codes, index maps have no value for pixels without a feature.
     assert Codebook(torch.eye(256)).assign(FeatureMap(torch.zeros(1, 1, 256))).item() == 0
 
 
-def test_numbers_too_large_for_a_length_are_refused(scene, tmp_path):
+def test_values_whose_norm_overflows_are_refused(capture, tmp_path):
     folder = write_arrays(tmp_path, np.full((4, 6, 3), 1e30, np.float32))
     with pytest.raises(FileFormatError, match="beyond 1e19"):
-        load_external_features(folder, scene)["left/0.png"]
+        load_external_features(folder, capture)["left/0.png"]
 
 
-def test_the_identity_follows_every_file_that_is_read(scene, tmp_path):
+def test_the_identity_follows_every_file_that_is_read(capture, tmp_path):
     for stem in ("left/0", "left/1"):
         (tmp_path / stem).parent.mkdir(exist_ok=True)
         np.save(tmp_path / f"{stem}_f.npy", np.eye(3))
         np.save(tmp_path / f"{stem}_s.npy", np.zeros((1, 4, 6)))
-    before = external_identity(tmp_path, scene)
+    before = external_identity(tmp_path, capture)
     assert len(before) == 4
     np.save(tmp_path / "left/1_s.npy", np.zeros((2, 4, 6)))
-    assert external_identity(tmp_path, scene) != before
+    assert external_identity(tmp_path, capture) != before
 
 
 # -- through the command line
@@ -149,7 +149,7 @@ def embed(capture: Path, output: Path, built: Path, features: Path, *options: st
     ])  # fmt: skip
 
 
-def test_masks_of_another_program_become_answers(tiny_capture, built, segments, tmp_path, capsys):
+def test_segments_of_another_program_answer_queries(tiny_capture, built, segments, tmp_path, capsys):
     output = tmp_path / "scene"
     assert embed(tiny_capture, output, built, segments, "--method", "lifted") == 0
     with Image.open(output / "codes" / "view_01.png") as image:
@@ -169,14 +169,16 @@ def test_masks_of_another_program_become_answers(tiny_capture, built, segments, 
 
 
 def measure(output: Path) -> None:
-    """Most of every thing is found."""
+    """Most of every object is found."""
     assert cli.main(["evaluate", str(output)]) == 0
     metrics = json.loads((output / "metrics.json").read_text())
     assert metrics["language"]["strict"]["auto"]["mIoU"] > 0.7
     assert metrics["language"]["strict"]["mAP"] > 0.9
 
 
-def test_a_view_without_an_array_is_told_before_anything_is_made(tiny_capture, built, tmp_path, capsys):
+def test_a_view_without_an_array_is_reported_before_anything_is_written(
+    tiny_capture, built, tmp_path, capsys
+):
     (tmp_path / "empty").mkdir()
     assert embed(tiny_capture, tmp_path / "scene", built, tmp_path / "empty") == 1
     assert "expected view_01.npy, view_01.safetensors or view_01_f.npy" in capsys.readouterr().err

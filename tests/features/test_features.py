@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from support.noise_photos import HEIGHT, WIDTH, FakeLens, FakeView, make_scene
+from support.noise_photos import HEIGHT, WIDTH, FakeLens, FakeView, make_capture
 
 from lexsplat.features import (
     FeatureConfig,
@@ -22,7 +22,6 @@ from lexsplat.features import (
     TextCache,
     extract_features,
     load_external_features,
-    pca_image,
 )
 from lexsplat.features.cache import resize_grid
 from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
@@ -32,7 +31,7 @@ from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetE
 
 @pytest.fixture(scope="module", autouse=True)
 def two_threads():
-    """So that two workers run, whatever the machine."""
+    """Two workers run on every machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -40,7 +39,7 @@ def two_threads():
 
 
 class ColorEncoder:
-    """Embeds the mean color; counts its work."""
+    """Embeds the mean color; counts its calls."""
 
     name, image_size, dim, patches = "color", 8, 4, 2
     device = torch.device("cpu")
@@ -91,14 +90,14 @@ CONFIG = FeatureConfig(
 
 
 @pytest.fixture
-def scene(tmp_path):
-    return make_scene(tmp_path / "images")
+def capture(tmp_path):
+    return make_capture(tmp_path / "images")
 
 
-def test_the_maps_are_those_of_crops_embedded_one_by_one(scene, tmp_path):
-    maps = extract_features(scene, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path / "cache")
-    assert list(maps) == list(scene.views)
-    for name, view in scene.views.items():
+def test_the_maps_are_those_of_crops_embedded_one_by_one(capture, tmp_path):
+    maps = extract_features(capture, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path / "cache")
+    assert list(maps) == list(capture.views)
+    for name, view in capture.views.items():
         image = view.load_image()
         levels = grid_levels(WIDTH, HEIGHT, CONFIG.crop_sizes, CONFIG.crop_strides)
         vectors = []
@@ -121,12 +120,12 @@ def test_the_maps_are_those_of_crops_embedded_one_by_one(scene, tmp_path):
 
 
 @pytest.mark.parametrize("tokens", ["patch", "both"])
-def test_patches_speak_beside_or_instead_of_the_whole_crops(tokens, scene, tmp_path):
+def test_patch_embeddings_are_used_beside_or_instead_of_image_embeddings(tokens, capture, tmp_path):
     config = dataclasses.replace(CONFIG, crop_tokens=tokens)
-    maps = extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path / "cache")
+    maps = extract_features(capture, ColorEncoder(), None, config, cache_dir=tmp_path / "cache")
     levels = grid_levels(WIDTH, HEIGHT, CONFIG.crop_sizes, CONFIG.crop_strides)
     boxes = np.concatenate([level.boxes for level in levels])
-    for name, view in scene.views.items():
+    for name, view in capture.views.items():
         image = torch.from_numpy(view.load_image()).permute(2, 0, 1)
         crops = torch.cat(list(cut_crops(image, boxes, 8, 64)))
         whole, patches = ColorEncoder().encode_patches(crops)
@@ -136,28 +135,29 @@ def test_patches_speak_beside_or_instead_of_the_whole_crops(tokens, scene, tmp_p
         torch.testing.assert_close(maps[name].clip, F.normalize(expected, dim=-1), atol=2e-3, rtol=0)
 
 
-def test_patches_that_do_not_fit_are_refused_with_a_budget_that_does(scene, tmp_path):
+def test_patches_that_do_not_fit_are_refused_with_a_budget_that_does(capture, tmp_path):
     class Fine(ColorEncoder):
         patches = 100
 
-    config = dataclasses.replace(CONFIG, crop_tokens="both", memory=4 << 20)
+    memory, patches = 4 << 20, dataclasses.replace(CONFIG, crop_tokens="both")
     with pytest.raises(MemoryBudgetError, match=r"features\.crop-tokens class"):
-        extract_features(scene, Fine(), None, config, cache_dir=tmp_path)
-    whole = dataclasses.replace(config, crop_tokens="class")
-    assert len(extract_features(scene, Fine(), None, whole, cache_dir=tmp_path)) == 5
+        extract_features(capture, Fine(), None, patches, cache_dir=tmp_path, memory=memory)
+    assert len(extract_features(capture, Fine(), None, CONFIG, cache_dir=tmp_path, memory=memory)) == 5
+    with pytest.raises(ValueError, match="memory"):
+        extract_features(capture, Fine(), None, CONFIG, cache_dir=tmp_path, memory=0)
 
 
-def test_what_patches_say_is_stored_for_one_size_of_the_maps(scene, tmp_path):
+def test_patch_embeddings_are_stored_for_one_map_size(capture, tmp_path):
     config = dataclasses.replace(CONFIG, crop_tokens="both")
-    assert _work(scene, tmp_path) == (True, 5)
-    assert _work(scene, tmp_path, config) == (True, 0)
-    assert _work(scene, tmp_path, dataclasses.replace(config, crop_tokens="patch")) == (False, 0)
-    assert _work(scene, tmp_path, dataclasses.replace(config, map_cells=5)) == (True, 0)
+    assert _work(capture, tmp_path) == (True, 5)
+    assert _work(capture, tmp_path, config) == (True, 0)
+    assert _work(capture, tmp_path, dataclasses.replace(config, crop_tokens="patch")) == (False, 0)
+    assert _work(capture, tmp_path, dataclasses.replace(config, map_cells=5)) == (True, 0)
 
 
-def test_a_cached_map_of_patches_that_does_not_fit_is_told(scene, tmp_path):
+def test_a_cached_patch_map_of_another_size_is_refused(capture, tmp_path):
     config = dataclasses.replace(CONFIG, crop_tokens="patch")
-    maps = extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path)
+    maps = extract_features(capture, ColorEncoder(), None, config, cache_dir=tmp_path)
     path = sorted(tmp_path.glob("*.clip.safetensors"))[0]
     tensors = load_file(path)
     with safe_open(path, framework="pt") as file:
@@ -176,17 +176,17 @@ def test_a_cached_map_of_patches_that_does_not_fit_is_told(scene, tmp_path):
         assert "cached features" in refused[0]
 
 
-def test_maps_are_unit_length_and_without_dino_have_none(scene, tmp_path):
-    maps = extract_features(scene, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
+def test_maps_are_unit_length_and_without_dino_have_none(capture, tmp_path):
+    maps = extract_features(capture, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
     for found in maps.values():
         assert found.dino is None
         torch.testing.assert_close(found.clip.norm(dim=-1), torch.ones(8, 12))
 
 
 @pytest.mark.parametrize("size", [(4000, 8), (8, 4000)])
-def test_the_maps_of_a_long_strip_have_no_more_cells_than_those_of_a_picture_of_16_by_1(size, tmp_path):
-    scene = make_scene(tmp_path, count=1)
-    (view,) = scene.views.values()
+def test_the_maps_of_long_images_have_a_bounded_number_of_cells(size, tmp_path):
+    capture = make_capture(tmp_path, count=1)
+    (view,) = capture.views.values()
     Image.new("RGB", size, (90, 20, 60)).save(view.image_path)
     seen = []
 
@@ -198,33 +198,33 @@ def test_the_maps_of_a_long_strip_have_no_more_cells_than_those_of_a_picture_of_
     config = dataclasses.replace(
         CONFIG, crop_sizes=(0.5,), crop_strides=(1.0,), map_cells=20, dino_short_side=100
     )
-    maps = extract_features(scene, ColorEncoder(), Asked(), config, cache_dir=tmp_path / "cache")
+    maps = extract_features(capture, ColorEncoder(), Asked(), config, cache_dir=tmp_path / "cache")
     rows, cols = maps[view.name].clip.shape[:2]
     assert rows * cols == pytest.approx(16 * 20**2, rel=0.2)
     assert max(rows, cols) / min(rows, cols) == pytest.approx(500, rel=0.2), "cells stay square"
     assert seen == [round(100 * (16 / 500) ** 0.5)]
 
 
-def test_a_second_run_costs_nothing_and_gives_the_same(scene, tmp_path):
-    first = extract_features(scene, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
+def test_a_second_run_costs_nothing_and_gives_the_same(capture, tmp_path):
+    first = extract_features(capture, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
     before = {name: first[name].clip for name in first}
-    scene.loads.clear()
+    capture.loads.clear()
     clip, dino = ColorEncoder(), GridEncoder()
     events = []
-    again = extract_features(scene, clip, dino, CONFIG, cache_dir=tmp_path, listener=events.append)
-    assert (clip.crops, dino.images, scene.loads) == (0, 0, [])
+    again = extract_features(capture, clip, dino, CONFIG, cache_dir=tmp_path, listener=events.append)
+    assert (clip.crops, dino.images, capture.loads) == (0, 0, [])
     assert [(event.done, event.total) for event in events] == [(5, 5)]
     for name in again:
         assert torch.equal(again[name].clip, before[name])
 
 
 @pytest.mark.parametrize("mode", ["grid", "random"])
-def test_the_number_of_threads_changes_nothing(mode, scene, tmp_path):
+def test_the_number_of_threads_changes_nothing(mode, capture, tmp_path):
     config = dataclasses.replace(CONFIG, mode=mode, random_crops=40, random_levels=3, random_sizes=(0.2, 0.6))
     found = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
-        maps = extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path / str(threads))
+        maps = extract_features(capture, ColorEncoder(), None, config, cache_dir=tmp_path / str(threads))
         assert torch.get_num_threads() == threads
         found.append({name: features.clip for name, features in maps.items()})
     torch.set_num_threads(2)
@@ -232,96 +232,96 @@ def test_the_number_of_threads_changes_nothing(mode, scene, tmp_path):
         torch.testing.assert_close(found[0][name], found[1][name], atol=1e-3, rtol=0)
 
 
-def test_a_killed_run_goes_on_with_what_is_missing(scene, tmp_path):
+def test_an_interrupted_run_resumes_with_the_missing_views(capture, tmp_path):
     torch.set_num_threads(1)
     try:
         whole = ColorEncoder()
-        extract_features(scene, whole, None, CONFIG, cache_dir=tmp_path / "whole")
-        small = dataclasses.replace(CONFIG, memory=4 * 24 * 12 * 64 * 8)  # batches of eight crops
+        extract_features(capture, whole, None, CONFIG, cache_dir=tmp_path / "whole")
+        cache, small = tmp_path / "cache", 4 * 24 * 12 * 64 * 8  # batches of eight crops
         broken = ColorEncoder(fail_after=whole.crops // 2)
         with pytest.raises(RuntimeError, match="stopped in the middle"):
-            extract_features(scene, broken, None, small, cache_dir=tmp_path / "cache")
-        assert not list((tmp_path / "cache").glob(".*"))  # no half-written file stays
+            extract_features(capture, broken, None, CONFIG, cache_dir=cache, memory=small)
+        assert not list((tmp_path / "cache").glob(".*"))  # no partial file remains
         stored = len(list((tmp_path / "cache").glob("*.safetensors")))
         assert 0 < stored < 5
         rest, events = ColorEncoder(), []
-        extract_features(scene, rest, None, small, cache_dir=tmp_path / "cache", listener=events.append)
+        extract_features(capture, rest, None, CONFIG, cache_dir=cache, memory=small, listener=events.append)
         assert rest.crops == whole.crops * (5 - stored) // 5
         assert [event.done for event in events] == list(range(stored, 6))
     finally:
         torch.set_num_threads(2)
 
 
-def test_an_error_in_one_worker_stops_all_and_restores_the_threads(scene, tmp_path):
+def test_an_error_in_one_worker_stops_all_and_restores_the_threads(capture, tmp_path):
     with pytest.raises(RuntimeError, match="stopped in the middle"):
-        extract_features(scene, ColorEncoder(fail_after=0), None, CONFIG, cache_dir=tmp_path)
+        extract_features(capture, ColorEncoder(fail_after=0), None, CONFIG, cache_dir=tmp_path)
     assert torch.get_num_threads() == 2
     assert threading.active_count() < 10
 
 
-def test_an_unreadable_image_is_told(scene, tmp_path):
+def test_an_unreadable_image_is_reported(capture, tmp_path):
     name = "left/3.png"
 
     class Broken(FakeView):
         def load_image(self, size=None):
             raise CaptureError(self.image_path, expected="an image", found="a truncated file")
 
-    old = scene.views[name]
-    scene.views[name] = Broken(old.name, old.image_path, old.camera, [])
+    old = capture.views[name]
+    capture.views[name] = Broken(old.name, old.image_path, old.camera, [])
     with pytest.raises(CaptureError, match="truncated"):
-        extract_features(scene, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
+        extract_features(capture, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
 
 
-def _work(scene, tmp_path, config=CONFIG, clip_hash="color"):
+def _work(capture, tmp_path, config=CONFIG, clip_hash="color"):
     clip, dino = ColorEncoder(clip_hash), GridEncoder()
-    extract_features(scene, clip, dino, config, cache_dir=tmp_path)
+    extract_features(capture, clip, dino, config, cache_dir=tmp_path)
     return clip.crops > 0, dino.images
 
 
-def test_the_cache_follows_everything_that_changes_features_and_nothing_else(scene, tmp_path):
-    assert _work(scene, tmp_path) == (True, 5)
-    assert _work(scene, tmp_path) == (False, 0)
-    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, map_cells=5, memory=1 << 25, seed=3)) == (
+def test_the_cache_follows_everything_that_changes_features_and_nothing_else(capture, tmp_path):
+    assert _work(capture, tmp_path) == (True, 5)
+    assert _work(capture, tmp_path) == (False, 0)
+    assert _work(capture, tmp_path, dataclasses.replace(CONFIG, map_cells=5, seed=3)) == (
         False,
         0,
     )
-    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, crop_sizes=(0.3, 0.5))) == (True, 0)
-    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, dino_stride=4)) == (False, 5)
-    assert _work(scene, tmp_path, dataclasses.replace(CONFIG, max_short_side=20)) == (True, 5)
-    assert _work(scene, tmp_path, clip_hash="another") == (True, 0)
-    path = scene.views["left/0.png"].image_path  # same name, same size, other content
+    assert _work(capture, tmp_path, dataclasses.replace(CONFIG, crop_sizes=(0.3, 0.5))) == (True, 0)
+    assert _work(capture, tmp_path, dataclasses.replace(CONFIG, dino_stride=4)) == (False, 5)
+    assert _work(capture, tmp_path, dataclasses.replace(CONFIG, max_short_side=20)) == (True, 5)
+    assert _work(capture, tmp_path, clip_hash="another") == (True, 0)
+    path = capture.views["left/0.png"].image_path  # same name, same size, other content
     Image.fromarray(np.full((HEIGHT, WIDTH, 3), 7, np.uint8)).save(path)
-    assert _work(scene, tmp_path) == (True, 1)
-    view = scene.views["left/1.png"]
-    scene.views["left/1.png"] = dataclasses.replace(view, lens=FakeLens((41.0, 24.0, 16.0)))
-    assert _work(scene, tmp_path) == (True, 1)
-    scene.views["left/1.png"] = dataclasses.replace(view, background=(1.0, 1.0, 1.0))
-    assert _work(scene, tmp_path) == (True, 1)
-    scene.views["left/1.png"] = dataclasses.replace(view, camera=view.camera.downscaled(2))
-    assert _work(scene, tmp_path) == (False, 0)  # the working resolution is not what features are made from
+    assert _work(capture, tmp_path) == (True, 1)
+    view = capture.views["left/1.png"]
+    capture.views["left/1.png"] = dataclasses.replace(view, lens=FakeLens((41.0, 24.0, 16.0)))
+    assert _work(capture, tmp_path) == (True, 1)
+    capture.views["left/1.png"] = dataclasses.replace(view, background=(1.0, 1.0, 1.0))
+    assert _work(capture, tmp_path) == (True, 1)
+    capture.views["left/1.png"] = dataclasses.replace(view, camera=view.camera.downscaled(2))
+    assert _work(capture, tmp_path) == (False, 0)  # features do not depend on the working resolution
 
 
-def test_a_damaged_cache_file_is_made_anew(scene, tmp_path):
-    extract_features(scene, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
+def test_a_damaged_cache_file_is_replaced(capture, tmp_path):
+    extract_features(capture, ColorEncoder(), None, CONFIG, cache_dir=tmp_path)
     files = sorted(tmp_path.glob("*.clip.safetensors"))
     files[0].write_bytes(files[0].read_bytes()[:-10])
     files[1].write_bytes(b"")
     clip = ColorEncoder()
-    maps = extract_features(scene, clip, None, CONFIG, cache_dir=tmp_path)
+    maps = extract_features(capture, clip, None, CONFIG, cache_dir=tmp_path)
     assert clip.crops > 0
     assert len([maps[name] for name in maps]) == 5
     files[0].unlink()
     save_file({"other": torch.zeros(1)}, files[0], {"format_version": "1", "facts": "{}"})
-    fresh = extract_features(scene, clip, None, CONFIG, cache_dir=tmp_path)
+    fresh = extract_features(capture, clip, None, CONFIG, cache_dir=tmp_path)
     with pytest.raises(FileFormatError, match="delete the file"):
         [fresh[name] for name in fresh]
 
 
-def test_the_same_picture_under_two_names_is_encoded_once(scene, tmp_path):
+def test_the_same_photo_under_two_names_is_encoded_once(capture, tmp_path):
     torch.set_num_threads(1)
-    twin = dataclasses.replace(scene.views["left/0.png"], name="right/0.png")
+    twin = dataclasses.replace(capture.views["left/0.png"], name="right/0.png")
     single = ColorEncoder()
-    views = {"left/0.png": scene.views["left/0.png"]}
+    views = {"left/0.png": capture.views["left/0.png"]}
     one = SimpleNamespace(views=views)
     extract_features(one, single, None, CONFIG, cache_dir=tmp_path / "one")
     both = SimpleNamespace(views={**views, "right/0.png": twin})
@@ -332,18 +332,18 @@ def test_the_same_picture_under_two_names_is_encoded_once(scene, tmp_path):
     assert torch.equal(maps["left/0.png"].clip, maps["right/0.png"].clip)
 
 
-def test_what_lies_on_disk_is_small_and_half_precision(scene, tmp_path):
-    extract_features(scene, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
+def test_cache_files_are_small_and_in_half_precision(capture, tmp_path):
+    extract_features(capture, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path)
     for path in tmp_path.glob("*.safetensors"):
         tensors = load_file(path)
         large = tensors.get("embeddings", tensors.get("features"))
         assert large.dtype == torch.float16
 
 
-def test_views_draw_different_random_crops_that_do_not_depend_on_each_other(scene, tmp_path):
+def test_views_draw_different_random_crops_that_do_not_depend_on_each_other(capture, tmp_path):
     config = dataclasses.replace(CONFIG, mode="random", random_crops=20, random_levels=2)
-    extract_features(scene, ColorEncoder(), None, config, cache_dir=tmp_path / "all")
-    first = {"left/0.png": scene.views["left/0.png"]}
+    extract_features(capture, ColorEncoder(), None, config, cache_dir=tmp_path / "all")
+    first = {"left/0.png": capture.views["left/0.png"]}
     alone = SimpleNamespace(views=first)
     extract_features(alone, ColorEncoder(), None, config, cache_dir=tmp_path / "alone")
     (path,) = (tmp_path / "alone").glob("*.safetensors")
@@ -352,7 +352,7 @@ def test_views_draw_different_random_crops_that_do_not_depend_on_each_other(scen
     assert len({tuple(lefts.tolist()) for lefts in stored.values()}) == 5
 
 
-def test_maps_in_memory_never_exceed_their_bound_and_the_latest_stay():
+def test_maps_in_memory_never_exceed_their_bound_and_the_latest_are_kept():
     loads = []
 
     def load(name):
@@ -363,7 +363,7 @@ def test_maps_in_memory_never_exceed_their_bound_and_the_latest_stay():
     for name in "abacad":
         _ = maps[name]
         assert maps.cached_bytes <= 8000
-    assert loads == ["a", "b", "c", "d"]  # a was asked for often enough to stay
+    assert loads == ["a", "b", "c", "d"]  # a was used recently enough to be kept
     _ = maps["b"]
     assert loads[-1] == "b"
     with pytest.raises(KeyError):
@@ -389,7 +389,7 @@ def test_resizing_a_grid_keeps_cell_centers():
 @pytest.mark.parametrize(
     "bad",
     [
-        {"mode": "spiral"}, {"crop_sizes": ()}, {"crop_sizes": (0.1,)}, {"map_cells": 0}, {"memory": 0},
+        {"mode": "spiral"}, {"crop_sizes": ()}, {"crop_sizes": (0.1,)}, {"map_cells": 0},
         {"dino_stride": 0}, {"crop_sizes": (0.0,) * 7}, {"random_sizes": (0.4, 0.2)}, {"random_crops": 0},
         {"dino_facet": "query"}, {"crop_tokens": "words"}, {"crop_tokens": "both", "mode": "random"},
     ],
@@ -399,33 +399,33 @@ def test_bad_settings_are_refused_at_once(bad):
         FeatureConfig(**bad)
 
 
-# -- features from elsewhere
+# -- external features
 
 
-def _external(scene, folder, write):
-    for view in scene.views.values():
+def _external(capture, folder, write):
+    for view in capture.views.values():
         path = folder / view.stem
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
     return folder
 
 
-def test_arrays_from_elsewhere_are_read_by_stem_and_normalized(scene, tmp_path):
+def test_external_arrays_are_read_by_stem_and_normalized(capture, tmp_path):
     array = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float16)
-    folder = _external(scene, tmp_path / "npy", lambda path: np.save(f"{path}.npy", array))
-    maps = load_external_features(folder, scene)
-    assert list(maps) == list(scene.views)
+    folder = _external(capture, tmp_path / "npy", lambda path: np.save(f"{path}.npy", array))
+    maps = load_external_features(folder, capture)
+    assert list(maps) == list(capture.views)
     expected = array.astype(np.float32)
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
     np.testing.assert_allclose(maps["left/2.png"].clip.numpy(), expected, atol=1e-6)
     tensors = {"clip": torch.from_numpy(array), "dino": torch.ones(5, 7, 2)}
-    folder = _external(scene, tmp_path / "st", lambda path: save_file(tensors, f"{path}.safetensors"))
-    found = load_external_features(folder, scene)["left/2.png"]
+    folder = _external(capture, tmp_path / "st", lambda path: save_file(tensors, f"{path}.safetensors"))
+    found = load_external_features(folder, capture)["left/2.png"]
     np.testing.assert_allclose(found.clip.numpy(), expected, atol=1e-6)
     torch.testing.assert_close(found.dino, torch.full((5, 7, 2), 0.5**0.5))
 
 
-def test_segments_with_features_are_painted_and_levels_averaged(scene, tmp_path):
+def test_segment_features_become_maps_and_levels_are_averaged(capture, tmp_path):
     features = np.array([[2.0, 0], [0, 3.0]], np.float32)
     segments = np.array([[[0, 1], [-1, 0]], [[1, 1], [-1, -1]]], np.float32)
 
@@ -433,7 +433,7 @@ def test_segments_with_features_are_painted_and_levels_averaged(scene, tmp_path)
         np.save(f"{path}_f.npy", features)
         np.save(f"{path}_s.npy", segments)
 
-    found = load_external_features(_external(scene, tmp_path / "fs", write), scene)["left/0.png"]
+    found = load_external_features(_external(capture, tmp_path / "fs", write), capture)["left/0.png"]
     half = 0.5**0.5
     expected = torch.tensor([[[half, half], [0, 1]], [[0, 0], [1, 0]]])  # no segment: zero
     torch.testing.assert_close(found.clip, expected)
@@ -448,40 +448,42 @@ def test_segments_with_features_are_painted_and_levels_averaged(scene, tmp_path)
         (np.array([[["a", {}]]], dtype=object), "without pickled objects"),
     ],
 )
-def test_wrong_arrays_from_elsewhere_are_told(array, message, scene, tmp_path):
-    folder = _external(scene, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True))
-    with pytest.raises(FileFormatError, match=message):
-        load_external_features(folder, scene)["left/0.png"]
-
-
-def test_missing_and_mismatched_arrays_from_elsewhere_are_told(scene, tmp_path):
-    with pytest.raises(FileFormatError, match="no folder"):
-        load_external_features(tmp_path / "nowhere", scene)
+def test_invalid_external_arrays_are_refused(array, message, capture, tmp_path):
     folder = _external(
-        scene, tmp_path / "x", lambda path: np.save(f"{path}.npy", np.ones((2, 2, 3), np.float32))
+        capture, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True)
+    )
+    with pytest.raises(FileFormatError, match=message):
+        load_external_features(folder, capture)["left/0.png"]
+
+
+def test_missing_and_mismatched_external_arrays_are_refused(capture, tmp_path):
+    with pytest.raises(FileFormatError, match="no folder"):
+        load_external_features(tmp_path / "nowhere", capture)
+    folder = _external(
+        capture, tmp_path / "x", lambda path: np.save(f"{path}.npy", np.ones((2, 2, 3), np.float32))
     )
     np.save(folder / "left/1.npy", np.ones((2, 2, 5), np.float32))
-    maps = load_external_features(folder, scene)
+    maps = load_external_features(folder, capture)
     _ = maps["left/0.png"]
     with pytest.raises(FileFormatError, match="depth"):
         maps["left/1.png"]
     (folder / "left/1.npy").unlink()
     with pytest.raises(FileFormatError, match=r"left/1\.npy"):
-        load_external_features(folder, scene)
+        load_external_features(folder, capture)
     (folder / "left/1.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(FileFormatError, match="npy array"):
-        load_external_features(folder, scene)["left/1.png"]
+        load_external_features(folder, capture)["left/1.png"]
     np.save(folder / "left/0_s.npy", np.full((2, 2), 4))
     np.save(folder / "left/0_f.npy", np.ones((4, 3)))
     (folder / "left/0.npy").unlink()
-    with pytest.raises(FileFormatError, match="whole numbers from -1 to 3"):
-        load_external_features(folder, scene)["left/0.png"]
+    with pytest.raises(FileFormatError, match="integers from -1 to 3"):
+        load_external_features(folder, capture)["left/0.png"]
 
 
-# -- text and pictures
+# -- texts
 
 
-def test_a_prompt_is_embedded_once_and_kept_on_disk(tmp_path):
+def test_a_prompt_is_embedded_once_and_cached_on_disk(tmp_path):
     encoder = ColorEncoder()
     cache = TextCache(tmp_path)
     prompts = ["red apple", 'äpfel\n"quoted"', "red apple", "__metadata__"]
@@ -500,7 +502,7 @@ def test_a_prompt_is_embedded_once_and_kept_on_disk(tmp_path):
 
 
 def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkeypatch):
-    """In a batch the last bits of an embedding depend on what else is in it."""
+    """In a batch, the last bits of an embedding depend on the other texts."""
     batches, written = [], []
 
     class Watched(ColorEncoder):
@@ -519,7 +521,7 @@ def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkey
     assert written == [2]
 
 
-def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path, caplog):
+def test_a_cache_that_cannot_be_written_is_reported_and_the_embedding_returned(tmp_path, caplog):
     in_the_way = tmp_path / "texts"
     in_the_way.write_text("no folder")
     found = TextCache(in_the_way).encode("color", ["apple"], ColorEncoder)
@@ -527,14 +529,14 @@ def test_a_cache_that_cannot_be_written_gives_the_answer_with_a_warning(tmp_path
     assert "not kept" in caplog.text
 
 
-def test_a_prompt_whose_end_is_not_heard_is_told(caplog):
+def test_a_truncated_prompt_is_reported(caplog):
     from lexsplat.features.encoders import load_clip
 
     clip = load_clip("bundled")
     clip.encode_text(["something that one could drink from"])
     assert not caplog.records
     clip.encode_text(["a very " * 200 + "red apple"])
-    assert "too long: the model hears 24 of its 804 tokens" in caplog.text
+    assert "prompt truncated: 804 tokens, the model's limit is 24" in caplog.text
 
 
 def test_text_of_another_model_is_never_used(tmp_path):
@@ -546,7 +548,7 @@ def test_text_of_another_model_is_never_used(tmp_path):
         TextCache(tmp_path).encode("third", ["apple"], ColorEncoder)
 
 
-def test_a_damaged_text_cache_is_made_anew_and_empty_prompts_are_refused(tmp_path):
+def test_a_damaged_text_cache_is_replaced_and_empty_prompts_are_refused(tmp_path):
     TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
     (file,) = tmp_path.iterdir()
     file.write_bytes(b"nonsense")
@@ -556,33 +558,6 @@ def test_a_damaged_text_cache_is_made_anew_and_empty_prompts_are_refused(tmp_pat
             TextCache(tmp_path).encode("color", prompts, ColorEncoder)
 
 
-def test_the_pca_picture_equals_sklearns_components():
-    from sklearn.decomposition import PCA
-
-    features = torch.from_numpy(np.random.default_rng(0).normal(size=(12, 9, 6)) * [5, 4, 3, 0.5, 0.2, 0.1])
-    picture = pca_image(features)
-    assert picture.dtype == np.uint8
-    assert picture.shape == (12, 9, 3)
-    parts = PCA(3).fit_transform(features.reshape(-1, 6).numpy())
-    low, high = np.percentile(parts, [2, 98], axis=0)
-    expected = np.round(np.clip((parts - low) / (high - low), 0, 1) * 255).reshape(12, 9, 3)
-    for channel in range(3):  # the sign of a component is arbitrary
-        found = picture[..., channel].astype(float)
-        off = min(
-            np.abs(found - expected[..., channel]).max(), np.abs(255 - found - expected[..., channel]).max()
-        )
-        assert off <= 1
-
-
-def test_the_pca_picture_of_equal_or_few_features_is_calm():
-    assert (pca_image(torch.ones(3, 4, 8)) == 128).all()
-    picture = pca_image(torch.rand(5, 5, 1))
-    assert picture.shape == (5, 5, 3)
-    assert (picture[..., 1:] == 128).all()
-    with pytest.raises(ValueError):
-        pca_image(torch.ones(3, 4))
-
-
 def test_the_sparse_settings_take_a_sixth_of_the_crops():
     def crops(config):
         return sum(map(len, grid_levels(1297, 840, config.crop_sizes, config.crop_strides)))
@@ -590,8 +565,8 @@ def test_the_sparse_settings_take_a_sixth_of_the_crops():
     assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
 
 
-def test_embedded_settings_with_the_embedded_encoders_find_the_red_half(tmp_path):
-    """The whole way, photo to answer: relevancy for a color is higher where the color is."""
+def test_the_bundled_settings_and_encoders_find_the_red_half(tmp_path):
+    """From photo to answer: the relevancy of a color is higher where the color is."""
     from lexsplat.features.encoders import load_clip, load_dino
 
     picture = np.zeros((240, 320, 3), np.uint8)
@@ -600,9 +575,9 @@ def test_embedded_settings_with_the_embedded_encoders_find_the_red_half(tmp_path
     Image.fromarray(picture).save(path)
     view = FakeView("a.png", path, Camera(320, 240, np.diag([200.0, 200.0, 1.0]), np.eye(4)), [])
     clip = load_clip("bundled")
-    scene = SimpleNamespace(views={"a.png": view})
+    capture = SimpleNamespace(views={"a.png": view})
     maps = extract_features(
-        scene, clip, load_dino("bundled"), FeatureConfig.bundled(), cache_dir=tmp_path / "c"
+        capture, clip, load_dino("bundled"), FeatureConfig.bundled(), cache_dir=tmp_path / "c"
     )
     found = maps["a.png"]
     assert found.clip.shape == (120, 160, 128)

@@ -1,4 +1,4 @@
-"""Crops to dense maps: where each embedding lands, on which crops, and how they are batched."""
+"""From crops to dense maps: positions of embeddings, choice of crops, and batching."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ def test_a_grid_level_puts_every_embedding_at_its_crop_center(size, stride):
     )
     side = levels[0].size
     low = torch.tensor([side / 2 / width, side / 2 / height])
-    # Beyond the outermost crop centers the nearest center counts: positions are clamped, never shifted.
+    # Beyond the outermost crop centers, positions are clamped, never shifted.
     expected = torch.minimum(torch.maximum(cell_centers(cols, rows), low), 1 - low)
     assert (found - expected).abs().max() < 1e-3
 
 
-def test_levels_of_different_sizes_agree_on_where_things_are():
-    """The published code moves the coarser maps by up to half a crop against the finest; here none moves."""
+def test_levels_of_different_sizes_are_aligned():
+    """The published code shifts coarser maps by up to half a crop relative to the finest; here none is shifted."""
     width, height = 320, 240
     levels = grid_levels(width, height, OFFICIAL_SIZES, OFFICIAL_STRIDES)
     found = positions(
@@ -128,7 +128,7 @@ def patch_positions(level: CropLevel, width: int, height: int, side: int) -> tor
 @pytest.mark.parametrize(
     ("size", "stride", "side"), [(0.2, 0.5, 6), (0.2, 1.0, 2), (0.5, 0.35, 6), (0.4, 0.5, 1)]
 )
-def test_every_patch_speaks_where_it_lies(size, stride, side):
+def test_every_patch_is_placed_at_its_position(size, stride, side):
     width, height, cols, rows = 160, 120, 64, 48
     (level,) = grid_levels(width, height, [size], [stride])
     found = positions(
@@ -138,12 +138,12 @@ def test_every_patch_speaks_where_it_lies(size, stride, side):
     inside = torch.minimum(
         torch.maximum(cell_centers(cols, rows) * image, torch.tensor(patch / 2)), image - patch / 2
     )
-    # Of crops that do not line up, patches at the rim count less: places bend by a part of a patch, no more.
+    # Border patches of unaligned crops have less weight, which shifts positions by a fraction of a patch.
     assert (found * image - inside).abs().max() < patch / 2
 
 
 def test_the_map_of_patches_is_a_weighted_mean_by_a_loop():
-    """Reference: every patch of every crop in float64; tents of a patch's size, times the way to the crop's rim."""
+    """Reference: every patch of every crop in float64; tents of a patch's size times the distance to the border."""
     width, height, cols, rows, dim, side = 57, 41, 9, 7, 5, 3
     levels = grid_levels(width, height, [0.3, 0.5], [0.6, 0.5])
     rng = np.random.default_rng(2)
@@ -214,7 +214,7 @@ def test_the_map_is_the_mean_of_the_levels_by_a_loop(mode):
 
 
 def test_every_level_counts_and_counts_once():
-    """One direction a level, all orthogonal: the map holds them equally; one left out would be missing."""
+    """One orthogonal direction per level: the map contains all of them equally."""
     levels = grid_levels(100, 80, OFFICIAL_SIZES, OFFICIAL_STRIDES)
     vectors = torch.cat([torch.eye(7)[i].expand(len(level), 7) for i, level in enumerate(levels)])
     found = dense_map(levels, vectors, 100, 80, 10, 8)
@@ -258,7 +258,7 @@ def test_constant_features_stay_constant_at_any_size(width, height, cols, rows, 
     size=st.floats(0.05, 2.0),
     stride=st.floats(0.2, 1.5),
 )
-def test_grid_crops_reach_every_edge_keep_inside_and_are_at_most_a_stride_apart(width, height, size, stride):
+def test_grid_crops_span_the_image_at_most_a_stride_apart(width, height, size, stride):
     (level,) = grid_levels(width, height, [size], [stride])
     for starts, length in ((level.lefts, width), (level.tops, height)):
         assert starts[0] == 0
@@ -270,12 +270,12 @@ def test_grid_crops_reach_every_edge_keep_inside_and_are_at_most_a_stride_apart(
 
 
 def test_the_official_grid_has_about_the_published_number_of_crops():
-    """About 1,300 crops a full-resolution image, some reaching half a tile outside; ours keep inside."""
+    """About 1,300 crops per full-resolution image, some of them half outside; ours lie inside."""
     crops = sum(map(len, grid_levels(1297, 840, OFFICIAL_SIZES, OFFICIAL_STRIDES)))
     assert 1000 < crops < 1500
 
 
-def test_random_crops_keep_inside_share_out_evenly_and_follow_the_seed():
+def test_random_crops_lie_inside_divide_evenly_and_follow_the_seed():
     def draw(seed):
         return random_levels(
             90, 70, crops=100, levels=6, smallest=0.05, largest=0.9, rng=np.random.default_rng(seed)
@@ -294,7 +294,7 @@ def test_random_crops_keep_inside_share_out_evenly_and_follow_the_seed():
     assert not np.array_equal(boxes, np.concatenate([level.boxes for level in draw(4)]))
 
 
-def test_a_corner_that_no_random_crop_reaches_takes_the_nearest_crop():
+def test_a_corner_outside_all_random_crops_takes_the_nearest_crop():
     levels = (CropLevel(10, np.array([0, 80]), np.array([0, 80]), grid=False),)
     vectors = torch.eye(2)
     found = dense_map(levels, vectors, 100, 100, 4, 4)
@@ -303,7 +303,7 @@ def test_a_corner_that_no_random_crop_reaches_takes_the_nearest_crop():
     torch.testing.assert_close(found.norm(dim=-1), torch.ones(4, 4))
 
 
-def test_crops_are_what_pillow_cuts_out_and_resizes():
+def test_crops_equal_those_of_pillow():
     image = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(0))
     boxes = np.array([[0, 0, 20], [60, 40, 20], [13, 7, 20], [5, 9, 48], [0, 0, 48]], dtype=np.int32)
     crops = list(cut_crops(image, boxes, 32, chunk=2))
@@ -349,7 +349,7 @@ def test_batches_run_across_images_are_full_and_come_back_in_order(chunks, batch
     assert max(encoder.batches, default=0) <= batch
 
 
-def test_an_image_is_handed_back_before_all_later_ones_are_read():
+def test_an_image_is_returned_before_later_ones_are_read():
     read = []
 
     def jobs():

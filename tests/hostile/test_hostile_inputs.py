@@ -1,8 +1,7 @@
-"""Whatever lies in a file, a reader ends in a right result or in one typed line: never in anything else.
+"""Whatever a file contains, a reader returns a valid result or raises a typed error of one line.
 
-`hostile_readers.py` has every reader with a sound input and what is done to it (`hostile_mutations.py`). It runs in
-two processes beside each other, each with a gigabyte of memory to spare and seconds for each input; a crash, a hang
-or a traceback fails the test that belongs to the reader.
+`support.hostile` registers every reader with a valid input and its mutations. They run in two processes with one
+gigabyte of spare memory and a few seconds per input; a crash, a hang or another exception fails the reader's test.
 """
 
 from __future__ import annotations
@@ -17,7 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support import TESTS_ON_PATH, hostile_mutations, hostile_readers
+from support import TESTS_ON_PATH
+from support.hostile import READERS, mutations
+from support.hostile.running import BASE_BYTES, GIGABYTE
+from support.hostile.scenes import check_open_scene
 from support.tiny_capture import write_capture
 from support.written_captures import write_colmap, write_transforms
 
@@ -27,42 +29,30 @@ from lexsplat.runtime.files import PICKLES, read_tensors
 from lexsplat.scenes.formats.reading import read_splats
 
 pytestmark = [
-    pytest.mark.xdist_group("hostile"),  # the corpus runs once, for all tests of this file
+    pytest.mark.xdist_group("hostile"),  # the corpus runs once for all tests of this file
     pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux"),
 ]
 
 LEAST_INPUTS = 10_000
-GIGABYTE = 1 << 30
-HALVES = (
-    (
-        "colmap_binary", "transforms", "feature_cache", "journal", "spz", "text_cache", "phrases", "masks", "jpeg",
-        "splat", "viewer_memory", "segment_features", "checkpoints", "points_cache", "lerf_ovs", "webp",
-        "trained_scene_folder",
-    ),
-    (
-        "colmap_text", "scene_folder", "splat_ply", "codebook", "code_maps", "compressed_ply", "ksplat", "png",
-        "tiff", "bmp", "ovs3d", "npy_features", "safetensors_features", "split_file", "model_folder",
-        "reconstruction_checkpoints",
-    ),
-)  # fmt: skip
-"""About as much work each."""
+PROCESSES = 2
 
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory):
-    """What came of all inputs, by reader."""
+    """The report of every reader. The processes share the readers: each takes the next one that is left."""
     shared = Path("/dev/shm")
     base = tmp_path_factory.mktemp("hostile")
-    script = Path(hostile_readers.__file__)
+    claims = base / "claims"
+    claims.mkdir()
+    environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     runs = []
-    for number, names in enumerate(HALVES):
+    for number in range(PROCESSES):
         # A folder in memory: ten thousand small files would otherwise wait for a disk.
         work = (shared if os.access(shared, os.W_OK) else base) / f"lexsplat-hostile-{os.getpid()}-{number}"
         output = base / f"{number}.json"
-        environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-        command = [sys.executable, str(script), str(work), str(output), *names]
-        with open(output.with_suffix(".log"), "w") as complaints:
-            process = subprocess.Popen(command, stdout=complaints, stderr=complaints, env=environment)
+        command = [sys.executable, "-m", "support.hostile.running", *map(str, (work, output, claims))]
+        with open(output.with_suffix(".log"), "w") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         runs.append((process, work, output))
     reports = {}
     for process, work, output in runs:
@@ -76,47 +66,42 @@ def corpus(tmp_path_factory):
         if process.returncode:
             current = output.with_suffix(".current")
             tried = current.read_text() if current.exists() else "the start"
-            reports[tried.split()[0]] = {
-                "crash": f"ended with {process.returncode} at {tried}: {complaints[-2000:]}"
-            }
+            last = output.with_suffix(".log").read_text(errors="replace")[-2000:]
+            reports[tried.split()[0]] = {"crash": f"ended with {process.returncode} at {tried}: {last}"}
     return reports
 
 
-def test_every_reader_is_in_the_corpus():
-    assert sorted(name for names in HALVES for name in names) == sorted(hostile_readers.READERS)
-
-
-@pytest.mark.parametrize("name", sorted(hostile_readers.READERS))
-def test_every_input_is_read_rightly_or_refused_in_one_typed_line(corpus, name):
-    assert name in corpus, "its process ended before it came to this reader"
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_every_input_is_read_correctly_or_refused_with_a_typed_error_of_one_line(corpus, name):
+    assert name in corpus, "all processes ended before this reader"
     report = corpus[name]
     assert "crash" not in report, report.get("crash")
     assert not report["failures"], "\n".join(report["failures"][:20])
-    assert report["peak"] < hostile_readers.BASE_BYTES + GIGABYTE
+    assert report["peak"] < BASE_BYTES + GIGABYTE
 
 
-def test_there_are_more_than_ten_thousand_inputs_of_every_kind(corpus):
+def test_the_corpus_has_ten_thousand_inputs_of_all_kinds(corpus):
     assert sum(report["inputs"] for report in corpus.values()) >= LEAST_INPUTS
     kinds = {kind for report in corpus.values() for kind in report["kinds"]}
     assert {"truncated", "flipped", "numbers", "moved", "foreign", "structure", "names", "counts"} <= kinds
-    # A corpus that is only refused, or only taken, tests half of the readers' work.
+    # The corpus must exercise both acceptance and refusal.
     refused = sum(sum(report["errors"].values()) for report in corpus.values())
     right = sum(report["right"] for report in corpus.values())
     assert refused > 4000
     assert right > 1000
 
 
-def test_the_corpus_is_the_same_every_time():
+def test_the_corpus_is_deterministic():
     content = bytes(range(200))
-    first, second = (list(hostile_mutations.binary(content, np.random.default_rng(1))) for _ in range(2))
+    first, second = (list(mutations.binary(content, np.random.default_rng(1))) for _ in range(2))
     assert first == second
 
 
-# -- what cannot be made by changing bytes
+# -- inputs that are not mutations of bytes
 
 
 @pytest.mark.parametrize("ending", PICKLES)
-def test_pickles_are_refused_with_the_way_out(tmp_path, ending):
+def test_pickles_are_refused_with_a_remedy(tmp_path, ending):
     path = tmp_path / f"model{ending}"
     path.write_bytes(b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x93\x94.")
     for read in (read_splats, read_tensors):
@@ -124,7 +109,7 @@ def test_pickles_are_refused_with_the_way_out(tmp_path, ending):
             read(path)
 
 
-def test_a_pickle_among_features_is_refused_with_the_way_out(tmp_path):
+def test_a_pickle_among_features_is_refused_with_a_remedy(tmp_path):
     from lexsplat.features import load_external_features
 
     write_transforms(tmp_path / "capture", ["a.png", "b.png"])
@@ -134,20 +119,20 @@ def test_a_pickle_among_features_is_refused_with_the_way_out(tmp_path):
         load_external_features(tmp_path / "features", load_capture(tmp_path / "capture"))
 
 
-def test_symlinks_that_lead_nowhere_or_in_circles_are_missing_photos(tmp_path):
+def test_broken_and_circular_symlinks_are_missing_photos(tmp_path):
     write_colmap(tmp_path, ["a.png", "b.png", "c.png", "d.png"])
     for name, target in (("b.png", "nowhere.png"), ("c.png", "c.png"), ("d.png", "../images")):
         (tmp_path / "images" / name).unlink()
         (tmp_path / "images" / name).symlink_to(target)
-    scene = load_capture(tmp_path)
-    assert list(scene.views) == ["a.png"]
-    assert "3 of 4 images have no file" in scene.warnings[0]
+    capture = load_capture(tmp_path)
+    assert list(capture.views) == ["a.png"]
+    assert "3 of 4 images have no file" in capture.warnings[0]
 
 
-def test_photos_that_are_no_files_are_not_waited_for(tmp_path):
+def test_photos_that_are_not_regular_files_are_skipped(tmp_path):
     write_colmap(tmp_path, ["a.png", "b.png"])
     (tmp_path / "images" / "b.png").unlink()
-    os.mkfifo(tmp_path / "images" / "b.png")  # whoever opens it waits for ever
+    os.mkfifo(tmp_path / "images" / "b.png")  # opening it blocks forever
     assert list(load_capture(tmp_path).views) == ["a.png"]
 
 
@@ -159,14 +144,14 @@ def test_names_in_other_alphabets_are_names(tmp_path):
     assert set(load_capture(tmp_path / "json").views) == set(names)
 
 
-def test_two_photos_that_would_share_their_files_are_refused(tmp_path):
+def test_photos_that_differ_only_in_their_suffix_are_refused(tmp_path):
     write_colmap(tmp_path, ["a.png", "a.jpg"])
-    with pytest.raises(CaptureError, match="differ in more than their endings"):
+    with pytest.raises(CaptureError, match="differ in more than their suffix"):
         load_capture(tmp_path)
 
 
 def turn_around(model: Path) -> None:
-    """All cameras look the other way: everything is behind them."""
+    """Turn all cameras around: everything is behind them."""
     lines = []
     for line in (model / "images.txt").read_text().split("\n"):
         words = line.split()
@@ -191,8 +176,8 @@ def same_pose(model: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["behind", "one view", "identical views", "identical photos"])
-def test_captures_that_make_no_scene_end_well_or_in_one_line(tmp_path, kind):
-    """Cameras that see nothing, one view only, views at one place: a scene of finite numbers, or a typed error."""
+def test_degenerate_captures_yield_a_finite_scene_or_a_typed_error(tmp_path, kind):
+    """Cameras that see nothing, a single view, views at one position: a finite scene, or a typed error."""
     from lexsplat.codebook import CodebookConfig
     from lexsplat.features import FeatureConfig
     from lexsplat.pipeline.build import build
@@ -216,11 +201,11 @@ def test_captures_that_make_no_scene_end_well_or_in_one_line(tmp_path, kind):
         features=FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24),
         codebook=CodebookConfig(num_codes=4, steps=5),
     )  # fmt: skip
-    told = ""
+    message = ""
     try:
         build(capture, tmp_path / "scene", config)
     except LexsplatError as error:
-        told = str(error)
-    assert "\n" not in told
-    if not told:
-        hostile_readers.check_open_scene(open_scene(tmp_path / "scene", device="cpu"))
+        message = str(error)
+    assert "\n" not in message
+    if not message:
+        check_open_scene(open_scene(tmp_path / "scene", device="cpu"))

@@ -114,7 +114,6 @@ def test_memory_bounds_the_store_of_every_stage_and_no_setting_that_decides_a_re
     assert bounded.trained.memory_bytes == quarter
     assert bounded.lifted.memory_bytes == quarter
     assert bounded.averaged.memory_bytes == quarter
-    assert bounded.features.memory == 4 * quarter
     again = replace(
         bounded,
         reconstruction=config.reconstruction,
@@ -158,7 +157,7 @@ def limited(tmp_path_factory):
 @pytest.mark.parametrize(
     ("stage", "expected"),
     [
-        ("poses", "9 of 9 photos placed"),
+        ("poses", "9 of 9 photos registered"),
         ("triangulation", " points"),
         ("undistortion", "1458x1087 [120, 90, 40]"),
         ("turning", "2700x3600"),

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from lexsplat import cli, open_scene
-from lexsplat.captures import load_mask
+from lexsplat.captures.images.reading import read_mask
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.encoders import load_clip
 from lexsplat.scenes.folder import BUNDLED_SCENE
@@ -44,7 +44,7 @@ def test_its_language_is_of_the_encoder_that_ships(scene):
 def test_what_is_asked_for_is_where_the_exact_mask_says(scene, prompt):
     found = []
     for folder in sorted((demo_capture() / "segmentations").iterdir())[::4]:
-        mask = load_mask(folder / f"{prompt.replace(' ', '_')}.png")
+        mask = read_mask(folder / f"{prompt.replace(' ', '_')}.png")
         relevancy = scene.relevancy([prompt], folder.name)[0]
         y, x = np.unravel_index(int(torch.argmax(relevancy)), relevancy.shape)
         scale = mask.shape[0] / relevancy.shape[0]

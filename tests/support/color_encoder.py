@@ -1,4 +1,4 @@
-"""Encoders that know colors only, for tests: quick, and independent of any model."""
+"""Fast encoders of colors for tests, independent of any model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ WORDS = {"red apple": 0, "blue ball": 1}
 
 
 class ColorClip:
-    """Redness, blueness and the rest of a picture's mean color; two names and everything else."""
+    """Embeds redness, blueness and the rest of an image's mean color; knows two prompts."""
 
     name, content_hash, image_size, dim = "color", "color-clip", 4, 6
     device = torch.device("cpu")
@@ -36,7 +36,7 @@ class ColorDino:
 
 
 def install(patch):
-    """Puts both in the place of the encoders that are loaded, by `pytest.MonkeyPatch`; no model is looked for."""
+    """Replace the loaded encoders with both, by `pytest.MonkeyPatch`."""
     patch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColorClip())
     patch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColorDino())
     patch.setattr("lexsplat.pipeline.build.model_folder", lambda *_: None)

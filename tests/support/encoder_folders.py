@@ -1,4 +1,4 @@
-"""Small encoders saved the way the Hub's are."""
+"""Small encoders saved in the layout of the Hub."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class FakeView:
             return np.asarray(resized, dtype=np.float32) / 255
 
 
-def make_scene(folder: Path, count: int = 5):
+def make_capture(folder: Path, count: int = 5):
     rng = np.random.default_rng(0)
     K = np.array([[40.0, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]])
     views, loads = {}, []

@@ -1,4 +1,4 @@
-"""A textured room that SIFT finds features in, and photos of it."""
+"""A textured room with many SIFT features, and photos of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lexsplat.geometry.cameras import look_at
 
 
 def texture() -> np.ndarray:
-    """Blobs of many sizes and colors ``[256, 256, 3]``: what SIFT likes."""
+    """Blobs of many sizes and colors ``[256, 256, 3]``, which yield many SIFT features."""
     rng = np.random.default_rng(0)
     layers = [gaussian_filter(rng.normal(size=(256, 256, 3)), (s, s, 0)) * s for s in (1.0, 2.0, 4.0, 8.0)]
     image = np.sum(layers, axis=0)
@@ -71,11 +71,11 @@ def assert_same_up_to_a_similarity(found: list, ground_truth: list) -> None:
 
 
 FOCAL_35 = 36
-"""Focal length in EXIF, for 35 mm film."""
+"""EXIF focal length as 35 mm equivalent."""
 
 
 def save_as_phone(path, image: np.ndarray, orientation: int, focal: float | None = FOCAL_35) -> None:
-    """A JPEG whose pixels are stored turned, as a phone does, and whose EXIF data say so."""
+    """A JPEG stored rotated, as by a phone, with its EXIF orientation."""
     # The inverse of each turn, by Pillow: orientations 6 and 8 undo each other, all others themselves.
     turns = {
         1: None, 2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180,

@@ -1,4 +1,4 @@
-"""Small captures on disk for the tests of scenes, and a smooth picture to see through lenses."""
+"""Small captures on disk, and a smooth image for tests of lenses."""
 
 from __future__ import annotations
 

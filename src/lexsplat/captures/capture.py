@@ -1,4 +1,4 @@
-"""What every other stage sees of a capture: views with pinhole cameras, keyed by image name, and points."""
+"""`Capture` and `View`, the input of every stage: views with pinhole cameras, keyed by image name, and points."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from lexsplat.captures.images.reading import (
     read_mask,
     read_rows,
     resize_image,
+    resize_nearest,
     sizes_agree,
 )
 from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_large
@@ -25,7 +26,7 @@ from lexsplat.runtime.errors import CaptureError
 
 
 def stem_of(name: str) -> str:
-    """An image name without its suffix; folders stay: ``"left/0001.jpg"`` gives ``"left/0001"``."""
+    """An image name without its suffix, with its folders: ``"left/0001.jpg"`` gives ``"left/0001"``."""
     folder, slash, file = name.rpartition("/")
     head, dot, _ = file.rpartition(".")
     return f"{folder}{slash}{head if dot and head else file}"
@@ -33,17 +34,16 @@ def stem_of(name: str) -> str:
 
 @dataclass(frozen=True)
 class View:
-    """One photo and the pinhole camera it is seen through after undistortion.
+    """One photo and its pinhole camera after undistortion.
 
     Args:
-        name: Path of the image relative to the image folder, with "/": the key of everything about this view.
-        image_path: The photo on disk, not undistorted.
+        name: Path of the image relative to the image folder, with "/": the key of the view everywhere.
+        image_path: The photo on disk, still distorted.
         camera: Pinhole camera at the working resolution.
         capture_size: Width and height of the undistorted photo at full resolution, in pixels.
-        lens: The lens the photo was taken through, for photos of the size on disk.
+        lens: The lens of the photo, at the photo's size on disk.
         background: Color behind transparent pixels, RGB in 0..1.
-        ignore_path: A picture that is black where pixels take no part in any loss (``masks/`` of a
-            capture); None where all pixels count.
+        ignore_path: Mask of the photo (from ``masks/``), black where pixels are ignored; None if no pixel is.
     """
 
     name: str
@@ -56,20 +56,20 @@ class View:
 
     @property
     def stem(self) -> str:
-        """The name without its suffix; folders stay."""
+        """The name without its suffix, with its folders."""
         return stem_of(self.name)
 
     def load_image(self, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
         """The undistorted photo ``[H, W, 3]`` in 0..1, read from disk at every call.
 
-        Masked pixels have the mean color of the others, so that nothing depends on what was there: not the pixels
-        beside them in a smaller picture, not the window of a loss, not the crop of an encoder.
+        Masked pixels are replaced by the mean color of the others, so resizing, SSIM windows and encoder crops never
+        see masked content.
 
         Args:
-            size: Width and height of the result; None takes the camera's.
+            size: Width and height of the result; None is the camera's.
 
         Raises:
-            CaptureError: If the file is missing, damaged, or no longer has the size it had.
+            CaptureError: If the file is missing or damaged, or its size has changed.
             ValueError: If ``size`` is not positive.
         """
         size = self._checked_size(size)
@@ -92,13 +92,13 @@ class View:
             return resize_image(filled(image, mask), size)
         if mask is not None:
             self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-            image = filled(image, _resize_nearest(mask, found))
+            image = filled(image, resize_nearest(mask, found))
         if self.lens.distorts:
             return undistort(image, self.lens, size)
         return resize_image(image, size)
 
     def _load_large(self, size: tuple[int, int]) -> NDArray[np.float32]:
-        """A photo that is masked or distorted, in bands."""
+        """Load a large masked or distorted photo in bands."""
         source: Rows = read_rows(self.image_path, self.background)
         mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
         if mask is not None and self._is_undistorted(mask):
@@ -106,7 +106,7 @@ class View:
         else:
             if mask is not None:
                 self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-                source = FilledRows(source, _resize_nearest(mask, (source.width, source.height)))
+                source = FilledRows(source, resize_nearest(mask, (source.width, source.height)))
             if self.lens.distorts:
                 return undistort_large(source, self.lens, size)
         if size[0] <= source.width and size[1] <= source.height:
@@ -114,26 +114,26 @@ class View:
         return resize_image(whole(source), size)
 
     def load_mask(self, path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-        """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, nearest pixel.
+        """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, by nearest pixel.
 
         Args:
-            path: The mask: a picture of the photo's aspect, drawn on the photo as it is on disk, or on the
-                undistorted photo where it has exactly that one's size.
+            path: The mask: an image of the photo's aspect, drawn on the photo on disk, or on the undistorted photo if
+                it has exactly that size.
             size: Width and height of the result; None keeps the mask's own resolution.
 
         Raises:
             CaptureError: If the mask cannot be read or its aspect is not the photo's.
         """
-        return self.place_mask(read_mask(path), path, size)
+        return self.undistort_mask(read_mask(path), path, size)
 
-    def place_mask(
+    def undistort_mask(
         self, mask: NDArray[np.bool_], subject: Path, size: tuple[int, int] | None = None
     ) -> NDArray[np.bool_]:
-        """A mask ``[h, w]`` drawn on the photo, as `load_mask` gives it.
+        """A mask ``[h, w]`` drawn on the photo, undistorted as by `load_mask`.
 
         Args:
-            mask: What was drawn.
-            subject: The file to name in messages.
+            mask: The mask.
+            subject: The file named in messages.
             size: Width and height of the result; None keeps the mask's own resolution.
 
         Raises:
@@ -142,7 +142,7 @@ class View:
         height, width = mask.shape
         self._check_aspect(subject, (width, height))
         if self._is_undistorted(mask) or not self.lens.distorts:
-            return mask if size is None else _resize_nearest(mask, self._checked_size(size))
+            return mask if size is None else resize_nearest(mask, self._checked_size(size))
         if size is None:
             full = self.capture_size
             size = (
@@ -153,9 +153,9 @@ class View:
         return undistort(pixels, self.lens, self._checked_size(size), nearest=True)[..., 0] > 0.5
 
     def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
-        """Which pixels take part in losses, ``[H, W]`` bool at the camera's size, or None for all.
+        """Pixels that losses use, ``[H, W]`` bool at the camera's size, or None for all.
 
-        A pixel takes part when no masked pixel of the photo has a share in it.
+        A pixel is used if no masked pixel of the photo contributes to it.
 
         Raises:
             CaptureError: As :meth:`load_mask`.
@@ -164,9 +164,9 @@ class View:
         return None if share is None else share > 1 - 1e-4
 
     def valid_share(self, size: tuple[int, int] | None = None) -> NDArray[np.float32] | None:
-        """Share of each pixel ``[H, W]`` in 0..1 that is not masked in the photo, or None where there is no mask.
+        """Share of each pixel ``[H, W]`` in 0..1 that is not masked in the photo, or None without a mask.
 
-        Where the photo is undistorted, the reach of its interpolation counts as masked too.
+        Undistortion widens the mask by the support of its interpolation.
 
         Raises:
             CaptureError: As :meth:`load_mask`.
@@ -177,7 +177,7 @@ class View:
         mask = read_mask(self.ignore_path, nonzero=True)
         self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
         undistorted = self._is_undistorted(mask)
-        masked = ~_resize_nearest(
+        masked = ~resize_nearest(
             mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
         )
         large = is_large(masked.shape[1], masked.shape[0])
@@ -188,12 +188,12 @@ class View:
             return 1.0 - undistort_large(MaskRows(masked, reach=2), self.lens, size)[..., 0]
         if undistorted or not self.lens.distorts:
             return 1.0 - resize_image(masked[..., None].astype(np.float32), size)[..., 0]
-        # Bicubic interpolation reaches two pixels far.
+        # Bicubic interpolation has a support of two pixels.
         reach = binary_dilation(masked, np.ones((5, 5), bool))[..., None].astype(np.float32)
         return 1.0 - undistort(reach, self.lens, size)[..., 0]
 
     def check_mask(self, path: Path) -> None:
-        """Compare a mask's size with the photo's, from the headers alone.
+        """Compare a mask's size with the photo's by their headers.
 
         Raises:
             CaptureError: If the mask cannot be read or its aspect is not the photo's.
@@ -201,7 +201,7 @@ class View:
         self._check_aspect(path, image_size(path))
 
     def _is_undistorted(self, mask: NDArray[np.bool_]) -> bool:
-        """Whether a mask was drawn on the undistorted photo: it has exactly that one's size, and not the photo's."""
+        """Whether a mask was drawn on the undistorted photo: it has exactly that size, and not the photo's."""
         found = (mask.shape[1], mask.shape[0])
         return found == self.capture_size != (self.lens.width, self.lens.height)
 
@@ -223,18 +223,12 @@ class View:
 
 
 def filled(image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """A picture ``[H, W, C]`` with the mean of the valid pixels ``[H, W]`` in place of the others."""
+    """An image ``[H, W, C]`` whose invalid pixels are replaced by the mean of the valid ones ``[H, W]``."""
     if valid.all():
         return image
     kept = image[valid]
     mean = kept.mean(0, dtype=np.float64) if len(kept) else np.zeros(image.shape[2])
     return np.where(valid[..., None], image, mean.astype(np.float32))
-
-
-def _resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
-    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
-    return mask[rows[:, None], columns[None, :]]
 
 
 def _no_points() -> NDArray[np.float32]:
@@ -243,18 +237,18 @@ def _no_points() -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture: views, their split, and what else lies beside them.
+    """A capture: its views, their split, points and ground-truth masks.
 
     Args:
         root: The capture folder.
         views: All views by name, sorted by name.
-        train_names: Names of the views that may be learned from, sorted.
-        test_names: Names of the views that are only measured on, sorted.
+        train_names: Names of the training views, sorted.
+        test_names: Names of the held-out views, sorted.
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
         point_colors: Their colors ``[P, 3]``, RGB in 0..1.
         segmentations: Folder with ``STEM/PROMPT.png``, or None.
-        warnings: What was left out and why, one line each.
-        source: Where the cameras came from: ``"colmap"`` or ``"transforms"``.
+        warnings: What was skipped and why, one line each.
+        source: Format of the camera files: ``"colmap"`` or ``"transforms"``.
         background: Color behind transparent pixels, RGB in 0..1.
     """
 
@@ -271,16 +265,16 @@ class Capture:
 
     @property
     def train_views(self) -> tuple[View, ...]:
-        """The views that may be learned from, by name."""
+        """The training views, in order of their names."""
         return tuple(self.views[name] for name in self.train_names)
 
     @property
     def test_views(self) -> tuple[View, ...]:
-        """The views that are only measured on, by name."""
+        """The held-out views, in order of their names."""
         return tuple(self.views[name] for name in self.test_names)
 
     def downscaled(self, factor: float) -> Capture:
-        """The same capture to be worked on ``factor`` times smaller than the undistorted photos."""
+        """The same capture at ``1 / factor`` of the size of the undistorted photos."""
         views = {
             name: replace(view, camera=view.camera.resized(*view.capture_size).downscaled(factor))
             for name, view in self.views.items()
@@ -289,5 +283,5 @@ class Capture:
 
     @property
     def extent(self) -> float:
-        """Radius of the training cameras' positions times 1.1, in world units: the scene scale of 3DGS."""
+        """Scene scale of 3DGS: 1.1 times the radius of the training cameras' positions, in world units."""
         return camera_extent(view.camera for view in self.train_views)

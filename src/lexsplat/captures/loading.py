@@ -1,4 +1,4 @@
-"""From a capture folder to a scene: find the camera files, check every photo's header, choose the split."""
+"""Loads a capture folder: finds the camera files, checks every photo's header, chooses the split."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import CaptureError
 
 SEGMENTATIONS = "segmentations"
-"""Folder of a capture with ``STEM/PROMPT.png``: masks to measure against."""
+"""Folder of a capture with ground-truth masks ``STEM/PROMPT.png``."""
 
 
 def load_capture(
@@ -34,44 +34,43 @@ def load_capture(
 ) -> Capture:
     """Load a capture: COLMAP (binary or text), ``transforms.json`` (nerfstudio, instant-ngp, NeRF-synthetic).
 
-    Photos are not read beyond their headers. Where a capture has both a COLMAP model and a
-    ``transforms.json``, the model is taken, because it also has points; give the JSON file as ``path`` to
-    take that.
+    Only the headers of photos are read. A COLMAP model takes precedence over a ``transforms.json``, because it also
+    has points; give the JSON file as ``path`` to use that.
 
     Args:
         path: The capture folder, or its ``transforms.json``.
-        downscale: How many times smaller than the undistorted photos to work, at least 1 as a rule.
+        downscale: Factor by which working images are smaller than the undistorted photos.
         test_every: Hold out every n-th view, counting from the first by name; 0 holds out nothing.
-        test_names: Names or stems of the views to hold out, instead of every other rule.
-        images: Where the photos of a COLMAP model are, if not in the capture folder.
-        beside: Folder with ``segmentations/`` and ``test_views.json`` where these do not lie with the cameras: that
-            of the photos, where the cameras were estimated. Masks (``masks/``) always lie with the cameras.
+        test_names: Names or stems of the views to hold out; overrides every other rule.
+        images: Folder of the photos of a COLMAP model, if not in the capture folder.
+        beside: Folder with ``segmentations/`` and ``test_views.json``, if not that of the cameras: the folder of the
+            photos if the cameras were estimated. Masks (``masks/``) always lie with the cameras.
 
     Raises:
-        CaptureError: If there are no cameras or photos, or one of them cannot be used.
+        CaptureError: If there are no cameras or no photos, or one of them cannot be used.
         FileFormatError: If a camera file is damaged.
-        ValueError: If ``downscale`` is not positive and finite or ``test_every`` makes no sense.
+        ValueError: If ``downscale`` is not positive and finite, or ``test_every`` is negative or 1.
     """
     if not 0 < downscale < 1e6:
         raise ValueError(f"downscale must be positive, got {downscale:g}")
-    capture = _read_capture(Path(path), None if images is None else Path(images))
-    warnings = [*capture.warnings, *_told_missing(capture)]
-    masked, strays = find_ignore_masks([capture.root / IGNORE_FOLDER], [p.name for p in capture.photos])
-    # Masks of photos that found no place are no mistake: `prepare_photos` has told which fit none.
+    files = _read_camera_files(Path(path), None if images is None else Path(images))
+    warnings = [*files.warnings, *_missing_files(files)]
+    masked, strays = find_ignore_masks([files.root / IGNORE_FOLDER], [p.name for p in files.photos])
+    # With estimated cameras, `prepare_photos` has reported them; masks of unregistered photos are no mistake.
     warnings += strays if beside is None else []
     views = {
-        photo.name: _make_view(photo, capture, downscale, masked.get(photo.name))
-        for photo in sorted(capture.photos, key=lambda photo: photo.name)
+        photo.name: _make_view(photo, files, downscale, masked.get(photo.name))
+        for photo in sorted(files.photos, key=lambda photo: photo.name)
     }
-    _check_names([photo.name for photo in capture.photos], capture.origin)
-    root = capture.root if beside is None else Path(beside)
+    _check_names([photo.name for photo in files.photos], files.origin)
+    root = files.root if beside is None else Path(beside)
     segmentations = root / SEGMENTATIONS
     has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
     chosen, split_warnings = choose_test_names(
         list(views),
         root=root,
         test_names=test_names,
-        listed=capture.test_names,
+        listed=files.test_names,
         annotated=_annotated(root, list(views)),
         test_every=test_every,
     )
@@ -83,43 +82,41 @@ def load_capture(
         views=views,
         train_names=tuple(name for name in views if name not in set(chosen)),
         test_names=chosen,
-        points=capture.points,
-        point_colors=capture.point_colors,
+        points=files.points,
+        point_colors=files.point_colors,
         segmentations=segmentations if has_masks else None,
         warnings=tuple(warnings),
-        source=capture.source,
-        background=capture.background,
+        source=files.source,
+        background=files.background,
     )
 
 
-def _told_missing(capture: CameraFiles) -> list[str]:
+def _missing_files(files: CameraFiles) -> list[str]:
     """A warning that lists the images without a file, if there are any.
 
     Raises:
-        CaptureError: If none is there.
+        CaptureError: If no image has a file.
     """
-    if not capture.photos:
+    if not files.photos:
         raise CaptureError(
-            capture.origin,
+            files.origin,
             expected="images with files",
-            found=f"{len(capture.missing)} images, none of which is there",
-            remedy="put the images where the capture names them, for COLMAP into images/",
+            found=f"{len(files.missing)} images without a file",
+            remedy="put the images where the camera files name them, for COLMAP into images/",
         )
-    if not capture.missing:
+    if not files.missing:
         return []
-    total = len(capture.photos) + len(capture.missing)
-    names = ", ".join(sorted(capture.missing))
-    return [
-        f"{capture.origin}: {len(capture.missing)} of {total} images have no file and are skipped: {names}"
-    ]
+    total = len(files.photos) + len(files.missing)
+    names = ", ".join(sorted(files.missing))
+    return [f"{files.origin}: {len(files.missing)} of {total} images have no file and are skipped: {names}"]
 
 
 def _check_names(names: list[str], origin: Path) -> None:
-    """Refuse an image that comes twice, and images whose names differ in their endings only: index maps, masks and
-    heatmaps are named by stems.
+    """Refuse duplicate images, and images whose names differ in their suffix only: index maps, masks and heatmaps are
+    named after stems.
 
     Raises:
-        CaptureError: If there are two.
+        CaptureError: If there are two of one stem.
     """
     stems: dict[str, str] = {}
     for name in names:
@@ -135,19 +132,19 @@ def _check_names(names: list[str], origin: Path) -> None:
         if other != name:
             raise CaptureError(
                 origin,
-                expected="names of images that differ in more than their endings",
+                expected="image names that differ in more than their suffix",
                 found=f"{other} and {name}",
                 remedy="rename or remove one of the two",
             )
 
 
 def _annotated(root: Path, names: list[str]) -> set[str]:
-    """Names of the views with ground truth beside them, in any layout."""
+    """Names of the views with ground truth, in any layout."""
     found = find_annotations(root)
     return set() if found is None else annotated_names(*found, names, root / "images")
 
 
-def _read_capture(path: Path, images: Path | None) -> CameraFiles:
+def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:
     if path.is_file() and path.suffix == ".json":
         return read_transforms(path)
     if not path.is_dir():
@@ -178,7 +175,7 @@ def _read_capture(path: Path, images: Path | None) -> CameraFiles:
 def is_photo_folder(path: Path) -> bool:
     """Whether a folder holds photos but no cameras, so that cameras have to be estimated first.
 
-    A video counts as such a folder: its frames are the photos.
+    A video counts as such a folder of frames.
     """
     return is_video(path) or (
         path.is_dir()
@@ -193,17 +190,17 @@ def _photos_of(path: Path) -> list[Path]:
     return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
 
 
-def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path | None) -> View:
-    """Fit the lens to the photo's real size and replace it by a pinhole camera; ``mask`` says which pixels count."""
+def _make_view(photo: Photo, files: CameraFiles, downscale: float, mask: Path | None) -> View:
+    """A view with a pinhole camera for the photo's actual size; ``mask`` is the file from ``masks/``, if any."""
     found = image_size(photo.path)
     stated = (photo.lens.width, photo.lens.height)
-    # Photos scaled after the cameras were computed are common (images_4 of Mip-NeRF 360); another aspect
-    # means that the photo was cropped, turned or exchanged, and no camera can be derived.
+    # Photos scaled after the cameras were computed are common (images_4 of Mip-NeRF 360). Another aspect
+    # means that the photo was cropped, rotated or replaced, and its camera is unknown.
     if not sizes_agree(found, stated):
-        turned = " (turned on its side)" if sizes_agree(found[::-1], stated) else ""
+        turned = " (rotated by 90 degrees)" if sizes_agree(found[::-1], stated) else ""
         raise CaptureError(
             photo.path,
-            expected=f"{stated[0]}x{stated[1]} pixels as in {capture.origin}, or scaled uniformly",
+            expected=f"{stated[0]}x{stated[1]} pixels as in {files.origin}, or scaled uniformly",
             found=f"{found[0]}x{found[1]}{turned}",
             remedy="use the photos the cameras were computed from, not cropped or rotated",
         )
@@ -213,7 +210,7 @@ def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path 
         camera = Camera(width, height, K, photo.viewmat)
     except ValueError as error:
         raise CaptureError(
-            capture.origin,
+            files.origin,
             expected=f"a usable camera for image {photo.name}",
             found=str(error),
             remedy="correct the camera, or run COLMAP again with a simpler camera model",
@@ -224,11 +221,9 @@ def _make_view(photo: Photo, capture: CameraFiles, downscale: float, mask: Path 
         camera=camera if downscale == 1 else camera.downscaled(downscale),
         capture_size=(width, height),
         lens=lens,
-        background=capture.background,
+        background=files.background,
         ignore_path=photo.ignore_path or mask,
     )
     if view.ignore_path is not None:
-        view.check_mask(
-            view.ignore_path
-        )  # a mask that does not fit is told now, not in the middle of a training
+        view.check_mask(view.ignore_path)  # report a mask of the wrong size now, not during training
     return view

@@ -1,4 +1,4 @@
-"""Which views are learned from and which are only measured on."""
+"""The split into training views and held-out views."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from lexsplat.captures.capture import stem_of
-from lexsplat.captures.readers.transforms_json import read_json
 from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.files import read_json
 
 SPLIT_FILE = "test_views.json"
-"""A list of image stems in the capture folder: the views to hold out."""
+"""File in the capture folder: a JSON list of the stems of the views to hold out."""
 
 
 def match_stem(stem: str, names: Iterable[str]) -> list[str]:
-    """The image names a stem can mean: those with this full stem, else those whose last part is this.
+    """The image names a stem can refer to: those with this full stem, else those with this last path component.
 
-    A full name with suffix counts as its own stem. More than one result means that the stem is ambiguous.
+    A full name with suffix is its own stem. More than one result means that the stem is ambiguous.
     """
     names = list(names)
     exact = [name for name in names if stem in (name, stem_of(name))]
@@ -36,12 +36,12 @@ def choose_test_names(
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names of the views to hold out, sorted, and warnings.
 
-    The first of these that is there decides: ``test_names`` (given by the caller), ``test_views.json`` in the
+    The first of these that exists applies: ``test_names`` (given by the caller), ``test_views.json`` in the
     capture, the split of the camera files (``listed``), views with ground truth (``annotated``), every
     ``test_every``-th view counting from the first.
 
     Raises:
-        CaptureError: If a held-out name matches no view, or nothing is left to learn from.
+        CaptureError: If a held-out name matches no view, or no view is left for training.
         ValueError: If ``test_every`` is negative or 1.
     """
     if test_every < 0 or test_every == 1:
@@ -53,20 +53,20 @@ def choose_test_names(
     elif file.is_file():
         chosen = _resolve(_read_split(file), names, file)
     elif listed is not None:
-        # The camera files may list images without a file; those were warned about already.
+        # The camera files may list images without a file, which were reported already.
         chosen = set(listed) & set(names)
     else:
         chosen = set(annotated)
         if chosen and len(chosen) == len(names):
-            warnings.append(f"{root}: every view has masks; every {test_every}th is held out")
+            warnings.append(f"{root}: every view has ground truth; every {test_every}th is held out")
             chosen = set()
         if not chosen and test_every and len(names) > 1:
             chosen = set(names[::test_every])
     if len(chosen) >= len(names):
         raise CaptureError(
             file if file.is_file() else root,
-            expected="at least one view to learn from",
-            found=f"all {len(names)} views held out for testing",
+            expected="at least one training view",
+            found=f"all {len(names)} views held out",
             remedy="hold out fewer views",
         )
     return tuple(sorted(chosen)), warnings
@@ -85,7 +85,7 @@ def _resolve(stems: Sequence[str], names: Collection[str], origin: Path) -> set[
             raise CaptureError(
                 origin,
                 expected="names of views to hold out",
-                found=f"{stem!r}, which is {'no view' if not matches else ' and '.join(matches[:3])}",
+                found=f"{stem!r}, which matches {'no view' if not matches else ' and '.join(matches[:3])}",
                 remedy="name views as in the image folder, with their subfolder",
             )
         chosen.add(matches[0])
@@ -93,7 +93,7 @@ def _resolve(stems: Sequence[str], names: Collection[str], origin: Path) -> set[
 
 
 def _read_split(file: Path) -> list[str]:
-    content = read_json(file)
+    content = read_json(file, remedy="copy the file again or correct it")
     if not isinstance(content, list) or not all(isinstance(stem, str) for stem in content):
         raise FileFormatError(
             file,

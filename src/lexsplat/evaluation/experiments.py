@@ -174,8 +174,7 @@ class Bench:
 
             self._clip = load_clip(self.config.clip, self.device)
             len(self.maps)  # makes sure that all features are stored
-        settings = replace(self.config.features, memory=parse_bytes(self.config.memory))
-        return load_level_maps(self.scene, self._clip, settings, self.folder.features_path, name)
+        return load_level_maps(self.scene, self._clip, self.config.features, self.folder.features_path, name)
 
     def encode_text(self, texts: list[str]) -> Tensor:
         """Embeddings ``[T, D]`` by the CLIP of the features; each text is encoded once."""

@@ -1,13 +1,15 @@
-"""Dense language features: CLIP (+) DINO for every view, cached on disk (section 3.2).
+"""Dense language features: CLIP (+) DINO maps of every view, cached on disk (section 3.2).
 
-The maps never lie in memory all at once: `extract_features` writes small files for one view after the other,
-`FeatureMaps` reads them when asked.
+Maps are never all in memory: `extract_features` writes small files per view, and `FeatureMaps` reads them on access.
+
+To add an encoder: implement `ImageTextEncoder` or `DenseEncoder` of ``encoders.py`` and return it from `load_clip` or
+`load_dino` there. Its ``content_hash`` is part of the cache keys.
 """
 
 from lexsplat.features.cache import FeatureMap, FeatureMaps
 from lexsplat.features.external import external_identity, load_external_features
-from lexsplat.features.extraction import FeatureConfig, extract_features, load_level_maps
-from lexsplat.features.pca import pca_image
+from lexsplat.features.extraction import extract_features, load_level_maps
+from lexsplat.features.settings import FeatureConfig
 from lexsplat.features.text import TextCache
 
 __all__ = [
@@ -19,5 +21,4 @@ __all__ = [
     "extract_features",
     "load_external_features",
     "load_level_maps",
-    "pca_image",
 ]

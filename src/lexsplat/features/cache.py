@@ -1,9 +1,7 @@
-"""The feature cache on disk: one file a view and encoder, named by a hash of everything that decides its
-content.
+"""The feature cache on disk: one file per view and encoder, named by a hash of everything its content depends on.
 
-For CLIP the crops' embeddings are stored, not the dense map made of them: that is ten to fifty times smaller,
-and the map is a few small matrix products away. For DINO the grid as the encoder gave it. Both in half
-precision.
+For CLIP, the file holds the embeddings of the crops, which are 10 to 50 times smaller than the dense map; the map is
+computed by a few small matrix products. For DINO, it holds the encoder's grid. Both are in half precision.
 """
 
 from __future__ import annotations
@@ -25,18 +23,19 @@ from torch import Tensor
 from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import file_hash
 
 FORMAT_VERSION = "1"
 
 Tokens = Literal["class", "patch", "both"]
-"""What of a crop speaks: the whole, its patches, or both."""
+"""Which embeddings of a crop are used: the image-level one, those of its patches, or both."""
 
 
 @dataclass(frozen=True)
 class FeatureMap:
     """Dense language features of one view, F = F_CLIP (+) F_DINO (Eq. 2).
 
-    Cell (i, j) stands for the pixel ((j + .5) W / w, (i + .5) H / h) of the W x H image.
+    Cell (i, j) is centered at the pixel ((j + .5) W / w, (i + .5) H / h) of the W x H image.
 
     Args:
         clip: Image-text features ``[h, w, Dc]``, float32, unit length.
@@ -58,13 +57,13 @@ class FeatureMap:
 
 
 class FeatureMaps(Mapping[str, FeatureMap]):
-    """Feature maps by view name, made when asked for; the latest are kept as long as they fit.
+    """Feature maps by view name, loaded on access; the most recent ones are kept as long as they fit.
 
     Args:
         names: Names of the views.
-        load: Makes the map of a view.
+        load: Returns the map of a view.
         cache_bytes: Most bytes of maps to keep.
-        source: What ``load`` takes maps from, if it keeps some too.
+        source: The maps that ``load`` reads from, if it keeps some too; `forget` is passed on to it.
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class FeatureMaps(Mapping[str, FeatureMap]):
         return found
 
     def forget(self) -> None:
-        """Let go of what is kept; maps are made again when they are asked for."""
+        """Free the kept maps; they are loaded again on access."""
         with self._lock:
             self._kept.clear()
         if self._source is not None:
@@ -107,23 +106,19 @@ class FeatureMaps(Mapping[str, FeatureMap]):
 
     @property
     def cached_bytes(self) -> int:
-        """Bytes of the maps kept in memory now."""
+        """Bytes of the maps currently in memory."""
         return sum(found.nbytes for found in self._kept.values())
 
 
 def hash_of(*parts: Any) -> str:
-    """Hash of JSON-like values, 32 hex digits."""
+    """Hash of JSON-like values, 32 hex digits: the cache keys. Changing it invalidates every cache."""
     text = json.dumps(parts, sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def hash_file(path: Path) -> str:
-    """Hash of a file's bytes, 32 hex digits."""
-    digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    """Hash of a file's bytes, 32 hex digits: part of cache keys."""
+    return file_hash(path, digest_size=16)
 
 
 def write_crops(
@@ -136,11 +131,11 @@ def write_crops(
     """Store the crops of a ``size`` = (width, height) image and their embeddings.
 
     Args:
-        path: Of the file.
+        path: The file.
         levels: Crops by size.
-        embeddings: One a crop ``[n, D]``.
+        embeddings: One per crop ``[n, D]``.
         size: Width and height of the image.
-        patches: The map of their patches ``[h, w, D]`` (`lexsplat.features.pyramid.mean_map`), where they were read.
+        patches: The map of their patches ``[h, w, D]`` (`lexsplat.features.pyramid.mean_map`), if used.
     """
     tensors = {"embeddings": embeddings.half().contiguous()}
     if patches is not None:
@@ -153,12 +148,12 @@ def write_crops(
 
 
 def read_crops(path: Path, cols: int, rows: int, tokens: Tokens = "class") -> Tensor:
-    """The dense map ``[rows, cols, D]`` of stored crops, of their patches, or of both, which then count alike.
+    """The dense map ``[rows, cols, D]`` of stored crops, of their patches, or of both with equal weight.
 
     See `lexsplat.features.pyramid.dense_map`.
 
     Raises:
-        FileFormatError: If the file is not such a store.
+        FileFormatError: If the file is not such a cache file.
     """
     levels, embeddings, (width, height), patches = _stored_crops(path)
     if tokens == "class":
@@ -171,12 +166,12 @@ def read_crops(path: Path, cols: int, rows: int, tokens: Tokens = "class") -> Te
 
 
 def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
-    """The map of each crop size by itself ``[L, rows, cols, D]``, unit length, and the sides of the crops.
+    """A map per crop size ``[L, rows, cols, D]``, unit length, and the sides of the crops.
 
     The sides are fractions of the image's width.
 
     Raises:
-        FileFormatError: If the file is not such a store.
+        FileFormatError: If the file is not such a cache file.
     """
     levels, embeddings, (width, height), _ = _stored_crops(path)
     maps = []
@@ -188,7 +183,7 @@ def read_levels(path: Path, cols: int, rows: int) -> tuple[Tensor, list[float]]:
 
 def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int], Tensor | None]:
     """Levels, embeddings ``[n, D]`` float32, width and height of the image, and the map of patches ``[h, w, D]``
-    float32 if there is one; checked against each other.
+    float32 if there is one. Checks them against each other.
     """
     tensors, facts = _read(path)
     try:
@@ -199,7 +194,7 @@ def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int],
         for i, level in enumerate(facts["levels"]):
             lefts, tops = tensors[f"lefts.{i}"], tensors[f"tops.{i}"]
             if {lefts.dtype, tops.dtype} != {torch.int32} or lefts.ndim != 1 or tops.ndim != 1:
-                raise ValueError("places of crops that are none")
+                raise ValueError("crop positions that are not int32 vectors")
             levels.append(CropLevel(level["size"], lefts.numpy(), tops.numpy(), level["grid"]))
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
@@ -209,11 +204,11 @@ def _stored_crops(path: Path) -> tuple[list[CropLevel], Tensor, tuple[int, int],
         type(level.grid) is bool and (level.grid or len(level.lefts) == len(level.tops)) for level in levels
     )
     if not whole or not grids or embeddings.ndim != 2 or len(embeddings) != sum(map(len, levels)):
-        raise _damaged(path, ValueError("crops and embeddings that do not fit"))
+        raise _damaged(path, ValueError("crops that do not match the embeddings"))
     if len(embeddings) == 0 or not bool(torch.isfinite(embeddings).all()):
-        raise _damaged(path, ValueError("no embeddings, or some that are not finite"))
+        raise _damaged(path, ValueError("no embeddings, or NaN or infinity"))
     if patches is not None and (patches.ndim != 3 or not bool(torch.isfinite(patches).all())):
-        raise _damaged(path, ValueError("patches that are no map, or not finite"))
+        raise _damaged(path, ValueError("patches that are not a map, or NaN or infinity"))
     return levels, embeddings, (width, height), patches
 
 
@@ -226,12 +221,12 @@ def read_grid(path: Path, cols: int, rows: int) -> Tensor:
     """Stored dense features at another size ``[rows, cols, D]``, unit length.
 
     Raises:
-        FileFormatError: If the file is not such a store.
+        FileFormatError: If the file is not such a cache file.
     """
     tensors, _ = _read(path)
     features = tensors.get("features", torch.zeros(0)).float()
     if features.ndim != 3 or features.numel() == 0 or not bool(torch.isfinite(features).all()):
-        raise _damaged(path, ValueError("no features, or some that are not finite"))
+        raise _damaged(path, ValueError("no features, or NaN or infinity"))
     return resize_grid(features, cols, rows)
 
 
@@ -245,7 +240,7 @@ def resize_grid(features: Tensor, cols: int, rows: int) -> Tensor:
 
 
 def is_stored(path: Path) -> bool:
-    """Whether a whole file of this layout is there; reads its header only."""
+    """Whether a complete cache file exists; reads its header only."""
     from safetensors import SafetensorError, safe_open
 
     try:

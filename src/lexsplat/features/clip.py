@@ -1,4 +1,4 @@
-"""CLIP and its relatives: images and words to one space."""
+"""CLIP and related models: images and texts to one space."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ _FEW_PATCHES = 64
 
 
 class ClipEncoder(PretrainedModel):
-    """A CLIP-like model of transformers: CLIP, SigLIP, SigLIP 2 and other models with both
-    ``get_*_features``.
-    """
+    """A CLIP-like model of transformers: CLIP, SigLIP, SigLIP 2, and others with both ``get_*_features``."""
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         from transformers import AutoTokenizer
@@ -61,7 +59,7 @@ class ClipEncoder(PretrainedModel):
             self._tokenizer = AutoTokenizer.from_pretrained(
                 folder, local_files_only=True, trust_remote_code=False
             )
-        except Exception as error:  # tokenizers raise a different type for each file they miss
+        except Exception as error:  # tokenizers raise a different type for each missing file
             raise ModelError(
                 f"model {name}",
                 expected="a tokenizer beside the weights",
@@ -82,34 +80,34 @@ class ClipEncoder(PretrainedModel):
 
     @property
     def patches(self) -> int:
-        """Patches along a side of an image that `encode_patches` reads; 0 where it does not know the architecture."""
+        """Patches along a side of an image in `encode_patches`; 0 for architectures it does not support."""
         if self._patches is None:
             return 0
         return self.image_size // int(self._model.config.vision_config.patch_size)
 
     @torch.inference_mode()
     def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The whole of images and each of their patches, read from one evaluation of the model.
+        """Embeddings of images and of each of their patches, from one forward pass.
 
-        A patch is read as in MaskCLIP (Zhou, Loy and Dai, "Extract free dense labels from CLIP", ECCV 2022): what it
-        would give to the class token in the last attention, its value, projected like the class token itself.
+        The embedding of a patch is that of MaskCLIP (Zhou, Loy and Dai, "Extract free dense labels from CLIP", ECCV
+        2022): the value vector of the last attention layer, projected like the class token.
 
         Args:
             images: ``[B, 3, h, w]`` in 0..1, of any size.
 
         Returns:
-            The embeddings of `encode_images` ``[B, D]``, and those of the patches ``[B, P, P, D]``, rows from top to
-            bottom; float32 on the CPU, unit length.
+            The embeddings of `encode_images` ``[B, D]``, and those of the patches ``[B, P, P, D]``, row-major;
+            float32 on the CPU, unit length.
 
         Raises:
             ModelError: If the model is not of CLIP's own architecture.
         """
         if self._patches is None:
             raise self._refusal(
-                "a model of CLIP's architecture to read patches",
-                "leave the patches out: `--features.crop-tokens class`",
+                "a model of CLIP's architecture for patch-level embeddings",
+                "use image-level embeddings only: `--features.crop-tokens class`",
             )
-        with self._patches.caught() as tokens:
+        with self._patches.captured() as tokens:
             whole = self.encode_images(images)
         with precision(self.device, crops=True):
             values = self._patches.read(tokens[0])
@@ -118,11 +116,10 @@ class ClipEncoder(PretrainedModel):
 
     @torch.inference_mode()
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
-        """Prompts to ``[B, D]``, float32 on the CPU, unit length; words beyond the model's text length are
-        cut.
+        """Prompts to ``[B, D]``, float32 on the CPU, unit length; long prompts are truncated.
 
         Raises:
-            ValueError: If there is no prompt or one is empty.
+            ValueError: If there is no prompt, or one is empty.
         """
         if not prompts or any(not prompt.strip() for prompt in prompts):
             raise ValueError("prompts must be one or more texts that are not empty")
@@ -133,10 +130,10 @@ class ClipEncoder(PretrainedModel):
         return F.normalize(torch.cat(features).float(), dim=-1).cpu()
 
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
-        if self._siglip:  # trained on lower case, padded to full length, and without an attention mask
+        if self._siglip:  # trained on lower case with padding to full length, without an attention mask
             prompts = [prompt.lower() for prompt in prompts]
         for prompt in prompts:
-            self._tell_if_cut(prompt)
+            self._warn_if_truncated(prompt)
         tokens = self._tokenizer(
             prompts,
             padding="max_length" if self._siglip else True,
@@ -147,21 +144,21 @@ class ClipEncoder(PretrainedModel):
         keys = ("input_ids",) if self._siglip else ("input_ids", "attention_mask")
         return {key: tokens[key].to(self.device) for key in keys}
 
-    def _tell_if_cut(self, prompt: str) -> None:
-        """Warn where the end of a prompt is not heard; a token has at least one character, but for its two ends."""
+    def _warn_if_truncated(self, prompt: str) -> None:
+        """Warn about a truncated prompt; a token has at least one character, except for the start and end tokens."""
         if len(prompt) + 2 <= self._text_length:
             return
         count = len(self._tokenizer(prompt, verbose=False)["input_ids"])
         if count > self._text_length:
             log.warning(
-                "%r is too long: the model hears %d of its %d tokens, not its end",
+                "%r: prompt truncated: %d tokens, the model's limit is %d",
                 prompt[:30] + "...",
-                self._text_length,
                 count,
+                self._text_length,
             )
 
     def _vision_inputs(self, pixels: Tensor) -> dict[str, Tensor]:
-        """What the image tower wants: pixels, or for SigLIP 2 of free size ("NaFlex") a list of patches."""
+        """Input of the image tower: pixels, or a list of patches for SigLIP 2 of variable size ("NaFlex")."""
         if self._model.config.model_type != "siglip2":
             return {"pixel_values": pixels}
         patch = int(self._model.config.vision_config.patch_size)
@@ -176,7 +173,7 @@ class ClipEncoder(PretrainedModel):
 
 
 def check_patches(folder: Path, name: str) -> None:
-    """Whether the patches of a model can be read, from its configuration alone.
+    """Check from its configuration that a model has patch-level embeddings.
 
     Raises:
         ModelError: If it is not of CLIP's own architecture.
@@ -184,18 +181,18 @@ def check_patches(folder: Path, name: str) -> None:
     try:
         kind = json.loads((folder / "config.json").read_text()).get("model_type")
     except (OSError, ValueError, AttributeError):
-        return  # that it is no model at all is told when it is loaded
+        return  # loading the model reports the error
     if kind != "clip":
         raise ModelError(
             f"model {name}",
-            expected="a model of CLIP's architecture, whose patches can be read",
+            expected="a model of CLIP's architecture for patch-level embeddings",
             found=str(kind),
-            remedy="let whole crops speak: `--features.crop-tokens class`",
+            remedy="use image-level embeddings only: `--features.crop-tokens class`",
         )
 
 
 class _PatchReader:
-    """Catches what the last attention of a CLIP image tower sees, where it is asked to; each thread gets its own."""
+    """Captures the input of the last attention layer of a CLIP image tower, per thread."""
 
     def __init__(self, model: Any) -> None:
         self._tower, self._project = model.vision_model, model.visual_projection
@@ -204,35 +201,35 @@ class _PatchReader:
         self._last.layer_norm1.register_forward_hook(self._catch)
 
     @contextmanager
-    def caught(self) -> Iterator[list[Tensor]]:
-        """A list that gets the tokens ``[B, 1 + P * P, width]`` of what this thread evaluates meanwhile."""
+    def captured(self) -> Iterator[list[Tensor]]:
+        """A list that receives the tokens ``[B, 1 + P * P, width]`` of this thread's forward passes."""
         tokens: list[Tensor] = []
         self._caught.tokens = tokens
         try:
             yield tokens
         finally:
-            del self._caught.tokens  # whole batches would stay in memory
+            del self._caught.tokens  # frees the batch
 
     def _catch(self, module: torch.nn.Module, inputs: Any, output: Tensor) -> None:
         if hasattr(self._caught, "tokens"):
             self._caught.tokens.append(output)
 
     def read(self, tokens: Tensor) -> Tensor:
-        """Embeddings of the patches ``[B, P * P, D]`` from the tokens that were caught."""
+        """Embeddings of the patches ``[B, P * P, D]`` from captured tokens."""
         attention = self._last.self_attn
         values = attention.out_proj(attention.v_proj(tokens[:, 1:]))  # the class token comes first
         return self._project(self._tower.post_layernorm(values))
 
 
 def _pooled(output: Any) -> Tensor:
-    """The embedding: newer transformers return an object that holds it, older ones the tensor."""
+    """The embedding: newer versions of transformers return an object that holds it, older ones the tensor."""
     return output if isinstance(output, Tensor) else output.pooler_output
 
 
 def _plain_attention(model: Any, vision_config: Any, image_size: int) -> None:
-    """For a handful of patches on a CPU, attention written out takes less time than the fused kernel.
+    """Use eager attention in the image tower: on a CPU it is faster than the fused kernel for a few patches.
 
-    Only the image tower changes; a model whose tower or patches are not where CLIP's are stays as it is.
+    Models without CLIP's image tower or patch size are unchanged.
     """
     tower, patch = getattr(model, "vision_model", None), getattr(vision_config, "patch_size", None)
     if tower is None or not isinstance(patch, int) or (image_size // patch) ** 2 > _FEW_PATCHES:
@@ -243,8 +240,8 @@ def _plain_attention(model: Any, vision_config: Any, image_size: int) -> None:
 
 
 def _image_size(vision_config: Any) -> int:
-    """Side in pixels of the square images that the model was trained on."""
+    """Side in pixels of the model's square input images."""
     size = getattr(vision_config, "image_size", None)
-    if size is None:  # SigLIP 2 of free size states the number of patches
+    if size is None:  # SigLIP 2 of variable size states the number of patches
         return round(int(vision_config.num_patches) ** 0.5) * int(vision_config.patch_size)
     return int(min(size)) if isinstance(size, Sequence) else int(size)

@@ -1,4 +1,4 @@
-"""DINO and its relatives: an image to a grid of features."""
+"""DINO and related models: from an image to a grid of features."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class DinoEncoder(PretrainedModel):
-    """A vision transformer without words: DINO (``vit``), DINOv2 with or without registers, DINOv3."""
+    """A vision transformer: DINO (``vit``), DINOv2 with or without registers, DINOv3."""
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         super().__init__(folder, name, device)
@@ -44,12 +44,14 @@ class DinoEncoder(PretrainedModel):
         self.dim = int(config.hidden_size)
         self.num_layers = len(self._keys)
         self._mean, self._std = normalization(folder, (_IMAGENET_MEAN, _IMAGENET_STD), self.device)
-        self._caught = threading.local()  # several threads may evaluate the model, each wants its own keys
+        self._caught = threading.local()  # each thread that evaluates the model captures its own keys
         for projection in self._keys:
             projection.register_forward_hook(self._catch)
         self._options: dict[str, Any] = {}
         if "interpolate_pos_encoding" in inspect.signature(self._model.forward).parameters:
-            self._options["interpolate_pos_encoding"] = True  # the others always do, or use rotary positions
+            self._options["interpolate_pos_encoding"] = (
+                True  # the others interpolate always, or use rotary positions
+            )
 
     @torch.inference_mode()
     def encode_dense(
@@ -64,20 +66,18 @@ class DinoEncoder(PretrainedModel):
     ) -> Tensor:
         """Dense features on a regular grid of cells that tiles the image.
 
-        A stride below the patch size is reached by evaluating shifted copies of the image, each on the
-        model's own patch grid, and interleaving the results: patch centers lie exactly on cell centers, and
-        attention sees ``(patch / stride)**2`` times fewer tokens at once than with a changed convolution
-        stride.
+        For a stride below the patch size, shifted copies of the image are evaluated on the model's own patch grid and
+        the results interleaved. Patch centers then lie exactly on cell centers, and attention sees
+        ``(patch / stride)**2`` times fewer tokens at once than with a smaller convolution stride.
 
         Args:
             image: ``[3, h, w]`` in 0..1.
             short_side: The image is resized to this many pixels on its short side (rounded to whole patches).
-            stride: Pixels of the resized image between cells; the patch is divided into a whole number of
-                strides, at most this long. None is the patch size.
-            facet: "key", the attention keys of a layer, or "token", the last layer's output tokens.
-            layer: Which layer's keys, 0-based; None is the last. Ignored for tokens.
-            max_tokens: Most patches that attention sees at once; a larger image is evaluated in overlapping
-                windows.
+            stride: Most pixels of the resized image between cells; rounded down to a whole fraction of the patch
+                size. None is the patch size.
+            facet: "key": attention keys of a layer. "token": output tokens of the last layer.
+            layer: Layer of the keys, 0-based; None is the last. Ignored for tokens.
+            max_tokens: Most patches that attention sees at once; larger images are evaluated in overlapping windows.
 
         Returns:
             Features ``[h', w', D]``, float32 on the CPU, unit length.
@@ -95,7 +95,7 @@ class DinoEncoder(PretrainedModel):
         image = resize_images(image[None].to(self.device, torch.float32), rows * patch, cols * patch)
         pixels = (image - self._mean) / self._std
         phases = -(-patch // min(stride or patch, patch))
-        # Cell centers of the fine grid; the shift of a phase brings its patch centers onto them.
+        # The shift of each phase aligns its patch centers with cell centers of the fine grid.
         shifts = [round((phase + 0.5) * patch / phases - patch / 2) for phase in range(phases)]
         margin = max(abs(shift) for shift in shifts)
         padded = F.pad(pixels, (margin, margin, margin, margin), mode="replicate")
@@ -134,7 +134,7 @@ class DinoEncoder(PretrainedModel):
             self._caught.keys = output
 
     def _forward(self, pixels: Tensor, facet: Facet, layer: int | None) -> Tensor:
-        """Patch features ``[rows, cols, D]`` of one evaluation of the model on ``[1, 3, H, W]``."""
+        """Patch features ``[rows, cols, D]`` of one forward pass on ``[1, 3, H, W]``."""
         rows, cols = pixels.shape[-2] // self.patch_size, pixels.shape[-1] // self.patch_size
         self._caught.layer = self._keys[-1 if layer is None else layer] if facet == "key" else None
         with precision(self.device):
@@ -146,7 +146,7 @@ class DinoEncoder(PretrainedModel):
 
 
 def _key_projections(model: torch.nn.Module) -> list[torch.nn.Module]:
-    """The linear layers that make attention keys, by layer; transformers has called them by two names."""
+    """The linear layers that compute attention keys, by layer; their name depends on the version of transformers."""
     found = {}
     for path, module in model.named_modules():
         if match := re.search(r"(?:^|\.)layers?\.(\d+)\..*\b(?:k_proj|key)$", path):
@@ -155,7 +155,7 @@ def _key_projections(model: torch.nn.Module) -> list[torch.nn.Module]:
 
 
 def _ramp(length: int) -> Tensor:
-    """Weights that fall off towards both ends, so that windows blend without seams; never zero."""
+    """Positive weights that decrease towards both ends, so that windows blend without seams."""
     position = torch.arange(length, dtype=torch.float32)
     return torch.minimum(position, length - 1 - position) + 1
 

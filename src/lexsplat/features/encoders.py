@@ -1,8 +1,7 @@
-"""Encoders: images and words to one space (CLIP, SigLIP), and images to dense features (DINO, DINOv2,
-DINOv3).
+"""Encoders: images and texts to one space (CLIP, SigLIP), and images to dense features (DINO, DINOv2, DINOv3).
 
-Built by transformers from a folder or a name. Every size (image, text length, projection, patch) is read from
-the model's configuration.
+transformers builds them from a folder or a name. Every size (image, text length, projection, patch) is read from the
+model's configuration.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ __all__ = [
 
 
 class ImageTextEncoder(Protocol):
-    """Images and words to unit vectors of one space."""
+    """Maps images and texts to unit vectors of one space."""
 
     name: str
     content_hash: str
@@ -43,7 +42,7 @@ class ImageTextEncoder(Protocol):
 
     @property
     def patches(self) -> int:
-        """Patches along a side that `encode_patches` reads; 0 where it reads none."""
+        """Patches along a side in `encode_patches`; 0 if the encoder has none."""
         ...
 
     def encode_images(self, images: Tensor) -> Tensor:
@@ -51,7 +50,7 @@ class ImageTextEncoder(Protocol):
         ...
 
     def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The same ``[B, D]`` and what their patches say ``[B, P, P, D]``; see `ClipEncoder`."""
+        """The same ``[B, D]``, and embeddings of the patches ``[B, P, P, D]``; see `ClipEncoder`."""
         ...
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
@@ -60,7 +59,7 @@ class ImageTextEncoder(Protocol):
 
 
 class DenseEncoder(Protocol):
-    """An image to a grid of unit vectors."""
+    """Maps an image to a grid of unit vectors."""
 
     name: str
     content_hash: str
@@ -85,7 +84,7 @@ def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> C
     """A CLIP-like encoder by name, folder, or "bundled".
 
     Raises:
-        ModelError: If it is not here and cannot be fetched, or is not a CLIP-like model.
+        ModelError: If it is not available and cannot be downloaded, or is not a CLIP-like model.
     """
     return ClipEncoder(model_folder(name, "clip"), name, device)
 
@@ -94,6 +93,6 @@ def load_dino(name: str = DEFAULT_DINO, device: torch.device | str = "cpu") -> D
     """A DINO-like encoder by name, folder, or "bundled".
 
     Raises:
-        ModelError: If it is not here and cannot be fetched, or is not a vision transformer.
+        ModelError: If it is not available and cannot be downloaded, or is not a vision transformer.
     """
     return DinoEncoder(model_folder(name, "dino"), name, device)

@@ -1,4 +1,4 @@
-"""Features made elsewhere: a folder with one array a view."""
+"""Features computed by other programs: a folder with one array per view."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from lexsplat.features.cache import FeatureMap, FeatureMaps
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import PICKLES, refuse_pickle
+from lexsplat.runtime.fingerprints import file_stamp
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
@@ -24,7 +25,7 @@ _FLOATS = ("F64", "F32", "F16", "BF16")
 
 def load_external_features(
     folder: Path,
-    scene: Capture,
+    capture: Capture,
     *,
     memory: int = budget.DEFAULT_MEMORY,
     dimension: int | None = None,
@@ -35,45 +36,45 @@ def load_external_features(
     Three forms are read, for a view ``a/b.jpg``:
 
     - ``a/b.npy``: ``[h, w, D]``;
-    - ``a/b.safetensors``: a tensor "clip" (or one tensor of any name) ``[h, w, D]``, and if wanted "dino";
-    - ``a/b_f.npy`` ``[n, D]`` with ``a/b_s.npy`` ``[h, w]`` or ``[L, h, w]``: one feature a segment, and the
-      segment of every pixel (-1 for none) for L levels of segments, as LangSplat-style preprocessing writes
-      them; levels are averaged, and pixels in no segment have the feature zero.
+    - ``a/b.safetensors``: a tensor "clip" (or one tensor of any name) ``[h, w, D]``, and optionally "dino";
+    - ``a/b_f.npy`` ``[n, D]`` with ``a/b_s.npy`` ``[h, w]`` or ``[L, h, w]``: one feature per segment, and the
+      segment of every pixel (-1 for none) for L levels of segments, as written by LangSplat's preprocessing. Levels
+      are averaged; pixels in no segment have a zero feature.
 
-    An array has the photo's shape at any size. What is finer than the pictures that language is learned from is
-    read at their pixels' centers only.
+    An array has the photo's aspect at any size. Arrays finer than the working images are read only at the centers of
+    their pixels.
 
     Args:
-        folder: Where the arrays are.
-        scene: Every view must have its array.
-        memory: Bytes that reading a map may take; a quarter of it is for maps that are kept.
-        dimension: Depth that the features must have to be compared with words; None takes any.
+        folder: Folder of the arrays.
+        capture: Every view must have an array.
+        memory: Bytes available for reading a map; a quarter of it is for maps that are kept.
+        dimension: Depth of the text embeddings, which the features must match; None accepts any.
         allow_holes: Whether pixels may have no feature.
 
     Returns:
-        Maps by view name; each array is read, and its numbers checked, when its view is asked for.
+        Maps by view name; each array is read and checked on access.
 
     Raises:
-        FileFormatError: If a view has no array or, when it is read, the array has a wrong shape or type, is
-            not finite, or has another depth than those before.
-        MemoryBudgetError: When it is read, if a map does not fit.
+        FileFormatError: If a view has no array. On access, if an array has a wrong shape or type, is not finite, or
+            differs in depth from the others.
+        MemoryBudgetError: On access, if a map does not fit.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileFormatError(folder, expected="a folder with one array a view", found="no folder")
-    sources = external_sources(folder, scene)
+        raise FileFormatError(folder, expected="a folder with one array per view", found="no folder")
+    sources = external_sources(folder, capture)
     depth: dict[str, int] = {}
 
     def load(name: str) -> FeatureMap:
-        path, reading = sources[name], _Reading(scene.views[name], memory)
+        path, reading = sources[name], _Reading(capture.views[name], memory)
         found = reading.segments(path) if path.name.endswith("_f.npy") else reading.arrays(path)
         dims = {"clip": found.clip.shape[-1]} | ({} if found.dino is None else {"dino": found.dino.shape[-1]})
         if dimension is not None and dims["clip"] != dimension:
             raise FileFormatError(
                 path,
-                expected=f"features of depth {dimension}, as the encoder of the words has them",
+                expected=f"features of depth {dimension}, like the embeddings of the text encoder",
                 found=str(dims["clip"]),
-                remedy="name with --clip the encoder that the features were made with",
+                remedy="give the encoder of the features with --clip",
             )
         if depth and dims != depth:
             raise FileFormatError(path, expected=f"features of depth {depth}", found=f"{dims}")
@@ -81,8 +82,8 @@ def load_external_features(
         if not allow_holes and not bool(found.clip.any(-1).all()):
             raise FileFormatError(
                 path,
-                expected="a feature for every pixel where there are 256 codes",
-                found="pixels without one",
+                expected="a feature for every pixel, because the codebook has 256 codes",
+                found="pixels without a feature",
                 remedy="give --codebook.num-codes 255 or less",
             )
         return found
@@ -90,24 +91,24 @@ def load_external_features(
     return FeatureMaps(list(sources), load, memory // 4)
 
 
-def external_sources(folder: Path, scene: Capture) -> dict[str, Path]:
-    """The file of each view by its name; of a pair, the features.
+def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:
+    """The file of each view by its name; of a pair, the file of features.
 
     Raises:
-        FileFormatError: If a view has none.
+        FileFormatError: If a view has no file.
     """
-    return {name: _source(folder, view.stem) for name, view in scene.views.items()}
+    return {name: _source(folder, view.stem) for name, view in capture.views.items()}
 
 
-def external_identity(folder: Path, scene: Capture) -> list[str]:
-    """Name, size and time of every file that is read: what tells that features have changed."""
+def external_identity(folder: Path, capture: Capture) -> list[str]:
+    """Name, size and modification time of every file that is read: changes whenever the features change."""
     files = []
-    for path in external_sources(folder, scene).values():
+    for path in external_sources(folder, capture).values():
         files.append(path)
         if path.name.endswith("_f.npy"):
             files.append(_segments_of(path))
-    facts = [(file, file.stat()) for file in files if file.is_file()]
-    return [f"{file.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}" for file, stat in facts]
+    stamps = {file.relative_to(folder): file_stamp(file) for file in files if file.is_file()}
+    return [f"{name} {size} {modified}" for name, (size, modified) in stamps.items()]
 
 
 def _segments_of(path: Path) -> Path:
@@ -126,16 +127,16 @@ def _source(folder: Path, stem: str) -> Path:
         folder,
         expected=f"{stem}.npy, {stem}.safetensors or {stem}_f.npy with {stem}_s.npy",
         found="none of them",
-        remedy="give one array for every view, named by the image's name without its ending",
+        remedy="give one array per view, named after the image without its suffix",
     )
 
 
 class _Reading:
-    """Reads the arrays of one view at no more cells than its picture has pixels.
+    """Reads the arrays of one view at no more cells than its working image has pixels.
 
     Args:
         view: The view.
-        memory: Bytes that this may take.
+        memory: Bytes available.
     """
 
     def __init__(self, view: View, memory: int) -> None:
@@ -173,13 +174,13 @@ class _Reading:
         return FeatureMap(*made)  # type: ignore[arg-type]
 
     def _sliced(self, part: Any, path: Path) -> torch.Tensor:
-        """Unit vectors of a slice of a safetensors file, row by row: a row is all that is held twice."""
+        """Unit vectors of a slice of a safetensors file, row by row: only one row is held twice."""
         rows, columns = self._cells(tuple(part.get_shape()), 0, path)
         read = [part[row : row + 1][:, columns].float().numpy() for row in rows.tolist()]
         return _unit(np.concatenate(read), path)
 
     def segments(self, path: Path) -> FeatureMap:
-        """One feature a segment and the segment of every pixel, painted."""
+        """The map of one feature per segment and the segments of every pixel."""
         features, pixels = _open_npy(path), _segments_of(path)
         if features.ndim != 2:
             raise FileFormatError(path, expected="[n, D]", found=str(list(features.shape)))
@@ -188,13 +189,12 @@ class _Reading:
             found = str(list(numbers.shape))
             raise FileFormatError(pixels, expected="[h, w] or [L, h, w]", found=found)
         if 0 in numbers.shape:
-            raise FileFormatError(pixels, expected="segment numbers", found="none")
+            raise FileFormatError(pixels, expected="segment ids", found="an empty array")
         rows, columns = self._cells((*numbers.shape[-2:], features.shape[1]), 0, pixels)
         index = _segment_numbers(numbers[..., rows[:, None], columns], len(features), pixels)
         unit = _unit(np.array(features)[None], path)[0].numpy()
-        padded = np.concatenate(
-            [unit, np.zeros((1, unit.shape[1]), np.float32)]
-        )  # -1 picks the zero at the end
+        # Segment -1 selects the zero at the end.
+        padded = np.concatenate([unit, np.zeros((1, unit.shape[1]), np.float32)])
         total = np.empty((*index.shape[1:], unit.shape[1]), np.float32)
         for row in range(len(total)):
             total[row] = padded[index[:, row]].sum(0)
@@ -206,23 +206,23 @@ class _Reading:
         """Rows and columns to read of an array ``[h, w, D]``.
 
         Raises:
-            FileFormatError: If it is no such array, or not of the photo's shape.
+            FileFormatError: If it has another shape, or not the photo's aspect.
             MemoryBudgetError: If the map does not fit.
         """
         if len(shape) != 3 or 0 in shape:
             raise FileFormatError(path, expected="features [h, w, D]", found=str(list(shape)))
         height, width, depth = shape
         photo_width, photo_height = self.view.capture_size
-        # Cells are whole: either side may be off by one.
+        # Numbers of cells are rounded: either side may be off by one.
         if abs(height * photo_width - width * photo_height) >= photo_width + photo_height:
             raise FileFormatError(
                 path,
-                expected=f"[h, w, D] of the photo's shape, {photo_width}x{photo_height}",
+                expected=f"[h, w, D] of the photo's aspect, {photo_width}x{photo_height}",
                 found=f"{width}x{height}",
                 remedy="give features of the whole photo",
             )
         rows, columns = min(height, self.view.camera.height), min(width, self.view.camera.width)
-        # The map, and beside it what it is read from or norms and a row.
+        # The map, and its source or its norms and a row.
         need = rows * columns * (depth * (4 + itemsize) + 16) + (16 << 20)
         what = f"features of {columns}x{rows}x{depth} of a view"
         budget.require("features", need, self.memory, what, "a larger --downscale")
@@ -230,26 +230,28 @@ class _Reading:
 
 
 def _centers(count: int, length: int) -> NDArray[np.intp]:
-    """The cells out of ``length`` in which the centers of ``count`` cells lie."""
+    """Indices of the cells, out of ``length``, that contain the centers of ``count`` cells."""
     return ((2 * np.arange(count) + 1) * length) // (2 * count)
 
 
 def _segment_numbers(segments: NDArray, count: int, path: Path) -> NDArray[np.int64]:
-    """Segments ``[L, h, w]`` of pixels ``[h, w]`` or ``[L, h, w]``: whole numbers from -1 to ``count`` - 1."""
+    """Segment ids ``[L, h, w]`` from ``[h, w]`` or ``[L, h, w]``: integers from -1 to ``count`` - 1."""
     if not np.isfinite(segments).all() or np.abs(segments.astype(np.float64)).max() > 2**31:
-        raise FileFormatError(path, expected="segment numbers", found="numbers that are none")
+        raise FileFormatError(
+            path, expected="integer segment ids", found="NaN, infinity or values beyond 2^31"
+        )
     index = segments.astype(np.int64)
     if index.min() < -1 or index.max() >= count or (index != segments).any():
         raise FileFormatError(
             path,
-            expected=f"whole numbers from -1 to {count - 1}",
+            expected=f"integers from -1 to {count - 1}",
             found=f"{segments.min():g} to {segments.max():g}",
         )
     return index.reshape(-1, *index.shape[-2:])
 
 
 def _open_npy(path: Path) -> NDArray:
-    """An array of numbers, mapped: a header that promises more than the file holds must not become memory."""
+    """An array of numbers, memory-mapped: a damaged header cannot allocate more than the file holds."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError) as error:
@@ -268,12 +270,12 @@ def _no_array(path: Path, error: Exception) -> FileFormatError:
 
 
 def _unit(array: NDArray, path: Path) -> torch.Tensor:
-    """Unit vectors ``[h, w, D]`` in float32, made in place where the array is that already."""
+    """Unit vectors ``[h, w, D]`` in float32; normalizes in place if the array is float32 already."""
     if 0 in array.shape:
         raise FileFormatError(path, expected="features [h, w, D]", found=str(list(array.shape)))
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, which is refused below
+    with np.errstate(over="ignore"):  # overflow becomes infinity, which is refused below
         values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
     lengths = torch.linalg.vector_norm(values, dim=-1, keepdim=True)
     if not bool(torch.isfinite(lengths).all()):
-        raise FileFormatError(path, expected="finite numbers", found="NaN, infinity, or numbers beyond 1e19")
+        raise FileFormatError(path, expected="finite numbers", found="NaN, infinity, or values beyond 1e19")
     return values.div_(lengths.clamp_min(1e-12))

@@ -1,4 +1,4 @@
-"""Extraction: features of every view into the cache, one view after the other (section 3.2)."""
+"""Extracts the features of every view into the cache (section 3.2)."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from lexsplat.features.cache import (
     FeatureMap,
     FeatureMaps,
-    Tokens,
     hash_file,
     hash_of,
     is_stored,
@@ -29,7 +27,7 @@ from lexsplat.features.cache import (
     write_crops,
     write_grid,
 )
-from lexsplat.features.encoders import DenseEncoder, Facet, ImageTextEncoder
+from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
 from lexsplat.features.pyramid import (
     CropLevel,
     batch_size_for,
@@ -40,188 +38,71 @@ from lexsplat.features.pyramid import (
     random_levels,
     unique_boxes,
 )
+from lexsplat.features.settings import GRID_SETTINGS, RANDOM_SETTINGS, FeatureConfig
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
 
-_CPU_BATCH = 64  # larger batches leave the processor's cache: measured 10 to 15 % slower at 256
-_LONGEST = 16  # in short sides: longer strips get coarser maps, or the memory of a map would know no bound
-_MAX_WORKERS = 4  # beyond this, threads inside an operation pay better than more images in flight
-
-_GRID = ("crop_sizes", "crop_strides", "crop_tokens")
-_RANDOM = ("random_crops", "random_levels", "random_sizes", "seed")
-
-
-@dataclass(frozen=True)
-class FeatureConfig:
-    """How dense features are made. The defaults suit CLIP ViT-B/16 and DINO ViT-S/8 on a GPU.
-
-    Args:
-        mode: "grid", a regular grid of crops for each size as in LERF and the authors' code; "random", the
-            paper's hierarchical random crops.
-        crop_sizes: Grid: sides of the crops as fractions of the image's short side.
-        crop_strides: Grid: distance between crops of each size, as a fraction of their side; the overlap is
-            the rest.
-        crop_tokens: Grid: what of a crop speaks for a place. "class", the whole of it at its middle (the paper);
-            "patch", each of its patches where it lies, read as in MaskCLIP, which needs a model of CLIP's own
-            architecture; "both". None is "class", but "both" for the encoders that ship.
-        random_crops: Random: crops of a view, shared out evenly over the sizes.
-        random_levels: Random: number of sizes.
-        random_sizes: Random: smallest and largest side as fractions of the image's short side.
-        seed: Random: seed of the positions; every view draws its own.
-        map_cells: Cells of the feature maps along the short side (fewer on strips longer than 16 short sides).
-        max_short_side: Larger images are reduced to this many pixels on the short side before cropping.
-        dino_short_side: Pixels on the short side of the image that DINO sees.
-        dino_stride: Pixels of that image between features; below the patch size, shifted copies are
-            evaluated.
-        dino_facet: "key", attention keys, or "token", output tokens.
-        dino_layer: Layer of the keys, 0-based; None is the last.
-        dino_max_tokens: Patches that DINO's attention sees at once; larger images are seen in overlapping
-            windows.
-        memory: Bytes that extraction and reading may use, beside the weights of the encoders; a build sets it to its
-            ``--memory``.
-    """
-
-    mode: Literal["grid", "random"] = "grid"
-    crop_sizes: tuple[float, ...] = (0.05, 0.125, 0.2, 0.275, 0.35, 0.425, 0.5)
-    crop_strides: tuple[float, ...] = (1.0, 0.625, 0.5, 0.5, 0.5, 0.5, 0.5)
-    crop_tokens: Tokens | None = None
-    random_crops: int = 3000
-    random_levels: int = 20
-    random_sizes: tuple[float, float] = (0.05, 0.2)
-    seed: int = 0
-    map_cells: int = 112
-    max_short_side: int = 1080
-    dino_short_side: int = 224
-    dino_stride: int = 2
-    dino_facet: Facet = "key"
-    dino_layer: int | None = None
-    dino_max_tokens: int = 4096
-    memory: tyro.conf.Suppress[int] = 4 << 30
-
-    def __post_init__(self) -> None:
-        if self.mode not in ("grid", "random"):
-            raise ValueError(f"mode must be 'grid' or 'random', got {self.mode!r}")
-        if len(self.crop_sizes) != len(self.crop_strides) or not self.crop_sizes:
-            raise ValueError(
-                f"needs one crop stride a crop size, got {len(self.crop_strides)} for {len(self.crop_sizes)}"
-            )
-        if min(self.crop_sizes) <= 0 or min(self.crop_strides) <= 0:
-            raise ValueError("crop sizes and strides must be positive")
-        if not 0 < self.random_sizes[0] <= self.random_sizes[1]:
-            raise ValueError(f"random_sizes must be positive and in order, got {self.random_sizes}")
-        if self.crop_tokens not in (None, "class", "patch", "both"):
-            raise ValueError(f"crop_tokens must be 'class', 'patch' or 'both', got {self.crop_tokens!r}")
-        if self.tokens != "class" and self.mode != "grid":
-            raise ValueError(f"crop_tokens={self.crop_tokens} needs mode=grid, random crops speak as wholes")
-        if self.dino_facet not in ("key", "token"):
-            raise ValueError(f"dino_facet must be 'key' or 'token', got {self.dino_facet!r}")
-        sizes = ("map_cells", "max_short_side", "dino_short_side", "dino_stride", "dino_max_tokens")
-        for name in (*sizes, "random_crops", "random_levels", "memory"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-
-    @property
-    def tokens(self) -> Tokens:
-        """What of a crop speaks."""
-        return self.crop_tokens or "class"
-
-    @classmethod
-    def sparse(cls) -> FeatureConfig:
-        """Settings for large encoders on a CPU: a sixth of the crops and a quarter of DINO's work."""
-        return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=4)
-
-    @classmethod
-    def bundled(cls) -> FeatureConfig:
-        """Settings for the small encoders that ship with the package, chosen by measurement."""
-        return cls(
-            crop_sizes=(18 / 240, 44 / 240),
-            crop_strides=(0.5, 0.35),
-            crop_tokens="both",
-            map_cells=120,
-            max_short_side=360,
-            dino_short_side=320,
-            dino_stride=8,
-        )
-
-    def where_open(self, suited: FeatureConfig) -> FeatureConfig:
-        """``suited`` with everything in which these settings differ from the defaults.
-
-        Sizes and strides of the grid are one thing: they must have the same length.
-        """
-        if self.mode == "random":  # whose crops speak as wholes
-            suited = dataclasses.replace(suited, crop_tokens=None)
-        usual = FeatureConfig()
-        given = {name for name in dataclasses.asdict(self) if getattr(self, name) != getattr(usual, name)}
-        if given & {"crop_sizes", "crop_strides"}:
-            given |= {"crop_sizes", "crop_strides"}
-        return dataclasses.replace(suited, **{name: getattr(self, name) for name in given})
-
-    def decisive(self, use_dino: bool) -> FeatureConfig:
-        """The same with those at their defaults that decide nothing: memory, the other mode's, an unused DINO's."""
-        usual = FeatureConfig()
-        unused = {"memory", *(_RANDOM if self.mode == "grid" else _GRID)}
-        if self.tokens == "class":
-            unused.add("crop_tokens")
-        if not use_dino:
-            unused |= {name for name in dataclasses.asdict(self) if name.startswith("dino_")}
-        return dataclasses.replace(self, **{name: getattr(usual, name) for name in unused})
+_CPU_BATCH = 64  # larger batches exceed the processor's cache: 256 is 10 to 15 % slower
+_LONGEST = 16  # in short sides: the maps of longer images get coarser, which bounds their memory
+_MAX_WORKERS = 4  # beyond this, more threads per operation are faster than more views at once
 
 
 def extract_features(
-    scene: Capture,
+    capture: Capture,
     clip: ImageTextEncoder,
     dino: DenseEncoder | None,
     config: FeatureConfig | None = None,
     *,
     cache_dir: Path,
+    memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> FeatureMaps:
-    """Extract and store the features of every view; views already stored with these settings cost nothing.
+    """Extract and cache the features of every view; views that are cached with these settings are skipped.
 
-    A run that was stopped goes on with the views that are missing. On the CPU several views are in work at
-    once, one thread each, which is faster than one view on several threads.
+    An interrupted run resumes with the missing views. On the CPU several views are processed at once, one thread
+    each, which is faster than one view on several threads.
 
     Args:
-        scene: Its views are read one after the other, at the resolution they were captured in.
-        clip: Embeds crops.
-        dino: Dense features beside CLIP; None for CLIP alone.
+        capture: Its views are read one at a time, at their capture resolution.
+        clip: Encoder of the crops.
+        dino: Encoder of dense features; None for CLIP alone.
         config: Settings; None for the defaults.
-        cache_dir: Folder of the cache; files of other settings or scenes may lie there too.
-        listener: Hears of stage "features" after every view.
+        cache_dir: Folder of the cache; it may hold files of other settings and captures.
+        memory: Bytes of host memory for extraction and for maps that are read, without the encoders' weights.
+        listener: Receives an event of stage "features" after every view.
 
     Returns:
-        Maps by view name, read from the cache when asked for.
+        Maps by view name, read from the cache on access.
 
     Raises:
         CaptureError: If an image cannot be read.
-        MemoryBudgetError: If a photo, or the patches of its crops, are too large for the memory of the settings.
-        ModelError: If patches are to speak and the encoder's cannot be read.
+        MemoryBudgetError: If a photo, or the patches of its crops, do not fit into ``memory``.
+        ModelError: If patches are requested of an encoder that has none.
+        ValueError: If ``memory`` is not positive.
     """
+    if memory < 1:
+        raise ValueError(f"memory must be at least 1 byte, got {memory}")
     config = config or FeatureConfig()
     cache_dir = Path(cache_dir)
-    entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in scene.views.items()}
+    entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in capture.views.items()}
     missing = [name for name, entry in entries.items() if not entry.is_complete()]
     done, total = len(entries) - len(missing), len(entries)
     listener(Event("features", done, total))
+    largest = max([1, *(_view_bytes(capture.views[n], entries[n], clip, config, memory) for n in entries)])
     workers = (
         1 if clip.device.type == "cuda" else min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing)))
     )
-    largest = 1
-    for name, entry in entries.items():
-        photo = scene.views[name].lens.width, scene.views[name].lens.height
-        budget.check_photo(photo, config.memory, entry.image_size)
-        largest = max(
-            largest, budget.photo_bytes(photo, entry.image_size) + _patch_bytes(entry, clip, config)
-        )
-    workers = max(1, min(workers, config.memory // 2 // largest))
-    pictures: dict[tuple[Path, Path | None], list[str]] = {}  # views with the same picture share their files
+    workers = max(1, min(workers, memory // 2 // largest))
+    same_files: dict[tuple[Path, Path | None], list[str]] = {}  # views of identical photos share their files
     for name in missing:
-        pictures.setdefault((entries[name].clip, entries[name].dino), []).append(name)
-    twins = {names[0]: names for names in pictures.values()}
-    for name in _Extraction(scene.views, entries, list(twins), clip, dino, config, workers).run():
+        same_files.setdefault((entries[name].clip, entries[name].dino), []).append(name)
+    twins = {names[0]: names for names in same_files.values()}
+    batch_size = batch_size_for(memory // workers, clip.image_size)
+    extraction = _Extraction(capture.views, entries, clip, dino, config, batch_size)
+    for name in extraction.run(list(twins), workers):
         done += len(twins[name])
         listener(Event("features", done, total))
 
@@ -231,42 +112,45 @@ def extract_features(
         grid = None if entry.dino is None else read_grid(entry.dino, cols, rows)
         return FeatureMap(read_crops(entry.clip, cols, rows, config.tokens), grid)
 
-    return FeatureMaps(list(entries), load, config.memory // 4)
+    return FeatureMaps(list(entries), load, memory // 4)
 
 
-def _patch_bytes(entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig) -> int:
-    """What the patches of all crops of a view take while they wait to be put together, with a copy; 0 without them.
+def _view_bytes(view: View, entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig, memory: int) -> int:
+    """Bytes that one view takes while it is processed: its photo, and the embeddings of its patches with a copy.
 
     Raises:
-        MemoryBudgetError: If that is more than half of the memory of the settings.
+        MemoryBudgetError: If the photo does not fit, or the patches take more than half of ``memory``.
     """
+    photo = view.lens.width, view.lens.height
+    budget.check_photo(photo, memory, entry.image_size)
+    need = budget.photo_bytes(photo, entry.image_size)
     if config.tokens == "class":
-        return 0
+        return need
     crops = sum(map(len, grid_levels(*entry.image_size, config.crop_sizes, config.crop_strides)))
-    need = 2 * 4 * crops * (1 + clip.patches**2) * clip.dim
+    patches = 2 * 4 * crops * (1 + clip.patches**2) * clip.dim
     what, remedy = f"the patches of {crops:,} crops", "features.crop-tokens class"
-    budget.require("features", 2 * need, config.memory, what, remedy)
-    return need
+    budget.require("features", 2 * patches, memory, what, remedy)
+    return need + patches
 
 
 def load_level_maps(
-    scene: Capture, clip: ImageTextEncoder, config: FeatureConfig, cache_dir: Path, name: str
+    capture: Capture, clip: ImageTextEncoder, config: FeatureConfig, cache_dir: Path, name: str
 ) -> tuple[Tensor, list[float]]:
-    """The CLIP map of each crop size of one view, from features that `extract_features` has stored.
+    """The CLIP map of each crop size of one view, from features that `extract_features` has cached.
 
     Returns:
         Maps ``[L, h, w, D]``, unit length, and the sides of the crops as fractions of the image's width.
 
     Raises:
-        FileFormatError: If the view's features are not stored.
+        FileFormatError: If the view's features are not cached.
     """
-    entry = _Entry.of(scene.views[name], clip, None, config, Path(cache_dir))
+    entry = _Entry.of(capture.views[name], clip, None, config, Path(cache_dir))
     return read_levels(entry.clip, *entry.map_size)
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """Where the features of a view are stored, and the sizes they have."""
+    """Cache files, image size and map size of a view."""
 
     clip: Path
     dino: Path | None
@@ -288,21 +172,24 @@ class _Entry:
         image_size = max(1, round(width * factor)), max(1, round(height * factor))
         cells = config.map_cells / min(width, height) * _strip_factor(width, height)
         map_size = max(1, round(width * cells)), max(1, round(height * cells))
-        # The pixels follow from the file, the lens they are undistorted by, the background, the size and the mask.
+        # Everything the pixels depend on: file, lens, background, size and mask.
         lens = dataclasses.asdict(view.lens)
         masked = [] if view.ignore_path is None else [hash_file(view.ignore_path)]
         pixels = hash_of(hash_file(view.image_path), lens, list(view.background), image_size, *masked)
         settings = dataclasses.asdict(config)
-        crops = {name: settings[name] for name in ("mode", *(_GRID if config.mode == "grid" else _RANDOM))}
+        crops = {
+            name: settings[name]
+            for name in ("mode", *(GRID_SETTINGS if config.mode == "grid" else RANDOM_SETTINGS))
+        }
         dense = {name: settings[name] for name in settings if name.startswith("dino_")}
         crops.pop("crop_tokens", None)
-        if config.tokens != "class":  # what patches say is stored as a map of this size
+        if config.tokens != "class":  # patches are stored as a map of this size
             crops["patches"] = map_size
         clip_key = hash_of("clip", clip.content_hash, crops, pixels)
         dino_path = None
         if dino is not None:
             dino_path = cache_dir / f"{hash_of('dino', dino.content_hash, dense, pixels)}.dino.safetensors"
-        # Seeded by the image, so that views differ and a view's crops do not depend on the others.
+        # Seeded by the image: views differ, and a view's crops do not depend on other views.
         seed = int(hash_of(config.seed, pixels)[:12], 16)
         return cls(cache_dir / f"{clip_key}.clip.safetensors", dino_path, image_size, map_size, seed)
 
@@ -311,45 +198,42 @@ class _Entry:
 
 
 def _strip_factor(width: int, height: int) -> float:
-    """1, or for strips what makes the area of their maps that of a picture of 16 by 1."""
+    """Scale of a map: 1, or less for images longer than 16 short sides, whose map area it bounds."""
     return min(1.0, (_LONGEST * min(width, height) / max(width, height)) ** 0.5)
 
 
 class _Extraction:
-    """Workers that take views from one queue; each streams the crops of its views through the encoder."""
+    """Workers that take views from one queue and stream their crops through the encoder."""
 
     def __init__(
         self,
         views: Mapping[str, View],
         entries: Mapping[str, _Entry],
-        missing: list[str],
         clip: ImageTextEncoder,
         dino: DenseEncoder | None,
         config: FeatureConfig,
-        workers: int,
+        batch_size: int,
     ) -> None:
         self.views, self.entries, self.clip, self.dino, self.config = views, entries, clip, dino, config
-        self.workers = workers
-        batch_size = batch_size_for(config.memory // workers, clip.image_size)
         self.batch_size = batch_size if clip.device.type == "cuda" else min(batch_size, _CPU_BATCH)
         self._todo: queue.SimpleQueue[str] = queue.SimpleQueue()
-        for name in missing:
-            self._todo.put(name)
         self._finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._stop = threading.Event()
 
-    def run(self) -> Iterator[str]:
-        """Names of the views as they get finished."""
-        if self._todo.empty():
+    def run(self, missing: list[str], workers: int) -> Iterator[str]:
+        """Extract ``missing`` views; yields their names as they are finished."""
+        if not missing:
             return
+        for name in missing:
+            self._todo.put(name)
         threads = torch.get_num_threads()
-        inner = max(1, threads // self.workers)
+        inner = max(1, threads // workers)
         torch.set_num_threads(inner)
         try:
-            with ThreadPoolExecutor(self.workers) as pool:
-                futures = [pool.submit(self._work, inner) for _ in range(self.workers)]
+            with ThreadPoolExecutor(workers) as pool:
+                futures = [pool.submit(self._work, inner) for _ in range(workers)]
                 try:
-                    running = self.workers
+                    running = workers
                     while running:
                         name = self._finished.get()
                         if name is None:
@@ -382,14 +266,14 @@ class _Extraction:
             self._finished.put(None)
 
     def _encode(self, crops: Tensor) -> Tensor:
-        """Crops to their embeddings ``[b, D]``, or with those of their patches after them ``[b, 1 + P * P, D]``."""
+        """Embeddings of crops ``[b, D]``, or of crops and their patches ``[b, 1 + P * P, D]``."""
         if self.config.tokens == "class":
             return self.clip.encode_images(crops)
         whole, patches = self.clip.encode_patches(crops)
         return torch.cat([whole[:, None], patches.flatten(1, 2)], 1)
 
     def _jobs(self) -> Iterator[tuple[tuple[str, tuple[CropLevel, ...], Tensor], Iterator[Tensor]]]:
-        """Views whose crops are missing, with their crops; DINO is done on the way."""
+        """Views whose crops are missing, with their crops. Also extracts missing DINO features."""
         while not self._stop.is_set():
             try:
                 name = self._todo.get_nowait()

@@ -1,44 +1,44 @@
-"""Where the weights of a model come from: the package, a folder, the hub's cache, or the hub.
+"""Finds the folder of a model: in the package, a given folder, the hub's cache, or on the hub.
 
-Only safetensors are ever loaded. Everything after this file works on a plain local folder, so the code that
-builds an encoder is the same with and without internet.
+Only safetensors are loaded. Encoders are built from a local folder, so their code is the same with and without
+internet.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import re
 from pathlib import Path
 from typing import Any
 
-from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.runtime.files import read_json
 
 log = logging.getLogger("lexsplat")
 
 BUNDLED_ENCODERS = Path(__file__).resolve().parent.parent / "demo" / "encoders"
-"""Folder of the encoders that ship with the package."""
+"""Folder of the bundled encoders."""
 
 _WANTED_FILES = ["*.json", "*.txt", "*.model", "model*.safetensors"]
-_HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first answer; without a network it fails at once
-_CONVERSION_BOT = "SFconvertbot"  # opens a pull request with safetensors on repositories that lack them
+_HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
+_CONVERSION_BOT = "SFconvertbot"  # opens pull requests with safetensors on repositories without them
 
 
 def model_folder(name: str, tower: str) -> Path:
-    """The local folder of a model, downloaded if need be.
+    """The local folder of a model, downloaded if necessary.
 
     Args:
         name: A folder, a name on the Hugging Face Hub, or "bundled".
-        tower: Subfolder of the package's own encoders that "bundled" stands for: "clip" or "dino".
+        tower: Which of the bundled encoders "bundled" is: "clip" or "dino".
 
     Returns:
         A folder with ``config.json`` and safetensors.
 
     Raises:
-        ModelError: If there is no such model here and none can be fetched.
+        ModelError: If the model is not available locally and cannot be downloaded.
     """
-    if name in ("bundled", "embedded"):  # the second is the word before the first
+    if name in ("bundled", "embedded"):  # "embedded" is an alias
         return BUNDLED_ENCODERS / tower
     folder = Path(name).expanduser()
     if folder.is_dir():
@@ -55,30 +55,30 @@ def model_folder(name: str, tower: str) -> Path:
 
 
 def is_model_folder(folder: Path) -> bool:
-    """Whether a folder holds a configuration and all its safetensors shards."""
+    """Whether a folder holds a configuration and all shards of its safetensors."""
     if not (folder / "config.json").is_file():
         return False
     index = folder / "model.safetensors.index.json"
     if index.is_file():
-        table = read_json(index).get("weight_map")
+        table = read_config(index).get("weight_map")
         shards = list(table.values()) if isinstance(table, dict) else []
-        # Only files of the folder itself: a name that leads elsewhere is no shard.
+        # Only files of the folder itself: shard names are not paths.
         plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in shards)
         return bool(shards) and plain and all((folder / shard).is_file() for shard in set(shards))
     return (folder / "model.safetensors").is_file()
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a model folder.
+def read_config(path: Path) -> dict[str, Any]:
+    """A JSON object of a model folder.
 
     Raises:
         ModelError: If the file is not a JSON object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        content = read_json(path)
+    except FileFormatError as error:
         raise ModelError(
-            path, expected="JSON", found=str(error)[:200], remedy="fetch the model again"
+            path, expected=error.expected, found=error.found[:200], remedy="fetch the model again"
         ) from error
     if not isinstance(content, dict):
         raise ModelError(path, expected="a JSON object", found=type(content).__name__)
@@ -86,10 +86,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def content_hash(folder: Path) -> str:
-    """Hash of everything that decides a model's output: weights, configuration, tokenizer. 32 hex digits."""
+    """Hash of everything a model's output depends on: weights, configuration, tokenizer. 32 hex digits."""
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(folder.glob("*")):
-        # Every weight file that is not loaded (other formats) is left out; so is prose such as a model card.
+        # Weights in other formats, which are not loaded, and documents such as model cards are skipped.
         if path.suffix in (".json", ".txt", ".model") or path.match("model*.safetensors"):
             digest.update(path.name.encode())
             with path.open("rb") as stream:
@@ -104,7 +104,7 @@ def _contents(folder: Path) -> str:
 
 
 def _cached_folder(name: str) -> Path | None:
-    """Folder of a model that an earlier download left in the hub's cache, without touching the network."""
+    """Folder of a model in the hub's cache; does not use the network."""
     from huggingface_hub import constants, snapshot_download
     from huggingface_hub.errors import HFValidationError
 
@@ -125,7 +125,7 @@ def _cached_folder(name: str) -> Path | None:
 
 
 def _download(name: str, tower: str) -> Path:
-    """Fetch a model from the hub; safetensors from the conversion bot's pull request where main has none."""
+    """Download a model from the hub; uses the conversion bot's pull request if main has no safetensors."""
     from huggingface_hub import HfApi, snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
@@ -145,10 +145,12 @@ def _download(name: str, tower: str) -> Path:
         raise _missing(name, tower, "neither a folder nor a valid model name") from error
     except HfHubHTTPError as error:
         status = getattr(getattr(error, "response", None), "status_code", None)
-        raise _missing(name, tower, f"the hub answered {status or 'with an error'}") from error
-    except Exception as error:  # no network shows as many types, depending on the HTTP library and the proxy
+        raise _missing(name, tower, f"the hub responded with {status or 'an error'}") from error
+    except (
+        Exception
+    ) as error:  # a missing network raises many types, depending on the HTTP library and the proxy
         raise _missing(
-            name, tower, f"no copy here and the hub cannot be reached ({type(error).__name__})"
+            name, tower, f"no local copy, and the hub cannot be reached ({type(error).__name__})"
         ) from error
     raise _missing(name, tower, "no safetensors in its repository")
 

@@ -1,7 +1,6 @@
-"""What masked pixels leave of feature maps: cells without any pixel that counts are zero.
+"""Masking of feature maps: cells that are masked entirely are zero.
 
-A pixel that is black in ``masks/`` is filled with the photo's mean color before anything looks at the photo
-(`lexsplat.captures.View.load_image`).
+Encoders see masked pixels in the photo's mean color (`lexsplat.captures.View.load_image`).
 """
 
 from __future__ import annotations
@@ -12,20 +11,20 @@ from lexsplat.captures import Capture
 from lexsplat.features.cache import FeatureMap, FeatureMaps
 
 
-def without_masked_cells(maps: FeatureMaps, scene: Capture) -> FeatureMaps:
-    """Feature maps whose cells without any pixel that counts are zero, which the codebook passes over.
+def without_masked_cells(maps: FeatureMaps, capture: Capture) -> FeatureMaps:
+    """Feature maps in which cells without an unmasked pixel are zero; the codebook skips zero cells.
 
     Args:
         maps: Maps by view name.
-        scene: The views.
+        capture: The views.
     """
-    if all(scene.views[name].ignore_path is None for name in maps if name in scene.views):
+    if all(capture.views[name].ignore_path is None for name in maps if name in capture.views):
         return maps
 
     def load(name: str) -> FeatureMap:
         found = maps[name]
         height, width = found.clip.shape[:2]
-        share = scene.views[name].valid_share((width, height))
+        share = capture.views[name].valid_share((width, height))
         if share is None:
             return found
         counts = torch.from_numpy(share > 0)[..., None].to(found.clip.device)

@@ -1,6 +1,6 @@
-"""What the encoders share: a model of transformers from a folder, its precision, and images as it wants them.
+"""Shared by the encoders: loading a transformers model from a folder, its precision, and preprocessing of images.
 
-Resizing and normalization are done here in torch, so no image library is needed for them.
+Resizing and normalization are done in torch, without an image library.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash, read_json
+from lexsplat.features.hub import content_hash, read_config
 from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 
 
 class PretrainedModel:
-    """A model of transformers that looks at images, as it was trained.
+    """A pretrained vision model of transformers, frozen.
 
     Args:
         folder: Local model folder.
-        name: What to call it in messages and records.
-        device: Where it runs.
+        name: Its name in messages and records.
+        device: Device of the model.
 
     Raises:
-        ModelError: If the folder is not such a model.
+        ModelError: If transformers cannot load the folder.
     """
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
@@ -39,7 +39,7 @@ class PretrainedModel:
         self._model = _load_model(folder, name, self.device)
 
     def _refusal(self, expected: str, remedy: str) -> ModelError:
-        """That the model is of another kind."""
+        """The error for a model of another architecture."""
         found = f"a {self._model.config.model_type!r} model"
         return ModelError(f"model {self.name}", expected=expected, found=found, remedy=remedy)
 
@@ -49,7 +49,7 @@ def _load_model(folder: Path, name: str, device: torch.device) -> Any:
     from transformers.utils import logging as transformers_logging
 
     verbosity = transformers_logging.get_verbosity()
-    transformers_logging.set_verbosity_error()  # it would list every unused head
+    transformers_logging.set_verbosity_error()  # it lists every unused head
     bars = transformers_logging.is_progress_bar_enabled()
     transformers_logging.disable_progress_bar()
     try:
@@ -67,14 +67,14 @@ def _load_model(folder: Path, name: str, device: torch.device) -> Any:
         transformers_logging.set_verbosity(verbosity)
         if bars:
             transformers_logging.enable_progress_bar()
-    return model.float().eval().requires_grad_(False).to(device)  # some are stored in half precision
+    return model.float().eval().requires_grad_(False).to(device)  # some models are stored in half precision
 
 
 def precision(device: torch.device, *, crops: bool = False) -> AbstractContextManager:
-    """Half precision where the device computes in it and gains by it; the angles change by less than 1e-2.
+    """Half precision where it is faster; angles between embeddings change by less than 1e-2.
 
-    Float16 on CUDA. Bfloat16 on processors with instructions for it, for many small crops only (1.8 times as fast;
-    dense images gain nothing). Texts are always encoded in float32.
+    Float16 on CUDA. Bfloat16 on processors with instructions for it, for many small crops only (1.8 times as fast, no
+    gain for dense images). Texts are always encoded in float32.
     """
     if device.type == "cuda":
         return torch.autocast("cuda", dtype=torch.float16)
@@ -83,25 +83,25 @@ def precision(device: torch.device, *, crops: bool = False) -> AbstractContextMa
 
 @functools.cache
 def _computes_in_bfloat16() -> bool:
-    """Whether the processor has instructions for bfloat16; without them it is emulated, and slow."""
+    """Whether the processor has bfloat16 instructions; without them, emulation is slow."""
     names = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     return any(getattr(torch.cpu, name, bool)() for name in names)
 
 
 def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Mean and deviation ``[3, 1, 1]`` from the model's preprocessing file, or its family's usual ones."""
+    """Mean and standard deviation ``[3, 1, 1]`` from the model's preprocessing file, or ``default``."""
     mean, std = default
     for file in ("preprocessor_config.json", "processor_config.json"):
         if not (folder / file).is_file():
             continue
-        content = read_json(folder / file)
+        content = read_config(folder / file)
         content = content.get("image_processor", content)
         if "image_mean" in content and "image_std" in content:
             mean, std = content["image_mean"], content["image_std"]
             break
     else:
         log.warning(
-            "%s: no preprocessing file; the usual image normalization of its family is used", folder.name
+            "%s: no preprocessing file; using the default image normalization of its family", folder.name
         )
     return tuple(torch.tensor(v, dtype=torch.float32, device=device).reshape(3, 1, 1) for v in (mean, std))  # type: ignore[return-value]
 
@@ -113,7 +113,7 @@ def check_images(images: Tensor) -> None:
 
 
 def resize_images(images: Tensor, height: int, width: int) -> Tensor:
-    """Antialiased bicubic resize of ``[B, 3, h, w]`` in 0..1; the overshoot of the filter is cut off."""
+    """Antialiased bicubic resize of ``[B, 3, h, w]`` in 0..1; overshoot of the filter is clamped."""
     if images.shape[-2:] == (height, width):
         return images
     return F.interpolate(images, (height, width), mode="bicubic", antialias=True, align_corners=False).clamp(

@@ -1,14 +1,13 @@
-"""Crops of many sizes to a dense map of image-text features (section 3.2 of the paper).
+"""From crops of many sizes to a dense map of image-text features (section 3.2 of the paper).
 
-CLIP gives one vector for a whole image. Cropping the image at many places and sizes and embedding each crop
-gives vectors for places; averaging the crops that speak for a place gives a dense map. Two ways to choose the
-crops:
+CLIP yields one vector per image. Embedding crops of the image at many positions and sizes, and averaging the
+embeddings of the crops around each position, yields a dense map. Crops are chosen in one of two ways:
 
 - a regular grid for each size (as in LERF), whose embeddings are interpolated between the crops' centers;
-- random crops for each size, averaged over the crops that cover a place, nearer centers counting more.
+- random crops for each size, averaged over the crops that cover a position, weighted by the distance to their center.
 
-Both put each embedding where its crop really is: crop centers are pixel positions, never cells of a resized
-grid. Crops keep inside the image; beyond the outermost centers the nearest ones count.
+Embeddings are placed at the true centers of their crops in pixels. Crops lie inside the image; beyond the outermost
+centers, the nearest crops are used.
 """
 
 from __future__ import annotations
@@ -39,8 +38,11 @@ class CropLevel:
         size: Side in pixels.
         lefts: Left edges in pixels: ``[nx]`` of the columns of a grid, or ``[n]`` of the random crops.
         tops: Top edges in pixels: ``[ny]`` of the rows of a grid, or ``[n]`` of the random crops.
-        grid: Whether the crops are all pairs of rows and columns (row-major) or single ones.
-        patches: Along a side of each crop, when each of them has an embedding of its own; 0 when the crop has one.
+        grid: Whether the crops are all pairs of rows and columns (row-major), or single ones.
+        patches: Patches along a side of each crop, if each has its own embedding; 0 if the crop has one.
+
+    Raises:
+        ValueError: If random crops have patches.
     """
 
     size: int
@@ -66,7 +68,7 @@ class CropLevel:
 
     @property
     def embeddings(self) -> int:
-        """How many embeddings the crops have together."""
+        """Total number of embeddings of the crops."""
         return len(self) * max(1, self.patches**2)
 
 
@@ -116,11 +118,11 @@ def random_levels(
     Args:
         width: Image width in pixels.
         height: Image height in pixels.
-        crops: Crops in all; shared out evenly, at least one for each size.
+        crops: Total number of crops, divided evenly; at least one per size.
         levels: Number of sizes, evenly spaced.
         smallest: Smallest side as a fraction of the image's short side.
         largest: Largest side as a fraction of the image's short side.
-        rng: Source of the positions.
+        rng: Random generator of the positions.
 
     Raises:
         ValueError: If a number is not positive or the sizes are in the wrong order.
@@ -148,7 +150,8 @@ def dense_map(
 ) -> Tensor:
     """Average the crops' embeddings at their true positions: the dense map of section 3.2.
 
-    Unit vectors ``[rows, cols, D]`` in the direction of `mean_map`, which see.
+    Returns:
+        `mean_map`, normalized: ``[rows, cols, D]``.
     """
     return F.normalize(mean_map(levels, embeddings, width, height, cols, rows), dim=-1)
 
@@ -156,12 +159,12 @@ def dense_map(
 def mean_map(
     levels: Sequence[CropLevel], embeddings: Tensor, width: int, height: int, cols: int, rows: int
 ) -> Tensor:
-    """Average of the embeddings that speak for each cell: each level gives a map, those that reach it count alike.
+    """Average embedding of each cell: every level yields a map, and the levels that cover a cell have equal weight.
 
     Args:
         levels: Crops by size.
-        embeddings: One unit vector a crop or patch of one ``[n, D]``, levels in order; patches from left to right and
-            top to bottom within their crop.
+        embeddings: One unit vector per crop or patch ``[n, D]``, in order of the levels; patches row-major within
+            their crop.
         width: Width in pixels of the image the crops were taken from.
         height: Its height.
         cols: Width of the map in cells.
@@ -171,7 +174,7 @@ def mean_map(
         ``[rows, cols, D]``; cell (i, j) is the pixel ((j + .5) width / cols, (i + .5) height / rows).
 
     Raises:
-        ValueError: If the number of embeddings is not the number of crops.
+        ValueError: If the number of embeddings is not that of the levels.
     """
     expected = sum(level.embeddings for level in levels)
     if len(embeddings) != expected:
@@ -181,7 +184,7 @@ def mean_map(
     dim = embeddings.shape[-1]
     total = torch.zeros(rows, cols * dim)
     count = torch.zeros(rows, cols, 1)
-    downs: list[Tensor] = []  # grid levels are summed by one matrix product over the rows of all of them
+    downs: list[Tensor] = []  # one matrix product sums the rows of all grid levels
     strips: list[Tensor] = []
     start = 0
     for level in levels:
@@ -202,7 +205,7 @@ def mean_map(
     if downs:
         total += torch.cat(downs, 1) @ torch.cat(strips)
     total = total.reshape(rows, cols, dim) / count.clamp_min(1)
-    if bool((count == 0).any()):  # random crops need not reach every corner: the nearest crop speaks for it
+    if bool((count == 0).any()):  # random crops need not cover every cell: the nearest crop fills it
         empty = (count == 0).squeeze(-1)
         total[empty] = embeddings[_nearest_crops(levels, xs, ys)[empty]].float()
     return total
@@ -211,7 +214,7 @@ def mean_map(
 def patch_map(
     levels: Sequence[CropLevel], patches: Tensor, width: int, height: int, cols: int, rows: int
 ) -> Tensor:
-    """`mean_map` of what the patches of grids of crops say, each at its own place.
+    """`mean_map` of the patches of grids of crops, each at its own position.
 
     Args:
         levels: Crops by size.
@@ -229,14 +232,17 @@ def patch_map(
 def _axis_weights(level: CropLevel, starts: NDArray, positions: NDArray) -> Tensor:
     """Weights ``[m, n]`` along one axis of the crops with these starts, or of their patches, crop after crop.
 
-    A patch counts within its own size, and more the farther it lies from the rim of its crop, where it sees less.
+    The weight of a patch falls to zero at its own size, and is larger the farther the patch lies from the border of
+    its crop, where it sees less context.
     """
     if not level.patches:
         return _linear_weights(positions, starts + level.size / 2)
     side = level.size / level.patches
     places = (np.arange(level.patches) + 0.5) * side
     centers = (starts[:, None] + places).ravel()
-    inside = np.clip(positions, centers.min(), centers.max())  # beyond the outermost ones the nearest count
+    inside = np.clip(
+        positions, centers.min(), centers.max()
+    )  # beyond the outermost centers, the nearest ones are used
     tents = np.maximum(0, 1 - np.abs(inside[:, None] - centers) / side)
     weights = tents * np.tile(np.minimum(places, level.size - places), len(starts))
     return torch.from_numpy((weights / weights.sum(1, keepdims=True)).astype(np.float32))
@@ -275,7 +281,7 @@ def _nearest_crops(levels: Sequence[CropLevel], xs: NDArray, ys: NDArray) -> Ten
 
 
 def unique_boxes(levels: Sequence[CropLevel]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """The different crops of all levels ``[m, 3]``, and for each crop its place among them ``[n]``."""
+    """The distinct crops of all levels ``[m, 3]``, and for each crop its index among them ``[n]``."""
     boxes = np.concatenate([level.boxes for level in levels])
     unique, places = np.unique(boxes, axis=0, return_inverse=True)
     return unique, places.reshape(-1)
@@ -312,15 +318,15 @@ def encode_stream(
     """Encode the crops of many images in full batches that run across sizes and images.
 
     Args:
-        encode: What embeds crops: ``[b, 3, s, s]`` to ``[b, ...]``.
-        jobs: For each image a key and its crops in chunks ``[b, 3, s, s]``; read only as far as needed.
+        encode: Embeds crops: ``[b, 3, s, s]`` to ``[b, ...]``.
+        jobs: For each image a key and its crops in chunks ``[b, 3, s, s]``; consumed lazily.
         batch_size: Crops encoded at once.
 
     Yields:
         Each key with its embeddings ``[n, ...]``, in the order of the jobs.
     """
-    waiting: deque[tuple[Key, list[Tensor]]] = deque()  # images whose crops are not all encoded yet
-    owners: deque[tuple[list[Tensor], int]] = deque()  # whose the buffered crops are, in order
+    waiting: deque[tuple[Key, list[Tensor]]] = deque()  # images with crops that are not encoded yet
+    owners: deque[tuple[list[Tensor], int]] = deque()  # owners of the buffered crops, in order
     buffer: list[Tensor] = []
     buffered = 0
 
@@ -358,9 +364,9 @@ def encode_stream(
 
 
 def batch_size_for(memory: int, image_size: int) -> int:
-    """Crops to encode at once within ``memory`` bytes.
+    """Number of crops to encode at once within ``memory`` bytes.
 
-    A transformer layer holds about twenty tensors of the input's size (in ViT-B/16 a token has as many
-    numbers as a patch has values); a quarter of the memory is given to it.
+    A transformer layer holds about 24 float32 tensors of the input's size (in ViT-B/16, a token has as many numbers
+    as a patch has values); it gets a quarter of the memory.
     """
     return int(min(256, max(1, memory // 4 // (24 * 12 * image_size**2))))

@@ -1,4 +1,4 @@
-"""Text embeddings kept on disk, so that a question asked twice needs no encoder."""
+"""Cache of text embeddings on disk: known prompts need no encoder."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ log = logging.getLogger("lexsplat")
 
 
 def encode_each(encoder: ImageTextEncoder, texts: Sequence[str]) -> Tensor:
-    """Embeddings ``[T, D]`` of texts one by one: in a batch the last bits depend on what else is in it."""
+    """Embeddings ``[T, D]`` of texts, encoded one by one: in a batch, the last bits depend on the other texts."""
     return torch.cat([encoder.encode_text([text]) for text in texts])
 
 
 class TextCache:
     """Embeddings of prompts by model and prompt.
 
-    One file a model, ``text-HASH.safetensors``, read once. A file that cannot be read is made anew.
+    One file per model, ``text-HASH.safetensors``, read once. A damaged file is replaced.
 
     Args:
-        folder: Where the files lie; made when first written.
+        folder: Folder of the files; created on the first write.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -43,10 +43,10 @@ class TextCache:
         Args:
             content_hash: The model's hash, as recorded with the features.
             prompts: Texts; repeated ones are embedded once.
-            encoder: Gives the model; called only if a prompt is new.
+            encoder: Returns the model; called only for new prompts.
 
         Raises:
-            ValueError: If there is no prompt, one is empty, or the model given is not the one of the hash.
+            ValueError: If there is no prompt, one is empty, or the model has another hash.
         """
         if not prompts or any(not prompt.strip() for prompt in prompts):
             raise ValueError("prompts must be one or more texts that are not empty")
@@ -55,12 +55,12 @@ class TextCache:
         if new:
             model = encoder()
             if model.content_hash != content_hash:
-                raise ValueError(f"{model.name} is not the model that was asked for ({content_hash})")
+                raise ValueError(f"{model.name} is not the model of the features ({content_hash})")
             known.update(zip(new, encode_each(model, new)))
             try:
                 self._write(content_hash, known)
-            except OSError as error:  # the answer does not depend on it
-                log.warning("%s: embeddings of words are not kept (%s)", self._folder, error.strerror)
+            except OSError as error:  # the cache is optional
+                log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
         return torch.stack([known[prompt] for prompt in prompts])
 
     def _path(self, content_hash: str) -> Path:
@@ -73,16 +73,15 @@ class TextCache:
                 tensors, prompts = read_tensors(self._path(content_hash))
                 found = {prompts[key]: vector for key, vector in tensors.items()}
             except (FileFormatError, KeyError):
-                pass  # a cache that cannot be read is an empty one
+                pass  # a damaged cache counts as empty
             sound = all(
                 v.ndim == 1 and v.dtype == torch.float32 and v.isfinite().all() for v in found.values()
             )
-            alike = len({len(vector) for vector in found.values()}) <= 1 if sound else False
-            self._known[content_hash] = found if alike else {}
+            uniform = len({len(vector) for vector in found.values()}) <= 1 if sound else False
+            self._known[content_hash] = found if uniform else {}
         return self._known[content_hash]
 
     def _write(self, content_hash: str, known: dict[str, Tensor]) -> None:
-        # Prompts may hold any character, and "__metadata__" is no name for a tensor: names are hashes of
-        # prompts.
+        # Tensors are named by hashes: prompts may contain any character, and "__metadata__" is reserved.
         keys = {hashlib.blake2b(prompt.encode(), digest_size=16).hexdigest(): prompt for prompt in known}
         write_tensors(self._path(content_hash), {key: known[prompt] for key, prompt in keys.items()}, keys)

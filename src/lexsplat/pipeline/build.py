@@ -418,8 +418,10 @@ def feature_maps(
         )
         return without_masked_cells(maps, scene), clip.content_hash
     dino = None if config.dino == "none" else load_dino(config.dino, device)
-    settings = replace(config.features, memory=parse_bytes(config.memory))
-    maps = extract_features(scene, clip, dino, settings, cache_dir=cache_dir, listener=listener)
+    memory = parse_bytes(config.memory)
+    maps = extract_features(
+        scene, clip, dino, config.features, cache_dir=cache_dir, memory=memory, listener=listener
+    )
     return without_masked_cells(maps, scene), clip.content_hash
 
 

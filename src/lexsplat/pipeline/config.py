@@ -131,7 +131,6 @@ class BuildConfig:
         return replace(
             self,
             reconstruction=replace(self.reconstruction, image_memory=photos),
-            features=replace(self.features, memory=whole),
             trained=replace(self.trained, memory_bytes=projections),
             averaged=replace(self.averaged, memory_bytes=max(1, min(self.averaged.memory_bytes, whole // 4))),
             lifted=replace(self.lifted, memory_bytes=histogram),
@@ -164,7 +163,7 @@ class BuildConfig:
             "lifted+tuned": {"averaged": AveragedConfig()},
         }
         parts |= unused[self.method]
-        return replace(self, features=self.features.decisive(use_dino=self.uses_dino), **parts)
+        return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **parts)
 
     @property
     def uses_dino(self) -> bool:
@@ -187,7 +186,7 @@ class BuildConfig:
         features = self.features
         if self.clip == "bundled" or device == "cpu":
             suited = FeatureConfig.bundled() if self.clip == "bundled" else FeatureConfig.sparse()
-            features = features.where_open(suited)
+            features = features.on_top_of(suited)
         iterations = self.iterations
         if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:
             iterations = self.reconstruction.iterations  # set from Python

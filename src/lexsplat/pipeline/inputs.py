@@ -58,8 +58,10 @@ def prepare_capture(
             memory=parse_bytes(config.memory),
             listener=listener,
         )
-        for note in (*found.notes, found.note):
-            logging.getLogger("lexsplat").warning(note)
+        log = logging.getLogger("lexsplat")
+        for note in found.notes:
+            log.warning(note)
+        log.log(logging.INFO if found.is_complete else logging.WARNING, found.note)
         inside = found.images.resolve().is_relative_to(folder.root.resolve())
         images = "poses/images" if inside else str(found.images.resolve())
         facts = {

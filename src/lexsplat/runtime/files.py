@@ -94,20 +94,30 @@ def write_json(path: Path, data: Any) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
+def read_json(path: Path, *, remedy: str = "") -> Any:
+    """Read a JSON file in UTF-8, with or without a byte order mark. NaN and infinity are read.
+
+    Args:
+        path: The file.
+        remedy: What the user can do if it is not valid.
 
     Raises:
-        FileFormatError: If it cannot be read, is not JSON, or is absurdly large.
+        FileFormatError: If it cannot be read, is not JSON, or is larger than 256 MiB.
     """
     try:
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            raise FileFormatError(path, expected="a JSON file", found=f"{path.stat().st_size} bytes")
-        return json.loads(path.read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        if size <= _MAX_JSON_BYTES:
+            return json.loads(path.read_bytes().decode("utf-8-sig"))
+        found = f"{size} bytes"
     except OSError as error:
-        raise FileFormatError(path, expected="a readable JSON file", found=str(error.strerror)) from error
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(path, expected="JSON", found=str(error)) from error
+        found = str(error.strerror)
+    except UnicodeDecodeError as error:
+        found = f"invalid UTF-8 at byte {error.start}"
+    except RecursionError:
+        found = "brackets nested too deeply"
+    except ValueError as error:
+        found = str(error)
+    raise FileFormatError(path, expected="JSON", found=found, remedy=remedy)
 
 
 PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".ckpt")

@@ -1,4 +1,12 @@
-"""Hashes that tell whether something has changed since a result was made from it."""
+"""Hashes and stamps that detect whether an input has changed since a result was computed from it.
+
+"The same file" has three meanings, by what is at stake:
+
+- content (`file_hash`): results that are recorded, or cached for other folders and machines;
+- name, size and modification time (`file_stamp`): intermediate files of one machine, where a pass over all photos
+  would cost too much;
+- name and size: the photos of a finished "poses" stage, which users copy and sync without keeping times.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +24,15 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.blake2b(text.encode("utf-8"), digest_size=12).hexdigest()
 
 
-def file_hash(path: Path) -> str:
-    """Of the content."""
-    digest = hashlib.blake2b(digest_size=12)
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Size in bytes and modification time in nanoseconds of a file: cheap, and valid on one machine only."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def file_hash(path: Path, digest_size: int = 12) -> str:
+    """Hash of a file's content, ``2 * digest_size`` hex digits."""
+    digest = hashlib.blake2b(digest_size=digest_size)
     with open(path, "rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)

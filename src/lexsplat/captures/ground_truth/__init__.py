@@ -1,1 +1,1 @@
-"""Annotations to measure against: masks, boxes and lists of prompts."""
+"""Ground truth for evaluation: masks, boxes and lists of prompts."""

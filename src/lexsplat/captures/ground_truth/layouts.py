@@ -1,11 +1,12 @@
-"""Truth as data sets have it, by their own layout; nothing has to be copied or renamed by hand.
+"""Ground truth in the layouts of public data sets; nothing has to be copied or renamed by hand.
 
-- **segmentations**: ``segmentations/STEM/PROMPT.png``, the layout of the authors' Mip-NeRF 360 and LERF folders
-  and ours (`masks.load_masks`).
-- **3d-ovs**: ``segmentations/NN/CLASS.png`` and ``segmentations/classes.txt``; NN counts the images in order.
+- **segmentations**: ``segmentations/STEM/PROMPT.png``, the layout of lexsplat and of the authors' Mip-NeRF 360 and
+  LERF folders (`masks.load_masks`).
+- **3d-ovs**: ``segmentations/NN/CLASS.png`` and ``segmentations/classes.txt``; NN is the index of the image.
 - **lerf-ovs**: LangSplat's ``label/SCENE/frame_*.json`` beside the capture ``SCENE``: polygons and boxes.
 
-A test holds each reader to small fixtures in its layout. Views with ground truth are the views to hold out.
+To add a layout: add its name to `LAYOUTS`, recognize it in `layout_of` and `annotated_names`, and read it in
+`_read_ground_truth`. Views with ground truth are held out by default.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from lexsplat.captures.ground_truth.prompt_lists import PromptList, capture_prom
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, MAX_PIXELS
 from lexsplat.captures.images.undistortion import MAX_SIDE
 from lexsplat.captures.readers.camera_files import checked_name
-from lexsplat.captures.readers.transforms_json import read_json
 from lexsplat.captures.splits import mask_folders, match_stem
 from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.files import read_json
 
 log = logging.getLogger("lexsplat")
 
@@ -36,21 +37,21 @@ LAYOUTS = ("segmentations", "3d-ovs", "lerf-ovs")
 """Names of the layouts."""
 
 CLASSES_FILE = "classes.txt"
-"""Of 3D-OVS: the names of the classes, one a line."""
+"""3D-OVS: class names, one per line."""
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """Truth by view and prompt.
+    """Ground truth by view and prompt.
 
     Args:
         layout: One of `LAYOUTS`.
         origin: The folder it was read from.
         masks: ``{view: {prompt: mask}}``: a file for `View.load_mask`, or an array ``[H, W]`` bool on the
             undistorted image.
-        boxes: ``{view: {prompt: boxes}}``, ``[B, 4]`` as x0, y0, x1, y1 in pixels of the mask; only where the data
-            set has boxes.
-        classes: Names of all classes, where the data set lists them.
+        boxes: ``{view: {prompt: boxes}}``, ``[B, 4]`` as x0, y0, x1, y1 in pixels of the mask, if the data set has
+            boxes.
+        classes: Names of all classes, if the data set lists them.
     """
 
     layout: str
@@ -60,15 +61,15 @@ class Annotations:
     classes: tuple[str, ...] = ()
 
     def prompts(self) -> tuple[str, ...]:
-        """All prompts that have ground truth somewhere, sorted."""
+        """All prompts with ground truth in any view, sorted."""
         return tuple(sorted({prompt for prompts in self.masks.values() for prompt in prompts}))
 
     def origin_facts(self, prompt_list: PromptList | None) -> dict[str, str | None]:
-        """Where the ground truth lay and which list was asked, as results record it."""
+        """Folder, layout and prompt list, as results record them."""
         return {"folder": str(self.origin), "layout": self.layout, "prompt_list": prompt_list}
 
     def renamed(self, names: Mapping[str, str]) -> Annotations:
-        """The same ground truth under other words; prompts that ``names`` does not list are left out."""
+        """The same ground truth under other prompts; prompts that ``names`` does not list are dropped."""
 
         def change(table: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             kept = {
@@ -84,7 +85,7 @@ class Annotations:
 def find_annotations(root: Path) -> tuple[str, Path] | None:
     """Layout and folder of the ground truth that belongs to a capture, or None.
 
-    Masks in ``segmentations/`` of the capture come first; else LERF-OVS labels in ``label/`` beside the capture.
+    Masks in ``segmentations/`` of the capture take precedence over LERF-OVS labels in ``label/`` beside it.
     """
     segmentations = root / "segmentations"
     if segmentations.is_dir() and mask_folders(segmentations):
@@ -104,7 +105,7 @@ def layout_of(folder: Path) -> str:
 
 
 def annotated_names(layout: str, folder: Path, names: Collection[str], image_folder: Path) -> set[str]:
-    """Which of the images ``names`` have truth. What matches no image is told by `load_annotations`."""
+    """Which of the images ``names`` have ground truth. `load_annotations` reports ground truth without an image."""
     if layout == "lerf-ovs":
         stems = [path.stem for path in folder.glob("frame_*.json")]
     else:
@@ -114,15 +115,15 @@ def annotated_names(layout: str, folder: Path, names: Collection[str], image_fol
 
 
 def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: PromptList | None) -> None:
-    """Refuse what `load_annotations` could not use, before hours are spent on a scene.
+    """Check the options of `load_annotations` before a long build.
 
     Args:
         root: The folder of the capture.
-        folder: Where the ground truth is said to be, if not in or beside the capture.
-        prompt_list: Whose words are to be asked, if not what the masks are called.
+        folder: Folder of the ground truth, if not in or beside the capture.
+        prompt_list: List of prompts, if not the file names of the masks.
 
     Raises:
-        CaptureError: If the folder is none, or the capture is called like no scene that has prompt lists.
+        CaptureError: If ``folder`` does not exist, or the capture has no prompt lists.
     """
     if folder is not None and not folder.is_dir():
         raise CaptureError(folder, expected="a folder with masks or labels", found="no such folder")
@@ -131,75 +132,95 @@ def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: Pro
 
 
 def load_annotations(
-    scene: Capture, folder: Path | None = None, prompt_list: PromptList | None = None
+    capture: Capture, folder: Path | None = None, prompt_list: PromptList | None = None
 ) -> Annotations:
-    """The ground truth of a capture, in whichever layout it is.
+    """The ground truth of a capture, in any of the layouts.
 
     Args:
-        scene: The capture.
-        folder: Where the ground truth is; None looks in and beside the capture (`find_annotations`).
-        prompt_list: Ask the words of the paper or of the released code, for captures called like its scenes;
-            None asks what the masks are called. Masks may be called in the words of either; others are left out.
+        capture: The capture.
+        folder: Folder of the ground truth, which must hold some; None searches in and beside the capture
+            (`find_annotations`), where it may be absent.
+        prompt_list: Use the prompts of the paper or of the released code, for captures named after its scenes. Masks
+            may be named after either list; others are dropped. None uses the file names of the masks as prompts.
 
     Returns:
         Masks and boxes; empty where the capture has none.
 
     Raises:
-        CaptureError: If a file belongs to no view or several, does not fit its photo, a class is missing, the
-            folder is none, the capture has no prompt lists, or no mask is called like one of their prompts.
-        FileFormatError: If a label file is not what LangSplat's reader expects.
+        CaptureError: If a given folder does not exist or holds no ground truth, a file belongs to no view or several
+            or does not fit its photo, a class is missing, the capture has no prompt lists, or no mask is named
+            after one of their prompts.
+        FileFormatError: If a label file is not in LangSplat's format.
     """
-    check_ground_truth_options(scene.root, folder, prompt_list)
-    ground_truth = _read_truth(scene, folder)
-    return _in_words_of(ground_truth, scene.root, prompt_list) if prompt_list else ground_truth
+    check_ground_truth_options(capture.root, folder, prompt_list)
+    ground_truth = _read_ground_truth(capture, folder)
+    if folder is not None and not ground_truth.prompts():
+        raise _no_ground_truth(folder, ground_truth.layout)
+    return _with_prompts_of(ground_truth, capture.root, prompt_list) if prompt_list else ground_truth
 
 
-def _in_words_of(ground_truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
-    """The ground truth that a list asks for, in its words; what is left out is told."""
+def _no_ground_truth(folder: Path, layout: str) -> CaptureError:
+    """The error for a given folder that holds no ground truth, with the most likely remedy."""
+    below = [path for path in sorted(folder.iterdir()) if path.is_dir() and any(path.glob("frame_*.json"))]
+    others = len(list(folder.glob("*.json")))
+    found, remedy = "no masks and no labels", "give the folder that holds STEM/PROMPT.png or frame_*.json"
+    if layout == "lerf-ovs":
+        found, remedy = "labels without objects", "annotate objects, or give another folder"
+    elif below:
+        found, remedy = f"labels in {below[0].name}/", f"give {below[0]}"
+    elif others:
+        found, remedy = f"{others} JSON files", "name labels frame_*.json, as LangSplat does"
+    return CaptureError(folder, expected="ground truth", found=found, remedy=remedy)
+
+
+def _with_prompts_of(ground_truth: Annotations, root: Path, prompt_list: PromptList) -> Annotations:
+    """The ground truth for the prompts of a list; logs the prompts that are not in it."""
     names = capture_prompt_names(root, prompt_list)
-    left_out = [prompt for prompt in ground_truth.prompts() if prompt not in names]
+    others = [prompt for prompt in ground_truth.prompts() if prompt not in names]
     found = ground_truth.renamed(names)
-    if left_out and not found.masks:
+    if others and not found.masks:
         raise CaptureError(
             ground_truth.origin,
-            expected="masks called like prompts of the paper",
-            found=f"none in the words of the list {prompt_list!r}, but {', '.join(left_out[:3])}",
-            remedy="leave the prompt list out: prompts are then what the masks are called",
+            expected=f"masks named after prompts of the list {prompt_list!r}",
+            found=", ".join(others[:3]),
+            remedy="omit the prompt list to use the file names of the masks as prompts",
         )
-    if left_out:
-        some = ", ".join(left_out[:5]) + (" and more" if len(left_out) > 5 else "")
-        log.warning("%s: not in the prompt list %r and not asked: %s", ground_truth.origin, prompt_list, some)
+    if others:
+        some = ", ".join(others[:5]) + (" and more" if len(others) > 5 else "")
+        log.warning(
+            "%s: masks not in the prompt list %r are ignored: %s", ground_truth.origin, prompt_list, some
+        )
     return found
 
 
-def _read_truth(scene: Capture, folder: Path | None) -> Annotations:
+def _read_ground_truth(capture: Capture, folder: Path | None) -> Annotations:
     if folder is None:
-        found = find_annotations(scene.root)
-        if scene.segmentations is not None:
-            found = layout_of(scene.segmentations), scene.segmentations
+        found = find_annotations(capture.root)
+        if capture.segmentations is not None:
+            found = layout_of(capture.segmentations), capture.segmentations
         if found is None:
-            return Annotations("segmentations", scene.root / "segmentations", {})
+            return Annotations("segmentations", capture.root / "segmentations", {})
         layout, folder = found
     else:
         layout = layout_of(folder)
     if layout == "lerf-ovs":
-        return _read_lerf_ovs(scene, folder)
+        return _read_lerf_ovs(capture, folder)
     if layout == "3d-ovs":
-        return _read_3d_ovs(scene, folder)
-    if folder != scene.segmentations:
-        scene = replace(scene, segmentations=folder)
-    return Annotations(layout, folder, load_masks(scene))
+        return _read_3d_ovs(capture, folder)
+    if folder != capture.segmentations:
+        capture = replace(capture, segmentations=folder)
+    return Annotations(layout, folder, load_masks(capture))
 
 
 # 3D-OVS
 
 
-def _read_3d_ovs(scene: Capture, folder: Path) -> Annotations:
+def _read_3d_ovs(capture: Capture, folder: Path) -> Annotations:
     classes = _read_classes(folder / CLASSES_FILE)
     masks: dict[str, dict[str, Path]] = {}
     for view_folder in mask_folders(folder):
         stem = view_folder.relative_to(folder).as_posix()
-        view = scene.views[_the_image(stem, "3d-ovs", scene, view_folder)]
+        view = capture.views[_the_image(stem, "3d-ovs", capture, view_folder)]
         prompts = masks.setdefault(view.name, {})
         for name in classes:
             path = view_folder / f"{name}.png"
@@ -208,7 +229,7 @@ def _read_3d_ovs(scene: Capture, folder: Path) -> Annotations:
                     view_folder,
                     expected=f"a mask for each of the {len(classes)} classes of {CLASSES_FILE}",
                     found=f"no {name}.png",
-                    remedy="draw it, black where the class is not seen, or take the class out of the list",
+                    remedy="draw it (black if the class is not visible), or remove the class from the list",
                 )
             view.check_mask(path)
             prompts[name] = path
@@ -217,24 +238,24 @@ def _read_3d_ovs(scene: Capture, folder: Path) -> Annotations:
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:
-    """The names of ``classes.txt``, each one of a file in a view's folder.
+    """The names in ``classes.txt``, each the name of a file in a view's folder.
 
     Raises:
-        CaptureError: If a name leads elsewhere.
-        FileFormatError: If it is no text.
+        CaptureError: If a name points outside the folder.
+        FileFormatError: If it is not UTF-8 text.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(path, expected="names of classes, one a line", found=str(error)) from error
+        raise FileFormatError(path, expected="class names, one per line", found=str(error)) from error
     classes = tuple(checked_name(line.strip(), path) for line in lines if line.strip())
     if any("/" in name for name in classes):
-        raise FileFormatError(path, expected="names of classes", found="names of folders")
+        raise FileFormatError(path, expected="class names", found="a path")
     return classes
 
 
 def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: Path) -> list[str]:
-    """The images a folder or file of the ground truth can mean; in 3D-OVS a number counts the images in order."""
+    """The images a folder or file of the ground truth can refer to; a number in 3D-OVS is an index of images."""
     matches = match_stem(stem, names)
     if layout != "3d-ovs" or not stem.isdigit() or not image_folder.is_dir():
         return matches
@@ -245,13 +266,13 @@ def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: 
     return matches if counted == matches else sorted({*matches, *counted})
 
 
-def _the_image(stem: str, layout: str, scene: Capture, subject: Path) -> str:
-    matches = _images_meant(stem, layout, scene.views, scene.root / "images")
+def _the_image(stem: str, layout: str, capture: Capture, subject: Path) -> str:
+    matches = _images_meant(stem, layout, capture.views, capture.root / "images")
     if len(matches) != 1:
         found = "no view of that name" if not matches else f"views {' and '.join(matches[:3])}"
         raise CaptureError(
             subject,
-            expected="truth for one view",
+            expected="ground truth of one view",
             found=found,
             remedy="name it like the image, or remove it",
         )
@@ -261,19 +282,19 @@ def _the_image(stem: str, layout: str, scene: Capture, subject: Path) -> str:
 # LERF-OVS
 
 
-def _read_lerf_ovs(scene: Capture, folder: Path) -> Annotations:
+def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
     masks: dict[str, dict[str, NDArray[np.bool_]]] = {}
     boxes: dict[str, dict[str, NDArray[np.float64]]] = {}
     for path in sorted(folder.glob("frame_*.json")):
-        name, size, objects = _read_labels(path)
-        view = scene.views[_the_image(stem_of(name), "lerf-ovs", scene, path)]
+        labels = _read_labels(path)
+        view = capture.views[_the_image(stem_of(labels.image), "lerf-ovs", capture, path)]
         parts: dict[str, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {}
-        for category, box, polygon in objects:
-            mask = polygon_mask(polygon, *size)
-            placed = view.place_mask(mask, path)
-            if view.lens.distorts:  # the box stood around the object in the photo as it is on disk
-                box = _box_around(placed)
-            parts.setdefault(category, []).append((placed, box))
+        for labeled in labels.objects:
+            box = labeled.box
+            mask = view.undistort_mask(polygon_mask(labeled.polygon, *labels.size), path)
+            if view.lens.distorts:  # the label's box is around the object in the distorted photo
+                box = _box_around(mask)
+            parts.setdefault(labeled.category, []).append((mask, box))
         masks[view.name] = {
             category: np.logical_or.reduce([mask for mask, _ in found])
             for category, found in sorted(parts.items())
@@ -284,16 +305,31 @@ def _read_lerf_ovs(scene: Capture, folder: Path) -> Annotations:
     return Annotations("lerf-ovs", folder, masks, boxes)
 
 
-def _read_labels(
-    path: Path,
-) -> tuple[str, tuple[int, int], list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]]:
-    """Image name, (width, height) and objects (category, box, polygon) of one label file."""
-    content = read_json(path)
+@dataclass(frozen=True)
+class _LabeledObject:
+    """One object of a label file: category, box ``[4]`` and polygon ``[n, 2]``, in pixels."""
+
+    category: str
+    box: NDArray[np.float64]
+    polygon: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """One label file: the name of its image, its width and height, and the objects."""
+
+    image: str
+    size: tuple[int, int]
+    objects: list[_LabeledObject]
+
+
+def _read_labels(path: Path) -> _Labels:
+    content = read_json(path, remedy="copy the file again or correct it")
     try:
         info = content["info"]
         name, size = str(info["name"]), (int(info["width"]), int(info["height"]))
         objects = [
-            (
+            _LabeledObject(
                 str(entry["category"]),
                 np.asarray(entry["bbox"], dtype=np.float64).reshape(4),
                 np.asarray(entry["segmentation"], dtype=np.float64).reshape(-1, 2),
@@ -307,26 +343,26 @@ def _read_labels(
             found=repr(error)[:200],
             remedy="use LangSplat's label files",
         ) from error
-    numbers = [part for _, box, polygon in objects for part in (box, polygon)]
+    numbers = [part for found in objects for part in (found.box, found.polygon)]
     if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
         raise FileFormatError(
             path, expected="a size and finite coordinates", found=f"size {size[0]}x{size[1]}"[:60]
         )
-    # Beyond the picture a corner may lie, but not where whole numbers end or a line takes minutes to draw.
+    # Corners may lie outside the image, but not so far that integers overflow or drawing takes minutes.
     if not all((np.abs(part) <= 10 * MAX_SIDE).all() for part in numbers):
-        raise FileFormatError(path, expected="finite coordinates in and around the photo", found="others")
-    return name, size, objects
+        raise FileFormatError(path, expected="finite coordinates in or near the photo", found="others")
+    return _Labels(name, size, objects)
 
 
 def polygon_mask(points: Sequence[Sequence[float]] | NDArray, width: int, height: int) -> NDArray[np.bool_]:
-    """A filled polygon ``[H, W]`` as LangSplat draws it: corners cut to whole pixels, the outline included.
+    """A filled polygon ``[H, W]`` as LangSplat draws it: corners truncated to whole pixels, the outline included.
 
-    Agrees with OpenCV's ``fillPoly`` but for 0.2 % of the pixels, all on the outline.
+    Differs from OpenCV's ``fillPoly`` in 0.2 % of the pixels, all on the outline.
 
     Args:
         points: Corners ``[n, 2]`` as x, y in pixels.
-        width: Of the mask.
-        height: Of the mask.
+        width: Width of the mask.
+        height: Height of the mask.
     """
     from skimage.measure import points_in_poly
 
@@ -340,10 +376,10 @@ def polygon_mask(points: Sequence[Sequence[float]] | NDArray, width: int, height
         ys, xs = np.mgrid[low[1] : high[1], low[0] : high[0]]
         inside = points_in_poly(np.stack([xs.ravel(), ys.ravel()], axis=1), corners)
         mask[low[1] : high[1], low[0] : high[0]] = inside.reshape(ys.shape)
-    picture = Image.fromarray(mask)
+    image = Image.fromarray(mask)
     closed = [(int(x), int(y)) for x, y in [*corners, corners[0]]]
-    ImageDraw.Draw(picture).line(closed, fill=1)
-    return np.asarray(picture, dtype=bool)
+    ImageDraw.Draw(image).line(closed, fill=1)
+    return np.asarray(image, dtype=bool)
 
 
 def _box_around(mask: NDArray[np.bool_]) -> NDArray[np.float64]:

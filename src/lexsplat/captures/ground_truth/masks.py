@@ -1,42 +1,29 @@
-"""Ground-truth masks of views."""
+"""Ground-truth masks in ``segmentations/STEM/PROMPT.png``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lexsplat.captures.capture import Capture
-from lexsplat.captures.images.reading import read_mask
 from lexsplat.captures.splits import mask_folders, match_stem
 from lexsplat.runtime.errors import CaptureError
 
 
-def load_mask(path: Path) -> NDArray[np.bool_]:
-    """A mask as ``[H, W]`` bool as it lies on disk: true where the picture is brighter than half.
+def load_masks(capture: Capture) -> dict[str, dict[str, Path]]:
+    """The mask files by view name and prompt, both sorted.
 
-    Raises:
-        CaptureError: If the file is missing or damaged.
-    """
-    return read_mask(path)
-
-
-def load_masks(scene: Capture) -> dict[str, dict[str, Path]]:
-    """Where the masks of each view are: view name to prompt to file, both sorted.
-
-    "_" in a file name means a space: ``plastic_box.png`` answers "plastic box". Sizes are checked from
-    headers; read a mask with ``scene.views[name].load_mask(path)``, which also undistorts it.
+    "_" in a file name stands for a space: ``plastic_box.png`` is the mask of "plastic box". Sizes are checked from
+    headers; read a mask with ``capture.views[name].load_mask(path)``, which also undistorts it.
 
     Raises:
         CaptureError: If a folder matches no view or several, or a mask does not have its photo's aspect.
     """
-    if scene.segmentations is None:
+    if capture.segmentations is None:
         return {}
     found: dict[str, dict[str, Path]] = {}
-    for folder in mask_folders(scene.segmentations):
-        stem = folder.relative_to(scene.segmentations).as_posix()
-        matches = match_stem(stem, scene.views)
+    for folder in mask_folders(capture.segmentations):
+        stem = folder.relative_to(capture.segmentations).as_posix()
+        matches = match_stem(stem, capture.views)
         if len(matches) != 1:
             what = (
                 "no view of that name" if not matches else f"{len(matches)} views of that name: {matches[:3]}"
@@ -49,6 +36,6 @@ def load_masks(scene: Capture) -> dict[str, dict[str, Path]]:
             )
         prompts = found.setdefault(matches[0], {})
         for path in sorted(folder.glob("*.png")):
-            scene.views[matches[0]].check_mask(path)
+            capture.views[matches[0]].check_mask(path)
             prompts[path.stem.replace("_", " ")] = path
     return {name: dict(sorted(found[name].items())) for name in sorted(found)}

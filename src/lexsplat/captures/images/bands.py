@@ -1,8 +1,8 @@
-"""Large pictures, a band of rows at a time: as floats they would take twelve bytes a pixel, several times over.
+"""Processes large images in bands of rows: as floats they take 12 bytes per pixel, several times over.
 
-A source has a width, a height, and rows on demand; what is done to it (masked pixels filled, a lens undone, made
-smaller) is a source again, or a picture of the size that is wanted. Whether a picture is large is a matter of its
-pixels alone, so that results do not depend on the memory there is.
+A source has a width, a height, and rows on demand. Operations on it (filling masked pixels, undistortion) are sources
+again; `reduced` and `whole` turn a source into an image. Whether an image is large depends on its size alone, so
+results do not depend on the available memory.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 LARGE_PIXELS = 2_000_000
-"""Pictures beyond are worked on in bands."""
+"""Images with more pixels are processed in bands."""
 
 BAND_PIXELS = 1 << 19
-"""Pixels of a band, of the source or the result, whichever is more."""
+"""Pixels per band, of the source or the result, whichever is more."""
 
 
 def is_large(width: int, height: int) -> bool:
-    """Whether a picture of this size is worked on in bands."""
+    """Whether an image of this size is processed in bands."""
     return width * height > LARGE_PIXELS
 
 
 class Rows(Protocol):
-    """A picture that gives its rows when asked."""
+    """An image whose rows are computed on demand."""
 
     width: int
     height: int
@@ -38,7 +38,7 @@ class Rows(Protocol):
 
 
 class ArrayRows:
-    """A picture ``[H, W, C]`` that is in memory."""
+    """An image ``[H, W, C]`` in memory."""
 
     def __init__(self, image: NDArray[np.float32]) -> None:
         self._image = image
@@ -50,7 +50,7 @@ class ArrayRows:
 
 
 class FilledRows:
-    """A source with the mean of the valid pixels ``[H, W]`` in place of the others."""
+    """A source whose invalid pixels are replaced by the mean of the valid ones ``[H, W]``."""
 
     def __init__(self, source: Rows, valid: NDArray[np.bool_]) -> None:
         self._source, self._valid = source, valid
@@ -67,14 +67,14 @@ class FilledRows:
 
 
 class MaskRows:
-    """A mask ``[H, W]`` as a picture of one channel, 1 where it is true or within ``reach`` pixels of that."""
+    """A mask ``[H, W]``, dilated by ``reach`` pixels, as an image of one channel in 0..1."""
 
     def __init__(self, mask: NDArray[np.bool_], reach: int = 0) -> None:
         self._mask, self._reach = mask, reach
         self.height, self.width = mask.shape
 
     def rows(self, first: int, last: int) -> NDArray[np.float32]:
-        """The rows, spread."""
+        """The rows, dilated."""
         top = max(0, first - self._reach)
         part = self._mask[top : last + self._reach]
         if self._reach:
@@ -84,7 +84,7 @@ class MaskRows:
 
 
 def band_ranges(height: int, width: int, step: float = 1.0) -> list[tuple[int, int]]:
-    """First and last row of every band of a picture, each of whose rows takes ``step`` rows of ``width`` pixels."""
+    """First and last row of every band, if each row is computed from ``step`` rows of ``width`` pixels."""
     count = max(1, int(BAND_PIXELS / (max(1, width) * max(1.0, step))))
     return [(first, min(first + count, height)) for first in range(0, height, count)]
 
@@ -98,7 +98,7 @@ def whole(source: Rows) -> NDArray[np.float32]:
 
 
 def reduced(source: Rows, size: tuple[int, int]) -> NDArray[np.float32]:
-    """A source at a smaller ``(width, height)``: pixels are the mean over the area they cover."""
+    """A source at a smaller ``(width, height)``: each pixel is the mean over the area it covers."""
     if size == (source.width, source.height):
         return whole(source)
     step = source.height / size[1]

@@ -1,6 +1,4 @@
-"""Masks of two kinds: ``segmentations/STEM/PROMPT.png`` to measure against, the layout of the authors' data set, and
-``masks/NAME.png``, black where pixels of a photo take no part in anything that is learned.
-"""
+"""Masks of ignored pixels: ``masks/NAME.png``, black where pixels of a photo are ignored by every stage."""
 
 from __future__ import annotations
 
@@ -11,19 +9,19 @@ from lexsplat.captures.capture import stem_of
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES
 
 IGNORE_FOLDER = "masks"
-"""Folder of a capture with ``NAME.png`` (COLMAP's way: ``0001.jpg.png``) or ``STEM.png``: a pixel that is 0 takes no
-part in features, matches and losses."""
+"""Folder of a capture with ``NAME.png`` (COLMAP's convention: ``0001.jpg.png``) or ``STEM.png``. Pixels of value 0
+are ignored by feature extraction, matching and losses."""
 
 
 def find_ignore_masks(folders: Sequence[Path], names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
-    """Which file masks which photo.
+    """The mask files of photos.
 
     Args:
-        folders: Where masks may lie; the first that is there counts.
+        folders: Where masks may be; the first existing folder is used.
         names: Names of the photos.
 
     Returns:
-        Files by name of photo, for those that have one; and a warning, if there are files that mask none.
+        Mask files by photo name, for photos that have one, and a warning if some files match no photo.
     """
     folder = next((folder for folder in folders if folder.is_dir()), None)
     if folder is None:
@@ -43,4 +41,4 @@ def find_ignore_masks(folders: Sequence[Path], names: Iterable[str]) -> tuple[di
     if not strays:
         return found, []
     some = ", ".join(strays[:3]) + (" and more" if len(strays) > 3 else "")
-    return found, [f"{folder}: {len(strays)} masks are called like no photo and are not used: {some}"]
+    return found, [f"{folder}: {len(strays)} masks match no photo and are ignored: {some}"]

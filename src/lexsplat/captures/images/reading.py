@@ -1,4 +1,4 @@
-"""Pictures on disk as arrays: every mode Pillow knows, and typed errors for what it cannot read."""
+"""Reads images of every mode Pillow supports as arrays, with typed errors for what it cannot read."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from lexsplat.captures.images.bands import band_ranges, is_large, reduced
 from lexsplat.runtime.errors import CaptureError
 
 HEIC_SUFFIXES = (".heic", ".heif")
-"""Suffixes of what phones of Apple write; it takes the library pi-heif to read it."""
+"""Suffixes of Apple's photos, which need the library pi-heif."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIC_SUFFIXES)
-"""Suffixes taken for pictures, in the order in which they are tried where a capture names none."""
+"""Suffixes of images, in the order in which they are tried for names without one."""
 
 MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-"""Largest picture that is opened: 179 million pixels. What claims more is a decompression bomb."""
+"""Largest image that is opened: 179 million pixels. Headers that claim more are decompression bombs."""
 
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """A picture opened by Pillow, its pixels not read yet.
+    """An image opened by Pillow; its pixels are not decoded yet.
 
-    The EXIF orientation is not applied: cameras that come with a capture were computed on the pixels as
-    they are stored (COLMAP, nerfstudio and instant-ngp ignore the tag); turning them would break the poses.
+    The EXIF orientation is not applied: the cameras of a capture were computed on the pixels as stored (COLMAP,
+    nerfstudio and instant-ngp ignore the tag), so rotating the pixels would break the poses.
 
     Raises:
-        CaptureError: If the file is missing, is no picture, is cut off, would unpack to an absurd size, or needs a
-            library that is not installed.
+        CaptureError: If the file is missing, truncated or not an image, exceeds `MAX_PIXELS`, or needs a library that
+            is not installed.
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
@@ -45,7 +45,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         _register_heic(path)
     try:
         with warnings.catch_warnings():
-            # Between one and two times the limit Pillow only warns; such photos are large but honest.
+            # Pillow warns between one and two times its limit; photos of that size are accepted.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with _BoundedFile(path) as file, Image.open(file) as image:
                 yield image
@@ -60,7 +60,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         raise CaptureError(
             path,
             expected="an image",
-            found=f"{path.stat().st_size} bytes that are none Pillow can read",
+            found=f"{path.stat().st_size} bytes that are not an image format Pillow supports",
             remedy="replace it with a JPEG or PNG, or remove it from the capture",
         ) from error
     except CaptureError:
@@ -69,7 +69,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         raise CaptureError(
             path,
             expected="an image that fits into memory",
-            found="one that does not",
+            found="a larger one",
             remedy="scale the image down before building",
         ) from error
     except (
@@ -82,7 +82,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         ArithmeticError,
         struct.error,
     ) as error:
-        # Pillow's decoders fail in all these ways on damaged files; nothing of ours runs inside the block.
+        # The types that Pillow's decoders raise on damaged files; callers only decode inside the block.
         raise CaptureError(
             path,
             expected="a whole image",
@@ -92,7 +92,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 class _BoundedFile(io.BufferedReader):
-    """A file of which no more is read than there is: a damaged length must not become memory."""
+    """A file that never allocates more than its size, whatever length a damaged header states."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
@@ -110,15 +110,15 @@ def _register_heic(path: Path) -> None:
     except ImportError as error:
         raise CaptureError(
             path,
-            expected="the library pi-heif, which reads HEIC pictures",
-            found="it is not installed",
+            expected="the library pi-heif, which reads HEIC images",
+            found="not installed",
             remedy='pip install "lexsplat[heic]", or save the photos as JPEG',
         ) from error
     register_heif_opener()
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels from the header alone.
+    """Width and height in pixels, from the header alone.
 
     Raises:
         CaptureError: As :func:`open_image`, and for an image without pixels.
@@ -138,13 +138,13 @@ def read_image(
     *,
     size: tuple[int, int] | None = None,
 ) -> NDArray[np.float32]:
-    """A picture as ``[H, W, 3]`` float32 in 0..1; alpha is composited on ``background``.
+    """An image as ``[H, W, 3]`` float32 in 0..1; alpha is composited on ``background``.
 
     Args:
         path: The file.
         background: Color behind transparent pixels.
-        size: Width and height of the result, as by :func:`resize_image`; a large photo never is in memory as
-            floats then (`lexsplat.captures.images.bands`). None keeps the picture's.
+        size: Width and height of the result, as by :func:`resize_image`; a large photo is then reduced in bands
+            (`lexsplat.captures.images.bands`). None keeps the image's size.
 
     Raises:
         CaptureError: As :func:`open_image`.
@@ -158,7 +158,7 @@ def read_image(
 
 
 class PhotoRows:
-    """An opened picture as a source of rows, composited on ``background``."""
+    """An opened image as a source of rows, composited on ``background``."""
 
     def __init__(self, image: Image.Image, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         image.load()
@@ -171,7 +171,7 @@ class PhotoRows:
 
 
 def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PhotoRows:
-    """A picture as a source of rows: in memory as it is decoded, three or four bytes a pixel.
+    """An image as a source of rows, held in memory as decoded: three or four bytes per pixel.
 
     Raises:
         CaptureError: As :func:`open_image`.
@@ -181,7 +181,7 @@ def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
 
 
 def read_bytes(path: Path) -> NDArray[np.uint8]:
-    """A picture as ``[H, W, 3]`` bytes, as `read_image` gives it on black, rounded.
+    """An image as ``[H, W, 3]`` bytes, composited on black: `read_image`, rounded.
 
     Raises:
         CaptureError: As :func:`open_image`.
@@ -194,11 +194,11 @@ def read_bytes(path: Path) -> NDArray[np.uint8]:
 
 
 def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> NDArray[np.float32]:
-    """All pixels of a picture, whatever its mode."""
+    """All pixels of an image of any mode as floats in 0..1."""
     image.load()
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, dtype=np.float32)
-        # Pillow hands out 16-bit gray as I or I;16; float pictures hold 0..1 by convention.
+        # Pillow decodes 16-bit gray as I or I;16; float images are in 0..1 by convention.
         gray = values if image.mode == "F" else values / 65535.0
         gray = np.clip(np.nan_to_num(gray, nan=0.0), 0.0, 1.0)
         return np.repeat(gray[..., None], 3, axis=2)
@@ -209,22 +209,21 @@ def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> ND
     pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
     if not pixels.flags.writeable:
         pixels = pixels.copy()
-    pixels /= np.float32(255.0)  # in place: a large photo takes enough memory as it is
+    pixels /= np.float32(255.0)  # in place, to save memory
     return pixels
 
 
 def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
-    """A mask as ``[H, W]`` bool: true where the picture is brighter than half.
+    """A mask as ``[H, W]`` bool: true where the image is brighter than half.
 
-    A picture with values 0 and 1 only counts 1 as true. What is transparent is outside.
+    In an image of values 0 and 1, 1 is true. Transparent pixels are false.
 
     Args:
-        path: The picture.
-        nonzero: True is every pixel that is not black, however dark: what COLMAP takes masks for.
+        path: The image.
+        nonzero: Every pixel that is not black is true, which is COLMAP's convention.
 
     Raises:
-        CaptureError: As :func:`open_image`, and for a mask that is dark and not black: of its labels nobody knows
-            which is meant.
+        CaptureError: As :func:`open_image`, and for a mask that is dark but not black, such as an image of labels.
     """
     with open_image(path) as image:
         image.load()
@@ -240,21 +239,21 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     if highest <= 1:
         return values > 0.5
     half = 127 if highest <= 255 else 32767
-    # A little over black is the noise of a JPEG. More of it is a mask in colors, such as labels in a palette.
+    # Slightly above black is JPEG noise. More is a mask in colors, such as palette labels.
     if half / 4 < highest <= half:
         raise CaptureError(
             path,
             expected="a mask in black and white",
-            found=f"nothing brighter than half, and yet not all black (up to {highest:g})",
+            found=f"values up to {highest:g}: neither black nor brighter than half",
             remedy="save it in black and white",
         )
     return values > half
 
 
 def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """A picture ``[H, W, C]`` at another ``(width, height)``.
+    """An image ``[H, W, C]`` at another ``(width, height)``.
 
-    Each new pixel is the mean over the area it covers when the picture shrinks, and bilinear when it grows.
+    Shrinking takes the mean over the area of each new pixel; enlarging is bilinear.
     """
     height, width = image.shape[:2]
     if (width, height) == tuple(size):
@@ -268,8 +267,15 @@ def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[n
     return np.stack(channels, axis=-1)
 
 
+def resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask ``[H, W]`` at another ``(width, height)``, by nearest pixel."""
+    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
+    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
+    return mask[rows[:, None], columns[None, :]]
+
+
 def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
-    """Whether one size is the other scaled uniformly, each side rounded by less than a pixel."""
+    """Whether one size is the other scaled uniformly, up to rounding of each side by less than a pixel."""
     low, high = 0.0, np.inf
     for a, b in zip(found, expected):
         low, high = max(low, (a - 1) / b), min(high, (a + 1) / b)

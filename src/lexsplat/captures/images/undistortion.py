@@ -1,7 +1,9 @@
-"""Lenses: from any COLMAP camera model to a pinhole image without invalid borders.
+"""Undistortion: from any perspective COLMAP camera model to a pinhole image without invalid borders.
 
-pycolmap owns the models: it chooses the pinhole camera (the largest one in which every pixel is seen by the
-lens, COLMAP's ``blank_pixels = 0``) and maps its rays into the distorted photo; we only resample.
+pycolmap implements the models: it chooses the pinhole camera (the largest one whose pixels all lie inside the photo,
+COLMAP's ``blank_pixels = 0``) and projects its rays into the distorted photo. This module resamples the pixels by
+bicubic interpolation, in bands for large photos. `pycolmap.undistort_image` is bilinear and blurs fine detail: it
+differs by up to 79/255 on noise, and by 1/255 on a smooth image.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
 MAX_SIDE = 65535
-"""Longest image side in pixels (the limit of JPEG); a camera that claims more is damaged."""
+"""Longest image side in pixels (the limit of JPEG); a camera with a larger one is damaged."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Lens:
         params: The model's parameters in COLMAP's order; lengths in pixels, pixel centers at +0.5.
 
     Raises:
-        ValueError: If the numbers cannot belong to a perspective camera of this model.
+        ValueError: If the parameters are not those of a perspective camera of this model.
     """
 
     model: str
@@ -55,18 +57,18 @@ class Lens:
         if not camera.verify_params():
             raise ValueError(f"{len(self.params)} parameters for model {self.model} ({camera.params_info})")
         if not camera.is_perspective():
-            raise ValueError(f"a {self.model} camera, which no pinhole image can replace")
+            raise ValueError(f"a {self.model} camera, which has no pinhole equivalent")
         side = max(self.width, self.height)
         for focal in (camera.focal_length_x, camera.focal_length_y):
             if not 1e-2 * side <= focal <= 1e3 * side:
                 raise ValueError(f"focal length {focal:g} for images of {self.width}x{self.height}")
-        # A picture cut out of a larger one has it outside, but not by a hundred pictures.
+        # The principal point of a crop may lie outside, but not by a hundred image sides.
         for center in (camera.principal_point_x, camera.principal_point_y):
             if abs(center) > 1e2 * side:
                 raise ValueError(f"principal point at {center:g} for images of {self.width}x{self.height}")
 
     def to_pycolmap(self) -> pycolmap.Camera:
-        """The same camera as pycolmap's object."""
+        """The same camera as a pycolmap object."""
         from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
         return pycolmap.Camera(
@@ -74,7 +76,7 @@ class Lens:
         )
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same lens for photos of another size (the field of view stays)."""
+        """The same lens for photos of another size, with the same field of view."""
         if (width, height) == (self.width, self.height):
             return self
         camera = self.to_pycolmap()
@@ -83,7 +85,7 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether photos have to be resampled; false for a pinhole and for distortion of zero."""
+        """Whether photos have to be resampled; false for a pinhole and for zero distortion."""
         return not self.to_pycolmap().is_undistorted()
 
 
@@ -91,8 +93,8 @@ class Lens:
 def pinhole_of(lens: Lens) -> tuple[int, int, NDArray[np.float64]]:
     """The pinhole camera that replaces a lens: width, height and ``K [3, 3]``.
 
-    Without distortion size and intrinsics stay as they are; otherwise COLMAP's undistortion chooses the
-    largest image without invalid pixels, between 0.2 and 2 times the photo.
+    Without distortion, size and intrinsics are unchanged. Otherwise COLMAP's undistortion chooses the largest image
+    without invalid pixels, 0.2 to 2 times the size of the photo.
 
     Raises:
         ValueError: If the distortion is so strong that no such image exists.
@@ -110,9 +112,9 @@ def pinhole_of(lens: Lens) -> tuple[int, int, NDArray[np.float64]]:
 
 
 def _covers(lens: Lens, pinhole: pycolmap.Camera) -> bool:
-    """Whether a grid of the pinhole image's pixels falls into the photo, give or take a fiftieth.
+    """Whether a grid of points of the pinhole image falls into the photo, within 2 % of its size.
 
-    COLMAP searches its pinhole camera by Newton steps, which wild parameters send anywhere without a word.
+    COLMAP finds the pinhole camera by Newton steps, which can silently diverge for extreme parameters.
     """
     steps = np.linspace(0, 1, 9)
     u, v = np.meshgrid(steps * pinhole.width, steps * pinhole.height)
@@ -126,19 +128,19 @@ def _covers(lens: Lens, pinhole: pycolmap.Camera) -> bool:
 def undistort(
     image: NDArray[Any], lens: Lens, size: tuple[int, int], *, nearest: bool = False
 ) -> NDArray[np.float32]:
-    """A photo ``[H, W, C]`` taken through ``lens`` as its pinhole image at ``size`` (width, height).
+    """The pinhole image at ``size`` (width, height) of a photo ``[H, W, C]`` taken through ``lens``.
 
-    When the result is much smaller, the photo is averaged down first and the remapped image once more, so
-    that no pixel of the photo is skipped.
+    If the result is much smaller, the photo is area-averaged before resampling and the result once more, so that no
+    pixel of the photo is skipped.
 
     Args:
         image: The photo, float32; its size may be any uniform scale of the lens's.
         lens: The lens.
         size: Width and height of the result in pixels.
-        nearest: Take the nearest pixel instead of interpolating, for masks; straight to ``size``.
+        nearest: Take the nearest pixel at ``size`` directly instead of interpolating, for masks.
 
     Raises:
-        ValueError: If the lens maps a pixel nowhere.
+        ValueError: If the lens maps a pixel to NaN or infinity.
     """
     width, height, _ = pinhole_of(lens)
     shrink = 1 if nearest else max(1, int(min(width / size[0], height / size[1]) / 2))
@@ -152,7 +154,7 @@ def undistort(
 
 
 def undistort_large(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
-    """As `undistort`, of a photo that is never in memory as floats but for a band of it and the result."""
+    """As `undistort`, in bands: only the result and a band of the photo are held in memory as floats."""
     width, height, _ = pinhole_of(lens)
     shrink = max(1, int(min(width / size[0], height / size[1]) / 2))
     if shrink > 1:
@@ -166,7 +168,7 @@ def undistort_large(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[
 
 
 class RemappedRows:
-    """The pinhole image of a source, of which only the rows of the photo are read that a band looks at."""
+    """The pinhole image of a source; each band reads only the rows of the photo that it samples."""
 
     def __init__(self, source: Rows, lens: Lens, size: tuple[int, int]) -> None:
         self._source, self._lens = source, lens
@@ -176,8 +178,8 @@ class RemappedRows:
         """Rows of the pinhole image."""
         grid = _grid_rows(self._lens, (self.width, self.height), first, last)
         height = self._source.height
-        y = (grid[..., 1].astype(np.float64) + 1.0) * (height / 2)  # pixels from the upper edge of the photo
-        # Bicubic interpolation reaches two pixels far; beyond the photo its edge goes on.
+        y = (grid[..., 1].astype(np.float64) + 1.0) * (height / 2)  # pixels from the top edge of the photo
+        # Bicubic interpolation has a support of two pixels; beyond the photo, its border is repeated.
         top = int(np.clip(np.floor(y.min()) - 3, 0, height - 1))
         bottom = int(np.clip(np.ceil(y.max()) + 3, top + 1, height))
         grid[..., 1] = (y - top) * (2.0 / (bottom - top)) - 1.0
@@ -200,11 +202,13 @@ def _grid_rows(lens: Lens, size: tuple[int, int], first: int, last: int) -> NDAr
     scale = 2.0 / np.array([lens.width, lens.height])
     rays = np.ones((size[0], 3))
     rays[:, 0] = x
-    for row in range(first, last):  # a large photo's rays in float64 would take more than the photo
+    for row in range(first, last):  # row by row: all rays in float64 would take more memory than the photo
         rays[:, 1] = y[row]
         grid[row - first] = np.asarray(camera.img_from_cam(rays)) * scale - 1.0
     if not np.isfinite(grid).all():
-        raise ValueError(f"distortion of {lens.model} {list(lens.params)} that maps a pixel nowhere")
+        raise ValueError(
+            f"distortion of {lens.model} {list(lens.params)} that maps a pixel to NaN or infinity"
+        )
     return grid
 
 
@@ -212,7 +216,7 @@ def _remap(image: NDArray[Any], grid: NDArray[np.float32], nearest: bool) -> NDA
     import torch
 
     source = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
-    # Its convention without align_corners, -1 and 1 at the outer edges, is that of pixel centers at +0.5.
+    # Without align_corners, -1 and 1 are the outer edges, which matches pixel centers at +0.5.
     sampled = torch.nn.functional.grid_sample(
         source,
         torch.from_numpy(grid)[None],

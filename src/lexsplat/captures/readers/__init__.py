@@ -1,1 +1,1 @@
-"""Readers of camera files and videos: COLMAP, ``transforms.json``, video."""
+"""Readers of camera files (COLMAP, ``transforms.json``) and of video frames."""

@@ -1,4 +1,4 @@
-"""What a reader of camera files hands over: photos with lenses and poses, sizes not checked yet."""
+"""`CameraFiles`, the result of every reader of camera files: photos with lenses and poses, sizes not checked yet."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from lexsplat.captures.images.undistortion import Lens
 from lexsplat.runtime.errors import CaptureError
 
 MAX_COORDINATE = 1e7
-"""Largest coordinate of a camera or point in world units; beyond, float32 no longer resolves a scene."""
+"""Largest coordinate of a camera or point in world units; beyond it, float32 is too coarse for a scene."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """An image name with its camera, as a capture's files say.
+    """An image and its camera, as stated by the camera files.
 
     Args:
         name: Path relative to the image folder, with "/".
         path: The image file.
-        lens: The lens, for the size the camera files state.
+        lens: The lens, at the size that the camera files state.
         viewmat: World to camera ``[4, 4]``, OpenCV axes.
-        ignore_path: Picture that is black where pixels take no part in losses, or None.
+        ignore_path: Mask of ignored pixels, which are black, or None.
     """
 
     name: str
@@ -41,15 +41,15 @@ class CameraFiles:
 
     Args:
         root: The capture folder.
-        origin: The file or folder the cameras were read from, for messages.
-        photos: The photos that have a file.
+        origin: The file or folder of the cameras, for messages.
+        photos: The photos whose file exists.
         source: ``"colmap"`` or ``"transforms"``.
         points: Points ``[P, 3]`` float32, world.
         point_colors: Their colors ``[P, 3]`` float32 in 0..1.
         missing: Names of images that have a camera but no file.
-        test_names: The split the files themselves prescribe, or None.
+        test_names: The split that the files prescribe, or None.
         background: Color behind transparent pixels.
-        warnings: What was left out and why.
+        warnings: What was skipped and why.
     """
 
     root: Path
@@ -68,7 +68,7 @@ def checked_name(name: str, origin: Path) -> str:
     """An image name as a plain relative path with "/".
 
     Raises:
-        CaptureError: If the name is empty, absolute, leads out of the capture, or is none a file can have.
+        CaptureError: If the name is empty, absolute, points outside the capture, or is not a valid file name.
     """
     plain = name.replace("\\", "/")
     parts = PurePosixPath(plain).parts
@@ -84,17 +84,17 @@ def checked_name(name: str, origin: Path) -> str:
 
 
 def _can_be_a_file(parts: tuple[str, ...]) -> bool:
-    """Whether a file system can have such a path: no control characters, no halves of characters, not too long."""
+    """Whether a path is valid on a file system: no control characters or lone surrogates, not too long."""
     lengths = [len(part.encode("utf-8", "replace")) for part in parts]
     odd = any(unicodedata.category(letter) in ("Cc", "Cs") for part in parts for letter in part)
     return bool(parts) and max(lengths) <= 250 and sum(lengths) < 3000 and not odd
 
 
 def checked_pose(viewmat: NDArray[np.float64], name: str, origin: Path) -> NDArray[np.float64]:
-    """A world-to-camera matrix ``[4, 4]`` whose numbers can be those of a camera.
+    """A world-to-camera matrix ``[4, 4]``, checked.
 
     Raises:
-        CaptureError: If a number is not finite or absurdly large.
+        CaptureError: If a number is not finite, or larger than `MAX_COORDINATE`.
     """
     if not np.isfinite(viewmat).all():
         raise CaptureError(

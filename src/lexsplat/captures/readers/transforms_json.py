@@ -1,12 +1,11 @@
-"""``transforms.json``: nerfstudio, instant-ngp and NeRF-synthetic captures.
+"""Reads ``transforms.json`` of nerfstudio, instant-ngp and NeRF-synthetic captures.
 
-Poses are camera to world with OpenGL axes. Intrinsics stand at the top, in each frame, or
-both (the frame wins).
+Poses are camera to world with OpenGL axes. Intrinsics are given at the top level, per frame, or both; those of the
+frame take precedence.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -21,14 +20,15 @@ from lexsplat.captures.images.undistortion import Lens
 from lexsplat.captures.readers.camera_files import CameraFiles, Photo, checked_name, checked_pose
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, invert_pose
 from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.files import read_json
 
 SPLIT_FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
-"""NeRF-synthetic's files; its validation views are not used."""
+"""The files of NeRF-synthetic; its validation views are not used."""
 
 MAX_FRAMES = 1_000_000
 
 _MODELS = {
-    # camera_model of nerfstudio -> COLMAP model that holds all its distortion parameters
+    # camera_model of nerfstudio -> COLMAP model with all of its distortion parameters
     "PINHOLE": "FULL_OPENCV",
     "SIMPLE_PINHOLE": "FULL_OPENCV",
     "PERSPECTIVE": "FULL_OPENCV",
@@ -51,10 +51,10 @@ def find_transforms(root: Path) -> Path | None:
 
 
 def read_transforms(file: Path) -> CameraFiles:
-    """The capture described by a ``transforms.json``, or by NeRF-synthetic's files for train and test.
+    """Read a ``transforms.json``, or NeRF-synthetic's files for train and test.
 
     Raises:
-        FileFormatError: If a file is not JSON of this kind.
+        FileFormatError: If a file is not JSON in this format.
         CaptureError: If a camera or pose cannot be used.
     """
     root = file.parent
@@ -66,7 +66,7 @@ def read_transforms(file: Path) -> CameraFiles:
     test_names: list[str] | None = None
     synthetic = False
     for part in files:
-        document = read_json(part)
+        document = read_json(part, remedy="copy the file again or correct it")
         reader = _Reader(part, document)
         found = [reader.photo(frame) for frame in reader.frames()]
         photos += [photo for photo, _ in found if photo is not None]
@@ -89,39 +89,20 @@ def read_transforms(file: Path) -> CameraFiles:
         source="transforms",
         missing=missing,
         test_names=test_names,
-        # NeRF-synthetic renders objects on nothing, and the field reports it on white.
+        # NeRF-synthetic images are transparent, and its benchmarks composite them on white.
         background=(1.0, 1.0, 1.0) if synthetic else (0.0, 0.0, 0.0),
     )
 
 
-def read_json(file: Path) -> Any:
-    """A JSON document; NaN and infinity are read and left to the checks that can name the image.
-
-    Raises:
-        FileFormatError: If the file cannot be read as JSON.
-    """
-    try:
-        return json.loads(file.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        found = str(error.strerror)
-    except UnicodeDecodeError as error:
-        found = f"byte {error.start} that is no UTF-8"
-    except RecursionError:
-        found = "brackets nested without end"
-    except ValueError as error:
-        found = str(error)
-    raise FileFormatError(file, expected="JSON", found=found, remedy="copy the file again or correct it")
-
-
 def _shared_folder(names: list[str]) -> str:
-    """``"images/"`` when all names start with it, else nothing: names are relative to the image folder."""
+    """``"images/"`` if all names start with it, else ``""``: names are relative to the image folder."""
     heads = {name.split("/")[0] + "/" if "/" in name else "" for name in names}
     head = heads.pop() if len(heads) == 1 else ""
     return head if re.fullmatch(r"(images|rgb|input)(_\d+)?/", head) else ""
 
 
 class _Reader:
-    """One ``transforms.json``: frames to photos, with the file's own defaults."""
+    """One ``transforms.json``: converts frames to photos, with the file's defaults."""
 
     def __init__(self, file: Path, document: Any) -> None:
         self.file = file
@@ -145,7 +126,7 @@ class _Reader:
                 )
 
     def frames(self) -> list[Mapping[str, Any]]:
-        """The frames, each checked to be an object."""
+        """The frames, checked to be objects with a ``file_path``."""
         frames = self.document["frames"]
         if len(frames) > MAX_FRAMES:
             raise self._wrong(f"at most {MAX_FRAMES} frames", str(len(frames)))
@@ -155,16 +136,16 @@ class _Reader:
         return frames
 
     def listed_test_names(self) -> list[str] | None:
-        """nerfstudio's own split, or None."""
+        """nerfstudio's split, or None."""
         names = self.document.get("test_filenames")
         if not isinstance(names, list) or not names:
             return None
         if not all(isinstance(name, str) for name in names):
-            raise self._wrong('"test_filenames" to be strings', "something else")
+            raise self._wrong('"test_filenames" to be strings', "other types")
         return [checked_name(name, self.file) for name in names]
 
     def photo(self, frame: Mapping[str, Any]) -> tuple[Photo | None, str]:
-        """A frame as a photo and its name; None where the image has no file."""
+        """The photo of a frame, or None if its file does not exist, and its name."""
         name, path = self._find(checked_name(frame["file_path"], self.file))
         viewmat = self._viewmat(frame, name)
         if path is None:
@@ -176,7 +157,7 @@ class _Reader:
         return Photo(name, path, self._lens(frame, name, path), viewmat, ignore_path), name
 
     def _find(self, name: str) -> tuple[str, Path | None]:
-        """The name with its file's suffix, which NeRF-synthetic leaves out, and the file if there is one."""
+        """The name with its suffix, which NeRF-synthetic omits, and the file if it exists."""
         for suffix in ("", *IMAGE_SUFFIXES, *(suffix.upper() for suffix in IMAGE_SUFFIXES)):
             path = self.file.parent / (name + suffix)
             if path.is_file():
@@ -218,7 +199,7 @@ class _Reader:
         if model == "OPENCV_FISHEYE":
             distortion: tuple[float | None, ...] = (k1, k2, k3, k4)
         else:
-            # OpenCV's meaning and order: k4 to k6 stand in the denominator.
+            # OpenCV's order: k4 to k6 are the coefficients of the denominator.
             distortion = (k1, k2, p1, p2, k3, k4, k5, k6)
             if not any(distortion):
                 model, distortion = "PINHOLE", ()
@@ -234,7 +215,7 @@ class _Reader:
             ) from error
 
     def _focal(self, frame: Mapping[str, Any], key: str, angle_key: str, side: float) -> float | None:
-        """Focal length in pixels from its own entry or from the angle of view; a frame's entry wins."""
+        """Focal length in pixels from its own key or from the angle of view; keys of the frame take precedence."""
         if key not in frame and (angle_key in frame or key not in self.document):
             angle = self._number(frame, angle_key)
             if angle is None:
@@ -258,13 +239,13 @@ class _Reader:
         return _MODELS[model.upper()]
 
     def _viewmat(self, frame: Mapping[str, Any], name: str) -> NDArray[np.float64]:
-        """World to camera from ``transform_matrix``, its rotation made exact and its scale taken out."""
+        """World to camera from ``transform_matrix``; its rotation is orthonormalized and its scale removed."""
         try:
             pose = np.array(frame.get("transform_matrix"), dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             pose = np.zeros(0)
         if pose.shape not in ((4, 4), (3, 4)):
-            raise self._wrong(f"a 4x4 transform_matrix for image {name}", "something else")
+            raise self._wrong(f"a 4x4 transform_matrix for image {name}", "another shape")
         checked_pose(pose, name, self.file)
         U, singular, Vt = np.linalg.svd(pose[:3, :3])
         rotation = U @ Vt
@@ -272,7 +253,7 @@ class _Reader:
             raise CaptureError(
                 self.file,
                 expected=f"a rotation in the transform_matrix of image {name}",
-                found=f"stretches by {singular[0]:.3g} and {singular[2]:.3g}, determinant "
+                found=f"scales of {singular[0]:.3g} and {singular[2]:.3g}, determinant "
                 f"{np.linalg.det(pose[:3, :3]):.3g}",
                 remedy="export the capture again",
             )
@@ -288,5 +269,5 @@ class _Reader:
 def _is_finite(value: int | float) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # an integer of more digits than a float holds
+    except OverflowError:  # an integer beyond the range of a float
         return False

@@ -1,7 +1,8 @@
-"""Frames of a video as photos: as many as wanted, sharp ones, spread by how far the camera moved.
+"""Samples frames of a video as photos: a given number of sharp frames, evenly spaced by camera motion.
 
-The video is read twice and never held in memory: first small gray copies say how sharp each frame is and how much the
-picture changes to the next one, then the chosen frames are written. Needs PyAV (the extra ``video``).
+The video is decoded twice and never held in memory. The first pass measures the sharpness of each frame and its
+change from the previous one on small gray copies; the second pass writes the chosen frames. Needs PyAV (the extra
+``video``).
 """
 
 from __future__ import annotations
@@ -27,25 +28,25 @@ from lexsplat.runtime.progress import Event, Listener, silent
 
 STAGE = "video"
 DEFAULT_FRAMES = 150
-"""How many frames a video is sampled to, unless told otherwise: a walk around a place or a thing."""
+"""Default number of frames: enough for a walk around a place or an object."""
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 _SHARPNESS_SIDE = 480
-"""Longest side in pixels at which sharpness is judged: blur that matters to features is still seen."""
+"""Longest side in pixels for measuring sharpness: blur that affects features is still visible."""
 _MOTION_SIDE = 64
-"""Longest side at which motion is judged: noise and sharpness have no say."""
+"""Longest side in pixels for measuring motion: noise and sharpness have no effect."""
 _TAPER = 0.3
-"""How much less a frame at the border of its window counts than one in its middle."""
+"""Relative reduction of the score of a frame at the border of its window."""
 _WHOLE = 0.9
-"""A video from which less than this share of its frames can be read is cut off."""
+"""Least share of its frames that must be readable for a video to count as complete."""
 _MANIFEST = "frames.json"
 _JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
 class FrameMeasures:
-    """What the first reading of a video tells, by frame.
+    """Measures of each frame, from the first pass.
 
     Args:
         sharpness: Variance of the Laplacian of the gray frame, relative to its contrast ``[F]``.
@@ -57,7 +58,7 @@ class FrameMeasures:
 
 
 def is_video(path: Path) -> bool:
-    """Whether this is a file that is called like a video."""
+    """Whether a path has the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
@@ -69,23 +70,23 @@ def sample_video(
     memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> list[str]:
-    """Write frames of a video as ``frame_NUMBER.jpg``, NUMBER being the frame's place in the video.
+    """Write frames of a video as ``frame_NUMBER.jpg``, where NUMBER is the index in the video.
 
-    Frames that an earlier call has written from the same video for the same count are kept.
+    Frames that an earlier call wrote from the same video with the same count are kept.
 
     Args:
         video: The file.
-        folder: Where the frames go; other ``frame_*.jpg`` there are removed.
-        count: How many are wanted; a video with fewer gives all it has.
-        memory: Bytes of host memory that decoding may take: decides how many threads it has.
-        listener: Hears of stage "video": a unit a frame read.
+        folder: Output folder; other ``frame_*.jpg`` in it are deleted.
+        count: Number of frames; a shorter video yields all of its frames.
+        memory: Bytes of host memory available for decoding; determines the number of threads.
+        listener: Receives events of stage "video": one unit per frame read.
 
     Returns:
         Names of the frames, in order.
 
     Raises:
         BackendError: If PyAV is not installed.
-        CaptureError: If the file is missing, no video, damaged, or has fewer than three frames.
+        CaptureError: If the file is missing, damaged, not a video, or has fewer than three frames.
         MemoryBudgetError: If ``memory`` is too little for frames of this size.
         ValueError: If ``count`` is below 3.
     """
@@ -93,8 +94,8 @@ def sample_video(
         raise ValueError(f"count must be at least 3, got {count}")
     if not video.is_file():
         raise CaptureError(video, expected="a video", found="no such file", remedy="check the path")
-    made_from = {"video": _identity(video), "count": count, "version": 1}
-    kept = _written_before(folder, made_from)
+    inputs = {"video": _identity(video), "count": count, "version": 1}
+    kept = _written_before(folder, inputs)
     if kept is not None:
         return kept
     measures = measure_frames(video, listener, memory=memory)
@@ -106,14 +107,14 @@ def sample_video(
             stale.unlink()
     _write_frames(video, folder, dict(zip(chosen, names)), len(measures.motion), memory, listener)
     with atomic_path(folder / _MANIFEST) as temporary:
-        temporary.write_text(json.dumps({**made_from, "names": names}, indent=1), encoding="utf-8")
+        temporary.write_text(json.dumps({**inputs, "names": names}, indent=1), encoding="utf-8")
     return names
 
 
 def measure_frames(
     video: Path, listener: Listener = silent, *, memory: int = budget.DEFAULT_MEMORY
 ) -> FrameMeasures:
-    """Read a video once and measure its frames.
+    """Measure all frames of a video: the first pass.
 
     Raises:
         BackendError: If PyAV is not installed.
@@ -135,8 +136,8 @@ def measure_frames(
     if len(motion) < _WHOLE * expected:
         raise CaptureError(
             video,
-            expected=f"{expected} frames, as the file promises",
-            found=f"{len(motion)} that can be read",
+            expected=f"{expected} frames, as the file states",
+            found=f"{len(motion)} readable ones",
             remedy="the video is cut off or damaged: copy it again",
         )
     if len(motion) < 3:
@@ -145,16 +146,16 @@ def measure_frames(
 
 
 def choose_frames(measures: FrameMeasures, count: int) -> list[int]:
-    """Numbers of the frames to take, ascending: the sharpest of each of ``count`` stretches of equal motion.
+    """Indices of the chosen frames, ascending: the sharpest of each of ``count`` segments of equal motion.
 
-    Where a stretch holds no frame, because the camera was faster than that, the widest gaps that are left get one
-    more each, so that there are ``count`` frames in the end, or all.
+    A segment without a frame, where the camera moved fast, is made up for by one more frame in the widest remaining
+    gap, so that the result has ``count`` frames, or all.
     """
     frames = len(measures.motion)
     if count >= frames:
         return list(range(frames))
     path = np.cumsum(measures.motion)
-    if path[-1] <= 0:  # nothing moves: spread by time
+    if path[-1] <= 0:  # no motion: evenly by time
         path = np.arange(frames, dtype=np.float64)
     place = path / path[-1] * count
     window = np.minimum(place.astype(np.int64), count - 1)
@@ -168,7 +169,7 @@ def choose_frames(measures: FrameMeasures, count: int) -> list[int]:
 
 
 def _fill_widest_gap(chosen: list[int], place: NDArray, score: NDArray) -> int:
-    """The best frame near the middle of the widest stretch between two chosen frames that holds one."""
+    """The best frame near the middle of the widest gap between two chosen frames."""
     ends = [-1, *chosen, len(place)]
     gaps = [(a, b) for a, b in itertools.pairwise(ends) if b - a > 1]
     start, end = max(gaps, key=lambda gap: place[min(gap[1], len(place) - 1)] - place[max(gap[0], 0)])
@@ -180,11 +181,11 @@ def _fill_widest_gap(chosen: list[int], place: NDArray, score: NDArray) -> int:
 
 @contextlib.contextmanager
 def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
-    """The picture stream of a video and its frames, decoded one after the other.
+    """The video stream and its decoded frames, in order.
 
     Raises:
         BackendError: If PyAV is not installed.
-        CaptureError: If it cannot be opened or decoded; also while frames are taken.
+        CaptureError: If it cannot be opened or decoded, also during iteration.
     """
     try:
         import av
@@ -198,7 +199,7 @@ def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
     try:
         with av.open(str(video)) as container:
             if not container.streams.video:
-                raise CaptureError(video, expected="a video", found="a file without pictures")
+                raise CaptureError(video, expected="a video", found="a file without a video stream")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             stream.codec_context.thread_count = _threads(video, (stream.width, stream.height), memory)
@@ -213,10 +214,10 @@ def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
 
 
 def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
-    """How many threads decode, so that the frames they hold fit.
+    """Number of decoding threads whose frames fit into the memory budget.
 
     Raises:
-        MemoryBudgetError: If one is too many.
+        MemoryBudgetError: If not even one thread fits.
     """
     need = {
         threads: budget.video_bytes(frame, threads) for threads in range(1, min(16, os.cpu_count() or 1) + 1)
@@ -227,7 +228,7 @@ def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
 
 
 def _small_gray(frame: Any, side: int) -> NDArray[np.float32]:
-    """A frame as gray ``[h, w]`` in 0..255, no side longer than ``side``."""
+    """A frame as gray image ``[h, w]`` in 0..255 with sides of at most ``side`` pixels."""
     factor = min(1.0, side / max(frame.width, frame.height))
     size = (max(2, round(frame.width * factor)), max(2, round(frame.height * factor)))
     small = frame.reformat(width=size[0], height=size[1], format="gray", interpolation="AREA")
@@ -235,7 +236,7 @@ def _small_gray(frame: Any, side: int) -> NDArray[np.float32]:
 
 
 def _sharpness(gray: NDArray[np.float32]) -> float:
-    """Variance of the Laplacian, relative to the variance of the picture, so that a plain wall is not "blurred"."""
+    """Variance of the Laplacian relative to the variance of the image, so that a plain wall is not "blurred"."""
     inner = gray[1:-1, 1:-1]
     laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner
     return float(laplacian.var() / (gray.var() + 1.0)) if laplacian.size else 0.0
@@ -249,7 +250,7 @@ def _change(before: NDArray[np.float32], now: NDArray[np.float32]) -> float:
 
 
 def _upright(frame: Any) -> NDArray[np.uint8]:
-    """The pixels of a frame ``[H, W, 3]``, turned as the video says it is to be shown."""
+    """The pixels of a frame ``[H, W, 3]``, rotated by the video's display matrix."""
     pixels = frame.to_ndarray(format="rgb24")
     quarters = round(getattr(frame, "rotation", 0) / 90) % 4
     return np.ascontiguousarray(np.rot90(pixels, quarters))
@@ -272,13 +273,13 @@ def _write_frames(
                 break
     if written < len(names):
         raise CaptureError(
-            video, expected=f"{total} frames, as when it was first read", found="fewer", remedy="try again"
+            video, expected=f"{total} frames, as in the first pass", found="fewer", remedy="try again"
         )
     listener(Event(STAGE, 2 * total, 2 * total, {"frames": float(written)}))
 
 
 def _identity(video: Path) -> list[Any]:
-    """Name, size and a hash of the ends of a file: enough to know it again without reading it all."""
+    """Name, size and a hash of the first and last MiB: identifies a video without reading all of it."""
     size = video.stat().st_size
     with open(video, "rb") as file:
         digest = hashlib.blake2b(file.read(1 << 20), digest_size=12)
@@ -287,14 +288,12 @@ def _identity(video: Path) -> list[Any]:
     return [video.name, size, digest.hexdigest()]
 
 
-def _written_before(folder: Path, made_from: dict[str, Any]) -> list[str] | None:
-    """The frames of an earlier call with the same video and count, if all are there."""
+def _written_before(folder: Path, inputs: dict[str, Any]) -> list[str] | None:
+    """The frames of an earlier call with the same video and count, if all of them exist."""
     try:
         content = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
         names = content.pop("names")
     except (OSError, ValueError, KeyError, AttributeError):
         return None
-    whole = (
-        content == made_from and isinstance(names, list) and all((folder / str(n)).is_file() for n in names)
-    )
+    whole = content == inputs and isinstance(names, list) and all((folder / str(n)).is_file() for n in names)
     return [str(name) for name in names] if whole else None

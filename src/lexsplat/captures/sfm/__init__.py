@@ -1,1 +1,1 @@
-"""Structure from motion: photos without cameras in, a COLMAP model out."""
+"""Structure from motion: from photos without cameras to a COLMAP model."""

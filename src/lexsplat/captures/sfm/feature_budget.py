@@ -1,7 +1,7 @@
-"""Features, matches and models of pycolmap within a budget of memory: how many threads, how many photos held at once.
+"""Fits pycolmap's extraction, matching and mapping into a memory budget: number of threads, photos held at once.
 
-What is chosen here decides nothing about a result: photos are numbered before, and every pair is matched and verified
-by itself, with a seed of its own.
+These choices never affect a result: image ids are assigned beforehand, and every pair is matched and verified by
+itself with its own seed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
 HELD_AT_MOST = 1225
-"""Photos whose features are held at once, at most: pycolmap's own number."""
+"""Most photos whose features are held at once: pycolmap's own limit."""
 
 _STAGE = "structure from motion"
 
@@ -26,10 +26,10 @@ _STAGE = "structure from motion"
 def extraction_threads(
     photo: tuple[int, int], max_side: int, max_features: int, memory: int, *, masked: bool = False
 ) -> int:
-    """In how many photos features are sought at once.
+    """Number of SIFT extraction threads that fit into the memory budget.
 
     Raises:
-        MemoryBudgetError: If one is too many.
+        MemoryBudgetError: If not even one thread fits.
     """
     need = {
         threads: budget.extraction_bytes(photo, max_side, max_features, threads, masked=masked)
@@ -49,15 +49,15 @@ def _fits(photo: tuple[int, int], side: int, max_features: int, memory: int, mas
 def matching_plan(
     database: Path, memory: int, *, least: int = 2
 ) -> tuple[pycolmap.FeatureMatchingOptions, int]:
-    """How photos are compared: options with a number of threads, and how many photos are held at once.
+    """Matching options with a number of threads that fits, and how many photos are held at once.
 
     Args:
-        database: pycolmap's, with features.
-        memory: Bytes there are.
-        least: Photos that must be held at least.
+        database: pycolmap's database, with features.
+        memory: Bytes available.
+        least: Fewest photos that must be held.
 
     Raises:
-        MemoryBudgetError: If even so many do not fit, with one thread.
+        MemoryBudgetError: If ``least`` photos do not fit even with one thread.
     """
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
@@ -65,7 +65,7 @@ def matching_plan(
     least = min(least, max(2, photos))
     need = budget.matching_bytes(most, least, 1)
     fewer = max(100, most * memory // max(need, 1) // 100 * 100)
-    budget.require(_STAGE, need, memory, f"comparing photos of {most:,} features", f"max-features of {fewer}")
+    budget.require(_STAGE, need, memory, f"matching photos of {most:,} features", f"max-features of {fewer}")
     threads = budget.most_within(
         memory, {count: budget.matching_bytes(most, least, count) for count in range(1, _cores() + 1)}
     )
@@ -74,10 +74,10 @@ def matching_plan(
 
 
 def check_mapping(database: Path, memory: int) -> None:
-    """Refuse to place photos by more matches than fit.
+    """Check that a model of all verified matches fits.
 
     Raises:
-        MemoryBudgetError: With the memory it takes.
+        MemoryBudgetError: If it does not; states the memory it needs.
     """
     _, features, photos, matches = _counts(database)
     need = budget.mapping_bytes(features, matches)
@@ -86,7 +86,7 @@ def check_mapping(database: Path, memory: int) -> None:
 
 
 def _counts(database: Path) -> tuple[int, int, int, int]:
-    """Most features of a photo, features of all, photos, and verified matches, as the database has them."""
+    """Most features of one photo, features in total, photos, and verified matches in a database."""
     with closing(sqlite3.connect(database)) as connection:
         most, features, photos = connection.execute(
             "SELECT COALESCE(MAX(rows), 0), COALESCE(SUM(rows), 0), COUNT(*) FROM keypoints"
@@ -96,5 +96,5 @@ def _counts(database: Path) -> tuple[int, int, int, int]:
 
 
 def _cores() -> int:
-    """Processors that this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,20 +1,18 @@
-"""Cameras from photos alone: structure from motion by pycolmap.
+"""Estimates cameras from photos alone: structure from motion with pycolmap.
 
-Photos are taken upright (`lexsplat.captures.sfm.preparation`); those of one size and focal length share a lens, which
-starts from the focal length in the EXIF data where there is one. Masked pixels give no features.
+Photos are processed upright (`lexsplat.captures.sfm.preparation`). Photos of the same size and focal length share a
+lens, initialized from the EXIF focal length where there is one. Masked pixels yield no features.
 
-What is being worked out is kept in a hidden folder of the output until the model is written, so that a run which was
-stopped goes on with the features and matches that it has.
+Intermediate results live in a hidden folder of the output until the model is written, so an interrupted run resumes
+with the features and matches it already has.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -22,12 +20,12 @@ from PIL import Image
 
 from lexsplat.captures.images.reading import image_size
 from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
-from lexsplat.captures.sfm.pose_agreement import misregistered, place_again
+from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
-from lexsplat.captures.sfm.triangulation import quiet_pycolmap
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
@@ -37,14 +35,14 @@ __all__ = ["PhotoPoses", "PoseConfig", "find_photos", "photo_folder", "poses_fro
 
 STAGE = "poses"
 EXHAUSTIVE_LIMIT = 80
-"""Up to so many photos every pair is matched; beyond, photos are taken to follow one another by name."""
+"""Up to this many photos every pair is matched; beyond it, photos are assumed to follow one another by name."""
 
 SEQUENTIAL_OVERLAP = 12
 BATCH = 8
-"""Photos whose features are sought in one go: what is lost at most when it is stopped."""
+"""Photos per call of SIFT extraction: the most work that an interruption can lose."""
 
-MAX_FURTHER_PAIRS = 20_000
-"""Pairs that are matched at most to place photos which follow no other."""
+MAX_LEFTOVER_PAIRS = 20_000
+"""Most pairs that are matched to register photos which sequential matching left unregistered."""
 
 _WORK = ".poses"
 
@@ -54,16 +52,16 @@ class PoseConfig:
     """Settings of structure from motion.
 
     Args:
-        mapper: "incremental" places photo after photo, "global" all at once (GLOMAP): faster on many photos, and
-            more easily misled by wrong matches.
-        pairs: Which photos are compared. "exhaustive": all with all. "sequential": each with the next ones by
-            name, and ones 2, 4, 8, ... further on, for videos and walks. "auto": exhaustive up to 80 photos, then
-            sequential, after which photos that found no place are compared with all others.
-        max_side: Photos are scaled down to this longest side, in pixels, to seek features.
-        max_features: Features sought in a photo.
+        mapper: "incremental" registers one photo after the other. "global" (GLOMAP) registers all at once: it is
+            faster on many photos, and more sensitive to wrong matches.
+        pairs: Which pairs of photos are matched. "exhaustive": all. "sequential": each photo with the next ones by
+            name, and with those 2, 4, 8, ... further on, for videos and walks. "auto": exhaustive up to 80 photos;
+            beyond, sequential, and then all pairs of the unregistered photos.
+        max_side: Photos are scaled down to this longest side, in pixels, for feature extraction.
+        max_features: Most features per photo.
 
     Raises:
-        ValueError: If a number makes no sense.
+        ValueError: If ``max_side`` or ``max_features`` is too small.
     """
 
     mapper: Literal["incremental", "global"] = "incremental"
@@ -79,23 +77,23 @@ class PoseConfig:
             )
 
     def compares_all(self, count: int) -> bool:
-        """Whether every pair of so many photos is compared."""
+        """Whether every pair of ``count`` photos is matched."""
         return self.pairs == "exhaustive" or (self.pairs == "auto" and count <= EXHAUSTIVE_LIMIT)
 
 
 @dataclass(frozen=True)
 class PhotoPoses:
-    """What structure from motion made of a folder of photos.
+    """Result of structure from motion on a folder of photos.
 
     Args:
         root: Folder whose ``sparse/0`` holds the COLMAP model; load it with
             ``load_capture(root, images=images)``.
-        images: Folder of the photos the model speaks of: the given one, or upright copies in ``root/images``.
-        placed: Names of the photos that have a camera, sorted; relative to ``images``.
-        left_out: Names of the photos that could not be placed, sorted.
-        points: How many points were triangulated.
-        models: How many models there were that did not join; the largest was kept.
-        notes: What else people should know, one line each.
+        images: Folder of the photos that the model refers to: the given one, or upright copies in ``root/images``.
+        registered: Names of the photos with a pose, sorted; relative to ``images``.
+        unregistered: Names of the photos without a pose, sorted.
+        points: Number of triangulated points.
+        models: Number of models that could not be joined; the largest is kept.
+        notes: Remarks for the user, one line each.
     """
 
     root: Path
@@ -107,13 +105,18 @@ class PhotoPoses:
     notes: tuple[str, ...] = ()
 
     @property
+    def is_complete(self) -> bool:
+        """Whether every photo is registered in a single model."""
+        return not self.unregistered and self.models == 1
+
+    @property
     def note(self) -> str:
-        """One line for people."""
+        """Summary in one line."""
         total = len(self.registered) + len(self.unregistered)
-        line = f"{len(self.registered)} of {total} photos placed, {self.points:,} points"
+        line = f"{len(self.registered)} of {total} photos registered, {self.points:,} points"
         if self.models > 1:
             line = f"{line}, the largest of {self.models} models"
-        return line if not self.unregistered else f"{line}; left out: {', '.join(self.unregistered)}"
+        return line if not self.unregistered else f"{line}; unregistered: {', '.join(self.unregistered)}"
 
 
 def poses_from_photos(
@@ -128,19 +131,21 @@ def poses_from_photos(
     """Estimate the cameras of a folder of photos and write them as a COLMAP model.
 
     Args:
-        folder: The photos, in subfolders if wanted, or in ``images/``; ``masks/`` are used (see `prepare_photos`).
-        output: Where ``sparse/0`` is written, whole or not at all; one that is there is replaced.
+        folder: The photos, in subfolders or in ``images/``; ``masks/`` are used (see `prepare_photos`).
+        output: Where ``sparse/0`` is written, atomically; an existing model is replaced.
         config: Settings.
         seed: Seed for pycolmap.
-        memory: Bytes of host memory that may be taken: decides how much is done at once, and no result.
-        listener: Hears of stage ``"poses"``: a unit a photo whose features are found, then one for the matches, then
-            one a photo that is placed.
+        memory: Bytes of host memory available. Determines threads and batches, never the result.
+        listener: Receives events of stage ``"poses"``: one unit per photo with features, one for matching, one per
+            registered photo.
 
     Raises:
-        CaptureError: If there are fewer than three photos, one is unreadable, or none can be placed.
-        BackendError: If this pycolmap has no global mapper, and it was asked for.
+        CaptureError: If there are fewer than three photos, one is unreadable, or none can be registered.
+        BackendError: If the global mapper is requested and this pycolmap has none.
         MemoryBudgetError: If ``memory`` is too little for photos of this size and number.
     """
+    from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
+
     folder, output, config = photo_folder(Path(folder)), Path(output), config or PoseConfig()
     _check_mapper(config)
     photos = prepare_photos(folder, output, memory=memory, listener=listener)
@@ -155,9 +160,9 @@ def poses_from_photos(
         check_mapping(database, memory)
         models = _map(database, photos, work / "models", config, seed, listener)
         best = _best(models)
-        outsiders = _not_placed(names, best)
-        if outsiders and config.pairs == "auto" and not config.compares_all(len(names)):
-            _match_further(database, names, outsiders, work, seed, memory)
+        leftover = _unregistered(names, best)
+        if leftover and config.pairs == "auto" and not config.compares_all(len(names)):
+            _match_leftover(database, names, leftover, work, seed, memory)
             check_mapping(database, memory)
             models = _map(database, photos, work / "models", config, seed, listener) or models
             best = _best(models)
@@ -166,11 +171,11 @@ def poses_from_photos(
             raise CaptureError(
                 folder,
                 expected="photos that overlap",
-                found=f"{len(names)} photos of which none could be placed",
+                found=f"{len(names)} photos, none of which could be registered",
                 remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
             )
-        best = _without_misplaced(best, database, photos, work / "again", seed)
-        unregistered = _not_placed(names, best)
+        best = _without_misregistered(best, database, photos, work / "again", seed)
+        unregistered = _unregistered(names, best)
         _write_model(best, output)
     _discard(work, output)
     registered = tuple(sorted(set(names) - set(unregistered)))
@@ -193,26 +198,25 @@ def _check_mapper(config: PoseConfig) -> None:
 
 
 def _best(models: list[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
-    """The model with the most photos; of equals the one with the most points."""
+    """The model with the most photos; on a tie, the one with the most points."""
     return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
 
-def _not_placed(names: tuple[str, ...] | list[str], model: pycolmap.Reconstruction | None) -> tuple[str, ...]:
+def _unregistered(
+    names: tuple[str, ...] | list[str], model: pycolmap.Reconstruction | None
+) -> tuple[str, ...]:
     registered = set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
     return tuple(sorted(set(names) - registered))
 
 
 def _work_folder(output: Path, photos: PreparedPhotos, config: PoseConfig, seed: int) -> Path:
-    """The folder of the unfinished work on exactly these photos; that of other ones is thrown away."""
+    """The work folder for exactly these photos and settings; one for anything else is deleted."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
-    about: list[object] = [pycolmap.__version__, asdict(config), seed, photos.lenses]
     files = [photos.images / name for name in photos.names]
     files += sorted(photos.masks.rglob("*.png")) if photos.masks else []
-    for file in files:
-        status = file.stat()
-        about.append([file.as_posix(), status.st_size, status.st_mtime_ns])
-    key = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]
+    stamps = [[file.as_posix(), *file_stamp(file)] for file in files]
+    key = fingerprint(pycolmap.__version__, config, seed, photos.lenses, stamps)
     work = output / _WORK
     note = work / "made_from.txt"
     if not (note.is_file() and note.read_text() == key):
@@ -223,7 +227,7 @@ def _work_folder(output: Path, photos: PreparedPhotos, config: PoseConfig, seed:
 
 
 def _discard(work: Path, output: Path) -> None:
-    """Forget finished or fruitless work; an output that holds nothing goes too."""
+    """Delete the work folder, and the output if it is empty."""
     shutil.rmtree(work, ignore_errors=True)
     with contextlib.suppress(OSError):
         output.rmdir()
@@ -232,7 +236,7 @@ def _discard(work: Path, output: Path) -> None:
 def _extract(
     database: Path, photos: PreparedPhotos, config: PoseConfig, memory: int, total: int, listener: Listener
 ) -> None:
-    """SIFT features of all photos, one camera for each lens; what the database has already is kept."""
+    """Extract SIFT features of all photos, one camera per lens; features already in the database are kept."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     pycolmap.Database.open(database).close()
@@ -240,7 +244,7 @@ def _extract(
     if photos.masks is not None:
         reader.mask_path = _complete_masks(photos, database.parent / "masks")
     for group in photos.lenses:
-        # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
+        # Importing first assigns image ids in order; extraction alone assigns them as threads finish.
         single = pycolmap.CameraMode.SINGLE
         pycolmap.import_images(database, photos.images, single, list(group), reader)
     masked = photos.masks is not None
@@ -262,7 +266,7 @@ def _extract(
 
 
 def _complete_masks(photos: PreparedPhotos, folder: Path) -> Path:
-    """A folder with a mask for every photo: white where there is none, for pycolmap leaves such photos out."""
+    """A folder with a mask for every photo, white where the user gave none: pycolmap skips photos without a mask."""
     for name in photos.names:
         target = folder / f"{name}.png"
         if target.is_file() or photos.masks is None:
@@ -293,9 +297,9 @@ def _match(database: Path, count: int, config: PoseConfig, seed: int, memory: in
             device=pycolmap.Device.cpu,
         )
         return
-    # Quadratic overlap adds photos 2, 4, 8, ... further on, which closes the loops of a walk around.
+    # Quadratic overlap adds photos 2, 4, 8, ... further on, which closes loops.
     pairing = pycolmap.SequentialPairingOptions(overlap=SEQUENTIAL_OVERLAP, quadratic_overlap=True)
-    if hasattr(pairing, "loop_detection_num_images"):  # not used, but pycolmap keeps features by it
+    if hasattr(pairing, "loop_detection_num_images"):  # unused, but pycolmap sizes its feature cache by it
         pairing.loop_detection_num_images = 1
     matching, _ = matching_plan(database, memory, least=budget.SEQUENTIAL_BLOCKS * SEQUENTIAL_OVERLAP)
     pycolmap.match_sequential(
@@ -307,15 +311,15 @@ def _match(database: Path, count: int, config: PoseConfig, seed: int, memory: in
     )
 
 
-def _match_further(
-    database: Path, names: tuple[str, ...], outsiders: tuple[str, ...], work: Path, seed: int, memory: int
+def _match_leftover(
+    database: Path, names: tuple[str, ...], leftover: tuple[str, ...], work: Path, seed: int, memory: int
 ) -> None:
-    """Compare photos that follow no other with all, or with as many, evenly spread, as is affordable."""
+    """Match unregistered photos with all others, or with every n-th so that `MAX_LEFTOVER_PAIRS` is not exceeded."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
-    step = max(1, -(-len(outsiders) * len(names) // MAX_FURTHER_PAIRS))
+    step = max(1, -(-len(leftover) * len(names) // MAX_LEFTOVER_PAIRS))
     others = names[::step]
-    pairs = {tuple(sorted((name, other))) for name in outsiders for other in others if name != other}
+    pairs = {tuple(sorted((name, other))) for name in leftover for other in others if name != other}
     listed = work / "pairs.txt"
     listed.write_text("".join(f"{first} {second}\n" for first, second in sorted(pairs)), encoding="utf-8")
     verification = pycolmap.TwoViewGeometryOptions()
@@ -343,7 +347,7 @@ def _map(
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
     if config.mapper == "global":
-        # Lenses whose focal length is a guess are calibrated from the pairs first, as GLOMAP needs it.
+        # GLOMAP needs focal lengths: those that are guesses are calibrated from the pairs first.
         pycolmap.calibrate_view_graph(database, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
         options = pycolmap.GlobalPipelineOptions(random_seed=seed, min_model_size=3)
         found = pycolmap.global_mapping(database, photos.images, models, options)
@@ -372,21 +376,21 @@ def _mapper_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     return pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3)
 
 
-def _without_misplaced(
+def _without_misregistered(
     model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, folder: Path, seed: int
 ) -> pycolmap.Reconstruction:
-    """The model with photos placed again, or left out, whose matches contradict their place."""
+    """The model with its mis-registered photos registered again, or removed."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         wrong = misregistered(model, opened)
     if not wrong:
         return model
-    return place_again(model, wrong, database, photos.images, folder, _mapper_options(seed))
+    return register_again(model, wrong, database, photos.images, folder, _mapper_options(seed))
 
 
 def _write_model(model: pycolmap.Reconstruction, output: Path) -> None:
-    """Write ``sparse/0`` beside its place and then exchange it, so that no half model is ever found."""
+    """Write the model beside ``sparse/0`` and then swap it in, so that no partial model is ever visible."""
     final = output / "sparse" / "0"
     final.parent.mkdir(parents=True, exist_ok=True)
     temporary = final.with_name(f".0.{os.getpid()}")

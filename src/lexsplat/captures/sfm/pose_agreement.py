@@ -1,8 +1,8 @@
-"""Whether photos stand where their matches say.
+"""Finds mis-registered photos: those whose verified matches contradict their pose.
 
-An incremental mapper places a photo by the few points that it has at that moment, and does not come back to it: a
-photo that was placed wrongly stays, with hardly a point, and teaches a reconstruction something that nobody saw.
-The matches with its neighbors, verified pair by pair before any photo was placed, tell: they contradict its place.
+An incremental mapper registers a photo from the few points it has at that moment and never revisits it. A
+mis-registered photo stays in the model with hardly a point, and the reconstruction then fits a false view. Its
+matches with neighboring photos, verified pair by pair before registration, reveal the error.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
 MAX_ERROR = 4.0
-"""Pixels (Sampson distance) within which a match agrees with two cameras; what pycolmap verifies pairs with."""
+"""Sampson distance in pixels within which a match agrees with two cameras; pycolmap's threshold for pairs."""
 
 MIN_AGREEMENT = 0.5
-"""A photo that most of its matches contradict is misplaced. Its neighbors each have many others that agree."""
+"""A photo is mis-registered if fewer than this share of its matches agree. Its neighbors have many others that do."""
 
 
 def agreements(model: pycolmap.Reconstruction, database: pycolmap.Database) -> dict[int, float]:
-    """The share of each placed photo's verified matches with other placed photos that agrees with the cameras.
+    """For each registered photo, the share of its verified matches with registered photos that agrees with the poses.
 
     Args:
-        model: The cameras; its images carry the numbers that they have in the database.
-        database: Keypoints, and matches that were verified pair by pair.
+        model: The cameras; image ids are those of the database.
+        database: Keypoints, and matches verified pair by pair.
 
     Returns:
-        The share for each image, 0 to 1, by its number; without those that match no placed photo.
+        Shares in 0..1 by image id; photos that match no registered photo are absent.
     """
     registered = set(model.reg_image_ids())
     rays = {number: _rays(_camera(model, number), database.read_keypoints(number)) for number in registered}
@@ -57,17 +57,17 @@ def sampson_errors(
     rays: Mapping[int, NDArray[np.float64]],
     matches: NDArray[np.integer],
 ) -> NDArray[np.float64]:
-    """First-order distances of matches from the epipolar geometry of two placed photos.
+    """First-order distances of matches from the epipolar geometry of two registered photos.
 
     Args:
         model: The cameras.
-        first: Number of one photo.
-        second: Number of the other.
-        rays: Keypoints of each photo in its normalized image plane ``[n, 2]``, by its number.
-        matches: Indices of keypoints in the first and in the second ``[m, 2]``.
+        first: Id of one photo.
+        second: Id of the other.
+        rays: Keypoints of each photo in its normalized image plane ``[n, 2]``, by image id.
+        matches: Indices of keypoints in the first and in the second photo ``[m, 2]``.
 
     Returns:
-        Distances in pixels ``[m]``; infinite where both cameras stand at one point.
+        Distances in pixels ``[m]``; infinite where both cameras share a position.
     """
     motion = model.image(second).cam_from_world() * model.image(first).cam_from_world().inverse()
     x, y, z = motion.translation
@@ -84,20 +84,20 @@ def sampson_errors(
 
 
 def misregistered(model: pycolmap.Reconstruction, database: pycolmap.Database) -> list[int]:
-    """Numbers of the placed photos that most of their matches contradict."""
+    """Ids of the registered photos whose pose most of their matches contradict."""
     shares = agreements(model, database)
     return sorted(number for number, share in shares.items() if share < MIN_AGREEMENT)
 
 
-def take_out(model: pycolmap.Reconstruction, images: list[int]) -> None:
-    """Take photos, and what they say of points, out of a model."""
+def deregister(model: pycolmap.Reconstruction, images: list[int]) -> None:
+    """Remove photos and their observations from a model."""
     for number in images:
         frame = model.image(number).frame_id
         if model.frame(frame).has_pose():
             model.deregister_frame(frame)
 
 
-def place_again(
+def register_again(
     model: pycolmap.Reconstruction,
     images: list[int],
     database: Path,
@@ -105,22 +105,22 @@ def place_again(
     folder: Path,
     options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.Reconstruction:
-    """Place photos anew in a model that has all the others; those that are misplaced again are left out of it.
+    """Register photos again in a model of all the others; those that are mis-registered again are removed.
 
     Args:
-        model: The model; the photos are taken out of it.
-        images: Numbers of the misplaced photos.
-        database: Where features and matches are.
+        model: The model; the photos are removed from it.
+        images: Ids of the mis-registered photos.
+        database: Features and matches.
         photos: Folder of the photos.
-        folder: For intermediate files; what is there is removed.
-        options: Of the mapper.
+        folder: For intermediate files; its content is deleted.
+        options: Mapper options.
 
     Returns:
-        The model to go on with: one in which no photo is misplaced.
+        A model without mis-registered photos.
     """
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
-    take_out(model, images)
+    deregister(model, images)
     shutil.rmtree(folder, ignore_errors=True)
     trusted = folder / "trusted"
     trusted.mkdir(parents=True)
@@ -130,7 +130,7 @@ def place_again(
     if again.num_reg_images() < model.num_reg_images():
         return model
     with pycolmap.Database.open(database) as opened:
-        take_out(again, misregistered(again, opened))
+        deregister(again, misregistered(again, opened))
     return again
 
 
@@ -139,14 +139,14 @@ def _camera(model: pycolmap.Reconstruction, image: int) -> pycolmap.Camera:
 
 
 def _rays(camera: pycolmap.Camera, keypoints: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Keypoints ``[n, 2+]`` in pixels to the normalized image plane ``[n, 2]``, without the lens's distortion."""
+    """Keypoints ``[n, 2+]`` in pixels as undistorted points ``[n, 2]`` of the normalized image plane."""
     if not len(keypoints):
         return np.empty((0, 2))
     return np.asarray(camera.cam_from_img(np.asarray(keypoints[:, :2], np.float64)))
 
 
 def _images_of(pair: int) -> tuple[int, int]:
-    """The two images of a pair as a COLMAP database numbers it."""
+    """The two image ids of a COLMAP pair id."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     first, second = pycolmap.pair_id_to_image_pair(pair)

@@ -1,9 +1,8 @@
-"""Photos made ready for structure from motion: which there are, upright copies where needed, masks, lenses.
+"""Prepares photos for structure from motion: finds them, writes upright copies where needed, masks and lenses.
 
-pycolmap takes pixels as they are stored: it does not turn a photo by its EXIF orientation, and it does not read
-every kind of picture. Photos that are stored turned, or in a kind that it does not read alike (anything but 8-bit
-gray or RGB in JPEG or PNG), are therefore copied, upright and with the focal length of their EXIF data; the others
-are linked beside them. Where no photo needs it, nothing is copied.
+pycolmap reads pixels as stored: it ignores the EXIF orientation and does not read every image format. Photos that
+are stored rotated, or in anything but 8-bit gray or RGB as JPEG or PNG, are therefore copied upright with their EXIF
+focal length, and the others are linked beside them. If no photo needs a copy, nothing is written.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from lexsplat.captures.images.reading import (
     open_image,
     read_bytes,
     read_mask,
+    resize_nearest,
     sizes_agree,
 )
 from lexsplat.captures.readers.camera_files import checked_name
@@ -38,22 +38,22 @@ STAGE = "photos"
 
 _ORIENTATION, _EXIF, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
 _FOCAL = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
-"""EXIF tags a focal length is worked out from: in millimeters, for 35 mm film, and pixels a unit of the sensor."""
+"""EXIF tags of the focal length: in millimeters, as 35 mm equivalent, and sensor pixels per unit."""
 _APART = (IGNORE_FOLDER, "segmentations")
 _JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
 class PreparedPhotos:
-    """Photos as structure from motion takes them.
+    """Photos ready for structure from motion.
 
     Args:
         images: Folder of the photos, upright.
-        names: Names of the photos in it, with "/", sorted.
-        lenses: The same names in groups that share a lens: one size and one focal length each.
-        masks: Folder with ``NAME.png`` as COLMAP wants it, or None where no photo is masked.
+        names: Names of the photos relative to it, with "/", sorted.
+        lenses: The same names, grouped by lens: one size and one focal length each.
+        masks: Folder with ``NAME.png`` in COLMAP's layout, or None if no photo is masked.
         largest: Width and height of the photo with the most pixels.
-        notes: What people should know, one line each.
+        notes: Remarks for the user, one line each.
     """
 
     images: Path
@@ -66,7 +66,7 @@ class PreparedPhotos:
 
 @dataclass(frozen=True)
 class _Photo:
-    """What the header of a photo says: its size upright, how it is stored, and its lens."""
+    """Header of a photo: its upright size, how it is stored, and its lens."""
 
     name: str
     size: tuple[int, int]
@@ -78,7 +78,7 @@ class _Photo:
 
 
 def photo_folder(capture: Path) -> Path:
-    """Where the photos of a folder are: in itself, or in its ``images/``."""
+    """The folder that holds the photos: the given one, or its ``images/``."""
     inside = capture / "images"
     direct = capture.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in capture.iterdir())
     return inside if inside.is_dir() and not direct else capture
@@ -89,7 +89,7 @@ def find_photos(folder: Path, without: Path | None = None) -> list[str]:
 
     Args:
         folder: Where to look; its ``masks/`` and ``segmentations/`` hold no photos.
-        without: A folder that is passed over: the output, where that lies among the photos.
+        without: A folder to skip: the output, where that lies among the photos.
     """
     apart = {folder / name for name in _APART}
     if without is not None and without.resolve() not in (folder.resolve(), *folder.resolve().parents):
@@ -107,7 +107,7 @@ def _all_parents(path: Path) -> set[Path]:
 
 
 def mask_places(folder: Path) -> list[Path]:
-    """Where masks of the photos in a folder may be: ``masks/`` in it, or beside it where it is called ``images``."""
+    """Where masks of the photos in a folder may be: ``masks/`` in it, or beside it if it is named ``images``."""
     return [
         place / IGNORE_FOLDER for place in (folder, *([folder.parent] if folder.name == "images" else []))
     ]
@@ -116,19 +116,19 @@ def mask_places(folder: Path) -> list[Path]:
 def prepare_photos(
     folder: Path, output: Path, *, memory: int = budget.DEFAULT_MEMORY, listener: Listener = silent
 ) -> PreparedPhotos:
-    """Look at a folder of photos, and write upright copies and masks where they are needed.
+    """Inspect a folder of photos, and write upright copies and masks where they are needed.
 
     Args:
-        folder: The photos, in subfolders if wanted; ``masks/`` in it, or beside it where it is called ``images``,
-            holds masks (black where pixels do not count).
-        output: Folder for ``images/`` (only where a photo has to be copied) and ``masks/`` (only where there are
-            some). Copies that are there from an earlier call and still fit are kept.
-        memory: Bytes of host memory that a photo on its way may take.
-        listener: Hears of stage "photos" while photos are copied.
+        folder: The photos, in subfolders if any; ``masks/`` in it, or beside it if it is named ``images``, holds
+            masks (black pixels are ignored).
+        output: Folder for ``images/`` (if a photo has to be copied) and ``masks/`` (if there are any). Valid copies
+            of an earlier call are kept.
+        memory: Bytes of host memory available to one photo.
+        listener: Receives events of stage "photos" while photos are copied.
 
     Raises:
         CaptureError: If there are fewer than three photos, one is unreadable, a mask does not fit its photo, or
-            the output would come to lie among the photos.
+            the output lies among the photos.
         MemoryBudgetError: If a photo is too large for ``memory``.
     """
     names = _checked_names(folder, output)
@@ -147,7 +147,7 @@ def prepare_photos(
         _copy_photos(photos, folder, images, renamed, listener)
         turned = sum(photo.orientation != 1 for photo in photos)
         converted = sum(not photo.plain for photo in photos)
-        notes.append(f"{turned} photos turned upright and {converted} of other kinds converted in {images}")
+        notes.append(f"{turned} photos rotated upright and {converted} converted to JPEG or PNG in {images}")
     masks = None
     if found:
         masks = _write_masks(photos, found, renamed, folder, output)
@@ -178,10 +178,10 @@ def _checked_names(folder: Path, output: Path) -> list[str]:
 
 
 def _check_name(folder: Path, name: str) -> None:
-    """Refuse a name that the camera files cannot hold, before hours of work lead to it.
+    """Refuse a name that camera files cannot hold.
 
     Raises:
-        CaptureError: If the name, or the folder's, is not in UTF-8, or has a line break or a backslash in it.
+        CaptureError: If the name or the folder's is not UTF-8, or contains a control character or a backslash.
     """
     try:
         str(folder).encode("utf-8")
@@ -198,22 +198,22 @@ def _check_name(folder: Path, name: str) -> None:
 
 
 def _look_at(folder: Path, name: str) -> _Photo:
-    """What the header of a photo says.
+    """The header of a photo.
 
     Raises:
-        CaptureError: If it is no picture, or not a whole one.
+        CaptureError: If it is not an image, or is truncated.
     """
     path = folder / name
     width, height = image_size(path)
     with open_image(path) as image:
         exif = image.getexif()
-        # Eight bits a channel without alpha, in a kind every build of pycolmap reads as Pillow does.
+        # Eight bits a channel without alpha, in a format every build of pycolmap reads as Pillow does.
         plain = image.format in ("JPEG", "PNG") and image.mode in ("L", "RGB")
         plain = plain and "transparency" not in image.info
         lossy = image.format not in ("PNG", "TIFF", "BMP")
         if plain:
-            # The others are read whole when they are converted. At an eighth of the size this takes a twentieth of
-            # a second for 12 megapixels, and a photo that is cut off is told now.
+            # Decoding at an eighth of the size finds truncated files now, in 50 ms for 12 megapixels. The other
+            # photos are decoded in full when they are converted.
             image.draft("RGB", (width // 8, height // 8))
             image.load()
     orientation = exif.get(_ORIENTATION, 1)
@@ -226,7 +226,7 @@ def _look_at(folder: Path, name: str) -> _Photo:
 
 
 def turned_upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """An array of pixels ``[H, W, ...]`` as it is stored, turned as EXIF orientation 1 to 8 says it is to be seen."""
+    """Pixels ``[H, W, ...]`` as stored, rotated and flipped upright by their EXIF orientation 1 to 8."""
     if orientation in (5, 6, 7, 8):  # stored with rows and columns exchanged
         pixels = np.swapaxes(pixels, 0, 1)
     if orientation in (3, 4, 7, 8):
@@ -237,7 +237,7 @@ def turned_upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def _new_names(photos: Sequence[_Photo]) -> dict[str, str]:
-    """Names of the copies: as before where the kind stays, else with another suffix, never twice the same."""
+    """Unique names of the copies: unchanged where the format stays, else with another suffix."""
     kept = {photo.name for photo in photos if photo.plain}
     names = {}
     for photo in photos:
@@ -257,7 +257,7 @@ def _new_names(photos: Sequence[_Photo]) -> dict[str, str]:
 def _copy_photos(
     photos: Sequence[_Photo], folder: Path, images: Path, renamed: dict[str, str], listener: Listener
 ) -> None:
-    """Fill ``images`` with links and copies, and take out what is of earlier photos."""
+    """Fill ``images`` with links and copies, and delete files of other photos."""
     wanted = {images / name for name in renamed.values()}
     for file in list(images.rglob("*")) if images.is_dir() else []:
         if file.is_file() and file not in wanted and not file.name.startswith("."):
@@ -272,16 +272,15 @@ def _copy_photos(
                     _link(source, temporary)
                 else:
                     _write_upright(photo, source, temporary)
-                    os.utime(
-                        temporary, ns=(stamp, stamp)
-                    )  # a copy is as old as its photo: so it is known again
+                    # The copy gets its photo's modification time, by which the next call recognizes it.
+                    os.utime(temporary, ns=(stamp, stamp))
         listener(Event(STAGE, done, len(photos)))
 
 
 def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # another file system, or one without links
+    except OSError:  # another file system, or one without hard links
         shutil.copy2(source, target)
 
 
@@ -309,7 +308,7 @@ def _write_masks(
     folder: Path,
     output: Path,
 ) -> Path:
-    """Masks as COLMAP reads them: ``NAME.png``, black and white, upright, of the photo's size."""
+    """Write masks in COLMAP's layout: ``NAME.png``, black and white, upright, of the photo's size."""
     _refuse_output_among_photos(folder, output)
     place = output / IGNORE_FOLDER
     shutil.rmtree(place, ignore_errors=True)
@@ -324,10 +323,10 @@ def _write_masks(
 
 
 def _fitted_mask(mask: NDArray[np.bool_], photo: _Photo, subject: Path) -> NDArray[np.bool_]:
-    """A mask ``[H, W]`` of the photo's upright size; one drawn on the stored pixels is turned with them.
+    """A mask ``[H, W]`` at the photo's upright size; one drawn on the stored pixels is rotated with them.
 
     Raises:
-        CaptureError: If it is of another shape than the photo.
+        CaptureError: If its aspect is not the photo's.
     """
     size = (mask.shape[1], mask.shape[0])
     if not sizes_agree(size, photo.size) and photo.orientation >= 5 and sizes_agree(size[::-1], photo.size):
@@ -339,18 +338,16 @@ def _fitted_mask(mask: NDArray[np.bool_], photo: _Photo, subject: Path) -> NDArr
             found=f"{size[0]}x{size[1]}",
             remedy="draw the mask on this photo, or remove it",
         )
-    rows = ((np.arange(photo.size[1]) + 0.5) * mask.shape[0] / photo.size[1]).astype(np.int64)
-    columns = ((np.arange(photo.size[0]) + 0.5) * mask.shape[1] / photo.size[0]).astype(np.int64)
-    return mask[rows[:, None], columns[None, :]]
+    return resize_nearest(mask, photo.size)
 
 
 def _refuse_output_among_photos(folder: Path, output: Path) -> None:
-    """Copies and masks never take the place of a user's own."""
+    """Keep copies and masks from overwriting the user's own files."""
     place = output.resolve()
     if place == folder.resolve() or (folder.name == "images" and place == folder.resolve().parent):
         raise CaptureError(
             output,
-            expected="an output beside the photos, because they have to be turned, converted or masked",
-            found="the photos' own folder",
+            expected="an output outside the folder of the photos, which have to be rotated, converted or masked",
+            found="the folder of the photos",
             remedy="give another --output",
         )

@@ -1,17 +1,21 @@
-"""The one place that imports pycolmap: ``from lexsplat.scenes.pycolmap_import import pycolmap``, where it is needed.
+"""The only module that imports pycolmap: use ``from lexsplat.captures.sfm.pycolmap_import import pycolmap``.
 
-Importing pycolmap takes time, and it installs a handler for SIGTERM that prints a stack trace and works on the heap
-while other threads may hold its lock, so that a process asked to end can stay. Here SIGTERM means again what it meant
-before: as a rule the process ends at once, and what was saved is what is there (``checkpoints.py``). Ctrl-C waits
-until the import is done: in the middle of it pycolmap would take it for a broken installation.
+pycolmap installs a SIGTERM handler that prints a stack trace and allocates memory while other threads may hold the
+allocator's lock, so a terminated process can deadlock. This module restores the previous handler: as a rule the
+process ends at once and resumes from its last checkpoint. Ctrl-C is deferred until the import is complete, because
+pycolmap reports an interrupted import as a broken installation.
+
+The import takes time; import it inside functions.
 """
 
 from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-# Only the main thread may set handlers, and None stands for one that Python did not install and cannot restore.
+# Only the main thread may set handlers. None is a handler that Python did not install and cannot restore.
 _is_main = threading.current_thread() is threading.main_thread()
 _before = signal.getsignal(signal.SIGTERM)
 _interrupt = signal.getsignal(signal.SIGINT)
@@ -28,4 +32,16 @@ if _is_main and _before is not None:
 if _waiting:
     signal.raise_signal(signal.SIGINT)
 
-__all__ = ["pycolmap"]
+__all__ = ["pycolmap", "quiet_pycolmap"]
+
+
+@contextmanager
+def quiet_pycolmap(seed: int) -> Iterator[None]:
+    """pycolmap with a fixed seed and without its log; failures are raised as typed errors."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

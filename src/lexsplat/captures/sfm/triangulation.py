@@ -1,17 +1,13 @@
-"""Points to start from: those of the capture, triangulated under its poses, or drawn inside its views.
+"""Initial points of a reconstruction: those of the capture, triangulated with its poses, or random.
 
-Starting from triangulated points instead of random ones is worth several dB on real photos, so a capture that
-has poses but no points gets them here: SIFT features, matches between views that look at the same place,
-kept where they obey the epipolar geometry of the known poses, and triangulated with the poses fixed.
+Triangulated points gain several dB over random ones on real photos. A capture with poses but without points gets them
+here: SIFT features are matched between views that look at the same place, matches that violate the epipolar geometry
+of the known poses are dropped, and the rest is triangulated with fixed poses.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +22,7 @@ from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threa
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
@@ -33,25 +30,25 @@ if TYPE_CHECKING:
 
 STAGE = "triangulate"
 ENOUGH_POINTS = 200
-"""With fewer triangulated points than this the reconstruction starts better from random ones."""
+"""With fewer triangulated points than this, random ones are the better start."""
 
 MAX_SIDE = 1000
-"""Longest side in pixels of the images in which features are sought: larger ones cost time, not points."""
+"""Longest side in pixels of the images for feature extraction: larger ones cost time and yield no more points."""
 
 MAX_FEATURES = 4096
 NEIGHBORS = 16
-"""How many other views each view is matched with."""
+"""Number of other views each view is matched with."""
 
 
 @dataclass(frozen=True)
 class InitialPoints:
-    """Where Gaussians start.
+    """The points Gaussians are initialized from.
 
     Args:
         points: Positions ``[P, 3]``, world.
         colors: RGB in 0..1 ``[P, 3]``.
         origin: ``"capture"``, ``"triangulated"`` or ``"random"``.
-        note: One line for people: how many points and how they were made.
+        note: Summary in one line: number and origin of the points.
     """
 
     points: NDArray[np.float32]
@@ -61,7 +58,7 @@ class InitialPoints:
 
 
 def initial_points(
-    scene: Capture,
+    capture: Capture,
     *,
     count: int = 20_000,
     seed: int = 0,
@@ -69,52 +66,52 @@ def initial_points(
     memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> InitialPoints:
-    """The best points to start a reconstruction from.
+    """The best available initial points.
 
-    Points of the capture where there are enough; else points triangulated under the known poses; as the last
-    resort ``count`` random points that several cameras see.
+    These are the points of the capture where there are enough, else points triangulated with the known poses, else
+    ``count`` random points that several cameras see.
 
     Args:
-        scene: The capture.
-        count: How many random points.
-        seed: Seed of all that is random here.
-        cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
-        memory: Bytes of host memory that a triangulation may take.
-        listener: Hears the progress of the triangulation.
+        capture: The capture.
+        count: Number of random points.
+        seed: Seed for pycolmap and the random points.
+        cache_dir: Folder that caches triangulated points; None disables the cache.
+        memory: Bytes of host memory available to the triangulation.
+        listener: Receives progress events of the triangulation.
 
     Raises:
         CaptureError: If an image cannot be read.
     """
-    if len(scene.points) >= ENOUGH_POINTS:
-        note = f"{len(scene.points):,} points of the capture"
-        return InitialPoints(scene.points, scene.point_colors, "capture", note)
-    points, colors = triangulate(scene, cache_dir=cache_dir, seed=seed, memory=memory, listener=listener)
+    if len(capture.points) >= ENOUGH_POINTS:
+        note = f"{len(capture.points):,} points of the capture"
+        return InitialPoints(capture.points, capture.point_colors, "capture", note)
+    points, colors = triangulate(capture, cache_dir=cache_dir, seed=seed, memory=memory, listener=listener)
     if len(points) >= ENOUGH_POINTS:
         return InitialPoints(points, colors, "triangulated", f"{len(points):,} points triangulated")
     found = len(points)
-    points, colors = random_points_in_frusta(scene, count, np.random.default_rng(seed))
+    points, colors = random_points_in_frusta(capture, count, np.random.default_rng(seed))
     note = f"{len(points):,} random points (only {found} could be triangulated)"
     return InitialPoints(points, colors, "random", note)
 
 
 def triangulate(
-    scene: Capture,
+    capture: Capture,
     *,
     cache_dir: Path | None = None,
     seed: int = 0,
     memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points matched between training views and triangulated under their poses.
+    """Points matched between training views and triangulated with their poses.
 
-    Held-out views take no part.
+    Held-out views are not used.
 
     Args:
-        scene: The capture.
-        cache_dir: Folder for the result, keyed by photos, cameras and settings; None keeps nothing.
+        capture: The capture.
+        cache_dir: Folder that caches the result by photos, cameras and settings; None disables the cache.
         seed: Seed for pycolmap.
-        memory: Bytes of host memory that may be taken: decides how much is done at once, and no result.
-        listener: Hears of stage ``"triangulate"``: one unit an image, then matching and triangulation.
+        memory: Bytes of host memory available. Determines threads and batches, never the result.
+        listener: Receives events of stage ``"triangulate"``: one unit per image, then matching and triangulation.
 
     Returns:
         Points ``[P, 3]`` float32, world, and their colors ``[P, 3]`` float32 in 0..1; P may be 0.
@@ -122,13 +119,15 @@ def triangulate(
     Raises:
         CaptureError: If an image cannot be read.
     """
-    views = scene.train_views
+    views = capture.train_views
     empty = np.zeros((0, 3), np.float32)
     if len(views) < 2:
         return empty, empty
     cached = None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.npz"
     if cached is not None and (known := _read_cache(cached)) is not None:
         return known
+    from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
+
     total = len(views) + 3
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
         folder = Path(temporary)
@@ -147,18 +146,18 @@ def triangulate(
 
 
 def random_points_in_frusta(
-    scene: Capture, count: int, rng: np.random.Generator
+    capture: Capture, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Random points where the cameras look, with the colors of the photos.
+    """Random points inside the view frusta, colored by the photos.
 
     Every point lies on a ray through a random pixel of a random training view, at 0.2 to 2 times the distance
-    at which the cameras' optical axes meet; of ten candidates the one that most views see is kept, so that
-    points gather where the views overlap.
+    at which the cameras' optical axes meet. Of ten candidates, the one that most views see is kept, which
+    concentrates points where views overlap.
 
     Args:
-        scene: The capture.
-        count: How many points.
-        rng: The source of randomness.
+        capture: The capture.
+        count: Number of points.
+        rng: Random generator.
 
     Returns:
         Points ``[count, 3]`` float32, world, and colors ``[count, 3]`` float32 in 0..1.
@@ -169,11 +168,11 @@ def random_points_in_frusta(
     """
     if count < 0:
         raise ValueError(f"count must not be negative, got {count}")
-    views = scene.train_views
+    views = capture.train_views
     owners = np.sort(rng.integers(0, len(views), count))
     pixels = rng.random((count, 10, 2))
     fractions = rng.uniform(0.2, 2.0, (count, 10))
-    distance = _focus_distance(views, scene.extent)
+    distance = _focus_distance(views, capture.extent)
     points = np.zeros((count, 3))
     colors = np.zeros((count, 3))
     for index, view in enumerate(views):
@@ -198,7 +197,7 @@ def random_points_in_frusta(
 def _focus_distance(views: tuple[View, ...], extent: float) -> float:
     """Median distance of the cameras to the point nearest to all optical axes, in world units.
 
-    Axes that meet nowhere in front of the cameras (a corridor, a single view) give three times the extent.
+    Three times the extent where the axes do not meet in front of the cameras (a corridor, a single view).
     """
     origins = np.stack([view.camera.position for view in views])
     axes = np.stack([view.camera.forward for view in views])
@@ -210,7 +209,7 @@ def _focus_distance(views: tuple[View, ...], extent: float) -> float:
 
 
 def _views_that_see(views: tuple[View, ...], points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """In how many views each point ``[P, 3]`` falls inside the image."""
+    """Number of views ``[P]`` in whose image each point ``[P, 3]`` falls."""
     counts = np.zeros(len(points), dtype=np.int64)
     for view in views:
         camera = view.camera
@@ -222,10 +221,10 @@ def _views_that_see(views: tuple[View, ...], points: NDArray[np.float64]) -> NDA
 
 
 def matching_pairs(views: tuple[View, ...], neighbors: int = NEIGHBORS) -> list[tuple[int, int]]:
-    """Which views to match: each with those that look most alike, by the known poses.
+    """Pairs of views to match: each view with its most similar ones by pose.
 
-    The cost of a pair is the distance of the cameras over the distance of what they look at, plus twice the
-    angle between their axes in radians; pairs that look apart by more than 90 degrees are left out.
+    The cost of a pair is the distance of the cameras relative to the focus distance, plus twice the angle between
+    their axes in radians. Pairs whose axes differ by more than 90 degrees are excluded.
 
     Returns:
         Pairs of indices, the lower first, sorted.
@@ -250,7 +249,7 @@ def _file_name(index: int) -> str:
 
 
 def _write_image(view: View, path: Path) -> tuple[int, int]:
-    """Write the undistorted photo where pycolmap reads it; gives its width and height."""
+    """Write the undistorted photo for pycolmap; returns its width and height."""
     width, height = view.capture_size
     shrink = max(1.0, max(width, height) / MAX_SIDE)
     size = max(1, round(width / shrink)), max(1, round(height / shrink))
@@ -261,7 +260,7 @@ def _write_image(view: View, path: Path) -> tuple[int, int]:
 
 
 def _write_mask(view: View, size: tuple[int, int], path: Path) -> None:
-    """Write what pycolmap may find features in: white where nothing is masked, else it would leave the image out."""
+    """Write the mask for pycolmap, all white for an unmasked view: pycolmap skips images without a mask."""
     valid = view.load_valid(size)
     pixels = np.full((size[1], size[0]), 255, np.uint8) if valid is None else valid.astype(np.uint8) * 255
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -277,14 +276,14 @@ def _run_pycolmap(
     total: int,
     listener: Listener,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Features, matches, verification under the known poses, triangulation."""
+    """Extract and match features, verify matches with the known poses, triangulate."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     database, images = folder / "database.db", folder / "images"
     done, names = len(views), [_file_name(index) for index in range(len(views))]
     listener(Event(STAGE, done, total))
     pycolmap.Database.open(database).close()
-    # Importing first gives the images their ids in order; extraction alone numbers them as threads finish.
+    # Importing first assigns image ids in order; extraction alone assigns them as threads finish.
     reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
     masked = any(view.ignore_path is not None for view in views)
     if masked:
@@ -311,7 +310,7 @@ def _run_pycolmap(
     matching.skip_geometric_verification = True
     pairing = pycolmap.ImportedPairingOptions(match_list_path=pairs, block_size=held)
     pycolmap.match_image_pairs(database, matching, pairing, device=pycolmap.Device.cpu)
-    # Matches are kept where they obey the epipolar geometry of the known poses; nothing is estimated.
+    # Drops matches that violate the epipolar geometry of the known poses; estimates nothing.
     pycolmap.guided_geometric_verification(known, database)
     check_mapping(database, memory)
     listener(Event(STAGE, done + 2, total))
@@ -332,7 +331,7 @@ def _run_pycolmap(
 def _known_reconstruction(
     database_path: Path, views: tuple[View, ...], sizes: list[tuple[int, int]]
 ) -> pycolmap.Reconstruction:
-    """The views' cameras and poses under the ids of the database, whose cameras are set to them."""
+    """The views' cameras and poses with the ids of the database, whose cameras are updated to match."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     known = pycolmap.Reconstruction()
@@ -360,7 +359,7 @@ def _known_reconstruction(
 
 
 def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Finite points of a pycolmap reconstruction, by id, and their colors."""
+    """Finite points of a pycolmap reconstruction in order of their ids, and their colors."""
     ordered = [model.points3D[key] for key in sorted(model.points3D)]
     points = np.array([point.xyz for point in ordered], dtype=np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in ordered], dtype=np.float64).reshape(-1, 3) / 255.0
@@ -368,41 +367,28 @@ def _points_of(model: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return points[keep].astype(np.float32), colors[keep].astype(np.float32)
 
 
-@contextmanager
-def quiet_pycolmap(seed: int) -> Iterator[None]:
-    """pycolmap with a fixed seed and without its log: what goes wrong is told as an error of ours."""
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
-    pycolmap.set_random_seed(seed)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
 def _cache_key(views: tuple[View, ...], seed: int) -> str:
-    """A hash of all that the points depend on; photos count by name, size and time of change."""
-    digest = hashlib.sha256(json.dumps([1, MAX_SIDE, MAX_FEATURES, NEIGHBORS, seed]).encode())
-    for view in views:
-        status = view.image_path.stat()
-        lens = [view.lens.model, view.lens.width, view.lens.height, *view.lens.params]
-        about: list[Any] = [view.name, status.st_size, status.st_mtime_ns, lens, view.background]
-        if view.ignore_path is not None:
-            mask = view.ignore_path.stat()
-            about += [mask.st_size, mask.st_mtime_ns]
-        digest.update(json.dumps(about).encode())
-        digest.update(view.camera.viewmat.tobytes())
-    return digest.hexdigest()[:16]
+    """Fingerprint of everything the points depend on."""
+    inputs = [
+        [
+            view.name,
+            file_stamp(view.image_path),
+            view.lens,
+            view.background,
+            None if view.ignore_path is None else file_stamp(view.ignore_path),
+            view.camera.viewmat.tolist(),
+        ]
+        for view in views
+    ]
+    return fingerprint(MAX_SIDE, MAX_FEATURES, NEIGHBORS, seed, inputs)
 
 
 def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Points kept by an earlier call; None where there are none or the file is damaged."""
+    """Cached points; None where there are none or the file is damaged."""
     try:
         with np.load(file, allow_pickle=False) as content:
             points, colors = content["points"], content["colors"]
-    except Exception:  # numpy's readers raise nearly everything on damaged archives; the points are made anew
+    except Exception:  # numpy raises many types on damaged archives; the points are triangulated again
         return None
     sound = points.ndim == 2 and points.shape[1:] == (3,) and points.shape == colors.shape
     if not sound or not (np.isfinite(points).all() and np.isfinite(colors).all()):
@@ -411,6 +397,6 @@ def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] |
 
 
 def _write_cache(file: Path, points: NDArray[np.float32], colors: NDArray[np.float32]) -> None:
-    """Keep points; the file appears whole or not at all."""
+    """Cache points atomically."""
     with atomic_path(file) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, points=points, colors=colors)

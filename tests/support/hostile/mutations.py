@@ -1,7 +1,7 @@
-"""Ways in which a file can be wrong, made from a sound one: every mutation is (kind, bytes), seeded.
+"""Mutations of valid files: each is a pair of kind and bytes, and all are seeded. Independent of lexsplat.
 
-Knows nothing of lexsplat. "truncated" is the file cut at every boundary (of a byte, up to a number of them, then at
-boundaries spread over it); the other kinds are drawn at random or walk over the structure of the format.
+The kind "truncated" cuts the file after every byte, or at evenly chosen places of a longer file. The other kinds are
+random, or enumerate the structure of the format.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WORDS = (
     struct.pack("<ff", float("nan"), float("-inf")),
     struct.pack("<ff", 3e38, -3e38),
 )
-"""Eight bytes that are absurd as a count or as a number."""
+"""Eight bytes that are invalid as a count or as a number."""
 
 NAMES = (
     "../../../../etc/passwd", "/etc/passwd", "C:\\windows\\win.ini", "..\\..\\secret.png", "a/../../b.png",
@@ -35,21 +35,21 @@ NAMES = (
     "صورة.png",
     "é.png", "e\u0301.png", "\u202egnp.png", "\ud83d.png", "%2e%2e/%2e%2e/x.png", "images", "sparse/0/cameras.bin",
 )  # fmt: skip
-"""Names that lead elsewhere, mean something to a system, or are in other alphabets."""
+"""Names that point outside the folder, are special to an operating system, or are in other alphabets."""
 
 VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1e308, -1e308, float("nan"), float("inf"), 10**400, 2**31, 2**63, "", "x", "../../x",
     "日本語.png", "1e999", [], {}, [[]], [None], [1e400], {"a": 1}, "A" * 2000,
 )  # fmt: skip
-"""What stands in JSON where something else should."""
+"""JSON values of unexpected types and sizes."""
 
 TOKENS = ("nan", "inf", "-inf", "1e400", "-1", "0", "99999999999999999999999", "18446744073709551615", "", "x", "1.5",
           "0x10", "١٢", "1_000", "../../../x.png", "写真.png", "\0", "1 2 3 4 5 6 7 8 9")  # fmt: skip
-"""What stands in text where a number or name should."""
+"""Words that replace a number or name in text."""
 
 
 def truncated(content: bytes, limit: int = 400) -> Iterator[Mutation]:
-    """Cut at every byte, or at ``limit`` places where the file is longer; the empty file is one of them."""
+    """The file cut after every byte, or at ``limit`` places if it is longer; includes the empty file."""
     count = min(len(content), limit)
     for length in np.unique(np.linspace(0, len(content) - 1, count).astype(int)) if count else []:
         yield "truncated", content[:length]
@@ -66,7 +66,7 @@ def flipped(content: bytes, rng: np.random.Generator, count: int) -> Iterator[Mu
 
 
 def overwritten(content: bytes, rng: np.random.Generator, count: int, start: int = 0) -> Iterator[Mutation]:
-    """Absurd counts and numbers written over eight bytes; the first places in turn, then any."""
+    """Invalid counts and numbers written over eight bytes; the first places in turn, then random ones."""
     span = max(1, len(content) - 8 - start)
     for number in range(count):
         word = WORDS[number % len(WORDS)]
@@ -77,7 +77,7 @@ def overwritten(content: bytes, rng: np.random.Generator, count: int, start: int
 
 
 def shifted(content: bytes, rng: np.random.Generator, count: int) -> Iterator[Mutation]:
-    """Parts cut out, put in twice, put in from elsewhere, filled with zeros, or appended."""
+    """Parts removed, duplicated, inserted from elsewhere, zeroed, or appended."""
     for number in range(count):
         a, b = sorted(int(v) for v in rng.integers(len(content) + 1, size=2))
         part = content[a:b]
@@ -95,7 +95,7 @@ def shifted(content: bytes, rng: np.random.Generator, count: int) -> Iterator[Mu
 
 
 def foreign(content: bytes) -> Iterator[Mutation]:
-    """Files of another kind under this name."""
+    """Files of another format under this name."""
     for data in (
         b"", b"\0", b"\0" * 4096, b"\xff" * 4096,
         b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00\x8c\x05posix\x94.",
@@ -110,7 +110,7 @@ def foreign(content: bytes) -> Iterator[Mutation]:
 def binary(
     content: bytes, rng: np.random.Generator, count: int = 120, limit: int = 400
 ) -> Iterator[Mutation]:
-    """Everything that can happen to a binary file."""
+    """All mutations of a binary file."""
     yield from truncated(content, limit)
     yield from flipped(content, rng, count)
     yield from overwritten(content, rng, count)
@@ -119,7 +119,7 @@ def binary(
 
 
 def text(content: bytes, rng: np.random.Generator, count: int = 120, limit: int = 300) -> Iterator[Mutation]:
-    """Everything that can happen to a text file: words exchanged, lines gone, doubled or in another order."""
+    """All mutations of a text file: words replaced, lines removed, duplicated or reordered."""
     yield from truncated(content, limit)
     yield from flipped(content, rng, count)
     yield from shifted(content, rng, count // 3)
@@ -139,7 +139,7 @@ def text(content: bytes, rng: np.random.Generator, count: int = 120, limit: int 
 
 
 def structure(document: Any, rng: np.random.Generator, limit: int = 600) -> Iterator[Mutation]:
-    """A JSON document with one place gone, doubled or exchanged for something else; ``limit`` of all such."""
+    """A JSON document with one value removed, duplicated or replaced; at most ``limit`` of them."""
     changes: list[tuple[list, Callable[[Any], Any] | None]] = []
     for path in _places(document):
         changes.append((path, None))
@@ -178,7 +178,7 @@ def _changed(document: Any, path: list, change: Callable[[Any], Any] | None) -> 
 def json_file(
     content: bytes, rng: np.random.Generator, count: int = 80, limit: int = 600
 ) -> Iterator[Mutation]:
-    """Everything that can happen to a JSON file."""
+    """All mutations of a JSON file."""
     yield from truncated(content, 150)
     yield from flipped(content, rng, count)
     yield from shifted(content, rng, count // 3)
@@ -189,7 +189,7 @@ def json_file(
 def safetensors(
     content: bytes, rng: np.random.Generator, count: int = 80, limit: int = 300
 ) -> Iterator[Mutation]:
-    """A safetensors file: its bytes, and its header as JSON with the length made right again."""
+    """Mutations of a safetensors file: of its bytes, and of its JSON header with a corrected length."""
     yield from truncated(content, 120)
     yield from flipped(content, rng, count)
     yield from overwritten(content, rng, count)
@@ -203,7 +203,7 @@ def safetensors(
 
 
 def tensors(content: bytes, rng: np.random.Generator, count: int) -> Iterator[Mutation]:
-    """Sound safetensors with another content: a tensor gone, of another shape or type, or with NaN or Inf."""
+    """Valid safetensors with other content: a tensor missing, of another shape or type, or with NaN or infinity."""
     import torch
     from safetensors.torch import load, save
 

@@ -1,0 +1,132 @@
+"""Settings of dense feature extraction (section 3.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+from lexsplat.features.cache import Tokens
+from lexsplat.features.encoders import Facet
+
+GRID_SETTINGS = ("crop_sizes", "crop_strides", "crop_tokens")
+"""Settings of mode "grid"."""
+
+RANDOM_SETTINGS = ("random_crops", "random_levels", "random_sizes", "seed")
+"""Settings of mode "random"."""
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Settings of feature extraction. The defaults suit CLIP ViT-B/16 and DINO ViT-S/8 on a GPU.
+
+    Args:
+        mode: "grid": a regular grid of crops for each size, as in LERF and the authors' code. "random": the paper's
+            hierarchical random crops.
+        crop_sizes: Grid: sides of the crops as fractions of the image's short side.
+        crop_strides: Grid: distance between crops of each size, as a fraction of their side.
+        crop_tokens: Grid: which embeddings of a crop are used. "class": the image-level embedding, placed at the
+            center of the crop (the paper). "patch": patch-level embeddings as in MaskCLIP, each placed at its patch;
+            needs a model of CLIP's own architecture. "both": both. None is "class", and "both" for the bundled
+            encoders.
+        random_crops: Random: crops per view, divided evenly among the sizes.
+        random_levels: Random: number of sizes.
+        random_sizes: Random: smallest and largest side as fractions of the image's short side.
+        seed: Random: seed of the positions; every view draws its own.
+        map_cells: Cells of the feature maps along the short side (fewer for images longer than 16 short sides).
+        max_short_side: Larger images are reduced to this many pixels on the short side before cropping.
+        dino_short_side: Pixels on the short side of DINO's input.
+        dino_stride: Pixels of DINO's input between features; below the patch size, shifted copies of the image are
+            evaluated.
+        dino_facet: "key": attention keys. "token": output tokens.
+        dino_layer: Layer of the keys, 0-based; None is the last.
+        dino_max_tokens: Most patches that DINO's attention sees at once; larger images are evaluated in overlapping
+            windows.
+
+    Raises:
+        ValueError: If a setting is out of range, or two contradict each other.
+    """
+
+    mode: Literal["grid", "random"] = "grid"
+    crop_sizes: tuple[float, ...] = (0.05, 0.125, 0.2, 0.275, 0.35, 0.425, 0.5)
+    crop_strides: tuple[float, ...] = (1.0, 0.625, 0.5, 0.5, 0.5, 0.5, 0.5)
+    crop_tokens: Tokens | None = None
+    random_crops: int = 3000
+    random_levels: int = 20
+    random_sizes: tuple[float, float] = (0.05, 0.2)
+    seed: int = 0
+    map_cells: int = 112
+    max_short_side: int = 1080
+    dino_short_side: int = 224
+    dino_stride: int = 2
+    dino_facet: Facet = "key"
+    dino_layer: int | None = None
+    dino_max_tokens: int = 4096
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("grid", "random"):
+            raise ValueError(f"mode must be 'grid' or 'random', got {self.mode!r}")
+        if len(self.crop_sizes) != len(self.crop_strides) or not self.crop_sizes:
+            raise ValueError(
+                f"needs one crop stride per crop size, got {len(self.crop_strides)} for {len(self.crop_sizes)}"
+            )
+        if min(self.crop_sizes) <= 0 or min(self.crop_strides) <= 0:
+            raise ValueError("crop sizes and strides must be positive")
+        if not 0 < self.random_sizes[0] <= self.random_sizes[1]:
+            raise ValueError(f"random_sizes must be positive and in order, got {self.random_sizes}")
+        if self.crop_tokens not in (None, "class", "patch", "both"):
+            raise ValueError(f"crop_tokens must be 'class', 'patch' or 'both', got {self.crop_tokens!r}")
+        if self.tokens != "class" and self.mode != "grid":
+            raise ValueError(f"crop_tokens={self.crop_tokens} needs mode=grid; random crops have no patches")
+        if self.dino_facet not in ("key", "token"):
+            raise ValueError(f"dino_facet must be 'key' or 'token', got {self.dino_facet!r}")
+        sizes = ("map_cells", "max_short_side", "dino_short_side", "dino_stride", "dino_max_tokens")
+        for name in (*sizes, "random_crops", "random_levels"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+    @property
+    def tokens(self) -> Tokens:
+        """Which embeddings of a crop are used."""
+        return self.crop_tokens or "class"
+
+    @classmethod
+    def sparse(cls) -> FeatureConfig:
+        """Settings for large encoders on a CPU: a sixth of the crops and a quarter of DINO's work."""
+        return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=4)
+
+    @classmethod
+    def bundled(cls) -> FeatureConfig:
+        """Settings for the bundled encoders, chosen by measurement."""
+        return cls(
+            crop_sizes=(18 / 240, 44 / 240),
+            crop_strides=(0.5, 0.35),
+            crop_tokens="both",
+            map_cells=120,
+            max_short_side=360,
+            dino_short_side=320,
+            dino_stride=8,
+        )
+
+    def on_top_of(self, base: FeatureConfig) -> FeatureConfig:
+        """``base`` with every setting in which this one differs from the defaults.
+
+        Sizes and strides of the grid are taken together, because they must have the same length.
+        """
+        if self.mode == "random":  # random crops have no patches
+            base = dataclasses.replace(base, crop_tokens=None)
+        usual = FeatureConfig()
+        given = {name for name in dataclasses.asdict(self) if getattr(self, name) != getattr(usual, name)}
+        if given & {"crop_sizes", "crop_strides"}:
+            given |= {"crop_sizes", "crop_strides"}
+        return dataclasses.replace(base, **{name: getattr(self, name) for name in given})
+
+    def result_settings(self, use_dino: bool) -> FeatureConfig:
+        """The settings that affect the result: the other mode and an unused DINO are at their defaults."""
+        usual = FeatureConfig()
+        unused = set(RANDOM_SETTINGS if self.mode == "grid" else GRID_SETTINGS)
+        if self.tokens == "class":
+            unused.add("crop_tokens")
+        if not use_dino:
+            unused |= {name for name in dataclasses.asdict(self) if name.startswith("dino_")}
+        return dataclasses.replace(self, **{name: getattr(usual, name) for name in unused})

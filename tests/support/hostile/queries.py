@@ -1,0 +1,50 @@
+"""Readers of what people type: phrases, and the history of the viewer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from support.hostile import mutations as mutate
+from support.hostile.registry import Reader, reader
+
+
+@reader
+def viewer_memory() -> Reader:
+    from lexsplat.viewer.history import Memory
+
+    def make(folder: Path) -> None:
+        (folder / "viewer.json").write_text(
+            json.dumps({"history": ["red apple", "床"], "vocabulary": ["mug"]})
+        )
+
+    def check(memory: Any) -> None:
+        phrases = [*memory.history, *memory.vocabulary]
+        assert all(isinstance(phrase, str) and phrase.strip() for phrase in phrases)
+        json.dumps(phrases, ensure_ascii=False).encode("utf-8")
+
+    return Reader(make, lambda folder: Memory.load(folder), check,
+                  {"viewer.json": lambda c, r: mutate.json_file(c, r, 40, 200)})  # fmt: skip
+
+
+@reader
+def phrases() -> Reader:
+    """Phrases as typed by people and programs: the bytes of the file are the phrase."""
+    from lexsplat.queries.phrases import parse
+    from lexsplat.queries.relevancy import check_prompts
+    from lexsplat.scenes.answers import file_name
+
+    def read(folder: Path) -> Any:
+        raw = (folder / "phrase.txt").read_bytes().decode("utf-8", "surrogateescape")
+        (phrase,) = check_prompts([raw])
+        return phrase, str(parse(phrase)), file_name(phrase)
+
+    def check(result: tuple[str, str, str]) -> None:
+        assert result[0].strip()
+        assert "/" not in result[2]
+        assert result[2] not in ("", ".", "..")
+
+    good = 'how many "salt and pepper" mugs on the largest book but not the red cup nearest to 床'
+    return Reader(lambda folder: (folder / "phrase.txt").write_text(good) and None, read, check,
+                  {"phrase.txt": lambda c, r: mutate.text(c, r, 150, 90)})  # fmt: skip

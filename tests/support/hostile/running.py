@@ -1,0 +1,173 @@
+"""Runs hostile readers in a process of its own::
+
+    python -m support.hostile.running WORK_FOLDER REPORT.json CLAIMS_FOLDER
+
+Several processes share the readers: each takes the next one that no other has claimed. Once everything is imported
+and a reader has read its valid input, the process may take one more gigabyte of memory (RLIMIT_DATA), and each input
+may take `SECONDS`. Every exception must be a typed error of lexsplat, and every result must pass the reader's check.
+Before each input, its content and its name are written to disk, so that a crash can be traced.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import resource
+import shutil
+import signal
+import sys
+import time
+import warnings
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from support.hostile import READERS, Reader
+
+SECONDS = 5.0
+GIGABYTE = 1 << 30
+BASE_BYTES = 3 << 28
+"""Memory of the process before any input: torch, Numba's kernels, the other libraries."""
+
+
+class Hang(BaseException):
+    """An input took longer than `SECONDS`."""
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    raise Hang
+
+
+@dataclass
+class Report:
+    """Results of all inputs of a reader."""
+
+    inputs: int = 0
+    errors: Counter = field(default_factory=Counter)
+    kinds: Counter = field(default_factory=Counter)
+    right: int = 0
+    failures: list[str] = field(default_factory=list)
+    peak: int = 0
+    seconds: float = 0.0
+
+    def data(self) -> dict[str, Any]:
+        return {**vars(self), "errors": dict(self.errors), "kinds": dict(self.kinds)}
+
+
+def summary(result: Any) -> bytes:
+    """Bytes that are equal for equal results."""
+    import torch
+
+    if hasattr(result, "gaussians"):
+        return summary([result.gaussians, list(result.field.tensors().values()), repr(result.views)])
+    if hasattr(result, "tensors"):
+        return summary(list(result.tensors().values()))
+    if isinstance(result, (torch.Tensor, np.ndarray)):
+        return np.asarray(result).tobytes()
+    if isinstance(result, (list, tuple)):
+        return b"|".join(map(summary, result))
+    return repr(result).encode("utf-8", "replace")
+
+
+def attempt(target: Reader, folder: Path, report: Report, about: str, whole: bytes | None) -> None:
+    """Read once and check the result; ``whole`` is the summary that a truncated file must yield, if it is read."""
+    from lexsplat.runtime.errors import LexsplatError
+
+    allowed = (LexsplatError, ValueError) if target.value_errors else (LexsplatError,)
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    try:
+        result = target.read(folder)
+        target.check(result)
+        assert whole is None or summary(result) == whole, "a truncated file was read as complete"
+        report.right += 1
+    except allowed as error:
+        report.errors[type(error).__name__] += 1
+        if "\n" in str(error) or not str(error):
+            report.failures.append(f"{about}: not one line: {error!r}")
+    except Hang:
+        report.failures.append(f"{about}: not finished after {SECONDS:g} s")
+    except (Exception, MemoryError) as error:
+        where = error.__traceback__
+        while where is not None and where.tb_next is not None:
+            where = where.tb_next
+        place = f"{Path(where.tb_frame.f_code.co_filename).name}:{where.tb_lineno}" if where else ""
+        report.failures.append(f"{about}: {type(error).__name__} at {place}: {str(error)[:300]}")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def run_reader(name: str, work: Path, current: Path) -> Report:
+    """Run all mutations of one reader; the file ``current`` names the one in progress."""
+    target, report = READERS[name](), Report()
+    folder = work / name
+    folder.mkdir(parents=True)
+    target.make(folder)
+    good = target.read(folder)
+    target.check(good)
+    # All inputs are a few kilobytes: one more gigabyte is ample.
+    limit = _data_bytes() + GIGABYTE
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
+    whole = summary(good)
+    for number, (file, mutations) in enumerate(target.mutations.items()):
+        path = folder / file
+        content = path.read_bytes()
+        for index, (kind, changed) in enumerate(mutations(content, np.random.default_rng(number))):
+            about = f"{name} {file} {kind} {index}"
+            current.write_text(about)
+            path.write_bytes(changed)
+            report.inputs += 1
+            report.kinds[kind] += 1
+            attempt(
+                target, folder, report, about, whole if kind == "truncated" and file in target.exact else None
+            )
+            if len(report.failures) >= 200:
+                break
+        path.write_bytes(content)
+    resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    shutil.rmtree(folder)
+    return report
+
+
+def _data_bytes() -> int:
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData"))
+
+
+def _claim(path: Path) -> bool:
+    """Whether this process is the first to ask for a reader."""
+    try:
+        path.touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
+
+
+def main() -> None:
+    """Run the readers that no other process has claimed."""
+    work, output, claims = map(Path, sys.argv[1:])
+    import logging
+
+    import torch
+
+    torch.set_num_threads(1)
+    logging.getLogger("lexsplat").setLevel(logging.CRITICAL)
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGALRM, _interrupt)
+    reports: dict[str, Any] = {}
+    for name in READERS:
+        if not _claim(claims / name):
+            continue
+        start = time.process_time()
+        with contextlib.redirect_stdout(sys.stderr):
+            report = run_reader(name, work, output.with_suffix(".current"))
+        report.peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        report.seconds = round(time.process_time() - start, 2)
+        reports[name] = report.data()
+        output.write_text(json.dumps(reports, indent=1))
+
+
+if __name__ == "__main__":
+    main()
