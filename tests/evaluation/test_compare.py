@@ -151,7 +151,7 @@ def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_cap
     granted, original = [], feature_rendering.TrainingViews.__init__
 
     def keep(*args, **wishes):
-        granted.append(wishes["memory_bytes"])
+        granted.append(wishes["memory"])
         original(*args, **wishes)
 
     monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)
