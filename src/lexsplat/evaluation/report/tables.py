@@ -35,10 +35,10 @@ _OTHERS = {
 OTHER_PROTOCOLS = tuple(_OTHERS)
 """Columns of the protocols of other authors."""
 
-_HEADINGS = {**_PAPER, **_HONEST, **_OTHERS}
+_HEADINGS = {**_PAPER, **_HONEST, **_OTHERS, "query_ms": ("ms/prompt", 1)}
 
 _MEASURED_ONCE = {
-    "fps", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
+    "fps", "query_ms", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
 }  # fmt: skip
 """Columns whose differences may be noise of the machine: no value of them is marked as best."""
 
