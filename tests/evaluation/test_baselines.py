@@ -1,4 +1,4 @@
-"""The rebuilt methods on balls whose meaning is known, and their parts against independent references."""
+"""The rebuilt methods on balls with known meaning, and their parts against independent references."""
 
 import math
 
@@ -18,13 +18,14 @@ from lexsplat.evaluation.baselines import (
     LerfConfig,
     Ovs3dConfig,
     ScaledFeatures,
+    TrainingData,
     ViewFeatures,
     distill,
     fit_3dovs,
     fit_lerf,
 )
-from lexsplat.evaluation.baselines.feature_rendering import TrainingViews, average_features, render_cosines
-from lexsplat.evaluation.baselines.lerf import level_weights, smooth_alike
+from lexsplat.evaluation.baselines.feature_rendering import TrainingViews, back_projected_mean, render_cosines
+from lexsplat.evaluation.baselines.lerf import level_weights, smooth_by_similarity
 from lexsplat.evaluation.baselines.ovs3d import alignment_loss, js_divergence
 from lexsplat.features import FeatureMap
 from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
@@ -81,7 +82,7 @@ def pixel_accuracy(method, scene, maps_shape=(24, 32)):
 # Full-dimensional features
 
 
-def test_spreading_is_the_transpose_of_rendering(scene):
+def test_back_projection_is_the_transpose_of_rendering(scene):
     views = TrainingViews(scene.gaussians, scene.cameras, lambda name: (16, 12))
     camera, prepared = views.prepared("view0")
     weights = render(scene.gaussians, camera, features=torch.eye(len(scene.gaussians)), color=False).features
@@ -91,14 +92,14 @@ def test_spreading_is_the_transpose_of_rendering(scene):
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=1e-4)
 
 
-def test_the_average_of_a_constant_is_that_constant_where_something_was_seen(scene):
+def test_the_mean_of_a_constant_is_that_constant_where_a_gaussian_was_seen(scene):
     views = TrainingViews(scene.gaussians, scene.cameras, lambda name: (16, 12), scale=2)
-    told = []
+    events = []
     constant = torch.tensor([0.25, -1.0])
-    features, weights = average_features(
-        views, lambda name, camera: constant.expand(camera.height, camera.width, 2), tell=told.append
+    features, weights = back_projected_mean(
+        views, lambda name, camera: constant.expand(camera.height, camera.width, 2), listener=events.append
     )
-    assert told == [1, 2, 3, 4, 5, 6]
+    assert events == [1, 2, 3, 4, 5, 6]
     seen = weights >= 0.01
     torch.testing.assert_close(features[seen], constant.expand(int(seen.sum()), 2), atol=1e-4, rtol=1e-3)
     assert not features[~seen].any()
@@ -120,15 +121,15 @@ def test_cosines_in_chunks_are_those_of_the_whole_feature(scene):
 # dff
 
 
-def test_distilled_features_find_what_the_views_show(scene, maps):
-    found = distill(scene.gaussians, scene.cameras, maps, DffConfig(steps=20))
+def test_distilled_features_find_the_balls(scene, maps):
+    found = distill(TrainingData(scene.gaussians, scene.cameras, maps), DffConfig(steps=20))
     assert isinstance(found, Method)
     assert ball_scores(found, scene) > 0.85
     assert pixel_accuracy(found, scene) > 0.9
     assert found.tensors()["features"].dtype == torch.float16
 
 
-def test_distilling_goes_from_the_average_towards_the_least_squares_and_has_a_seed(scene):
+def test_distilling_moves_from_the_mean_towards_the_least_squares_solution_and_is_reproducible(scene):
     noisy = feature_maps(scene, noise=0.3)
     eye = torch.eye(len(scene.gaussians))
     weights, targets = [], []
@@ -142,11 +143,12 @@ def test_distilling_goes_from_the_average_towards_the_least_squares_and_has_a_se
     def error(features):
         return float((system @ features.double() - target).square().mean())
 
-    average = distill(scene.gaussians, scene.cameras, noisy, DffConfig(steps=0))
-    fitted = distill(scene.gaussians, scene.cameras, noisy, DffConfig(steps=40, learning_rate=0.05))
+    data = TrainingData(scene.gaussians, scene.cameras, noisy)
+    average = distill(data, DffConfig(steps=0))
+    fitted = distill(data, DffConfig(steps=40, learning_rate=0.05))
     left = (error(fitted.features) - error(best)) / (error(average.features) - error(best))
     assert 0 <= left < 0.6
-    again = distill(scene.gaussians, scene.cameras, noisy, DffConfig(steps=40, learning_rate=0.05))
+    again = distill(data, DffConfig(steps=40, learning_rate=0.05))
     torch.testing.assert_close(fitted.features, again.features)
 
 
@@ -175,7 +177,7 @@ def test_level_weights_sum_to_one_and_interpolate_the_logarithm(sides, wanted):
     assert mean == pytest.approx(math.log(min(max(wanted, min(sides)), max(sides))), abs=1e-3)
 
 
-def test_the_scale_with_the_highest_relevancy_answers_for_each_prompt(scene):
+def test_each_prompt_takes_the_scale_with_the_highest_relevancy(scene):
     blind = torch.eye(DIM)[BALLS].expand(len(scene.gaussians), DIM)
     first, second = blind.clone(), blind.clone()
     labels = torch.from_numpy(scene.labels)
@@ -192,21 +194,23 @@ def test_the_scale_with_the_highest_relevancy_answers_for_each_prompt(scene):
     assert ((scores[1] > 0.9).numpy() == (scene.labels == 1)).all()
 
 
-def test_neighbors_that_look_different_do_not_mix_and_the_unseen_are_filled_in():
+def test_dissimilar_neighbors_do_not_mix_and_unseen_gaussians_are_filled_in():
     means = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.15, 0, 0]])
     dino = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 0]])
     features = torch.tensor([[[1.0], [3.0], [9.0], [0.0]]])
-    found = smooth_alike(means, dino, features, LerfConfig(neighbors=3, sharpness=50.0))[0, :, 0]
+    found = smooth_by_similarity(means, dino, features, LerfConfig(neighbors=3, sharpness=50.0))[0, :, 0]
     torch.testing.assert_close(found[:3], torch.tensor([2.0, 2.0, 9.0]), atol=1e-4, rtol=0)
     assert float(found[3]) == pytest.approx((1 + 3 + 9) / 3)
 
 
-def test_lerf_finds_what_the_views_show(scene, maps):
-    def levels(name):  # the larger crops see nothing but the surroundings
+def test_lerf_finds_the_balls(scene, maps):
+    def levels(name):  # the larger crops show only the surroundings
         blur = torch.eye(DIM)[BALLS].expand_as(maps[name].clip)
         return torch.stack([maps[name].clip, blur]), [0.1, 0.6]
 
-    found = fit_lerf(scene.gaussians, scene.cameras, maps, levels, LerfConfig(scales=2, neighbors=3))
+    found = fit_lerf(
+        TrainingData(scene.gaussians, scene.cameras, maps, levels), LerfConfig(scales=2, neighbors=3)
+    )
     assert isinstance(found, Method)
     assert found.features.shape == (2, len(scene.gaussians), DIM)
     assert float(found.scales[0]) < float(found.scales[1])
@@ -227,8 +231,8 @@ def test_the_divergence_is_scipys_and_bounded(first, second):
     assert -1e-12 <= found <= math.log(2) + 1e-12
 
 
-def test_alignment_pulls_alike_pixels_together_and_pushes_others_apart():
-    config = Ovs3dConfig(alike_weight=1.0, unlike_weight=1.0)
+def test_alignment_pulls_similar_pixels_together_and_pushes_others_apart():
+    config = Ovs3dConfig(similar_weight=1.0, dissimilar_weight=1.0)
     same, other = torch.tensor([4.0, 0]).log_softmax(-1), torch.tensor([0.0, 4]).log_softmax(-1)
     alike, unlike = torch.tensor([[1.0, 0], [1, 0]]), torch.tensor([[1.0, 0], [0, 1]])
     assert float(alignment_loss(torch.stack([same, same]), alike, config)) == pytest.approx(0, abs=1e-6)
@@ -241,19 +245,20 @@ def test_alignment_pulls_alike_pixels_together_and_pushes_others_apart():
     )
 
 
-def test_3dovs_tells_the_classes_apart_and_a_half_is_the_choice_of_the_best(scene, maps):
+def test_3dovs_separates_the_classes_and_one_half_selects_the_best_class(scene, maps):
     def levels(name):
         return torch.stack([maps[name].clip, maps[name].clip.flip(0)]), [0.1, 0.6]
 
     classes = torch.cat([WORDS, OTHER])
-    found = fit_3dovs(scene.gaussians, scene.cameras, maps, levels, classes, Ovs3dConfig(steps=15, pairs=32))
+    data = TrainingData(scene.gaussians, scene.cameras, maps, levels)
+    found = fit_3dovs(data, classes, Ovs3dConfig(steps=15, pairs=32))
     assert isinstance(found, Method)
     assert ball_scores(found, scene) > 0.85
     scores = found.gaussian_scores(classes, OTHER, CONFIG)
     known = found.features.norm(dim=1) > 0
     assert ((scores >= 0.5).sum(0)[known] == 1).all(), "one class is the best of all"
     with pytest.raises(ValueError, match="two classes"):
-        fit_3dovs(scene.gaussians, scene.cameras, maps, levels, WORDS[:1])
+        fit_3dovs(data, WORDS[:1])
 
 
 # nearest

@@ -105,7 +105,7 @@ def test_the_report_shows_every_method_beside_the_others_and_loads_nothing(compa
     column = rows[0].index("mIoU")
     for row in record["rows"]:
         assert table[row["name"]][column] == f"{row['mIoU'][0]:.3f}"
-    cases = re.findall(r'<div class="versus">.*?(?=<div class="versus">|</section>)', text)
+    cases = re.findall(r'<div class="versus">.*?(?=<div class="versus">|</section>)', text, re.S)
     prompts = record["per_prompt"]["dff"][0]
     assert len(cases) == sum(row["views"] for row in prompts.values())
     for case in cases:
@@ -151,7 +151,7 @@ def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_cap
     granted, original = [], feature_rendering.TrainingViews.__init__
 
     def keep(*args, **wishes):
-        granted.append(wishes["memory_bytes"])
+        granted.append(wishes["memory"])
         original(*args, **wishes)
 
     monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)

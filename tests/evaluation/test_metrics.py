@@ -18,7 +18,7 @@ MASKS = arrays(bool, (5, 7))
 SCORES = arrays(np.float32, (5, 7), elements=st.sampled_from([i / 16 for i in range(17)]))
 
 
-def picture(seed, size=(37, 41, 3)):
+def random_image(seed, size=(37, 41, 3)):
     return np.random.default_rng(seed).random(size).astype(np.float32)
 
 
@@ -27,17 +27,19 @@ def picture(seed, size=(37, 41, 3)):
 
 def test_psnr_of_a_constant_difference_of_a_tenth_is_20_db():
     assert metrics.psnr(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) == pytest.approx(20)
-    assert metrics.psnr(picture(0), picture(0)) == math.inf
+    assert metrics.psnr(random_image(0), random_image(0)) == math.inf
 
 
 def test_psnr_agrees_with_scikit_image():
-    expected = peak_signal_noise_ratio(picture(0).astype(float), picture(1).astype(float), data_range=1)
-    assert metrics.psnr(picture(0), picture(1)) == pytest.approx(expected)
+    expected = peak_signal_noise_ratio(
+        random_image(0).astype(float), random_image(1).astype(float), data_range=1
+    )
+    assert metrics.psnr(random_image(0), random_image(1)) == pytest.approx(expected)
 
 
 def test_ssim_agrees_with_torchmetrics_where_the_window_lies_inside():
-    image = np.clip(picture(0) * 0.3 + np.linspace(0, 0.7, 41)[None, :, None], 0, 1)
-    target = np.clip(image + 0.1 * (picture(1) - 0.5), 0, 1)
+    image = np.clip(random_image(0) * 0.3 + np.linspace(0, 0.7, 41)[None, :, None], 0, 1)
+    target = np.clip(image + 0.1 * (random_image(1) - 0.5), 0, 1)
     pair = [torch.from_numpy(side.astype(np.float64)).permute(2, 0, 1)[None] for side in (image, target)]
     _, full = structural_similarity_index_measure(*pair, data_range=1.0, return_full_image=True)
     expected = float(full[..., 5:-5, 5:-5].mean())
@@ -45,60 +47,59 @@ def test_ssim_agrees_with_torchmetrics_where_the_window_lies_inside():
 
 
 def test_ssim_of_equal_pictures_is_one_and_small_pictures_are_refused():
-    assert metrics.ssim(picture(0), picture(0)) == pytest.approx(1)
+    assert metrics.ssim(random_image(0), random_image(0)) == pytest.approx(1)
     with pytest.raises(ValueError, match="11x11"):
-        metrics.ssim(picture(0, (10, 30, 3)), picture(0, (10, 30, 3)))
+        metrics.ssim(random_image(0, (10, 30, 3)), random_image(0, (10, 30, 3)))
 
 
 @pytest.mark.parametrize("measure", [metrics.psnr, metrics.ssim])
 def test_pictures_of_two_sizes_are_refused(measure):
-    with pytest.raises(ValueError, match="one shape"):
-        measure(picture(0), picture(0)[1:])
+    with pytest.raises(ValueError, match="same shape"):
+        measure(random_image(0), random_image(0)[1:])
 
 
-def test_lpips_says_why_it_is_missing(monkeypatch):
+def test_lpips_states_why_it_is_unavailable(monkeypatch):
     monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", None)
     function, reason = metrics.load_lpips()
     assert function is None
     assert "pip install 'lexsplat[lpips]'" in reason
 
 
-# Masks, strict
+# Relevancy maps, strict protocol
 
 
-@given(MASKS, MASKS)
-def test_mask_scores_agree_with_scikit_learn(prediction, ground_truth):
-    flat = ground_truth.ravel(), prediction.ravel()
-    assert metrics.pixel_accuracy(prediction, ground_truth) == pytest.approx(
-        sklearn.metrics.accuracy_score(*flat)
-    )
-    expected = sklearn.metrics.jaccard_score(*flat, zero_division=1.0)
-    assert metrics.iou(prediction, ground_truth) == pytest.approx(expected)
-    if prediction.any():
-        assert metrics.precision(prediction, ground_truth) == pytest.approx(
-            sklearn.metrics.precision_score(*flat)
-        )
+@given(SCORES, MASKS, st.integers(0, 1000))
+def test_mask_scores_agree_with_scikit_learn_at_every_threshold(scores, ground_truth, step):
+    counts = metrics.threshold_counts(scores, ground_truth)
+    found, predicted = counts.at(step / 1000), scores >= step / 1000
+    flat = ground_truth.ravel(), predicted.ravel()
+    assert found.accuracy == pytest.approx(sklearn.metrics.accuracy_score(*flat))
+    assert found.iou == pytest.approx(sklearn.metrics.jaccard_score(*flat, zero_division=1.0))
+    assert counts.iou[step] == found.iou
+    if predicted.any():
+        assert found.precision == pytest.approx(sklearn.metrics.precision_score(*flat))
+    else:
+        assert found.precision == float(not ground_truth.any())
 
 
 def test_mask_scores_by_hand():
-    prediction = np.array([[True, True, False, False]])
+    scores = np.array([[0.9, 0.9, 0.1, 0.1]])
     ground_truth = np.array([[False, True, True, True]])
-    assert metrics.iou(prediction, ground_truth) == 1 / 4
-    assert metrics.pixel_accuracy(prediction, ground_truth) == 1 / 4
-    assert metrics.precision(prediction, ground_truth) == 1 / 2
+    found = metrics.threshold_counts(scores, ground_truth).at(0.5)
+    assert (found.iou, found.accuracy, found.precision) == (1 / 4, 1 / 4, 1 / 2)
 
 
-def test_empty_masks():
-    empty, full = np.zeros((2, 2), bool), np.ones((2, 2), bool)
-    assert metrics.iou(empty, empty) == metrics.precision(empty, empty) == 1
-    assert metrics.iou(empty, full) == metrics.precision(empty, full) == 0
+def test_an_empty_prediction_is_right_only_where_the_ground_truth_is_empty():
+    scores, empty, full = np.zeros((2, 2)), np.zeros((2, 2), bool), np.ones((2, 2), bool)
+    right, wrong = (metrics.threshold_counts(scores, mask).at(0.5) for mask in (empty, full))
+    assert right.iou == right.precision == 1
+    assert wrong.iou == wrong.precision == 0
 
 
-def test_masks_must_be_boolean_and_of_one_shape():
-    with pytest.raises(ValueError, match="boolean"):
-        metrics.iou(np.zeros((2, 2)), np.zeros((2, 2), bool))
-    with pytest.raises(ValueError, match="one shape"):
-        metrics.iou(np.zeros((2, 3), bool), np.zeros((2, 2), bool))
+def test_ground_truth_must_be_boolean_and_of_the_shape_of_the_scores():
+    for mask in (np.zeros((2, 2)), np.zeros((2, 3), bool)):
+        with pytest.raises(ValueError, match="boolean mask of the same shape"):
+            metrics.threshold_counts(np.zeros((2, 2)), mask)
 
 
 @given(SCORES, MASKS.filter(np.any))
@@ -131,8 +132,8 @@ def test_a_perfect_ranking_has_average_precision_one():
     assert metrics.average_precision(ground_truth * 0.5 + 0.1, ground_truth) == 1
 
 
-def test_a_score_that_is_not_a_number_is_refused():
-    with pytest.raises(ValueError, match="finite"):
+def test_scores_with_nan_are_refused():
+    with pytest.raises(ValueError, match="NaN"):
         metrics.average_precision(np.array([[np.nan, 1.0]]), np.array([[True, False]]))
 
 
@@ -158,18 +159,6 @@ def test_resizing_scores_keeps_pixel_centers():
         larger[:, 1:-1], np.tile((np.arange(16) + 0.5) / 16, (8, 1))[:, 1:-1], atol=1e-6
     )
     assert metrics.resize_scores(ramp, 8, 4) is ramp
-
-
-@given(SCORES, MASKS, st.integers(0, 1000))
-def test_threshold_counts_equal_the_mask_at_that_threshold(scores, ground_truth, step):
-    threshold = step / 1000
-    counts = metrics.threshold_counts(scores, ground_truth)
-    predicted = scores >= threshold
-    found = counts.at(threshold)
-    assert found.iou == pytest.approx(metrics.iou(predicted, ground_truth))
-    assert found.accuracy == pytest.approx(metrics.pixel_accuracy(predicted, ground_truth))
-    assert found.precision == pytest.approx(metrics.precision(predicted, ground_truth))
-    assert counts.iou[step] == found.iou
 
 
 def test_counts_of_two_views_add_up_to_the_counts_of_both():

@@ -1,4 +1,4 @@
-"""The protocols of others, against their descriptions followed one pixel and one threshold at a time."""
+"""Protocols of other authors against literal implementations of their descriptions."""
 
 import math
 
@@ -22,7 +22,7 @@ SCORES = arrays(np.float32, (5, 7), elements=st.sampled_from([i / 16 for i in ra
 
 
 def official_reference(relevancy, mask, threshold):
-    """The description in torch, float32, one threshold and one recall after the other."""
+    """The description in torch, float32, threshold by threshold and recall by recall."""
     height, width = relevancy.shape
     picture = Image.fromarray(mask.astype(np.uint8) * 255)
     if picture.size != (width, height):
@@ -83,10 +83,10 @@ def test_official_average_precision_reaches_one_point_zero_one():
     assert found.accuracy == 1
 
 
-def test_a_soft_pixel_that_is_found_is_officially_right_and_wrong():
+def test_a_predicted_soft_pixel_is_a_true_and_a_false_positive_in_the_official_protocol():
     ground_truth = np.zeros((8, 8), bool)
     ground_truth[:, 4:] = True
-    soft = protocols.official_truth(ground_truth, 5, 5)
+    soft = protocols.official_ground_truth(ground_truth, 5, 5)
     undecided = (soft > 0) & (soft < 1)
     assert undecided.any()
     found = protocols.official_scores(np.ones((5, 5), np.float32), ground_truth)
@@ -119,7 +119,7 @@ def test_official_masks_agree_with_scikit_learn_where_nothing_is_resized(scores,
 
 
 def lerf_2d_reference(relevancy, ground_truth, boxes, threshold):
-    """LangSplat's evaluation in words, one pixel at a time, in float64."""
+    """LangSplat's evaluation, pixel by pixel in float64."""
     height, width = relevancy.shape
 
     def mirrored(i, size):
@@ -160,7 +160,7 @@ def test_lerf_2d_equals_the_description_one_pixel_at_a_time(size, seed):
     assert found.hit == expected[1]
 
 
-def test_lerf_2d_hits_where_the_blurred_peak_lies_and_not_where_the_map_peaks():
+def test_lerf_2d_localizes_by_the_peak_of_the_blurred_map():
     relevancy = np.zeros((60, 80), np.float32)
     relevancy[5, 70] = 1.0
     relevancy[20:50, 10:40] = 0.6
@@ -169,7 +169,7 @@ def test_lerf_2d_hits_where_the_blurred_peak_lies_and_not_where_the_map_peaks():
     assert not protocols.lerf_2d_scores(relevancy, ground_truth, [[60, 0, 79, 10]]).hit
 
 
-def test_lerf_2d_cuts_a_faint_map_as_well_as_a_strong_one():
+def test_lerf_2d_does_not_depend_on_the_range_of_the_map():
     ground_truth = np.zeros((60, 80), bool)
     ground_truth[15:45, 20:60] = True
     strong = protocols.lerf_2d_scores(ground_truth.astype(np.float32), ground_truth)
@@ -200,7 +200,7 @@ def test_boxes_of_a_mask_are_those_of_its_parts():
 
 
 def test_lerf_2d_refuses_a_map_of_another_size():
-    with pytest.raises(ValueError, match="one size"):
+    with pytest.raises(ValueError, match="same size"):
         protocols.lerf_2d_scores(np.zeros((3, 4)), np.zeros((4, 3), bool))
 
 

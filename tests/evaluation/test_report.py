@@ -10,9 +10,12 @@ from support.report_pages import NASTY, Page, evaluated
 
 from lexsplat.evaluation import Metrics
 from lexsplat.evaluation.report import (
+    Comparison,
+    MeasuredMethod,
     format_rows,
     format_table,
     table_rows,
+    write_comparison,
     write_report,
     write_rows,
 )
@@ -27,11 +30,11 @@ def result():
 def page_text(result, tmp_path):
     path = tmp_path / "new" / "report.html"
     write_report(path, *result, title="A & B")
-    assert [entry.name for entry in path.parent.iterdir()] == ["report.html"], "nothing else is left behind"
+    assert [entry.name for entry in path.parent.iterdir()] == ["report.html"], "no temporary file remains"
     return path.read_text(encoding="utf-8")
 
 
-def test_the_page_is_well_formed_and_runs_nothing(page_text):
+def test_the_page_is_well_formed_and_has_no_scripts(page_text):
     page = Page(page_text)
     assert page_text.startswith("<!doctype html>")
     assert not {"script", "link", "iframe", "object", "base", "form"} & set(page.tags)
@@ -48,10 +51,10 @@ def test_the_page_loads_nothing(page_text):
     assert ("content", "default-src 'none'; img-src data:; style-src 'unsafe-inline'") in page.attributes
 
 
-def test_its_pictures_can_be_read(page_text):
-    pictures = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", page_text)
-    assert len(pictures) >= 3 * 2 * 3 + 3 * 2
-    for data in pictures:
+def test_its_images_can_be_read(page_text):
+    images = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", page_text)
+    assert len(images) >= 3 * 2 * 3 + 3 * 2
+    for data in images:
         assert Image.open(io.BytesIO(base64.b64decode(data))).size == (60, 45)
 
 
@@ -80,7 +83,7 @@ def test_its_numbers_are_those_of_the_metrics(result, page_text):
     for prompt, row in data["language"]["per_prompt"].items():
         assert rows[prompt][0] == f"{row['IoU_auto']:.3f}"
         assert rows[prompt][5] == f"{row['AP']:.3f}"
-    assert rows["frames a second, color and one prompt"] == ["12.3"]
+    assert rows["frames per second, color and one prompt"] == ["12.3"]
     assert rows["language"] == ["150.0 KB"]
     assert "31.23" in page.text
 
@@ -139,7 +142,7 @@ def results_of_three_seeds():
     return runs
 
 
-def test_several_seeds_give_mean_and_spread():
+def test_several_seeds_give_mean_and_standard_deviation():
     rows = table_rows({"full": results_of_three_seeds(), "one": results_of_three_seeds()[0]})
     assert rows[0]["runs"] == 3
     assert rows[0]["mIoU"] == [0.5, 0.6, 0.7]
@@ -149,6 +152,22 @@ def test_several_seeds_give_mean_and_spread():
     assert "±" not in table.splitlines()[-1]
 
 
+def test_the_headline_of_a_comparison_names_the_best_method_and_never_the_reference(tmp_path):
+    worst, middle, best = results_of_three_seeds()
+    results = {"<b>trained</b>": [worst], "averaged": [middle], "nearest": [best]}
+    methods = [MeasuredMethod(name, runs) for name, runs in results.items()]
+    path = tmp_path / "any name.html"
+    write_comparison(path, Comparison(methods, title="<i>title</i>"))
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    assert "".join(page.text).count("<i>title</i>") == 2
+    card = re.search(r'<div class="card"><b>(.*?)</b><span>best mIoU</span><small>(.*?)</small>', text)
+    assert card.groups() == ("0.600", "averaged")
+    assert "<b>0.600</b></td>" in text
+    assert "<b>0.700</b></td>" not in text
+    assert [row[0] for row in page.rows[1:4]] == list(results)
+
+
 def test_csv_can_be_read_back(tmp_path):
     write_rows(tmp_path, "table", table_rows({'a, "b"': results_of_three_seeds()}))
     with (tmp_path / "table.csv").open(newline="", encoding="utf-8") as file:
@@ -156,7 +175,7 @@ def test_csv_can_be_read_back(tmp_path):
     assert row["name"] == 'a, "b"'
     assert float(row["mIoU"]) == pytest.approx(0.6)
     assert float(row["mIoU_std"]) == pytest.approx(np.std([0.5, 0.6, 0.7], ddof=1))
-    assert row["lpips"] == "", "what was not measured is empty"
+    assert row["lpips"] == "", "empty where not measured"
     assert float(row["lerf_3d_acc_25"]) == 0
 
 

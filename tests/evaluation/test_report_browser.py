@@ -1,4 +1,4 @@
-"""The report in a real browser, wide and narrow: what it says can be read there."""
+"""The report is readable in a real browser, wide and narrow."""
 
 import shutil
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the pat
 
 @pytest.fixture(scope="module", params=[1280, 400])
 def opened(request, tmp_path_factory):
-    """The report in a window of a width; what it asked for or complained about is in ``refused``."""
+    """The report in a window of some width; failed requests and console messages are in ``refused``."""
     playwright = pytest.importorskip("playwright.sync_api")
     metrics, gallery = evaluated()
     metrics.machine["versions"] = VERSIONS
@@ -32,12 +32,12 @@ def opened(request, tmp_path_factory):
         browser.close()
 
 
-def test_the_page_is_no_wider_than_its_window_and_asks_for_nothing(opened):
+def test_the_page_is_no_wider_than_its_window_and_requests_nothing(opened):
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert opened.refused == []
 
 
-def test_settings_and_costs_can_be_read_without_moving_sideways(opened):
+def test_settings_and_costs_can_be_read_without_scrolling_sideways(opened):
     edges = opened.evaluate(
         "[...document.querySelectorAll('.facts td')].map(cell => cell.getBoundingClientRect().right)"
     )
@@ -45,7 +45,7 @@ def test_settings_and_costs_can_be_read_without_moving_sideways(opened):
     assert max(edges) <= opened.viewport_size["width"]
 
 
-def test_pictures_of_a_case_are_large_enough_to_see_something(opened):
+def test_images_of_a_case_are_large_enough(opened):
     widths = opened.evaluate(
         "[...document.querySelectorAll('.case img, .case .pic')].map(p => p.getBoundingClientRect().width)"
     )

@@ -1,4 +1,4 @@
-"""What is packed: every file of the demo that git knows, and nothing that lies about beside them."""
+"""Package data: every file of the demo that git knows, every template, and no stray files beside them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def packed(root: Path) -> set[str]:
     return {path.relative_to(root).as_posix() for path in found}
 
 
-def test_every_file_of_the_demo_is_packed():
+def test_every_file_of_the_demo_and_every_template_is_packed():
     shipped = {
         path.relative_to(DATA).as_posix()
         for path in (DATA / "demo").rglob("*")
@@ -36,7 +36,8 @@ def test_every_file_of_the_demo_is_packed():
         and "ground_truth" not in path.parts
     }
     assert len(shipped) > 400
-    assert shipped | {"py.typed"} == packed(DATA)
+    templates = {path.relative_to(DATA).as_posix() for path in DATA.rglob("templates/*.*")}
+    assert shipped | templates | {"py.typed"} == packed(DATA)
 
 
 def test_the_data_of_a_wheel_stay_under_forty_megabytes():

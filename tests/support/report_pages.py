@@ -1,4 +1,4 @@
-"""Reports of a small evaluation, and their HTML as text."""
+"""A small synthetic evaluation and a parser of report pages."""
 
 from __future__ import annotations
 
@@ -9,21 +9,15 @@ import numpy as np
 from lexsplat.evaluation import Metrics, PairResult, ViewPictures, precision_curves, summarize_language
 from lexsplat.evaluation.metrics import average_precision, threshold_counts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
-from lexsplat.evaluation.report import (
-    Gallery,
-)
+from lexsplat.evaluation.report import Gallery
 
 NASTY = '<script>alert("x")</script> & more'
-
-
 PROMPTS = ("red apple", NASTY)
-
-
 VOID = {"meta", "img", "link", "br", "input"}
 
 
 class Page(HTMLParser):
-    """Every tag closed in order; texts and attributes collected."""
+    """Checks that tags are closed in order; collects texts, attributes and table rows."""
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
@@ -56,7 +50,7 @@ class Page(HTMLParser):
 
 
 def evaluated(views=3):
-    """Metrics and pictures of a made-up evaluation; the nasty prompt is found worse."""
+    """Metrics and images of a synthetic evaluation; the nasty prompt has the lower scores."""
     rng = np.random.default_rng(0)
     gallery, pairs = Gallery(width=60), {}
     thresholds = {prompt: {"auto": 0.5, "fixed": 0.5, "oracle": 0.4} for prompt in PROMPTS}

@@ -1,4 +1,4 @@
-"""How good a scene is on its held-out views: pictures, words, speed and size, as in the paper's Table 1."""
+"""Evaluation of a scene on held-out views: image quality, language, speed and size, as in the paper's Table 1."""
 
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.memory import forget_peak_memory, peak_gpu_memory, peak_memory

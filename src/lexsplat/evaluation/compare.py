@@ -16,6 +16,7 @@ from lexsplat.evaluation.methods import Method
 from lexsplat.language.fields import LanguageField
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import embed_prompts
+from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Listener, silent
 
 OURS = ("averaged", "lifted", "trained", "lifted+tuned")
@@ -101,26 +102,21 @@ def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[],
 def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
     scene, maps = bench.scene, bench.maps
     training: Mapping[str, Any] = {view: scene.views[view].camera for view in scene.train_names}
-    memory = bench.config.within_memory().trained.memory_bytes
+    memory = parse_bytes(bench.config.memory)
+    data = baselines.TrainingData(bench.gaussians, training, maps, bench.level_maps)
     start = time.perf_counter()
     found: Method
     if name == "dff":
-        found = baselines.distill(
-            bench.gaussians, training, maps, settings, seed=seed, memory_bytes=memory, listener=bench.listener
-        )
+        found = baselines.distill(data, settings, seed=seed, memory=memory, listener=bench.listener)
     elif name == "lerf":
-        found = baselines.fit_lerf(
-            bench.gaussians, training, maps, bench.level_maps, settings,
-            memory_bytes=memory, listener=bench.listener,
-        )  # fmt: skip
+        found = baselines.fit_lerf(data, settings, memory=memory, listener=bench.listener)
     elif name == "3dovs":
         classes = embed_prompts(
             bench.ground_truth.prompts(), bench.encode_text, bench.evaluation.query.templates
         )
         found = baselines.fit_3dovs(
-            bench.gaussians, training, maps, bench.level_maps, classes, settings, seed=seed,
-            memory_bytes=memory, listener=bench.listener,
-        )  # fmt: skip
+            data, classes, settings, seed=seed, memory=memory, listener=bench.listener
+        )
     else:
         found = baselines.ViewFeatures({view: v.camera for view, v in scene.views.items()}, maps)
     return found, {name: time.perf_counter() - start}

@@ -32,7 +32,14 @@ from lexsplat.evaluation import (
     peak_memory,
 )
 from lexsplat.evaluation.methods import Method
-from lexsplat.evaluation.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
+from lexsplat.evaluation.report import (
+    Comparison,
+    Gallery,
+    MeasuredMethod,
+    table_rows,
+    write_comparison,
+    write_rows,
+)
 from lexsplat.evaluation.results import plain
 from lexsplat.features import FeatureMaps, TextCache, load_level_maps
 from lexsplat.geometry.gaussians import Gaussians
@@ -343,10 +350,8 @@ class Results:
         rows, folder = self.rows(), self.bench.output
         write_rows(folder, self.stem, rows, self.columns)
         write_json(folder / f"{self.stem}.json", self._content(rows))
-        write_comparison(
-            folder / "report.html",
+        comparison = Comparison(
             [self._measured(name) for name in self.names if name in self.runs],
-            rows,
             title=f"lexsplat {'ablate' if self.stem == 'ablation' else 'compare'}: {self.bench.scene.root.name}",
             subtitle="The same Gaussians and the same features, measured on held-out views",
             columns=self.columns,
@@ -358,6 +363,7 @@ class Results:
             },
             machine=machine_facts(),
         )
+        write_comparison(folder / "report.html", comparison)
 
     def rows(self) -> list[dict[str, Any]]:
         """Rows of the table so far (`report.table_rows`)."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lexsplat.captures.ground_truth.layouts import load_ground_truth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import FieldMethod, Method, method_thresholds
 from lexsplat.evaluation.metrics import (
@@ -243,7 +243,7 @@ class _Evaluation:
         self, view: View
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.bool_]]]:
         sources = sorted(self.masks.get(view.name, {}).items())
-        ground_truth = {prompt: _mask(view, source) for prompt, source in sources}
+        ground_truth = {prompt: load_ground_truth(view, source) for prompt, source in sources}
         if not ground_truth:
             return {}, {}
         working = self._relevancy(view.camera, list(ground_truth))
@@ -329,10 +329,6 @@ def _spread(items: Sequence[Any], count: int) -> list[Any]:
     if len(items) <= count:
         return list(items)
     return [items[round(i * (len(items) - 1) / max(1, count - 1))] for i in range(count)]
-
-
-def _mask(view: View, source: Path | NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return source.astype(bool) if isinstance(source, np.ndarray) else view.load_mask(source)
 
 
 def _sizes(gaussians: Gaussians, method: Method | None, stored: Mapping[str, int]) -> dict[str, int | None]:

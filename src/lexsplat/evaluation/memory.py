@@ -1,4 +1,4 @@
-"""How much memory a process has needed at most."""
+"""Peak memory of the process."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def peak_memory() -> int | None:
-    """Largest resident size of this process in bytes, since the last `forget_peak_memory` where that worked.
+    """Peak resident size of this process in bytes since the last successful `forget_peak_memory`, or since its start.
 
-    None where the system does not tell.
+    None if the system does not report it.
     """
     try:
         found = re.search(r"^VmHWM:\s*(\d+) kB", _STATUS.read_text(), flags=re.MULTILINE)
@@ -34,16 +34,16 @@ def peak_memory() -> int | None:
 
 
 def peak_gpu_memory(device: torch.device | str) -> int | None:
-    """Most bytes that tensors took on a GPU, counted as `peak_memory`; None for other devices."""
+    """Peak bytes of tensors on a GPU since `forget_peak_memory`; None for other devices."""
     device = torch.device(device)
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
 
 
 def forget_peak_memory() -> bool:
-    """Count the peaks of host and GPU memory from now on; False where the system cannot (not Linux).
+    """Reset the peaks of host and GPU memory; False if the system does not support it (not Linux).
 
-    What was freed goes back to the system first: the allocator would keep it, and what comes next would seem to need
-    what went before.
+    Freed memory is returned to the system first. Otherwise the allocator would keep it, and it would count for the
+    next measurement.
     """
     gc.collect()
     _give_back_freed()
@@ -57,6 +57,6 @@ def forget_peak_memory() -> bool:
 
 
 def _give_back_freed() -> None:
-    """glibc's ``malloc_trim``; nothing where there is none (macOS, Windows, musl)."""
+    """Call glibc's ``malloc_trim`` where it exists (not macOS, Windows, musl)."""
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,9 +1,9 @@
-"""Numbers: how good the pictures are and how well words are found. Arrays in, floats out, never a disk.
+"""Metrics of image quality and of relevancy maps, as functions of arrays.
 
-What is here is strict: ground truth is binary and never resized; where sizes differ, the relevancy is
-(`resize_scores`). Average precision takes every distinct score as a threshold and is the mean over the recalls
-0, 0.01, ..., 1 of the interpolated precision (COCO's), so it lies in 0..1. Prompts are averaged within an
-image, then images (`mean_over_images`). Other people's protocols stand in `evaluation.protocols`.
+The strict protocol: ground truth is binary and never resized; where sizes differ, the relevancy map is resized
+(`resize_scores`). Average precision uses every distinct score as a threshold and is the mean of the interpolated
+precision at the recalls 0, 0.01, ..., 1 (COCO), so it lies in 0..1. Prompts are averaged within an image, then images
+(`mean_over_images`). The protocols of other authors are in `evaluation.protocols`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 RECALLS: NDArray[np.float64] = np.arange(101) / 100
-"""The 101 recall points. Divided, not accumulated, so that a recall of exactly 29 in 100 reaches point 29."""
+"""The 101 recall points. Divided rather than accumulated, so that a recall of exactly 29 in 100 reaches point 29."""
 
 THRESHOLDS: NDArray[np.float64] = np.arange(1001) / 1000
-"""Where `ThresholdCounts` counts."""
+"""Thresholds of `ThresholdCounts`."""
 
-# Pictures
+# Image quality
 
 
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
-    """Peak signal-to-noise ratio in dB of images in 0..1; infinite when they are equal."""
+    """Peak signal-to-noise ratio in dB of images in 0..1; infinite for equal images."""
     first, second = _same_shape(image, target)
     error = float(np.mean((first - second) ** 2))
     return math.inf if error == 0 else -10 * math.log10(error)
@@ -35,9 +35,9 @@ def psnr(image: ArrayLike, target: ArrayLike) -> float:
 def ssim(image: ArrayLike, target: ArrayLike) -> float:
     """Structural similarity of images ``[H, W, 3]`` in 0..1 as in Wang et al. 2004.
 
-    Gaussian window of 11 pixels, sigma 1.5, biased moments, mean over the pixels whose window lies inside
-    (scikit-image's). torchmetrics and the code of splatting papers count the border too, with reflected or
-    zero padding, and differ in the third decimal.
+    Gaussian window of 11 pixels, sigma 1.5, biased moments, mean over the pixels whose window lies inside the image
+    (scikit-image). torchmetrics and the code of splatting papers include the border with reflected or zero padding
+    and differ in the third decimal.
 
     Raises:
         ValueError: If shapes differ or a side is shorter than 11 pixels.
@@ -63,7 +63,7 @@ Perceptual = Callable[[ArrayLike, ArrayLike], float]
 
 
 def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
-    """LPIPS (VGG) by torchmetrics: the function and no reason, or nothing and the reason why there is none.
+    """LPIPS (VGG) of torchmetrics: the function and None, or None and the reason why it is unavailable.
 
     The metric needs the extra ``lexsplat[lpips]`` and the weights of VGG-16, which are downloaded once.
     """
@@ -91,29 +91,7 @@ def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
     return distance, None
 
 
-# Masks, strict
-
-
-def iou(prediction: ArrayLike, ground_truth: ArrayLike) -> float:
-    """Intersection over union of two boolean masks; 1 when both are empty."""
-    first, second = _masks(prediction, ground_truth)
-    union = np.count_nonzero(first | second)
-    return np.count_nonzero(first & second) / union if union else 1.0
-
-
-def pixel_accuracy(prediction: ArrayLike, ground_truth: ArrayLike) -> float:
-    """Share of pixels on which two boolean masks agree."""
-    first, second = _masks(prediction, ground_truth)
-    return float(np.mean(first == second))
-
-
-def precision(prediction: ArrayLike, ground_truth: ArrayLike) -> float:
-    """Share of predicted pixels that are true; for an empty prediction 0, or 1 if the ground truth is empty too."""
-    first, second = _masks(prediction, ground_truth)
-    found = np.count_nonzero(first)
-    if not found:
-        return 0.0 if second.any() else 1.0
-    return np.count_nonzero(first & second) / found
+# Relevancy maps, strict protocol
 
 
 def precision_recall(scores: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray, NDArray, NDArray]:
@@ -124,12 +102,12 @@ def precision_recall(scores: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArra
         at least the threshold.
 
     Raises:
-        ValueError: If shapes differ, a score is not a number, or nothing is true.
+        ValueError: If shapes differ, a score is NaN or infinite, or the ground truth is empty.
     """
     values, mask = _scores(scores, ground_truth)
     positives = np.count_nonzero(mask)
     if not positives:
-        raise ValueError("precision and recall need at least one true pixel")
+        raise ValueError("precision and recall need at least one pixel of ground truth")
     order = np.argsort(-values, kind="stable")
     ranked = values[order]
     last = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
@@ -141,7 +119,7 @@ def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
     """Strict average precision: mean over 101 recalls of the best precision at that recall or a higher one.
 
     Returns:
-        A number in 0..1; NaN when nothing is true, for such an image cannot be ranked.
+        A number in 0..1; NaN if the ground truth is empty.
     """
     if not np.asarray(ground_truth).any():
         return math.nan
@@ -150,23 +128,23 @@ def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
 
 
 def interpolated_precision(precisions: NDArray, recalls: NDArray) -> NDArray:
-    """Best precision at each of `RECALLS` or beyond ``[101]``, 0 where none is; recalls must not fall."""
+    """Best precision at each of `RECALLS` or beyond ``[101]``, 0 if not reached; ``recalls`` must be sorted."""
     best = np.append(np.maximum.accumulate(precisions[::-1])[::-1], 0.0)
     return best[np.searchsorted(recalls, RECALLS, side="left")]
 
 
 def localization(scores: ArrayLike, ground_truth: ArrayLike) -> float:
-    """Whether the highest score lies on the object: 1 or 0; NaN when nothing is true.
+    """Whether the highest score lies on the object: 1 or 0; NaN if the ground truth is empty.
 
-    Where several pixels share the highest score, the share of them that lies on the object, which is what
-    picking one at random hits on average: a flat map is worth no more than the object's area.
+    If several pixels share the highest score, the fraction of them on the object, the expected value for a random
+    choice: a constant map scores the object's share of the area.
     """
     values, mask = _scores(scores, ground_truth)
     return float(mask[values == values.max()].mean()) if mask.any() else math.nan
 
 
 def resize_scores(scores: ArrayLike, width: int, height: int) -> NDArray[np.float32]:
-    """A relevancy map ``[H, W]`` at another size, bilinear, centers kept; unchanged when sizes agree."""
+    """A relevancy map ``[H, W]`` at another size, bilinear, pixel centers aligned; unchanged if sizes agree."""
     values = np.asarray(scores, dtype=np.float32)
     if values.shape == (height, width):
         return values
@@ -176,7 +154,13 @@ def resize_scores(scores: ArrayLike, width: int, height: int) -> NDArray[np.floa
 
 @dataclass(frozen=True)
 class MaskScores:
-    """`iou`, `pixel_accuracy` and `precision` of one mask."""
+    """Scores of one mask, in 0..1.
+
+    Args:
+        iou: Intersection over union; 1 if both masks are empty.
+        accuracy: Share of pixels on which the masks agree.
+        precision: Share of predicted pixels that are true; 0 for an empty prediction, 1 if both masks are empty.
+    """
 
     iou: float
     accuracy: float
@@ -185,10 +169,10 @@ class MaskScores:
 
 @dataclass(frozen=True)
 class ThresholdCounts:
-    """What a map finds at each of `THRESHOLDS`, small enough to keep for every view and prompt.
+    """Pixel counts of a map at each of `THRESHOLDS`, small enough to keep for every view and prompt.
 
     Args:
-        hits: True pixels with a score at or above the threshold ``[1001]``.
+        hits: Pixels of the ground truth with a score at or above the threshold ``[1001]``.
         false_alarms: Other pixels with a score at or above the threshold ``[1001]``.
     """
 
@@ -218,14 +202,14 @@ class ThresholdCounts:
 
     @property
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Precision and recall ``[T]`` from the highest threshold that finds something to the lowest."""
+        """Precision and recall ``[T]`` from the highest threshold with a predicted pixel to the lowest."""
         found = self.hits + self.false_alarms
         keep = np.flatnonzero(found)[::-1]
         return self.hits[keep] / found[keep], self.hits[keep] / max(int(self.hits[0]), 1)
 
 
 def threshold_counts(scores: ArrayLike, ground_truth: ArrayLike) -> ThresholdCounts:
-    """Counts at 1001 thresholds in 0..1; scores outside are clipped."""
+    """Counts at 1001 thresholds in 0..1; scores outside this range are clipped."""
     values, mask = _scores(scores, ground_truth)
     bins = np.searchsorted(THRESHOLDS, np.clip(values, 0, 1), side="right") - 1
     counts = [np.bincount(bins[side], minlength=1001)[::-1].cumsum()[::-1] for side in (mask, ~mask)]
@@ -236,7 +220,7 @@ def threshold_counts(scores: ArrayLike, ground_truth: ArrayLike) -> ThresholdCou
 
 
 def mean_over_images(values: Mapping[str, Mapping[str, float]]) -> float | None:
-    """Mean over images of the mean over an image's prompts; NaN is left out, None when nothing is left.
+    """Mean over images of the mean over an image's prompts, ignoring NaN; None if nothing remains.
 
     Args:
         values: ``{image: {prompt: value}}``.
@@ -255,16 +239,7 @@ def _first_line(error: BaseException) -> str:
 def _same_shape(image: ArrayLike, target: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     first, second = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if first.shape != second.shape or not first.size:
-        raise ValueError(f"images must have one shape, got {list(first.shape)} and {list(second.shape)}")
-    return first, second
-
-
-def _masks(prediction: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    first, second = np.asarray(prediction), np.asarray(ground_truth)
-    if first.dtype != bool or second.dtype != bool:
-        raise ValueError(f"masks must be boolean, got {first.dtype} and {second.dtype}")
-    if first.shape != second.shape or not first.size:
-        raise ValueError(f"masks must have one shape, got {list(first.shape)} and {list(second.shape)}")
+        raise ValueError(f"images must have the same shape, got {list(first.shape)} and {list(second.shape)}")
     return first, second
 
 
@@ -272,9 +247,9 @@ def _scores(scores: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray[np.floa
     values, mask = np.asarray(scores), np.asarray(ground_truth)
     if mask.dtype != bool or values.shape != mask.shape or not values.size:
         raise ValueError(
-            f"scores {list(values.shape)} need a boolean mask as large, got {mask.dtype} {list(mask.shape)}"
+            f"scores {list(values.shape)} need a boolean mask of the same shape, got {mask.dtype} {list(mask.shape)}"
         )
     values = values.astype(np.float64).ravel()
     if not np.isfinite(values).all():
-        raise ValueError("a score is not finite")
+        raise ValueError("scores contain NaN or infinity")
     return values, mask.ravel()

@@ -1,12 +1,12 @@
-"""Other people's protocols, by name, to be comparable with numbers made by them.
+"""Protocols of other authors, for comparable numbers.
 
 - **official**: the authors' released evaluation of LEGaussians, quirks included (`official_scores`).
-- **lerf-2d**: LangSplat's evaluation on LERF-OVS: localization by the peak of a blurred map, IoU of a mask cut
-  from the map stretched to its own range (`lerf_2d_scores`).
-- **lerf-3d**: Gaussians are selected in 3D, then rendered alone (OpenGaussian's evaluation on LERF-OVS); the two
-  LERF-OVS protocols cannot be compared (`silhouette_iou`).
+- **lerf-2d**: LangSplat's evaluation on LERF-OVS: localization by the peak of a blurred map, IoU of a mask
+  obtained by thresholding the map stretched to its own range (`lerf_2d_scores`).
+- **lerf-3d**: OpenGaussian's evaluation on LERF-OVS: Gaussians are selected in 3D, then rendered alone
+  (`silhouette_iou`). The two LERF-OVS protocols are not comparable.
 
-The strict protocol, which is ours, stands in `lexsplat.evaluation.metrics`. Arrays in, numbers out, never a disk.
+The strict protocol is in `lexsplat.evaluation.metrics`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ PROTOCOLS = ("strict", "official", "lerf-2d", "lerf-3d")
 """Names of the protocols."""
 
 LERF_2D_THRESHOLD = 0.4
-"""LangSplat's cut through a map stretched to -1..1."""
+"""LangSplat's threshold for a map stretched to -1..1."""
 
 LERF_2D_WINDOW = 30
-"""Side in pixels of LangSplat's blur."""
+"""Side of LangSplat's box blur, in pixels."""
 
 SILHOUETTE_ALPHA = 0.7
-"""Opacity beyond which a pixel belongs to the silhouette of selected Gaussians (OpenGaussian)."""
+"""Opacity above which a pixel belongs to the silhouette of the selected Gaussians (OpenGaussian)."""
 
 _EPSILON = np.float32(1e-6)
 
@@ -40,7 +40,7 @@ _EPSILON = np.float32(1e-6)
 
 @dataclass(frozen=True)
 class OfficialScores:
-    """Numbers of one image and prompt under the official protocol: float32 as in the code, the AP float64."""
+    """Scores of one image and prompt in the official protocol: float32 as in their code, the AP float64."""
 
     iou: float
     accuracy: float
@@ -48,35 +48,35 @@ class OfficialScores:
     average_precision: float
 
 
-def official_truth(mask: ArrayLike, width: int, height: int) -> NDArray[np.float32]:
-    """A mask resized by a bicubic filter and not made binary again: ``[H, W]`` in 0..1, edges soft."""
-    picture = Image.fromarray(np.asarray(mask, dtype=bool).astype(np.uint8) * 255)
-    if picture.size != (width, height):
-        picture = picture.resize((width, height), Image.Resampling.BICUBIC)
-    return np.asarray(picture, dtype=np.float32) / np.float32(255)
+def official_ground_truth(mask: ArrayLike, width: int, height: int) -> NDArray[np.float32]:
+    """A mask resized by a bicubic filter and not binarized: ``[H, W]`` in 0..1 with soft edges."""
+    image = Image.fromarray(np.asarray(mask, dtype=bool).astype(np.uint8) * 255)
+    if image.size != (width, height):
+        image = image.resize((width, height), Image.Resampling.BICUBIC)
+    return np.asarray(image, dtype=np.float32) / np.float32(255)
 
 
 def official_scores(relevancy: ArrayLike, mask: ArrayLike, threshold: float = 0.5) -> OfficialScores:
     """The authors' evaluation of one map, quirks included, in float32 as they compute it.
 
-    - Truth is resized to the map (`official_truth`) and keeps soft edges. Logic takes every number that is not 0
-      for true, so a soft pixel belongs to the object, and 1 - soft to the background as well: a soft pixel that
-      is predicted counts as a true *and* as a false positive.
-    - The accuracy compares floats, so soft pixels are wrong whatever is predicted.
+    - Ground truth is resized to the map (`official_ground_truth`) and keeps soft edges. Logical operators treat every
+      nonzero number as true, so a soft pixel belongs to the object and, as 1 - soft, to the background: if it is
+      predicted, it counts as a true *and* as a false positive.
+    - The accuracy compares floats, so soft pixels are always wrong.
     - The mask is relevancy >= threshold. IoU is I / (U + 1e-6), precision TP / (TP + FP + 1e-6); empty gives 0.
     - Average precision: thresholds 0, 0.01, ..., 1 with >, recall TP / (TP + FN + 1e-6), the best precision at each
-      of 101 recalls or beyond, divided by **100**: 1.01 at most.
+      of 101 recalls or beyond, divided by **100**: at most 1.01.
 
-    Where the result depends on the version of numpy (float32 recalls meet float64 levels, float32 precisions a
-    Python sum), it is that of 1.24, which the authors pin: compared in float32, added up in float64.
+    Where the result depends on the version of numpy (comparison of float32 recalls with float64 levels, sum of
+    float32 precisions), it is that of 1.24, which the authors pin: compared in float32, summed in float64.
 
     Args:
         relevancy: ``[H, W]`` in 0..1, at the size of the rendered image.
         mask: Boolean ground truth at its own size.
-        threshold: For everything but the average precision.
+        threshold: Of the mask; the average precision does not depend on it.
     """
     values = np.asarray(relevancy, dtype=np.float32)
-    ground_truth = official_truth(mask, values.shape[1], values.shape[0])
+    ground_truth = official_ground_truth(mask, values.shape[1], values.shape[0])
     predicted = values >= np.float32(threshold)
     thing, ground = ground_truth != 0, ground_truth != 1
     hits, alarms = _count(predicted & thing), _count(predicted & ground)
@@ -96,7 +96,7 @@ def _official_average_precision(
     values: NDArray[np.float32], thing: NDArray[np.bool_], ground: NDArray[np.bool_]
 ) -> float:
     levels = np.arange(0.0, 1.01, 0.01).astype(np.float32)
-    # Pixel v is found by thresholds below v: the first `n` of them, with n = how many levels are < v.
+    # A pixel of value v is predicted at the thresholds below v: the first n, where n levels are < v.
     found_by = np.searchsorted(levels, values, side="left")
     hits, alarms = (
         np.bincount(found_by[side], minlength=102)[::-1].cumsum()[::-1][1:].astype(np.float32)
@@ -106,8 +106,7 @@ def _official_average_precision(
     precisions, recalls = hits / (hits + alarms + _EPSILON), hits / (hits + misses + _EPSILON)
     best = np.append(np.float32(0), np.maximum.accumulate(precisions))
     reached = len(recalls) - np.searchsorted(recalls[::-1], levels, side="left")
-    # A running sum, one after the other, as the authors' loop adds them: in float64, since in numpy 1 a Python
-    # number plus a float32 is one.
+    # Sequential, in the order of the authors' loop, and in float64: in numpy 1 a Python number plus a float32 is one.
     return float(np.cumsum(best[reached], dtype=np.float64)[-1] / 100)
 
 
@@ -116,10 +115,10 @@ def _official_average_precision(
 
 @dataclass(frozen=True)
 class Lerf2dScores:
-    """LangSplat's numbers of one image and prompt.
+    """LangSplat's scores of one image and prompt.
 
     Args:
-        iou: Of the mask cut from the stretched map; NaN when both masks are empty.
+        iou: IoU of the thresholded stretched map; NaN if both masks are empty.
         hit: Whether the peak of the blurred map lies in one of the boxes.
     """
 
@@ -135,17 +134,16 @@ def lerf_2d_scores(
 ) -> Lerf2dScores:
     """LangSplat's evaluation of one map: localization and IoU.
 
-    The map is blurred by a box of 30 pixels, borders mirrored. Localization: does a highest pixel of the blurred
-    map lie in a box, edges included? IoU: the mean of map and blurred map is stretched to its own range, to -1..1,
-    cut above ``threshold`` and smoothed by a majority of 7x7 pixels. A map is thus always cut somewhere,
-    whatever its absolute values.
+    The map is blurred by a box of 30 pixels with mirrored borders. Localization: whether a maximum of the blurred map
+    lies in a box, edges included. IoU: the mean of map and blurred map is stretched from its own range to -1..1,
+    thresholded, and smoothed by a majority vote of 7x7 pixels. Absolute values of the map therefore have no effect.
 
-    LangSplat has three maps for a prompt and takes the one with the highest peak; we have one.
+    LangSplat has three maps per prompt and takes the one with the highest peak; lexsplat has one.
 
     Args:
-        relevancy: ``[H, W]`` at the size of the truth.
-        ground truth: Boolean mask ``[H, W]``.
-        boxes: Boxes ``[B, 4]`` as x0, y0, x1, y1 in pixels; None takes those of the mask's parts (`mask_boxes`).
+        relevancy: ``[H, W]`` at the size of the ground truth.
+        ground_truth: Boolean mask ``[H, W]``.
+        boxes: Boxes ``[B, 4]`` as x0, y0, x1, y1 in pixels; None: those of the connected parts (`mask_boxes`).
         threshold: In -1..1.
 
     Raises:
@@ -154,7 +152,7 @@ def lerf_2d_scores(
     values, mask = np.asarray(relevancy, dtype=np.float32), np.asarray(ground_truth, dtype=bool)
     if values.ndim != 2 or values.shape != mask.shape or not values.size:
         raise ValueError(
-            f"map {list(values.shape)} and ground truth {list(mask.shape)} must be [H, W] of one size"
+            f"map {list(values.shape)} and ground truth {list(mask.shape)} must be [H, W] of the same size"
         )
     areas = mask_boxes(mask) if boxes is None else np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
     blurred = ndimage.uniform_filter(values, LERF_2D_WINDOW, mode="mirror")
@@ -172,7 +170,7 @@ def lerf_2d_scores(
 
 
 def mask_boxes(mask: ArrayLike) -> NDArray[np.float64]:
-    """Boxes ``[B, 4]`` (x0, y0, x1, y1: first and last pixel) of the parts of a mask that hang together."""
+    """Boxes ``[B, 4]`` (x0, y0, x1, y1: first and last pixel) of the connected components of a mask."""
     labels, _ = ndimage.label(np.asarray(mask, dtype=bool))
     slices = [part for part in ndimage.find_objects(labels) if part is not None]
     rows = [(s[1].start, s[0].start, s[1].stop - 1, s[0].stop - 1) for s in slices]
@@ -180,7 +178,7 @@ def mask_boxes(mask: ArrayLike) -> NDArray[np.float64]:
 
 
 def _majority(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """LangSplat's smoothing: more ones than zeros among 7x7 pixels, where the last row and column never count."""
+    """LangSplat's smoothing: more ones than zeros among 7x7 pixels; the image's last row and column never count."""
     height, width = mask.shape
     sums = np.zeros((height + 1, width + 1), dtype=np.int64)
     sums[1:, 1:] = mask.cumsum(0).cumsum(1)
@@ -196,21 +194,23 @@ def _majority(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def silhouette_iou(alpha: ArrayLike, ground_truth: ArrayLike, threshold: float = SILHOUETTE_ALPHA) -> float:
-    """IoU of the silhouette of selected Gaussians, rendered alone, with the ground truth; 0 when both are empty.
+    """IoU of the silhouette of the selected Gaussians with the ground truth; 0 if both are empty.
 
-    Rendered alone means that nothing hides them: an object behind another one is seen through it.
+    The Gaussians are rendered alone, so other objects do not occlude them.
 
     Args:
         alpha: Opacity of the selected Gaussians ``[H, W]`` in 0..1.
-        ground truth: Boolean mask ``[H, W]``.
-        threshold: Opacity beyond which a pixel belongs to the silhouette.
+        ground_truth: Boolean mask ``[H, W]``.
+        threshold: Opacity above which a pixel belongs to the silhouette.
 
     Raises:
         ValueError: If shapes differ.
     """
     found, mask = np.asarray(alpha) > threshold, np.asarray(ground_truth, dtype=bool)
     if found.shape != mask.shape:
-        raise ValueError(f"alpha {list(found.shape)} and ground truth {list(mask.shape)} must be of one size")
+        raise ValueError(
+            f"alpha {list(found.shape)} and ground truth {list(mask.shape)} must have the same size"
+        )
     union = np.count_nonzero(found | mask)
     return np.count_nonzero(found & mask) / union if union else 0.0
 

@@ -1,4 +1,4 @@
-"""What an evaluation finds: numbers of each prompt in each view, and everything of ``metrics.json``."""
+"""Results of an evaluation: scores of each prompt in each view, and the content of ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 THRESHOLD_KINDS = ("auto", "fixed", "oracle")
 
 Masks = Mapping[str, Mapping[str, "Path | NDArray[np.bool_]"]]
-"""Truth by view and prompt: files or boolean arrays ``[H, W]``."""
+"""Ground truth by view and prompt: files or boolean arrays ``[H, W]``."""
 
 Boxes = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """Boxes ``[B, 4]`` (x0, y0, x1, y1 in pixels of the mask) by view and prompt."""
@@ -28,12 +28,12 @@ class PairResult:
     """One prompt in one view.
 
     Args:
-        counts: What the map finds at every threshold; ``counts.at(threshold)`` has IoU, accuracy, precision.
-        average_precision: Strict, in 0..1; NaN when the ground truth is empty.
-        localization: 1 if the highest relevancy lies on the object; NaN when the ground truth is empty.
-        official: The authors' protocol, if asked for.
-        lerf_2d: LangSplat's, if asked for.
-        lerf_3d: IoU of the selected Gaussians' silhouette, if asked for and the method has scores in 3D.
+        counts: Pixel counts at every threshold; ``counts.at(threshold)`` has IoU, accuracy and precision.
+        average_precision: Strict, in 0..1; NaN if the ground truth is empty.
+        localization: 1 if the highest relevancy lies on the object, else 0; NaN if the ground truth is empty.
+        official: Scores of the authors' protocol, if requested.
+        lerf_2d: Scores of LangSplat's protocol, if requested.
+        lerf_3d: IoU of the selected Gaussians' silhouette, if requested and the method scores Gaussians.
     """
 
     counts: ThresholdCounts
@@ -50,14 +50,14 @@ Pairs = Mapping[str, Mapping[str, PairResult]]
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """What an observer sees of a view before it is forgotten; arrays must not be changed.
+    """The images of one view, passed to an observer; arrays must not be changed.
 
     Args:
-        name: The view.
+        name: Name of the view.
         photo: ``[H, W, 3]`` in 0..1, at the working size.
         image: The rendering, same shape.
-        relevancy: ``[h, w]`` in 0..1 by prompt, at the size of the truth.
-        ground truth: Boolean ``[h, w]`` by prompt.
+        relevancy: ``[h, w]`` in 0..1 by prompt, at the size of the ground truth.
+        ground_truth: Boolean ``[h, w]`` by prompt.
         thresholds: The automatic threshold by prompt.
     """
 
@@ -71,18 +71,18 @@ class ViewPictures:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Everything measured. The first six are the sections of ``metrics.json``.
+    """All results. The first six attributes are the sections of ``metrics.json``.
 
     Args:
         quality: "psnr", "ssim", "lpips" (or None with "lpips_reason"), "per_view".
         language: "strict", "official", "lerf_2d", "lerf_3d", "per_prompt", "per_view", "form"; None for a scene
             without masks.
-        speed: "render_fps" (a view in color with one prompt's map), "rgb_fps", "query_ms" (a prompt's map in
-            a view, language rendered anew), "stage_seconds".
+        speed: "render_fps" (color and the map of one prompt), "rgb_fps", "query_ms" (the map of one prompt in one
+            view, including the rendering of the language), "stage_seconds".
         size: "gaussians", "language_bytes", "gaussian_bytes", "peak_rss_bytes", "peak_gpu_bytes".
         config: Settings.
-        machine: What it ran on.
-        curves: Interpolated precision at the 101 recalls by prompt, pixels of all views together.
+        machine: Hardware and versions.
+        curves: Interpolated precision at the 101 recalls by prompt, over the pixels of all views.
         thresholds: ``{prompt: {kind: threshold}}``.
         pairs: ``{view: {prompt: PairResult}}``.
     """
@@ -98,13 +98,13 @@ class Metrics:
     pairs: dict[str, dict[str, PairResult]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """The content of ``metrics.json``: plain types, 6 digits, None for what is not finite."""
+        """The content of ``metrics.json``: plain types, 6 decimals, None for NaN and infinity."""
         names = ("quality", "language", "speed", "size", "config", "machine")
         return {name: plain(getattr(self, name)) for name in names}
 
 
 def plain(value: Any) -> Any:
-    """Plain JSON data: 6 digits, None for numbers that are not finite, texts for paths."""
+    """Plain JSON data: 6 decimals, None for NaN and infinity, strings for paths."""
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

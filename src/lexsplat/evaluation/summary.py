@@ -1,4 +1,4 @@
-"""From the numbers of each prompt in each view to the numbers of a scene."""
+"""Averages the scores of each prompt in each view to the metrics of a scene."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ _MASK_NAMES = {"mIoU": "iou", "mPA": "accuracy", "mP": "precision"}
 
 
 def summarize_language(pairs: Pairs, thresholds: Thresholds) -> dict[str, Any] | None:
-    """Means as ``metrics.json`` holds them; None without pairs.
+    """The section "language" of ``metrics.json``; None without pairs.
 
-    Strict and official average prompts within a view, then views; the LERF-OVS protocols average all pairs alike.
+    The strict and the official protocol average prompts within a view, then views. The LERF-OVS protocols average all
+    pairs equally.
 
     Args:
         pairs: ``{view: {prompt: result}}``.
@@ -89,7 +90,7 @@ def _other_protocols(pairs: Pairs) -> dict[str, Any]:
 
 
 def summarize_kinds(pairs: Pairs, thresholds: Thresholds, kinds: Mapping[str, str]) -> dict[str, Any]:
-    """The strict numbers of `summarize_language` for each kind of prompt alone: ``{kind: {..., "prompts"}}``."""
+    """The strict metrics of `summarize_language` by kind of prompt: ``{kind: {..., "prompts"}}``."""
     table: dict[str, Any] = {}
     for kind in sorted({kinds[prompt] for prompt in thresholds if prompt in kinds}):
         chosen = {prompt: limits for prompt, limits in thresholds.items() if kinds.get(prompt) == kind}
@@ -151,6 +152,6 @@ def _average(entries: Mapping[str, Mapping[str, Any]], name: str) -> float | Non
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
-    """Mean of what is a number; None when nothing is."""
+    """Mean ignoring None and NaN; None if nothing remains."""
     known = [value for value in values if value is not None and not math.isnan(value)]
     return float(np.mean(known)) if known else None

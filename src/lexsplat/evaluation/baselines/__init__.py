@@ -1,15 +1,16 @@
-"""The methods that the paper compares with, rebuilt on our Gaussians from the ideas of their papers.
+"""The methods that the paper compares with, rebuilt on our Gaussians from their papers.
 
-Same scene, same Gaussians, same features as ours; what differs is what a Gaussian carries and how a question is
-answered. They are not the authors' programs: docs/evaluation.md says what was kept and what was not.
+Scene, Gaussians and features are those of our methods; what differs is what a Gaussian stores and how a prompt is
+scored. They are not the authors' programs: docs/evaluation.md lists the differences.
 
 - `dff`: distilled feature fields (Kobayashi et al. 2022): raw features on the Gaussians, fitted by rendering.
-- `lerf`: LERF (Kerr et al. 2023): features at several physical scales, the scale chosen for each question.
+- `lerf`: LERF (Kerr et al. 2023): features at several physical scales, the scale chosen per prompt.
 - `ovs3d`: 3D-OVS (Liu et al. 2023): a list of classes known in advance, fitted by their distributions.
-- `nearest`: no 3D at all: the features of the very photo that is asked about.
+- `nearest`: no 3D: the features of the evaluated photo itself.
 """
 
 from lexsplat.evaluation.baselines.dff import DffConfig, DistilledFeatures, distill
+from lexsplat.evaluation.baselines.feature_rendering import TrainingData
 from lexsplat.evaluation.baselines.lerf import LerfConfig, ScaledFeatures, fit_lerf
 from lexsplat.evaluation.baselines.nearest import ViewFeatures
 from lexsplat.evaluation.baselines.ovs3d import ClassFeatures, Ovs3dConfig, fit_3dovs
@@ -21,6 +22,7 @@ __all__ = [
     "LerfConfig",
     "Ovs3dConfig",
     "ScaledFeatures",
+    "TrainingData",
     "ViewFeatures",
     "distill",
     "fit_3dovs",

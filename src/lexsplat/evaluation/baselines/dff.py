@@ -1,30 +1,29 @@
-"""DFF: the raw features distilled into the scene by rendering them in full dimension, in channel chunks.
+"""DFF: features distilled into the scene by rendering them in full dimension.
 
-Kobayashi et al. 2022 fit a feature field with the squared error between rendered and extracted features. Here the
-field is a vector on every Gaussian. The fit starts from the average of what each Gaussian shows and goes on by Adam,
-one training view a step, `CHANNELS` channels at a time: memory does not grow with the dimension but for the result.
+Kobayashi et al. 2022 fit a feature field by the squared error between rendered and extracted features. Here the field
+is a vector on each Gaussian. The fit starts from the back-projected mean and continues with Adam, one training view
+per step, `CHANNELS` channels at a time, so that only the result grows with the dimension.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from lexsplat.evaluation.baselines.feature_rendering import (
-    TrainingViews,
-    average_features,
+    TrainingData,
+    back_projected_mean,
     chunks,
     render_cosines,
     resized_map,
     unit_texts,
 )
-from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
+from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
 
 
@@ -33,9 +32,9 @@ class DffConfig:
     """Settings of `distill`.
 
     Args:
-        steps: Gradient steps for each chunk of channels after the average; 0 keeps the average.
-        learning_rate: Of Adam on the features, which are of unit length or below.
-        scale: Pixels rendered for each cell of a feature map along a side.
+        steps: Gradient steps per chunk of channels; 0 keeps the back-projected mean.
+        learning_rate: Learning rate of Adam on the features, whose length is at most 1.
+        scale: Rendered pixels per cell of a feature map along a side.
     """
 
     steps: int = 120
@@ -48,11 +47,11 @@ class DffConfig:
 
 
 class DistilledFeatures:
-    """A feature on every Gaussian.
+    """A feature on each Gaussian.
 
     Args:
         features: ``[N, D]``; 0 for a Gaussian that no training view shows.
-        method: Name of the row.
+        method: Name of the method.
     """
 
     def __init__(self, features: Tensor, *, method: str = "dff") -> None:
@@ -87,40 +86,31 @@ def feature_scores(features: Tensor, positives: Tensor, negatives: Tensor, confi
 
 
 def distill(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    maps: Mapping[str, FeatureMap],
+    data: TrainingData,
     config: DffConfig | None = None,
     *,
     seed: int = 0,
-    memory_bytes: int = 1 << 30,
+    memory: int = DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> DistilledFeatures:
     """Fit CLIP features to the Gaussians.
 
     Args:
-        gaussians: The geometry.
-        cameras: The training views by name, and only these.
-        maps: Dense features by view name.
+        data: Gaussians, training views and features.
         config: Settings.
-        seed: Of the order of the views.
-        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
-        listener: Hears of stage "dff".
+        seed: Seed of the order of the views.
+        memory: Memory budget in bytes; results do not depend on it.
+        listener: Receives events of stage "dff".
     """
     config = config or DffConfig()
-
-    def cells(name: str) -> tuple[int, int]:
-        rows, cols = maps[name].clip.shape[:2]
-        return cols, rows
-
-    views = TrainingViews(gaussians, cameras, cells, scale=config.scale, memory_bytes=memory_bytes)
+    maps, views = data.maps, data.views(memory, scale=config.scale)
     dimensions = maps[views.names[0]].clip.shape[-1]
     ranges = chunks(dimensions)
     total = len(views.names) + config.steps * len(ranges)
-    features, weights = average_features(
+    features, weights = back_projected_mean(
         views,
         lambda name, camera: resized_map(maps[name].clip, camera),
-        tell=lambda done: listener(Event("dff", done, total)),
+        listener=lambda done: listener(Event("dff", done, total)),
     )
     seen = (weights > 0)[:, None]
     generator = torch.Generator().manual_seed(seed)

@@ -1,37 +1,84 @@
-"""Full-dimensional features on Gaussians: averaged from views, rendered a few channels at a time.
+"""Full-dimensional features on Gaussians: back-projected from views, rendered a few channels at a time.
 
-With A the blending weights of a view (pixels by Gaussians), what is rendered is A F. Its transpose spreads a feature
-map over the Gaussians, and the sum over views divided by the weights is the average of what each Gaussian shows.
+With A the blending weights of a view (pixels by Gaussians), the rendered features are A F. The transpose of A
+back-projects a feature map to the Gaussians; the sum over views divided by the weights is the mean feature of each
+Gaussian.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import PreparedView, accumulate_weights, back_project, prepare, render
+from lexsplat.runtime.memory import DEFAULT_MEMORY
 
 CHANNELS = 32
 """Feature channels rendered in one pass."""
 
 MIN_WEIGHT = 0.01
-"""A Gaussian with less weight than this over all views, in pixels, was never seen."""
+"""A Gaussian with less weight than this over all views, in pixels, counts as never seen."""
+
+MAX_STORE = 1 << 30
+"""Upper bound in bytes for the projections that are kept."""
+
+LevelMaps = Callable[[str], tuple[Tensor, list[float]]]
+"""The CLIP map of each crop size of a view ``[L, h, w, D]``, and their sides as fractions of the image's width."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What the compared methods are fitted to.
+
+    Args:
+        gaussians: The geometry.
+        cameras: The training views by name, and only these.
+        maps: Dense features by view name.
+        level_maps: Features of each crop size; for `lerf` and `ovs3d`.
+    """
+
+    gaussians: Gaussians
+    cameras: Mapping[str, Camera]
+    maps: Mapping[str, FeatureMap]
+    level_maps: LevelMaps | None = None
+
+    def views(self, memory: int = DEFAULT_MEMORY, *, scale: int = 1) -> TrainingViews:
+        """The training views at ``scale`` pixels per cell of their maps; a quarter of ``memory`` for projections."""
+        return TrainingViews(
+            self.gaussians, self.cameras, self._cells, scale=scale, memory=min(MAX_STORE, memory // 4)
+        )
+
+    def levels(self) -> LevelMaps:
+        """Features of each crop size.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        if self.level_maps is None:
+            raise ValueError("this method needs the features of each crop size (level_maps)")
+        return self.level_maps
+
+    def _cells(self, name: str) -> tuple[int, int]:
+        rows, cols = self.maps[name].clip.shape[:2]
+        return cols, rows
 
 
 class TrainingViews:
-    """Training views at the resolution of their feature maps, with their projections kept as memory allows.
+    """Training views at the resolution of their feature maps; projections are kept as far as memory allows.
 
     Args:
         gaussians: The geometry.
         cameras: The training views by name.
         cells: Width and height of the feature maps by view name.
-        scale: Pixels rendered for each cell along a side; never more than the camera has.
-        memory_bytes: Bound for the projections that are kept.
+        scale: Rendered pixels per cell along a side; never more than the camera has.
+        memory: Bound in bytes for the projections that are kept; results do not depend on it.
     """
 
     def __init__(
@@ -41,15 +88,15 @@ class TrainingViews:
         cells: Callable[[str], tuple[int, int]],
         *,
         scale: int = 1,
-        memory_bytes: int = 1 << 30,
+        memory: int = MAX_STORE,
     ) -> None:
         self.gaussians = gaussians.detach()
         self.names = sorted(cameras)
         self._cameras, self._cells, self._scale = cameras, cells, scale
-        self._limit, self._kept = memory_bytes, dict[str, PreparedView]()
+        self._limit, self._kept = memory, dict[str, PreparedView]()
 
     def prepared(self, name: str) -> tuple[Camera, PreparedView]:
-        """The small camera of a view and its projection."""
+        """Camera and projection of a view at the rendered size."""
         if name in self._kept:
             return self._kept[name].camera, self._kept[name]
         full, (cols, rows) = self._cameras[name], self._cells(name)
@@ -66,7 +113,7 @@ class TrainingViews:
         return render(self.gaussians, camera, features=features, color=False, prepared=view).features
 
     def order(self, steps: int, generator: torch.Generator) -> Iterator[str]:
-        """Names for a number of steps: all views in random order, again and again."""
+        """Names for a number of steps: all views in random order, repeated."""
         queue: list[int] = []
         for _ in range(steps):
             if not queue:
@@ -83,15 +130,18 @@ def resized_map(values: Tensor, camera: Camera) -> Tensor:
     return planes[0].permute(1, 2, 0)
 
 
-def average_features(
-    views: TrainingViews, map_of: Callable[[str, Camera], Tensor], *, tell: Callable[[int], None]
+def back_projected_mean(
+    views: TrainingViews, map_of: Callable[[str, Camera], Tensor], *, listener: Callable[[int], None]
 ) -> tuple[Tensor, Tensor]:
-    """Mean of what each Gaussian shows, over all training views, weighted by how much of a pixel it is.
+    """Mean feature of each Gaussian over all training views, weighted by alpha T.
+
+    Not the sum of `language.methods.averaged.average_features`: maps are resampled bilinearly to the rendered size
+    instead of taking the nearest cell, masked pixels count, and the mean stays float32, because fits start from it.
 
     Args:
         views: The training views.
-        map_of: The map ``[H, W, C]`` of a view at the size of its small camera.
-        tell: Hears how many views are done.
+        map_of: The map ``[H, W, C]`` of a view at the size of its camera.
+        listener: Receives the number of finished views.
 
     Returns:
         Features ``[N, C]``, 0 where never seen, and weights ``[N]`` in pixels.
@@ -103,7 +153,7 @@ def average_features(
         found = back_project(views.gaussians, camera, map_of(name, camera).to(weights.device), prepared)
         total = found if total is None else total + found
         weights += accumulate_weights(views.gaussians, camera, prepared=prepared)
-        tell(done)
+        listener(done)
     if total is None:
         raise ValueError("features need at least one training view")
     seen = weights >= MIN_WEIGHT
@@ -114,7 +164,7 @@ def average_features(
 def render_cosines(
     gaussians: Gaussians, camera: Camera, features: Tensor, texts: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Cosines of rendered features with texts, without holding a feature map.
+    """Cosines of rendered features with texts, without storing a feature map.
 
     Args:
         gaussians: The geometry.

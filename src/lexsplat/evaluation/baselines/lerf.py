@@ -1,17 +1,16 @@
-"""LERF: CLIP at several physical scales, the scale chosen for each question, DINO as a regularizer.
+"""LERF: CLIP at several physical scales, the scale chosen per prompt, DINO as a regularizer.
 
 Kerr et al. 2023 train a field F(x, s) whose target at a pixel is the embedding of the crop that is s wide at the
-depth of the surface. Here every Gaussian carries one vector for each of a few scales s: the average of what the
-training views show of it at that scale, where depth is rendered and the crop size that is s wide there is
-interpolated between the crop sizes at hand. LERF's DINO branch makes neighbors that look alike agree through a
-shared grid; here a Gaussian takes the mean of its nearest neighbors, weighted by how alike their DINO features are.
+depth of the surface. Here each Gaussian stores one vector for each of a few scales s: the back-projected mean of maps
+at that scale. The depth of a pixel is rendered, and the embedding of the crop that is s wide at this depth is
+interpolated between the available crop sizes. LERF's DINO branch makes similar neighbors agree through a shared grid;
+here the features of a Gaussian are averaged over its nearest neighbors, weighted by DINO similarity.
 
-A question is asked at every scale; the scale with the highest relevancy answers (LERF's rule, for each view).
+A prompt is scored at every scale; the scale with the highest relevancy is taken (LERF's rule, per view).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +21,10 @@ from torch import Tensor
 
 from lexsplat.evaluation.baselines.dff import feature_scores
 from lexsplat.evaluation.baselines.feature_rendering import (
+    LevelMaps,
+    TrainingData,
     TrainingViews,
-    average_features,
+    back_projected_mean,
     render_cosines,
     resized_map,
     unit_texts,
@@ -33,10 +34,8 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
 from lexsplat.rendering import render
+from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
-
-LevelMaps = Callable[[str], tuple[Tensor, list[float]]]
-"""The CLIP map of each crop size of a view ``[L, h, w, D]``, and their sides as fractions of the image's width."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,8 @@ class LerfConfig:
 
     Args:
         scales: Number of physical scales.
-        neighbors: Neighbors a Gaussian is averaged with; 0 leaves DINO out.
-        sharpness: How fast a neighbor's weight falls with the DINO cosine: exp(sharpness (cos - 1)).
+        neighbors: Number of neighbors in the average; 0 disables it, and with it DINO.
+        sharpness: Weight of a neighbor by its DINO cosine: exp(sharpness (cos - 1)).
     """
 
     scales: int = 4
@@ -59,7 +58,7 @@ class LerfConfig:
 
 
 class ScaledFeatures:
-    """Features on every Gaussian at several scales.
+    """Features on each Gaussian at several scales.
 
     Args:
         features: ``[S, N, D]``.
@@ -103,54 +102,43 @@ def _higher(maps: Tensor, best: Tensor) -> Tensor:
 
 
 def fit_lerf(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    maps: Mapping[str, FeatureMap],
-    level_maps: LevelMaps,
+    data: TrainingData,
     config: LerfConfig | None = None,
     *,
-    memory_bytes: int = 1 << 30,
+    memory: int = DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> ScaledFeatures:
-    """Average CLIP at each scale over the training views, then over neighbors that look alike.
+    """Average CLIP at each scale over the training views, then over similar neighbors.
 
     Args:
-        gaussians: The geometry.
-        cameras: The training views by name, and only these.
-        maps: Dense features by view name; their DINO part regularizes.
-        level_maps: Features of each crop size.
+        data: Gaussians, training views, features (their DINO part regularizes) and features of each crop size.
         config: Settings.
-        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
-        listener: Hears of stage "lerf".
+        memory: Memory budget in bytes; results do not depend on it.
+        listener: Receives events of stage "lerf".
     """
     config = config or LerfConfig()
-
-    def cells(name: str) -> tuple[int, int]:
-        rows, cols = maps[name].clip.shape[:2]
-        return cols, rows
-
-    views = TrainingViews(gaussians, cameras, cells, memory_bytes=memory_bytes)
+    maps, level_maps, views = data.maps, data.levels(), data.views(memory)
     scales = physical_scales(views, level_maps, config.scales)
     total = (config.scales + 1) * len(views.names)
     found = []
     for index, scale in enumerate(scales.tolist()):
         offset = index * len(views.names)
-        features, _ = average_features(
+        features, _ = back_projected_mean(
             views,
             lambda name, camera, scale=scale: _map_at_scale(views, name, camera, level_maps, scale),  # type: ignore[misc]
-            tell=lambda done, offset=offset: listener(Event("lerf", offset + done, total)),  # type: ignore[misc]
+            listener=lambda done, offset=offset: listener(Event("lerf", offset + done, total)),  # type: ignore[misc]
         )
         found.append(features)
     stacked = torch.stack(found)
     del found, features
     with_dino = maps[views.names[0]].dino is not None
-    if config.neighbors and with_dino and len(gaussians) > 1:
-        dino, _ = average_features(
+    if config.neighbors and with_dino and len(data.gaussians) > 1:
+        dino, _ = back_projected_mean(
             views,
             lambda name, camera: resized_map(_dino(maps[name]), camera),
-            tell=lambda done: listener(Event("lerf", total - len(views.names) + done, total)),
+            listener=lambda done: listener(Event("lerf", total - len(views.names) + done, total)),
         )
-        stacked = smooth_alike(gaussians.means, dino, stacked, config)
+        stacked = smooth_by_similarity(data.gaussians.means, dino, stacked, config)
     listener(Event("lerf", total, total))
     return ScaledFeatures(stacked, scales)
 
@@ -162,7 +150,7 @@ def _dino(found: FeatureMap) -> Tensor:
 
 
 def physical_scales(views: TrainingViews, level_maps: LevelMaps, count: int) -> Tensor:
-    """Widths ``[S]`` in world units, evenly spaced in their logarithm over what the crops of the views span."""
+    """Widths ``[S]`` in world units, spaced evenly in the logarithm over the range of the crops."""
     smallest, largest = [], []
     for name in views.names[:: max(1, len(views.names) // 12)]:
         camera, _ = views.prepared(name)
@@ -219,12 +207,12 @@ def level_weights(wanted: Tensor, sides: list[float]) -> Tensor:
     return weights
 
 
-def smooth_alike(means: Tensor, dino: Tensor, features: Tensor, config: LerfConfig) -> Tensor:
-    """Every Gaussian's mean with its nearest neighbors, weighted by how alike their DINO features are.
+def smooth_by_similarity(means: Tensor, dino: Tensor, features: Tensor, config: LerfConfig) -> Tensor:
+    """Features averaged over the nearest neighbors of each Gaussian, weighted by DINO similarity.
 
     Args:
         means: Centers ``[N, 3]``.
-        dino: DINO features ``[N, E]``; a zero row (never seen) has no say and is filled in by its neighbors.
+        dino: DINO features ``[N, E]``; a zero row (never seen) contributes nothing and is filled in by its neighbors.
         features: ``[S, N, D]``.
         config: Settings.
     """
@@ -238,10 +226,10 @@ def smooth_alike(means: Tensor, dino: Tensor, features: Tensor, config: LerfConf
     weights = torch.zeros(len(points), device=features.device)
     for column in range(near):
         other = neighbors[:, column]
-        alike = torch.exp(config.sharpness * ((unit * unit[other]).sum(-1) - 1))
-        # Nothing is known of what was never seen, so its neighbors count alike.
-        weight = torch.where(seen > 0, alike, torch.ones_like(alike)) * seen[other]
-        for scale, values in enumerate(features):  # one scale at a time: what is gathered is a copy
+        similarity = torch.exp(config.sharpness * ((unit * unit[other]).sum(-1) - 1))
+        # A Gaussian that was never seen has no similarity to its neighbors: they count equally.
+        weight = torch.where(seen > 0, similarity, torch.ones_like(similarity)) * seen[other]
+        for scale, values in enumerate(features):  # one scale at a time: gathering copies
             total[scale] += weight[:, None] * values[other]
         weights += weight
     return total / weights.clamp_min(1e-12)[:, None]

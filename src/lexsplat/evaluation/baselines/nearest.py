@@ -1,7 +1,7 @@
-"""No 3D: the 2D features of the very photo that is asked about, the sanity line.
+"""No 3D: the 2D features of the evaluated photo itself, as a reference.
 
-What the features of one photo can tell without any scene. It looks at the held-out photo, so it is no method for
-novel views; a 3D method that stays below it loses more by its geometry than it gains from the other views.
+It reads the held-out photo, so it is not a method for novel views. A 3D method below it loses more by its geometry
+than it gains from the other views.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
 
 
 class ViewFeatures:
-    """Feature maps found by their camera's pose.
+    """Feature maps, looked up by the pose of their camera.
 
     Args:
         cameras: All views by name, at any size.
@@ -53,5 +53,5 @@ class ViewFeatures:
         return None
 
     def tensors(self) -> dict[str, Tensor]:
-        """The maps of all views in half precision: what would have to be kept to answer."""
+        """The maps of all views in half precision."""
         return {name: self._maps[name].clip.half() for name in self._names.values()}

@@ -1,18 +1,18 @@
 """3D-OVS: a list of classes known in advance, fitted by relevancy distributions and feature distributions.
 
 Liu et al. 2023 fit a feature field and, for each pixel, a choice among the scales of CLIP, with three losses: the
-cosine with the chosen feature; the Jensen-Shannon divergence between the distribution over classes of the field and
-that of the chosen relevancies (relevancy-distribution alignment); and, for pairs of pixels, a divergence between
-class distributions that is small where DINO is alike and large where it is not (feature-distribution alignment).
-Here feature and choice are on the Gaussians. The classes are the prompts of the evaluation: told, not learned.
+cosine with the chosen feature; the Jensen-Shannon divergence between the class distribution of the field and that of
+the chosen relevancies (relevancy-distribution alignment); and, for pairs of pixels, a divergence between class
+distributions that is small where DINO features are similar and large where they are not (feature-distribution
+alignment). Here feature and choice are stored on the Gaussians. The classes are the prompts of the evaluation, known
+in advance.
 
-A question is answered against the other classes: relevancy 0.5 is where a prompt and the best other class are even,
-so the fixed threshold is 3D-OVS's choice of the best class.
+A prompt is scored against the other classes: at relevancy 0.5 it ties with the best other class, so the fixed
+threshold is 3D-OVS's choice of the best class.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -21,42 +21,41 @@ from torch import Tensor
 
 from lexsplat.evaluation.baselines.feature_rendering import (
     CHANNELS,
+    TrainingData,
     TrainingViews,
-    average_features,
+    back_projected_mean,
     render_cosines,
     resized_map,
     unit_texts,
 )
-from lexsplat.evaluation.baselines.lerf import LevelMaps
-from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
 
 
 @dataclass(frozen=True)
 class Ovs3dConfig:
-    """Settings of `fit_3dovs`; weights as in the authors' configuration where our features allow it.
+    """Settings of `fit_3dovs`; weights follow the authors' configuration unless stated.
 
     Args:
         steps: Gradient steps, one training view each.
-        learning_rate: Of Adam on features and choices.
-        relevancy_weight: Of the relevancy-distribution alignment.
-        alike_weight: Of pairs that DINO finds alike. How much is right depends on how many those are: to the
-            bundled DINO it is a quarter of all pairs, and with 200 every class became the same (second scene:
-            mIoU .20, with 0.67 .63).
-        unlike_weight: Of pairs that DINO finds unlike.
-        shift: DINO cosine that separates alike from unlike.
-        temperature: Of the class distributions in the feature-distribution alignment.
-        pairs: Pixels of a step between which pairs are formed.
+        learning_rate: Learning rate of Adam on features and choices.
+        relevancy_weight: Weight of the relevancy-distribution alignment.
+        similar_weight: Weight of pairs with similar DINO features. The authors' 200 makes all classes equal with the
+            bundled DINO, to which a quarter of all pairs are similar (second scene: mIoU .20; .63 with 0.67).
+        dissimilar_weight: Weight of pairs with dissimilar DINO features.
+        shift: DINO cosine that separates similar from dissimilar pairs.
+        temperature: Temperature of the class distributions in the feature-distribution alignment.
+        pairs: Number of pixels of a step between which pairs are formed.
     """
 
     steps: int = 150
     learning_rate: float = 0.01
     relevancy_weight: float = 1.0
-    alike_weight: float = 0.67
-    unlike_weight: float = 0.22
+    similar_weight: float = 0.67
+    dissimilar_weight: float = 0.22
     shift: float = 0.7
     temperature: float = 0.2
     pairs: int = 192
@@ -67,7 +66,7 @@ class Ovs3dConfig:
 
 
 class ClassFeatures:
-    """A feature on every Gaussian and a list of classes it was fitted to.
+    """A feature on each Gaussian and the classes it was fitted to.
 
     Args:
         features: ``[N, D]``.
@@ -130,16 +129,16 @@ def alignment_loss(log_classes: Tensor, dino: Tensor, config: Ovs3dConfig) -> Te
     Args:
         log_classes: Logarithms of their class distributions ``[M, K]``.
         dino: Their DINO features ``[M, E]``.
-        config: Weights and the shift.
+        config: Weights and shift.
     """
     unit = F.normalize(dino, dim=-1)
-    alike = unit @ unit.T - config.shift
+    similarity = unit @ unit.T - config.shift
     divergence = js_divergence(log_classes[:, None], log_classes[None])
     off = ~torch.eye(len(unit), dtype=torch.bool, device=unit.device)
     loss = divergence.new_zeros(())
     for part, weight in (
-        (alike.clamp(min=0), config.alike_weight),
-        (alike.clamp(max=0), config.unlike_weight),
+        (similarity.clamp(min=0), config.similar_weight),
+        (similarity.clamp(max=0), config.dissimilar_weight),
     ):
         count = int((part[off] != 0).sum())
         if count:
@@ -148,100 +147,100 @@ def alignment_loss(log_classes: Tensor, dino: Tensor, config: Ovs3dConfig) -> Te
 
 
 def fit_3dovs(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    maps: Mapping[str, FeatureMap],
-    level_maps: LevelMaps,
+    data: TrainingData,
     classes: Tensor,
     config: Ovs3dConfig | None = None,
     *,
     seed: int = 0,
-    memory_bytes: int = 1 << 30,
+    memory: int = DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> ClassFeatures:
-    """Fit features to the Gaussians with the classes known.
+    """Fit features to the Gaussians for known classes.
 
     Args:
-        gaussians: The geometry.
-        cameras: The training views by name, and only these.
-        maps: Dense features by view name; their DINO part enters the feature-distribution alignment, if there is one.
-        level_maps: Features of each crop size.
+        data: Gaussians, training views, features and features of each crop size. The DINO part of the features, if
+            there is one, enters the feature-distribution alignment.
         classes: Text embeddings ``[K, D]`` of all classes.
         config: Settings.
-        seed: Of views and pixels.
-        memory_bytes: Bound for projections of views kept between steps; results do not depend on it.
-        listener: Hears of stage "3dovs".
+        seed: Seed of views and pixels.
+        memory: Memory budget in bytes; results do not depend on it.
+        listener: Receives events of stage "3dovs".
 
     Raises:
         ValueError: If there are fewer than two classes.
     """
     if len(classes) < 2:
-        raise ValueError("3dovs needs at least two classes to tell apart")
+        raise ValueError(f"3dovs needs at least two classes, got {len(classes)}")
     config = config or Ovs3dConfig()
     (classes,) = unit_texts(classes)
-
-    def cells(name: str) -> tuple[int, int]:
-        rows, cols = maps[name].clip.shape[:2]
-        return cols, rows
-
-    views = TrainingViews(gaussians, cameras, cells, memory_bytes=memory_bytes)
+    views = data.views(memory)
     total = len(views.names) + config.steps
-    start, weights = average_features(
+    start, weights = back_projected_mean(
         views,
-        lambda name, camera: resized_map(maps[name].clip, camera),
-        tell=lambda done: listener(Event("3dovs", done, total)),
+        lambda name, camera: resized_map(data.maps[name].clip, camera),
+        listener=lambda done: listener(Event("3dovs", done, total)),
     )
-    device = start.device
-    classes = classes.to(device)
-    features = start.clone().requires_grad_()
-    levels = len(level_maps(views.names[0])[1])
-    choices = torch.zeros(len(start), levels, device=device, requires_grad=True)
-    optimizer = torch.optim.Adam([features, choices], lr=config.learning_rate)
+    fit = _Fit(data, views, start, classes.to(start.device), config)
+    optimizer = torch.optim.Adam([fit.features, fit.choices], lr=config.learning_rate)
     generator = torch.Generator().manual_seed(seed)
     for step, name in enumerate(views.order(config.steps, generator), start=1):
-        loss = _step_loss(views, name, features, choices, maps[name], level_maps, classes, config, generator)
+        loss = fit.loss(name, generator)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
         if step % 10 == 0 or step == config.steps:
             listener(Event("3dovs", len(views.names) + step, total, {"loss": float(loss.detach())}))
-    fitted = torch.where((weights > 0)[:, None], features.detach(), 0.0)
-    return ClassFeatures(fitted, classes)
+    fitted = torch.where((weights > 0)[:, None], fit.features.detach(), 0.0)
+    return ClassFeatures(fitted, fit.classes)
 
 
-def _step_loss(
-    views: TrainingViews,
-    name: str,
-    features: Tensor,
-    choices: Tensor,
-    found: FeatureMap,
-    level_maps: LevelMaps,
-    classes: Tensor,
-    config: Ovs3dConfig,
-    generator: torch.Generator,
-) -> Tensor:
-    """The three losses of one training view."""
-    camera, _ = views.prepared(name)
-    carried = torch.cat([features, choices], dim=1)
-    rendered = torch.cat([views.render(name, part) for part in carried.split(CHANNELS, dim=1)], dim=-1)
-    image, select = rendered[..., : features.shape[1]], rendered[..., features.shape[1] :].softmax(-1)
-    stack, _ = level_maps(name)
-    targets = torch.stack([resized_map(level.to(image.device), camera) for level in stack])
-    targets = F.normalize(targets, dim=-1)
-    chosen = F.normalize((select.permute(2, 0, 1)[..., None] * targets).sum(0), dim=-1)
-    loss = 1 - F.cosine_similarity(image, chosen, dim=-1).mean()
+class _Fit:
+    """The optimized tensors and their loss.
 
-    relevancies = targets @ classes.T  # [L, H, W, K], stretched to 0..1 over the view as 3D-OVS does
-    low, high = relevancies.amin((1, 2), keepdim=True), relevancies.amax((1, 2), keepdim=True)
-    relevancies = (relevancies - low) / (high - low).clamp_min(1e-6)
-    wanted = (select.permute(2, 0, 1)[..., None] * relevancies).sum(0).log_softmax(-1)
-    cosines = F.normalize(image, dim=-1) @ classes.T
-    loss = loss + config.relevancy_weight * js_divergence(cosines.log_softmax(-1), wanted).mean()
+    Args:
+        data: What is fitted.
+        views: Its training views.
+        start: Initial features ``[N, D]``.
+        classes: Unit text embeddings ``[K, D]``.
+        config: Settings.
+    """
 
-    if found.dino is not None:
-        pixels = torch.randperm(camera.height * camera.width, generator=generator)[: config.pairs]
-        pixels = pixels.to(image.device)
-        dino = resized_map(found.dino.to(image.device), camera).flatten(0, 1)[pixels]
-        log_classes = (cosines.flatten(0, 1)[pixels] / config.temperature).log_softmax(-1)
-        loss = loss + alignment_loss(log_classes, dino, config)
-    return loss
+    def __init__(
+        self, data: TrainingData, views: TrainingViews, start: Tensor, classes: Tensor, config: Ovs3dConfig
+    ) -> None:
+        self.views, self.maps, self.level_maps = views, data.maps, data.levels()
+        self.classes, self.config = classes, config
+        self.features = start.clone().requires_grad_()
+        levels = len(self.level_maps(views.names[0])[1])
+        self.choices = torch.zeros(len(start), levels, device=start.device, requires_grad=True)
+
+    def loss(self, name: str, generator: torch.Generator) -> Tensor:
+        """The three losses of one training view; ``generator`` draws the pixels of the pairs."""
+        config, dimension = self.config, self.features.shape[1]
+        camera, _ = self.views.prepared(name)
+        stored = torch.cat([self.features, self.choices], dim=1)
+        rendered = torch.cat(
+            [self.views.render(name, part) for part in stored.split(CHANNELS, dim=1)], dim=-1
+        )
+        image, select = rendered[..., :dimension], rendered[..., dimension:].softmax(-1)
+        stack, _ = self.level_maps(name)
+        targets = torch.stack([resized_map(level.to(image.device), camera) for level in stack])
+        targets = F.normalize(targets, dim=-1)
+        chosen = F.normalize((select.permute(2, 0, 1)[..., None] * targets).sum(0), dim=-1)
+        loss = 1 - F.cosine_similarity(image, chosen, dim=-1).mean()
+
+        relevancies = targets @ self.classes.T  # [L, H, W, K], stretched to 0..1 over the view as 3D-OVS does
+        low, high = relevancies.amin((1, 2), keepdim=True), relevancies.amax((1, 2), keepdim=True)
+        relevancies = (relevancies - low) / (high - low).clamp_min(1e-6)
+        wanted = (select.permute(2, 0, 1)[..., None] * relevancies).sum(0).log_softmax(-1)
+        cosines = F.normalize(image, dim=-1) @ self.classes.T
+        loss = loss + config.relevancy_weight * js_divergence(cosines.log_softmax(-1), wanted).mean()
+
+        features = self.maps[name]
+        if features.dino is not None:
+            pixels = torch.randperm(camera.height * camera.width, generator=generator)[: config.pairs]
+            pixels = pixels.to(image.device)
+            dino = resized_map(features.dino.to(image.device), camera).flatten(0, 1)[pixels]
+            log_classes = (cosines.flatten(0, 1)[pixels] / config.temperature).log_softmax(-1)
+            loss = loss + alignment_loss(log_classes, dino, config)
+        return loss

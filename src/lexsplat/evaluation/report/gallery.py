@@ -1,4 +1,4 @@
-"""Small pictures of an evaluation, kept while it runs."""
+"""Small images of an evaluation, collected while it runs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from lexsplat.queries.heatmaps import overlay_heatmap, overlay_mask
 
 @dataclass
 class Gallery:
-    """Collects small pictures while a scene is evaluated: pass `add` as the observer.
+    """Collects small images while a scene is evaluated: pass `add` as the observer.
 
     Args:
-        width: Width of a picture in pixels.
+        width: Width of an image in pixels.
         views: ``{view: {"photo" | "render": JPEG}}``.
-        cases: ``{(view, prompt): {"heatmap" | "mask" | "truth": JPEG}}``.
+        cases: ``{(view, prompt): {"heatmap" | "mask" | "ground_truth": JPEG}}``.
     """
 
     width: int = 300
@@ -31,7 +31,7 @@ class Gallery:
     cases: dict[tuple[str, str], dict[str, bytes]] = field(default_factory=dict)
 
     def add(self, pictures: ViewPictures) -> None:
-        """Keep a view and all its prompts, small."""
+        """Store thumbnails of a view and of all its prompts."""
         self.views[pictures.name] = {
             "photo": self._jpeg(_to_bytes(pictures.photo)),
             "render": self._jpeg(_to_bytes(pictures.image)),
@@ -49,7 +49,7 @@ class Gallery:
             }
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every JPEG by name, for safetensors."""
+        """All JPEGs by name as uint8 tensors, for safetensors."""
         stored = {
             f"view/{kind}/{view}": jpeg for view, kinds in self.views.items() for kind, jpeg in kinds.items()
         }
@@ -62,7 +62,7 @@ class Gallery:
         """The inverse of `tensors`.
 
         Raises:
-            ValueError: If a name is not one of ours.
+            ValueError: If a name was not written by `tensors`.
         """
         gallery = cls()
         for name, tensor in tensors.items():
@@ -75,9 +75,9 @@ class Gallery:
                 gallery.cases.setdefault((view, prompt), {})[kind] = jpeg
         return gallery
 
-    def _jpeg(self, picture: NDArray[np.uint8]) -> bytes:
-        height = max(1, round(picture.shape[0] * self.width / picture.shape[1]))
-        image = Image.fromarray(picture).resize(
+    def _jpeg(self, pixels: NDArray[np.uint8]) -> bytes:
+        height = max(1, round(pixels.shape[0] * self.width / pixels.shape[1]))
+        image = Image.fromarray(pixels).resize(
             (self.width, height), Image.Resampling.LANCZOS, reducing_gap=3.0
         )
         buffer = io.BytesIO()
@@ -85,11 +85,11 @@ class Gallery:
         return buffer.getvalue()
 
 
-def _to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return (np.clip(picture, 0, 1) * 255).round().astype(np.uint8)
+def _to_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return (np.clip(image, 0, 1) * 255).round().astype(np.uint8)
 
 
-def _fit(picture: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    if picture.shape[:2] == shape:
-        return picture
-    return np.asarray(Image.fromarray(picture).resize((shape[1], shape[0]), Image.Resampling.BICUBIC))
+def _fit(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    if image.shape[:2] == shape:
+        return image
+    return np.asarray(Image.fromarray(image).resize((shape[1], shape[0]), Image.Resampling.BICUBIC))

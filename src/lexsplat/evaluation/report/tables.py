@@ -1,17 +1,15 @@
-"""Numbers as text: for the terminal, as CSV and as LaTeX rows in the columns of the paper's Table 1."""
+"""Results as tables: for the terminal, as CSV, and as LaTeX in the columns of the paper's Table 1."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lexsplat.runtime.files import atomic_path
+from lexsplat.evaluation.report.numbers import known_values, mean_and_spread, number, size_text
+from lexsplat.evaluation.report.templating import latex_table, write_text
 
 COLUMNS = ("mIoU", "mPA", "mP", "mAP")
 
@@ -20,13 +18,13 @@ _PAPER = {
     "mIoU": ("mIoU", 3), "mAP": ("mAP", 3), "fps": ("FPS", 1), "host_bytes": ("host memory", -1),
     "gpu_bytes": ("GPU memory", -1), "storage_bytes": ("storage", -1), "training_seconds": ("training", -2),
 }  # fmt: skip
-"""Columns of the paper's Table 1: key of a row, heading, digits (-1 bytes, -2 seconds)."""
+"""Columns of the paper's Table 1: key, heading, decimals (-1: bytes, -2: seconds)."""
 
 _HONEST = {
     "mIoU_fixed": ("mIoU 0.5", 3), "mIoU_oracle": ("oracle", 3), "localization": ("localization", 3),
     "language_seconds": ("language", -2),
 }  # fmt: skip
-"""Columns that the paper does not have."""
+"""Columns that the paper does not report."""
 
 _OTHERS = {
     "official_mIoU": ("official mIoU", 3), "official_mPA": ("mPA", 3), "official_mP": ("mP", 3),
@@ -35,24 +33,35 @@ _OTHERS = {
 }  # fmt: skip
 
 OTHER_PROTOCOLS = tuple(_OTHERS)
-"""Columns of other people's protocols."""
+"""Columns of the protocols of other authors."""
 
-_HEADINGS = {**_PAPER, **_HONEST, **_OTHERS}
+_HEADINGS = {**_PAPER, **_HONEST, **_OTHERS, "query_ms": ("ms/prompt", 1)}
 
 _MEASURED_ONCE = {
-    "fps", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
+    "fps", "query_ms", "host_bytes", "gpu_bytes", "storage_bytes", "training_seconds", "language_seconds",
 }  # fmt: skip
-"""Columns whose small differences are those of the machine: none of them is named the best."""
+"""Columns whose differences may be noise of the machine: no value of them is marked as best."""
+
+REFERENCE_ROWS = frozenset({"nearest"})
+"""Rows that are shown but never marked as best: they use the evaluated photo itself."""
 
 Row = Mapping[str, Any]
 """One line of a table: "name", and numbers by key; several runs give a list of numbers."""
 
 
-def protocol_rows(language: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """The lines of the language table: a name and its numbers in `COLUMNS`."""
+def protocol_rows(
+    language: Mapping[str, Any], *, with_localization: bool = False
+) -> list[tuple[str, Mapping[str, Any]]]:
+    """The lines of the language table: a name and its numbers in `COLUMNS`.
+
+    Args:
+        language: The section of ``metrics.json``.
+        with_localization: Whether the line of the automatic threshold has the strict localization, too.
+    """
     strict = language["strict"]
+    found = {"localization": strict["localization"]} if with_localization else {}
     rows = [
-        ("automatic threshold", {**strict["auto"], "mAP": strict["mAP"]}),
+        ("automatic threshold", {**strict["auto"], "mAP": strict["mAP"], **found}),
         ("fixed threshold", strict["fixed"]),
         ("oracle threshold", strict["oracle"]),
     ]
@@ -61,7 +70,7 @@ def protocol_rows(language: Mapping[str, Any]) -> list[tuple[str, Mapping[str, A
 
 
 def prompts_worst_first(prompts: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Rows of "per_prompt", the worst first."""
+    """Rows of "per_prompt", the worst IoU first."""
     return sorted(prompts.items(), key=lambda item: (item[1]["IoU_auto"] or 0.0, item[0]))
 
 
@@ -77,7 +86,7 @@ def format_table(result: Mapping[str, Any]) -> str:
     lines += ["", f"{size['gaussians']:,} Gaussians, {stored}; peak memory {memory}"]
     if speed["render_fps"]:
         fps, query = number(speed["render_fps"], 1), number(speed["query_ms"], 1)
-        lines.append(f"{fps} frames/s with language, {query} ms a prompt and view")
+        lines.append(f"{fps} frames/s with language, {query} ms per prompt and view")
     return "\n".join(lines)
 
 
@@ -115,10 +124,10 @@ def table_rows(
     """Rows for `write_rows` from contents of ``metrics.json``.
 
     Args:
-        results: By the name of the row: one result, or one for each seed.
+        results: By row name: one result, or one for each seed.
 
     Returns:
-        Dictionaries with "name", "runs" and for every number the list of its values over the runs.
+        Dictionaries with "name", "runs" and, for each number, the list of its values over the runs.
     """
     rows = []
     for name, found in results.items():
@@ -157,33 +166,33 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def row_cells(rows: Sequence[Row], keys: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """What of some rows is shown: the keys that are known, and a text for each of them in each row.
+    """The keys that have a value in any row, and their values as text, row by row.
 
     Args:
-        rows: As `table_rows` makes them.
-        keys: Which numbers; none takes the columns of the paper's Table 1 and ours.
+        rows: As `table_rows` returns them.
+        keys: Which numbers; empty: the columns of the paper's Table 1 and ours.
     """
-    shown = [key for key in keys or (*_PAPER, *_HONEST) if any(_known(row.get(key)) for row in rows)]
+    shown = [key for key in keys or (*_PAPER, *_HONEST) if any(known_values(row.get(key)) for row in rows)]
     return shown, [[_cell(row.get(key), _HEADINGS[key][1]) for key in shown] for row in rows]
 
 
 def heading(key: str) -> str:
-    """What stands above a column."""
+    """Heading of a column."""
     return _HEADINGS[key][0]
 
 
 def best_rows(rows: Sequence[Row], key: str) -> set[int]:
-    """Places of the rows with the best mean of a score; empty when all are alike, and for times and sizes."""
-    means = {place: mean_and_spread(row.get(key))[0] for place, row in enumerate(rows)}
-    known = {place: mean for place, mean in means.items() if mean is not None}
-    if len(set(known.values())) < 2 or key in _MEASURED_ONCE:
+    """Indices of the rows with the best mean of a score; empty if all are equal, and for times and sizes."""
+    methods = {i: row.get(key) for i, row in enumerate(rows) if row.get("name") not in REFERENCE_ROWS}
+    means = {i: mean for i, values in methods.items() if (mean := mean_and_spread(values)[0]) is not None}
+    if len(set(means.values())) < 2 or key in _MEASURED_ONCE:
         return set()
-    best = (min if key == "lpips" else max)(known.values())
-    return {place for place, mean in known.items() if mean == best}
+    best = (min if key == "lpips" else max)(means.values())
+    return {i for i, mean in means.items() if mean == best}
 
 
 def format_rows(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
-    """Rows as a table for the terminal, mean and spread where there were several runs."""
+    """Rows as a table for the terminal; several runs as mean and standard deviation."""
     shown, texts_of_rows = row_cells(rows, keys)
     cells = [["", *map(heading, shown)]]
     cells += [[str(row["name"]), *line] for row, line in zip(rows, texts_of_rows)]
@@ -196,17 +205,16 @@ def format_rows(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
 
 
 def write_rows(folder: Path, stem: str, rows: Sequence[Row], keys: Sequence[str] = ()) -> None:
-    """Write rows as ``STEM.csv`` (every number, mean and spread) and ``STEM.tex`` (a table in LaTeX).
+    """Write rows as ``STEM.csv`` (every number) and ``STEM.tex`` (for ``booktabs``).
 
-    The LaTeX table has the columns of the paper's Table 1, or ``keys`` of them, and needs ``booktabs``.
+    The LaTeX table has the columns of the paper's Table 1, or ``keys`` of them.
     """
-    for suffix, text in ((".csv", csv_text(rows)), (".tex", latex_text(rows, keys))):
-        with atomic_path(folder / f"{stem}{suffix}") as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    write_text(folder / f"{stem}.csv", csv_text(rows))
+    write_text(folder / f"{stem}.tex", latex_text(rows, keys))
 
 
 def csv_text(rows: Sequence[Row]) -> str:
-    """Rows as CSV: for each number its mean, and its spread (standard deviation) where there were several runs."""
+    """Rows as CSV: the mean of each number, and its standard deviation if there were several runs."""
     keys = list(dict.fromkeys(key for row in rows for key in row if key not in ("name", "runs")))
     several = any(row.get("runs", 1) > 1 for row in rows)
     columns = [name for key in keys for name in ((key, f"{key}_std") if several else (key,))]
@@ -224,31 +232,9 @@ def csv_text(rows: Sequence[Row]) -> str:
 
 def latex_text(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
     """Rows as a LaTeX table."""
-    shown, texts_of_rows = row_cells(rows, keys or tuple(_PAPER))
-    lines = [
-        "% mPA, mP and mIoU at the automatic threshold, strict protocol",
-        rf"\begin{{tabular}}{{l{'c' * len(shown)}}}",
-        r"\toprule",
-        " & ".join(["Method", *map(heading, shown)]) + r" \\",
-        r"\midrule",
-    ]
-    for row, line in zip(rows, texts_of_rows):
-        texts = [text.replace("±", r"$\pm$") for text in line]
-        lines.append(" & ".join([_latex(str(row["name"])), *texts]) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def mean_and_spread(values: Any) -> tuple[float | None, float | None]:
-    """Mean and standard deviation (of a sample) of the numbers that are known; None where there are too few."""
-    known = _known(values)
-    if not known:
-        return None, None
-    return float(np.mean(known)), float(np.std(known, ddof=1)) if len(known) > 1 else None
-
-
-def _known(values: Any) -> list[float]:
-    listed = values if isinstance(values, (list, tuple)) else [values]
-    return [float(value) for value in listed if value is not None and math.isfinite(value)]
+    shown, texts = row_cells(rows, keys or tuple(_PAPER))
+    named = [(str(row["name"]), line) for row, line in zip(rows, texts)]
+    return latex_table([heading(key) for key in shown], named)
 
 
 def _cell(values: Any, digits: int) -> str:
@@ -259,29 +245,3 @@ def _cell(values: Any, digits: int) -> str:
         return "-" if mean is None else f"{mean:.0f} s"
     text = number(mean, digits)
     return text if spread is None else f"{text} ± {number(spread, digits)}"
-
-
-def _latex(text: str) -> str:
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    special |= {character: f"\\{character}" for character in "&%$#_{}"}
-    return "".join(special.get(character, character) for character in text)
-
-
-# Single values
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number with a fixed count of digits, "-" where it is not known."""
-    return "-" if value is None or value != value else f"{value:.{digits}f}"
-
-
-def size_text(count: int | None) -> str:
-    """A count of bytes in the largest fitting unit (powers of 1000)."""
-    if count is None:
-        return "-"
-    value, unit = float(count), "B"
-    for larger in ("KB", "MB", "GB"):
-        if value < 1000:
-            break
-        value, unit = value / 1000, larger
-    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
