@@ -159,7 +159,10 @@ class _Blend(torch.autograd.Function):
         )  # fmt: skip
         background = None
         if ctx.needs_input_grad[5]:
-            background = torch.einsum("hwc,hw->c", grad_image[..., :color_channels], 1 - alpha)
+            # NumPy sums on one thread: torch's order of addition depends on the number of threads.
+            factors = _array(grad_image[..., :color_channels]), _array(1 - alpha)
+            total = np.einsum("hwc,hw->c", *factors, dtype=np.float64)
+            background = torch.from_numpy(total.astype(np.float32))
         wanted = [g if ctx.needs_input_grad[i] else None for i, g in enumerate(outputs)]
         return (*wanted, background, None)
 
