@@ -133,8 +133,8 @@ def test_events_count_up_to_the_end(scene):
 
 def test_a_memory_budget_of_nothing_changes_nothing(scene, points):
     results = []
-    for memory in (0, 1 << 30):
-        trainer = Reconstructor(scene, dataclasses.replace(SHORT, image_memory=memory), points)
+    for memory in (0, 4 << 30):
+        trainer = Reconstructor(scene, SHORT, points, memory=memory)
         for _ in range(15):
             trainer.step()
         results.append(trainer.gaussians().means)

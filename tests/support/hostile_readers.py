@@ -429,7 +429,7 @@ def checkpoints() -> Reader:
     """A damaged checkpoint is told and left aside; then the training must stand at its very beginning."""
     from lexsplat.language.methods.trained_settings import TrainedConfig
     from lexsplat.language.methods.trainer import FieldTrainer
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
     from support.language_scene import make_scene
 
     scene = make_scene(per_ball=2, views=1, width=8, height=6)
@@ -476,7 +476,7 @@ def reconstruction_checkpoints() -> Reader:
     from lexsplat.captures import load_capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
     from support.tiny_capture import write_capture
 
     config = ReconstructionConfig(iterations=10, max_gaussians=5, sh_degree=1, exposure=True)
