@@ -190,7 +190,7 @@ def test_divergence_is_noticed(scene, points):
 
 def test_a_scene_without_points_or_training_views_is_refused(scene):
     nothing = InitialPoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "capture", "")
-    with pytest.raises(TrainingError, match="points to start from"):
+    with pytest.raises(TrainingError, match="initial points"):
         Reconstructor(scene, SHORT, nothing)
     with pytest.raises(TrainingError, match="training view"):
         Reconstructor(dataclasses.replace(scene, train_names=()), SHORT, nothing)
