@@ -163,8 +163,8 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
 
     values = torch.rand(count, channels, generator=generator)
     with torch.no_grad():
-        blend = measure(lambda: cpu_backend.blend(view.projected, pairs, values, None, None), repeats)
-        ours, _ = cpu_backend.blend(view.projected, pairs, values, None, None)
+        blend = measure(lambda: cpu_backend.blend(view.projection, pairs, values, None, None), repeats)
+        ours, _ = cpu_backend.blend(view.projection, pairs, values, None, None)
     gathered = values.numpy()[pairs.order]
     image, alpha = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
     lists = (pairs.ellipses, pairs.tile_offsets, pairs.members, gathered, pairs.tiles_x, image, alpha)

@@ -64,7 +64,7 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
     # Features are averaged: no other way to the language, nor how much is kept in memory, has a part in it.
     idle = ["--trained.no-use-smoothing", "--tuning.iterations", "9", "--averaged.memory-bytes", "999999"]
     idle += ["--lifted.top", "3", "--features.dino-stride", "9"]
-    idle += ["--features.random-crops", "7", "--reconstruction.image-memory", "999999", "--memory", "3GB"]
+    idle += ["--features.random-crops", "7", "--memory", "3GB"]
     assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, *idle]) == 0
     after = modified(copy)
     assert {name for name in before if after[name] != before[name]} <= {"scene.json", "cameras.json", ".lock"}

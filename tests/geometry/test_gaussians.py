@@ -95,7 +95,7 @@ def test_detach_ends_the_gradient_history_and_shares_the_values():
     [
         (np.zeros((0, 3)), "N > 0"),
         (np.zeros((4, 2)), r"\[N, 3\]"),
-        (np.full((4, 3), np.nan), "not finite"),
+        (np.full((4, 3), np.nan), "must be finite"),
     ],
 )
 def test_points_that_cannot_be_used_are_refused(points, message):

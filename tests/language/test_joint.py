@@ -13,7 +13,7 @@ from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.runtime.checkpoints import Checkpoint
+from lexsplat.runtime.training import Checkpoint
 
 GEOMETRY = ReconstructionConfig(iterations=120, sh_degree=1, densify_min_every=10, max_gaussians=3000)
 LANGUAGE = TrainedConfig(pixel_sample=256, smoothing_sample=64)

@@ -17,9 +17,9 @@ from lexsplat.language.code_maps import codes_at_pixels
 from lexsplat.language.methods.trained import train_field
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
-from lexsplat.runtime.checkpoints import Checkpoint
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.progress import Event
+from lexsplat.runtime.training import Checkpoint
 
 QUICK = TrainedConfig(
     iterations=80,

@@ -83,7 +83,6 @@ def test_steps_set_in_the_part_they_belong_to_are_taken():
 def test_fingerprints_hold_what_decides_a_result_and_nothing_else():
     config = BuildConfig()
     idle = [
-        replace(config, reconstruction=ReconstructionConfig(image_memory=9)),
         replace(config, features=FeatureConfig(random_crops=9)),
         replace(config, trained=TrainedConfig(iterations=9)),
         replace(config, tuning=TuningConfig(iterations=9)),

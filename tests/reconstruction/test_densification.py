@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from lexsplat.geometry.rotations import covariances
 from lexsplat.reconstruction.densification import (
+    DensityConfig,
     DensityControl,
     DensitySchedule,
-    covariances,
     density_schedule,
     relocate,
 )
@@ -61,8 +62,9 @@ def run(control: DensityControl, parameters: dict, optimizers: dict, steps: rang
 
 
 def new_control(strategy: str = "default", **options) -> DensityControl:
-    settings = {"extent": 1.0, "max_gaussians": 10_000, "seed": 3}
-    return DensityControl(strategy, SCHEDULE, **{**settings, **options})
+    seed = options.pop("seed", 3)
+    rules = {"strategy": strategy, "schedule": SCHEDULE, "extent": 1.0, "max_gaussians": 10_000, **options}
+    return DensityControl(DensityConfig(**rules), seed=seed)
 
 
 def assert_same(left: dict, right: dict) -> None:

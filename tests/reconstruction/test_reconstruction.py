@@ -133,8 +133,8 @@ def test_events_count_up_to_the_end(scene):
 
 def test_a_memory_budget_of_nothing_changes_nothing(scene, points):
     results = []
-    for memory in (0, 1 << 30):
-        trainer = Reconstructor(scene, dataclasses.replace(SHORT, image_memory=memory), points)
+    for memory in (0, 4 << 30):
+        trainer = Reconstructor(scene, SHORT, points, memory=memory)
         for _ in range(15):
             trainer.step()
         results.append(trainer.gaussians().means)
@@ -190,7 +190,7 @@ def test_divergence_is_noticed(scene, points):
 
 def test_a_scene_without_points_or_training_views_is_refused(scene):
     nothing = InitialPoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "capture", "")
-    with pytest.raises(TrainingError, match="points to start from"):
+    with pytest.raises(TrainingError, match="initial points"):
         Reconstructor(scene, SHORT, nothing)
     with pytest.raises(TrainingError, match="training view"):
         Reconstructor(dataclasses.replace(scene, train_names=()), SHORT, nothing)

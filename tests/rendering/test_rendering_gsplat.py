@@ -15,8 +15,7 @@ import torch
 from support import gsplat_kernels
 from support.rendering_reference import front_camera, random_gaussians
 
-from lexsplat import rendering
-from lexsplat.rendering import accumulate_codes, gsplat_backend, prepare, render
+from lexsplat.rendering import accumulate_codes, backends, gsplat_backend, prepare, render
 from lexsplat.runtime.errors import BackendError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -29,7 +28,7 @@ def on_gsplat(monkeypatch):
     gsplat_kernels.install(monkeypatch)
 
     def switch():
-        monkeypatch.setattr(rendering, "_module", lambda *_: gsplat_backend)
+        monkeypatch.setattr(backends, "backend_for", lambda _: gsplat_backend)
 
     return switch
 

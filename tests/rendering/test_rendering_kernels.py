@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numba
@@ -43,16 +44,20 @@ def test_projection_equals_gsplats_torch_twin(antialiased):
         opacities = opacities * compensations[0]
     ours = gaussians.map(lambda t: t.clone().requires_grad_())
     found = cpu_backend.project(ours, camera, 0.01)
-    drawn = found[4] > 0
+    drawn = found.radii > 0
     # Their box is for opacity 1, ours for the opacity there is: what we draw they draw, and hardly less.
     assert (radii[0].amin(-1) > 0)[drawn].all()
     assert drawn.float().mean() > 0.5
-    for mine, theirs in zip(found[:4], (means2d[0], conics[0], opacities, depths[0])):
+    for mine, theirs in zip(
+        (found.means2d, found.conics, found.opacities, found.depths),
+        (means2d[0], conics[0], opacities, depths[0]),
+    ):
         assert torch.allclose(mine[drawn].double(), theirs[drawn], rtol=2e-5, atol=2e-5)
 
     g = torch.Generator().manual_seed(0)
-    grads = [torch.randn(t.shape, generator=g) * drawn.reshape(-1, *[1] * (t.ndim - 1)) for t in found[:3]]
-    torch.autograd.backward(found[:3], grads)
+    outputs = (found.means2d, found.conics, found.opacities)
+    grads = [torch.randn(t.shape, generator=g) * drawn.reshape(-1, *[1] * (t.ndim - 1)) for t in outputs]
+    torch.autograd.backward(outputs, grads)
     torch.autograd.backward((means2d[0], conics[0], opacities), [t.double() for t in grads])
     for name in ("means", "quats", "log_scales", "opacity_logits"):
         mine, theirs = getattr(ours, name).grad.double(), leaves[name].grad
@@ -67,7 +72,8 @@ def test_what_is_not_drawn_could_not_be_seen():
     gaussians.means.mul_(2.5)
     leaves = {k: v.double() for k, v in gaussians.tensors().items()}
     projected = reference.project(leaves, camera, antialiased=True)
-    *_, radii, extents, _ = cpu_backend.project(gaussians, camera, 0.01)
+    found = cpu_backend.project(gaussians, camera, 0.01)
+    radii, extents = found.radii, found.extents
     hidden = (radii == 0) & (projected["depth"] > 0.01)
     assert int(hidden.sum()) > 50
     xs, ys = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(30) + 0.5, indexing="xy")
@@ -91,10 +97,9 @@ def test_colors_equal_gsplats_torch_twin(degree):
     direction = leaves["means"] - torch.from_numpy(camera.position)
     expected = (_spherical_harmonics(degree, direction, coefficients) + 0.5).clamp_min(0)
     ours = gaussians.map(lambda t: t.clone().requires_grad_())
-    projected = list(cpu_backend.project(ours, camera, 0.01))
-    projected[4] = torch.ones(300, dtype=torch.int32)  # colors of all, drawn or not
-    projected[6] = ours.means
-    found = cpu_backend.shade(ours, camera, tuple(projected), degree)
+    everything = torch.ones(300, dtype=torch.int32)  # colors of all, drawn or not
+    projection = replace(cpu_backend.project(ours, camera, 0.01), radii=everything, means=ours.means)
+    found = cpu_backend.shade(ours, camera, projection, degree)
     assert torch.allclose(found.double(), expected, atol=1e-5)
     grad = torch.randn(300, 3, generator=torch.Generator().manual_seed(1))
     found.backward(grad)
@@ -397,6 +402,7 @@ def test_where_nothing_can_be_written_kernels_go_to_a_temporary_folder(tmp_path,
 def test_a_far_turned_camera_keeps_depths_positive():
     camera = look_at(np.array([0.0, 0, 0]), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]), 64, 48, 1.2)
     gaussians = random_gaussians(300, 4, scale=0.05)
-    _, _, _, depths, radii, *_ = cpu_backend.project(gaussians, camera, 0.2)
+    found = cpu_backend.project(gaussians, camera, 0.2)
+    depths, radii = found.depths, found.radii
     assert (depths[radii > 0] >= 0.2).all()
     assert (radii[(gaussians.means[:, 0] < 0.2 - 1e-5)] == 0).all()

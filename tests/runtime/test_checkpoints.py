@@ -1,4 +1,4 @@
-"""Checkpoints: a training killed anywhere goes on as if never stopped; nothing broken is ever kept."""
+"""The training loop and its checkpoints: killed trainings continue bit for bit, invalid states are never saved."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import torch
 from lexsplat.codebook import CodebookConfig
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.runtime.checkpoints import Checkpoint
 from lexsplat.runtime.errors import TrainingError
+from lexsplat.runtime.training import Checkpoint, run_training
 
 
 @pytest.fixture(autouse=True)
-def ctrl_c_is_heard():
-    """Tests started in the background of a shell inherit a Ctrl-C that is ignored."""
+def ctrl_c_raises():
+    """Tests started in the background of a shell inherit an ignored Ctrl-C."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -25,8 +25,25 @@ def ctrl_c_is_heard():
 class Counter:
     """The smallest training: counts."""
 
+    parameter_prefixes = ("parameters/",)
+    device, total_steps, rate_factor = torch.device("cpu"), 25, 1.0
+
     def __init__(self) -> None:
         self.value = torch.zeros(3)
+
+    @property
+    def steps_done(self):
+        return int(self.value[0])
+
+    @property
+    def metrics(self):
+        return {"value": float(self.value[0])}
+
+    def step(self):
+        self.value += 1
+
+    def find_invalid(self):
+        return ""
 
     def state_dict(self):
         return {"parameters/value": self.value.clone(), "count": torch.tensor(1)}
@@ -45,9 +62,54 @@ def test_a_saved_state_comes_back_exactly(tmp_path):
     assert torch.equal(first.value, second.value)
 
 
-def test_the_time_of_a_stopped_training_counts(tmp_path, monkeypatch):
+def test_the_loop_sends_events_at_multiples_and_at_the_end():
+    events = []
+    run_training(Counter(), stage="count", name="counter", every=10, listener=events.append)
+    assert [(event.stage, event.done, event.total) for event in events] == [
+        ("count", 10, 25),
+        ("count", 20, 25),
+        ("count", 25, 25),
+    ]
+    assert [event.metrics for event in events] == [{"value": 10.0}, {"value": 20.0}, {"value": 25.0}]
+
+
+def test_an_interrupted_loop_continues_where_it_stopped(tmp_path):
+    class Interrupted(Counter):
+        def step(self):
+            super().step()
+            if self.steps_done == 7:
+                signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training(
+            Interrupted(), stage="s", name="n", every=10, checkpoint=Checkpoint(tmp_path / "state", "inputs")
+        )
+    counter, steps = Counter(), []
+    counter.step = lambda: (steps.append(1), Counter.step(counter))
+    run_training(counter, stage="s", name="n", every=10, checkpoint=Checkpoint(tmp_path / "state", "inputs"))
+    assert counter.steps_done == 25
+    assert len(steps) == 18
+
+
+def test_ctrl_c_during_the_last_event_is_not_lost(tmp_path):
+    def press_at_the_end(event):
+        if event.done == event.total:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training(
+            Counter(),
+            stage="s",
+            name="n",
+            every=10,
+            checkpoint=Checkpoint(tmp_path / "state", "inputs"),
+            listener=press_at_the_end,
+        )
+
+
+def test_the_time_of_earlier_runs_counts(tmp_path, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("lexsplat.runtime.checkpoints.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("lexsplat.runtime.training.time.perf_counter", lambda: now[0])
     path = tmp_path / "state"
     for begun, expected in ((100.0, 0.0), (500.0, 7.0), (900.0, 14.0)):
         now[0] = begun
@@ -59,13 +121,13 @@ def test_the_time_of_a_stopped_training_counts(tmp_path, monkeypatch):
     assert Checkpoint(path, "other inputs").seconds_before == 0
 
 
-def test_the_state_of_other_inputs_is_not_taken_up(tmp_path):
+def test_the_state_of_other_inputs_is_ignored(tmp_path):
     Checkpoint(tmp_path / "state", "inputs").save(Counter())
     assert not Checkpoint(tmp_path / "state", "other inputs").resume(Counter())
 
 
 @pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b"\xff" * len(b)])
-def test_a_damaged_state_is_told_and_not_used(tmp_path, caplog, damage):
+def test_a_damaged_state_is_reported_and_ignored(tmp_path, caplog, damage):
     path = tmp_path / "state"
     Checkpoint(path, "inputs").save(Counter())
     path.write_bytes(damage(path.read_bytes()))
@@ -73,7 +135,7 @@ def test_a_damaged_state_is_told_and_not_used(tmp_path, caplog, damage):
     assert str(path) in caplog.text
 
 
-def test_nan_never_reaches_the_file_and_the_last_good_state_stays(tmp_path):
+def test_nan_is_never_saved_and_the_last_good_state_stays(tmp_path):
     checkpoint, trainer = Checkpoint(tmp_path / "state", "inputs"), Counter()
     trainer.value = torch.ones(3)
     checkpoint.save(trainer)
@@ -84,9 +146,9 @@ def test_nan_never_reaches_the_file_and_the_last_good_state_stays(tmp_path):
     assert torch.equal(trainer.value, torch.ones(3))
 
 
-def test_ctrl_c_waits_for_the_end_of_the_step_and_saves(tmp_path):
+def test_ctrl_c_takes_effect_after_the_step_and_saves(tmp_path):
     checkpoint, trainer = Checkpoint(tmp_path / "state", "inputs", every=1e9), Counter()
-    with checkpoint.guarding():
+    with checkpoint.deferring_interrupts():
         signal.raise_signal(signal.SIGINT)
         trainer.value += 5  # the rest of the step still happens
         with pytest.raises(KeyboardInterrupt):
@@ -96,16 +158,16 @@ def test_ctrl_c_waits_for_the_end_of_the_step_and_saves(tmp_path):
     assert torch.equal(resumed.value, torch.full((3,), 5.0))
 
 
-def test_a_second_ctrl_c_stops_at_once(tmp_path):
+def test_a_second_ctrl_c_takes_effect_immediately(tmp_path):
     checkpoint = Checkpoint(tmp_path / "state", "inputs")
-    with checkpoint.guarding():
+    with checkpoint.deferring_interrupts():
         signal.raise_signal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_states_are_saved_no_more_often_than_asked(tmp_path):
+def test_states_are_saved_no_more_often_than_requested(tmp_path):
     checkpoint = Checkpoint(tmp_path / "state", "inputs", every=1e9)
     checkpoint.after_step(Counter())
     assert not checkpoint.path.exists()

@@ -1,4 +1,4 @@
-"""Trainings that diverge: noticed, told, taken back; and captures in which nothing can be seen give finite scenes."""
+"""Divergence is detected, reported and undone; captures that show nothing give finite scenes."""
 
 from __future__ import annotations
 
@@ -19,42 +19,46 @@ from lexsplat.language.methods.trained import train_field
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.runtime.divergence import ATTEMPTS, Guard
 from lexsplat.runtime.errors import TrainingError
+from lexsplat.runtime.training import ATTEMPTS, KEEP_EVERY, DivergenceGuard, run_training
 
 ITERATIONS = 60
 
 
 class Walk:
-    """The smallest training: adds its rate to a number, and may fall over at some values."""
+    """The smallest training: adds its rate to a number, and gets an invalid number at some value."""
+
+    parameter_prefixes = ("value",)
+    device, total_steps, metrics = torch.device("cpu"), 30, {"count": 1.0}
 
     def __init__(self, falls_at: float = float("inf"), wrong: float = float("nan")) -> None:
-        self.value, self.rate_factor, self.steps = torch.zeros(2), 1.0, 0
+        self.value, self.rate_factor, self.steps_done = torch.zeros(2), 1.0, 0
         self.falls_at, self.wrong = falls_at, wrong
 
     def step(self) -> None:
-        self.steps += 1
+        self.steps_done += 1
         self.value = self.value + self.rate_factor
         if self.rate_factor > 0.25 and float(self.value[0]) > self.falls_at:
             self.value[1] = self.wrong
 
-    def damage(self) -> str:
+    def find_invalid(self) -> str:
         return "" if bool(torch.isfinite(self.value).all()) else "NaN or Inf in value"
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        return {"value": self.value.clone(), "steps": torch.tensor(self.steps)}
+        return {"value": self.value.clone(), "steps": torch.tensor(self.steps_done)}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        self.value, self.steps = state["value"].clone(), int(state["steps"])
+        self.value, self.steps_done = state["value"].clone(), int(state["steps"])
 
 
-def run(walk: Walk, steps: int = 30, every: int = 5) -> Walk:
-    guard = Guard(walk, "walk", every=every)
-    while walk.steps < steps:
-        with guard:
-            walk.step()
-            guard.after_step(walk.steps == steps)
+def run(walk: Walk) -> Walk:
+    run_training(walk, stage="walk", name="walk", every=10)
     return walk
+
+
+@pytest.fixture(autouse=True)
+def copies_every_five_steps(monkeypatch):
+    monkeypatch.setitem(KEEP_EVERY, "cpu", 5)
 
 
 def test_a_healthy_training_takes_every_step_once(caplog):
@@ -63,28 +67,29 @@ def test_a_healthy_training_takes_every_step_once(caplog):
     assert not caplog.records
 
 
-def test_what_is_not_finite_is_taken_back_with_half_the_rates_and_told_in_one_line(caplog):
+def test_an_invalid_parameter_restores_the_last_good_state_halves_the_rates_and_logs_one_line(caplog):
     walk = run(Walk(falls_at=12.0))
     # Steps of 1 as far as 10, the last good state; from there steps of 1/2, from 12 (step 14) of 1/4, as far as 30.
     assert walk.rate_factor == 0.25
     assert torch.isfinite(walk.value).all()
-    assert walk.steps == 30
-    told = [record.getMessage() for record in caplog.records]
-    assert len(told) == 2
-    assert all("walk diverged (NaN or Inf in value)" in line and "\n" not in line for line in told)
-    assert "halved to 0.5" in told[0]
-    assert "halved to 0.25" in told[1]
+    assert walk.steps_done == 30
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == 2
+    assert all("walk diverged (NaN or Inf in value)" in line and "\n" not in line for line in lines)
+    assert "learning rates now 0.5 " in lines[0]
+    assert "learning rates now 0.25 " in lines[1]
 
 
-def test_what_comes_out_at_the_end_is_looked_at():
-    walk = run(Walk(falls_at=28.0), every=1000)
+def test_the_result_is_always_checked(monkeypatch):
+    monkeypatch.setitem(KEEP_EVERY, "cpu", 1000)
+    walk = run(Walk(falls_at=28.0))
     assert torch.isfinite(walk.value).all()
 
 
-def test_a_training_that_always_diverges_ends_with_what_to_do():
+def test_a_training_that_always_diverges_fails_with_a_remedy():
     class Hopeless(Walk):
         def step(self) -> None:
-            self.steps += 1
+            self.steps_done += 1
             self.value[0] = float("inf")
 
     walk = Hopeless()
@@ -93,8 +98,8 @@ def test_a_training_that_always_diverges_ends_with_what_to_do():
     assert walk.rate_factor == 0.5**ATTEMPTS
 
 
-def test_other_errors_are_not_swallowed():
-    guard = Guard(Walk(), "walk")
+def test_other_errors_pass_through():
+    guard = DivergenceGuard(Walk(), "walk")
     with pytest.raises(KeyError), guard:
         raise KeyError("no view")
     with pytest.raises(KeyboardInterrupt), guard:
@@ -112,7 +117,7 @@ def paint(folder, color_of) -> None:
 
 
 def capture(tmp_path, name: str):
-    """A capture in which there is nothing to learn, or too much."""
+    """A capture without information, or with contradictory photos."""
     folder = write_capture(tmp_path / name, views=6, width=48, height=36)
     shutil.rmtree(folder / "segmentations")
     if name == "black":
@@ -139,29 +144,29 @@ def reconstructed(scene, config=CONFIG):
 
 
 @pytest.mark.parametrize("name", ["black", "white", "constant", "a color a view", "one point"])
-def test_captures_that_show_nothing_give_finite_gaussians(tmp_path, name):
+def test_captures_without_content_give_finite_gaussians(tmp_path, name):
     gaussians = reconstructed(capture(tmp_path, name)).gaussians()
     assert len(gaussians) > 0
-    assert not gaussians.damage()
+    assert not gaussians.find_invalid()
 
 
 @pytest.mark.parametrize("times", [10.0, 1000.0])
-def test_learning_rates_that_are_too_high_end_in_finite_numbers_or_one_line(tmp_path, times, caplog):
+def test_excessive_learning_rates_give_finite_numbers_or_one_error(tmp_path, times, caplog):
     rates = ("means_rate", "scales_rate", "quats_rate", "opacities_rate", "sh0_rate", "shN_rate")
     config = replace(CONFIG, **{name: getattr(CONFIG, name) * times for name in rates})
-    trainer, told = None, ""
+    trainer, message = None, ""
     try:
         trainer = reconstructed(capture(tmp_path, "sound"), config)
     except TrainingError as error:
-        told = str(error)
+        message = str(error)
     if trainer is None:
-        assert "lower the learning rates" in told
+        assert "lower the learning rates" in message
     else:
-        assert not trainer.damage()
+        assert not trainer.find_invalid()
     assert all("diverged" in record.getMessage() for record in caplog.records)
 
 
-def test_a_reconstruction_that_meets_nan_goes_back_and_ends_well(tmp_path, caplog):
+def test_a_reconstruction_recovers_from_nan(tmp_path, caplog):
     scene = capture(tmp_path, "sound")
     trainer = Reconstructor(scene, CONFIG, initial_points(scene))
     healthy, steps = trainer.step, []
@@ -178,7 +183,7 @@ def test_a_reconstruction_that_meets_nan_goes_back_and_ends_well(tmp_path, caplo
     with caplog.at_level(logging.WARNING, "lexsplat"):
         trainer.run()
     assert trainer.done
-    assert not trainer.damage()
+    assert not trainer.find_invalid()
     assert trainer.rate_factor == 0.5
     assert [r.getMessage().split(" (")[0] for r in caplog.records] == ["reconstruction diverged"]
     rates = [optimizer.param_groups[0]["lr"] for optimizer in trainer._optimizers.values()]
@@ -186,7 +191,7 @@ def test_a_reconstruction_that_meets_nan_goes_back_and_ends_well(tmp_path, caplo
     assert rates == pytest.approx([rate / 2 for rate in full])
 
 
-def test_pictures_much_worse_than_nothing_are_divergence(tmp_path):
+def test_renderings_much_worse_than_the_background_are_divergence(tmp_path):
     scene = capture(tmp_path, "sound")
     trainer = Reconstructor(scene, CONFIG, initial_points(scene))
     with torch.no_grad():
@@ -206,26 +211,26 @@ def test_the_guard_does_not_change_a_healthy_reconstruction(tmp_path):
 
 
 @pytest.mark.parametrize("times", [1.0, 10.0, 1e4])
-def test_language_trained_with_any_rates_is_finite_or_told(times, caplog):
+def test_language_trained_with_any_rates_is_finite_or_fails_with_a_remedy(times, caplog):
     scene = make_scene(per_ball=10, views=4)
     config = TrainedConfig(iterations=60, pixel_sample=128, smoothing_sample=32, clip_decoder_grad=None)
     names = ("semantics_lr", "uncertainty_lr", "decoder_lr", "smoothing_lr")
     config = replace(config, **{name: getattr(config, name) * times for name in names})
-    field, told = None, ""
+    field, message = None, ""
     try:
         field = train_field(scene.gaussians, scene.cameras, scene.code_maps, scene.codebook, config)
     except TrainingError as error:
-        told = str(error)
+        message = str(error)
     if field is None:
         assert times > 10
-        assert "lower the learning rates" in told
+        assert "lower the learning rates" in message
     else:
         assert all(bool(torch.isfinite(t).all()) for t in field.tensors().values() if t.is_floating_point())
     if times == 1.0:
         assert not caplog.records
 
 
-def test_a_language_training_that_meets_nan_goes_back(caplog):
+def test_a_language_training_recovers_from_nan(caplog):
     scene = make_scene(per_ball=10, views=4)
     config = TrainedConfig(iterations=60, pixel_sample=128, smoothing_sample=32)
     trainer = FieldTrainer(scene.gaussians, scene.codebook, config)

@@ -110,13 +110,11 @@ def test_memory_bounds_the_store_of_every_stage_and_no_setting_that_decides_a_re
     config = BuildConfig(memory="400MB")
     bounded = config.within_memory()
     quarter = 100 * MEGABYTE
-    assert bounded.reconstruction.image_memory == quarter
     assert bounded.trained.memory_bytes == quarter
     assert bounded.lifted.memory_bytes == quarter
     assert bounded.averaged.memory_bytes == quarter
     again = replace(
         bounded,
-        reconstruction=config.reconstruction,
         trained=config.trained,
         lifted=config.lifted,
         averaged=config.averaged,

@@ -10,9 +10,9 @@ from support.splats import make
 
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.rotations import multiply_quaternions, quaternion_from_matrix
 from lexsplat.rendering import render
-from lexsplat.rendering.posing import multiplied
-from lexsplat.scenes.transforms import moved, quaternion_of, rotated_harmonics
+from lexsplat.scenes.transforms import moved, rotated_harmonics
 
 
 def cloud(degree: int = 3, count: int = 80) -> Gaussians:
@@ -54,7 +54,7 @@ def test_turning_twice_is_turning_by_the_product(seed):
 @settings(max_examples=20, deadline=None)
 def test_quaternions_multiply_as_scipy_says(seed):
     a, b = (Rotation.random(random_state=seed + k) for k in (0, 5000))
-    product = multiplied(*(torch.from_numpy(quaternion_of(r.as_matrix())) for r in (a, b)))
+    product = multiply_quaternions(*(torch.from_numpy(quaternion_from_matrix(r.as_matrix())) for r in (a, b)))
     expected = (a * b).as_quat()[[3, 0, 1, 2]]
     assert abs(float(product @ torch.from_numpy(expected))) == pytest.approx(1)
 

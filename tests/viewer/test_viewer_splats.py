@@ -9,7 +9,8 @@ from hypothesis.extra import numpy as npst
 from scipy.spatial.transform import Rotation
 
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.viewer.splats import SplatBlocks, covariances_of, level_of_detail, morton_order
+from lexsplat.geometry.rotations import covariances
+from lexsplat.viewer.splats import SplatBlocks, level_of_detail, morton_order
 
 
 def cloud(count: int, seed: int = 0) -> Gaussians:
@@ -26,7 +27,7 @@ def cloud(count: int, seed: int = 0) -> Gaussians:
 
 def test_covariances_are_rotated_squares_of_the_scales():
     gaussians = cloud(50)
-    found = covariances_of(gaussians)
+    found = covariances(gaussians.quats, gaussians.scales).numpy()
     rotations = Rotation.from_quat(gaussians.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
     for number in range(50):
         squares = np.diag(np.exp(2 * gaussians.log_scales[number].double().numpy()))
@@ -44,7 +45,7 @@ def test_everything_is_drawn_once_within_the_budget():
     for block in splats.blocks:
         assert np.allclose(block.centers / splats.unit, gaussians.means.numpy()[block.index], atol=1e-5)
         assert np.allclose(block.opacities[:, 0], gaussians.opacities.numpy()[block.index])
-        expected = covariances_of(gaussians)[block.index]
+        expected = covariances(gaussians.quats, gaussians.scales).numpy()[block.index]
         assert np.allclose(block.covariances / splats.unit**2, expected, rtol=1e-4, atol=1e-9)
 
 

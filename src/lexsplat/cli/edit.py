@@ -114,7 +114,7 @@ class Edit:
         print(f"{len(editor.scene.gaussians):,} Gaussians, {len(editor.undone)} steps undone")
 
     def _change(self, editor: Editor) -> None:
-        from lexsplat.geometry.boxes import rotation_about
+        from lexsplat.geometry.rotations import rotation_about
         from lexsplat.scenes.editing import Motion
 
         chosen = editor.scene.find(self.select or "", self.view, threshold=self.threshold)

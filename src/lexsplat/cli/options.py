@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.runtime.device import check_seed
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
 
+# tyro offers --iterations for this one; the settings of the reconstruction do not depend on tyro.
+ReconstructionConfig.__annotations__["iterations"] = tyro.conf.Suppress[int]
 Settings = Annotated[BuildConfig, tyro.conf.arg(name="")]
 Device = Literal["auto", "cpu", "cuda"]
 PromptListName = Literal["paper", "released"]

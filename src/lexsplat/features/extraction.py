@@ -235,11 +235,11 @@ class _Extraction:
                 try:
                     running = workers
                     while running:
-                        name = self._finished.get()
-                        if name is None:
+                        finished = self._finished.get()
+                        if finished is None:
                             running -= 1
                         else:
-                            yield name
+                            yield finished
                 finally:
                     self._stop.set()  # also when the consumer stops early or is interrupted
             for future in futures:

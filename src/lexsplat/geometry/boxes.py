@@ -161,14 +161,6 @@ def box_iou(first: Box, second: Box) -> float:
     return min(1.0, shared / (first.volume + second.volume - shared))
 
 
-def rotation_about(axis: NDArray, degrees: float) -> NDArray[np.float64]:
-    """The rotation ``[3, 3]`` by an angle about an axis ``[3]``, anticlockwise for who looks against the axis."""
-    from scipy.spatial.transform import Rotation
-
-    unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-    return np.asarray(Rotation.from_rotvec(unit * np.radians(degrees)).as_matrix(), dtype=np.float64)
-
-
 def _turn(angle: float) -> NDArray[np.float64]:
     return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 

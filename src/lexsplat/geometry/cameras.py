@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.geometry.rotations import looking_along
+
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Flips the y and z axes of the camera: OpenGL looks along -z with y up, OpenCV along +z with y down."""
 
@@ -93,11 +95,7 @@ def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height:
         height: Image height in pixels.
         fov_y: Vertical field of view in radians.
     """
-    forward = np.asarray(target, float) - np.asarray(position, float)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, np.asarray(up, float))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
+    rotation = looking_along(np.asarray(target, float) - np.asarray(position, float), up)
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
     viewmat[:3, 3] = -rotation @ np.asarray(position, float)

@@ -1,8 +1,7 @@
-"""The 3D Gaussians: stored (unconstrained) and activated forms, and how they start from points.
+"""The 3D Gaussians: stored (unconstrained) and activated values, and their initialization from points.
 
-Dimension letters used across the project: N Gaussians, K codes of the codebook (the paper calls this number
-    N),
-S = 8 semantic channels, D feature dimensions, H and W image size, C rendered channels.
+Dimension letters used across the project: N Gaussians, K codes of the codebook (N in the paper), S = 8 semantic
+channels, D feature dimensions, H and W image size, C rendered channels.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 LARGEST = 1e12
-"""Numbers of Gaussians beyond this are damage (see `Gaussians.damage`)."""
+"""Upper limit of the magnitude of valid numbers (see `Gaussians.find_invalid`)."""
 
 
 @dataclass
@@ -35,7 +34,7 @@ class Gaussians:
         opacity_logits: Inverse sigmoid of the opacities ``[N]``.
         sh0: Constant color coefficient ``[N, 1, 3]``.
         shN: Higher spherical-harmonic coefficients ``[N, (degree + 1)^2 - 1, 3]``.
-        antialiased: Whether they were trained with the mip filter and must be rendered with it.
+        antialiased: Whether they were trained with the mip filter and need it for rendering.
     """
 
     means: Tensor
@@ -67,12 +66,12 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """Device of the tensors."""
         return self.means.device
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree of spherical harmonics that is stored."""
+        """Highest stored degree of spherical harmonics."""
         return round((self.shN.shape[1] + 1) ** 0.5) - 1
 
     @property
@@ -99,13 +98,13 @@ class Gaussians:
         return self.map(lambda tensor: tensor.to(device))
 
     def detach(self) -> Gaussians:
-        """The same values without their gradient history."""
+        """The same values without gradient history."""
         return self.map(lambda tensor: tensor.detach())
 
-    def damage(self) -> str:
-        """What makes these no Gaussians that can be drawn, such as "NaN or Inf in means"; nothing where all is well.
+    def find_invalid(self) -> str:
+        """The first defect that prevents rendering, such as "NaN or Inf in means"; empty if there is none.
 
-        Finite is not enough: beyond `LARGEST` squares and sums overflow in float32, and a picture gets NaN.
+        Finite numbers can be invalid too: beyond `LARGEST`, squares and sums overflow in float32 and images get NaN.
         """
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
@@ -121,11 +120,11 @@ class Gaussians:
             values = getattr(self, name)
             low = -math.inf if name == "log_scales" else -limit
             if values.numel() and not bool(((values <= limit) & (values >= low)).all()):
-                return f"absurd numbers in {name}"
+                return f"numbers out of range in {name}"
         return ""
 
     def select(self, index: Tensor) -> Gaussians:
-        """The Gaussians named by a boolean mask or an index tensor ``[M]``."""
+        """The Gaussians selected by a boolean mask ``[N]`` or an index tensor ``[M]``."""
         return self.map(lambda tensor: tensor[index])
 
 
@@ -138,25 +137,25 @@ def gaussians_from_points(
     antialiased: bool = False,
     device: torch.device | str = "cpu",
 ) -> Gaussians:
-    """One round Gaussian per point, as large as the mean distance to its three nearest neighbors (3DGS).
+    """One isotropic Gaussian per point; its scale is the mean distance to the three nearest neighbors (3DGS).
 
     Args:
         points: Positions ``[N, 3]``, world units.
         colors: RGB ``[N, 3]`` in 0..1.
-        sh_degree: Degree up to which coefficients are stored; all but the constant start at zero.
+        sh_degree: Highest stored degree of spherical harmonics; all coefficients but the constant start at zero.
         opacity: Initial opacity in 0..1.
         antialiased: See `Gaussians`.
-        device: Where the tensors go.
+        device: Device of the result.
 
     Raises:
-        ValueError: If there are no points, a coordinate is not finite, colors do not match, or the opacity
-            is not between 0 and 1.
+        ValueError: If there are no points, a coordinate is not finite, the shape of the colors differs, or the
+            opacity is not between 0 and 1.
     """
     points = np.asarray(points, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"points must be [N, 3] with N > 0, got {list(points.shape)}")
     if not np.isfinite(points).all():
-        raise ValueError("points have a coordinate that is not finite")
+        raise ValueError("points must be finite, got NaN or infinity")
     if np.shape(colors) != points.shape:
         raise ValueError(f"colors must be {list(points.shape)}, got {list(np.shape(colors))}")
     if not 0 < opacity < 1:
@@ -175,7 +174,7 @@ def gaussians_from_points(
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     return Gaussians(
-        means=torch.from_numpy(points.copy()),  # trained in place: must not be the caller's memory
+        means=torch.from_numpy(points.copy()),  # a copy, because training is in place
         quats=quats,
         log_scales=log_scales,
         opacity_logits=torch.full((count,), float(np.log(opacity / (1 - opacity)))),

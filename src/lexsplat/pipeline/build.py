@@ -43,13 +43,13 @@ from lexsplat.pipeline.provenance import model_identity, write_provenance
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.rendering import render
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.checkpoints import Checkpoint
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.training import Checkpoint
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.previous import drop_previous
@@ -218,7 +218,7 @@ class _Builder:
     def _reconstruct(self) -> dict[str, Any]:
         gaussians = reconstruct(
             self.scene,
-            self.bounded.reconstruction,
+            self.config.reconstruction,
             device=self.device,
             seed=self.config.seed,
             cache_dir=self.folder.root / "checkpoints" / "points",
@@ -238,12 +238,10 @@ class _Builder:
         )
         check_gaussians(config.reconstruction, self.device, memory)
         reconstructor = Reconstructor(
-            scene, config.reconstruction, points, device=self.device, seed=config.seed
+            scene, config.reconstruction, points, device=self.device, seed=config.seed, memory=memory
         )
         cameras, code_maps, codebook = self._lessons()
         trainer = JointTrainer(reconstructor, cameras, code_maps, codebook, config.trained, seed=config.seed)
-        if self.checkpoint is not None:
-            self.checkpoint.resume(trainer)
         trainer.run(self.listener, self.checkpoint)
         gaussians, field = trainer.result()
         self.folder.write_gaussians(gaussians)

@@ -125,12 +125,10 @@ class BuildConfig:
         What does not fit is read or computed again when it is needed: results do not depend on the bound.
         """
         whole = parse_bytes(self.memory)
-        photos = min(self.reconstruction.image_memory, whole // 4)
         projections = min(self.trained.memory_bytes, whole // 4)
         histogram = max(1, min(self.lifted.memory_bytes, whole // 4))
         return replace(
             self,
-            reconstruction=replace(self.reconstruction, image_memory=photos),
             trained=replace(self.trained, memory_bytes=projections),
             averaged=replace(self.averaged, memory_bytes=max(1, min(self.averaged.memory_bytes, whole // 4))),
             lifted=replace(self.lifted, memory_bytes=histogram),
@@ -142,7 +140,6 @@ class BuildConfig:
         How much is kept in memory, the ways to the language that are not taken, the crops of the other mode.
         """
         kept = {
-            "reconstruction": {"image_memory": ReconstructionConfig.image_memory},
             "trained": {"memory_bytes": TrainedConfig.memory_bytes},
             "averaged": {"memory_bytes": AveragedConfig.memory_bytes},
             "lifted": {"memory_bytes": LiftedConfig.memory_bytes},

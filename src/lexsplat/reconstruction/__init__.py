@@ -1,5 +1,4 @@
-"""Reconstruction (section 3.1): 3D Gaussians from photos with cameras, by gradient descent on the
-photometric loss."""
+"""Reconstruction (section 3.1): 3D Gaussians from photos with cameras, trained on the photometric loss."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from lexsplat.runtime.progress import Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
 
 __all__ = [
     "EVENT_EVERY",
@@ -29,8 +28,8 @@ __all__ = [
 ]
 
 
-def reconstruct(
-    scene: Capture,
+def reconstruct(  # eight parameters: two inputs, and what every stage takes
+    capture: Capture,
     config: ReconstructionConfig,
     *,
     device: torch.device | str = "cpu",
@@ -40,40 +39,38 @@ def reconstruct(
     checkpoint: Checkpoint | None = None,
     listener: Listener = silent,
 ) -> Gaussians:
-    """Train Gaussians on the training views of a scene.
+    """Train Gaussians on the training views of a capture.
 
     Args:
-        scene: Views, split, and the points to start from; where it has none they are triangulated.
+        capture: Views, split, and initial points; missing points are triangulated.
         config: Settings.
         device: Where to train.
-        seed: Of the order of views, of density control and of what replaces missing points.
-        cache_dir: Where triangulated points are kept for the next call; None keeps nothing.
-        memory: Bytes of host memory that the triangulation, and then the Gaussians, may take.
-        checkpoint: Where the training is saved on the way, and goes on from.
-        listener: Hears an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
-            views) and "gaussians".
+        seed: Seed of the view order, of density control and of the points that replace missing ones.
+        cache_dir: Folder where triangulated points are kept for the next call; None keeps nothing.
+        memory: Budget of host memory in bytes, for the triangulation and then for Gaussians and photos.
+        checkpoint: Where the training is saved on the way, and from which it resumes.
+        listener: Receives an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
+            views, dB) and "gaussians" (their number).
 
     Raises:
-        TrainingError: If there is nothing to train on or the optimization diverges.
+        TrainingError: If there is nothing to train on, or the training diverges.
         CaptureError: If a photo cannot be read.
-        MemoryBudgetError: If the Gaussians, or the photos while they are triangulated, do not fit into ``memory``.
+        MemoryBudgetError: If the Gaussians, or the photos during triangulation, do not fit into ``memory``.
     """
     from lexsplat.captures.sfm.triangulation import initial_points
 
     check_gaussians(config, device, memory)
-    points = initial_points(scene, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
-    trainer = Reconstructor(scene, config, points, device=device, seed=seed)
-    if checkpoint is not None:
-        checkpoint.resume(trainer)
+    points = initial_points(capture, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
+    trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)
     return trainer.gaussians()
 
 
 def check_gaussians(config: ReconstructionConfig, device: torch.device | str, memory: int) -> None:
-    """Refuse to train more Gaussians on the host than half of the budget holds: the rest is for photos.
+    """Refuse a cap on the Gaussians that needs more than half of the host memory; the other half is for photos.
 
     Raises:
-        MemoryBudgetError: With the number that it holds.
+        MemoryBudgetError: With the number of Gaussians that fits.
     """
     cap = config.cap(torch.device(device))
     if torch.device(device).type != "cpu":

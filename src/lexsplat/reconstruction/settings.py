@@ -1,5 +1,8 @@
-"""Settings of the reconstruction. Learning rates, schedules and density control are those of 3DGS; every step
-number refers to a training of 30,000 iterations and is stretched to the number that is run."""
+"""Settings of the reconstruction.
+
+Learning rates, schedules and density control are those of 3DGS. Every step number refers to a training of 30,000
+iterations and is scaled to the actual number.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-import tyro
 
 from lexsplat.reconstruction.densification import REFERENCE_ITERATIONS
 
 LONG_TRAINING = 15_000
-"""From here on opacities are reset and all iterations run at full resolution, unless a setting says otherwise."""
+"""Trainings of this length reset opacities and run entirely at full resolution, unless a setting overrides it."""
 
 
 @dataclass(frozen=True)
@@ -20,29 +22,28 @@ class ReconstructionConfig:
     """Settings of the reconstruction; numbers of steps refer to a training of 30,000.
 
     Args:
-        iterations: Optimization steps, one view each; on the command line ``--iterations`` sets it.
+        iterations: Optimization steps, one view each; the command line sets it with ``--iterations``.
         ssim_weight: Weight of 1 - SSIM against L1, in 0..1.
         sh_degree: Highest degree of spherical harmonics, 0..3 (4 where the backend can).
-        sh_degree_every: Steps after which the next degree joins.
+        sh_degree_every: Steps after which the next degree is added.
         strategy: Density control: "default" (3DGS) or "mcmc".
-        max_gaussians: Never more than this many; None is 3,000,000 on CUDA and 40,000 on a CPU.
+        max_gaussians: Upper limit of the number of Gaussians; None is 3,000,000 on CUDA and 40,000 on a CPU.
         densify_every: Steps between two rounds of density control.
-        densify_min_every: Rounds of "default" are never closer than this many actual steps.
+        densify_min_every: Lower limit of the actual steps between two rounds of "default".
         grow_gradient: Mean gradient of projected centers above which "default" adds Gaussians.
-        min_opacity: Fainter Gaussians are removed ("default") or moved ("mcmc").
-        reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None does so in trainings of at
-            least 15,000, which have the time to recover.
+        min_opacity: Gaussians below this opacity are removed ("default") or moved ("mcmc").
+        reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None enables it from 15,000
+            iterations on, where the training has time to recover.
         noise: Strength of the noise of "mcmc".
         opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
-        scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as
-            above.
+        scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as above.
         antialiased: Train and render with the mip filter.
-        initial_opacity: Opacity of the first Gaussians.
-        warm_up: Share of the iterations that run at half resolution, at the start; None is 0.3 in trainings
+        initial_opacity: Opacity of the initial Gaussians.
+        warm_up: Share of the iterations, at the start, that run at half resolution; None is 0.3 in trainings
             shorter than 15,000, else 0.
         exposure: Fit an affine color change per training photo, for captures whose exposure varies.
         rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
-            30,000 / iterations, between 1 and 3: a short training takes longer strides.
+            30,000 / iterations, between 1 and 3, so that a short training takes larger steps.
         means_rate: Learning rate of the centers at the start, relative to the extent of the scene.
         means_rate_final: The same at the end; it decays exponentially.
         scales_rate: Learning rate of the logarithms of the scales.
@@ -51,10 +52,9 @@ class ReconstructionConfig:
         sh0_rate: Learning rate of the constant color.
         shN_rate: Learning rate of the other color coefficients.
         exposure_rate: Learning rate of the color change.
-        image_memory: Bytes for photos kept in memory.
     """
 
-    iterations: tyro.conf.Suppress[int] = 30_000
+    iterations: int = 30_000
     ssim_weight: float = 0.2
     sh_degree: int = 3
     sh_degree_every: int = 1_000
@@ -81,7 +81,6 @@ class ReconstructionConfig:
     sh0_rate: float = 2.5e-3
     shN_rate: float = 1.25e-4
     exposure_rate: float = 1e-3
-    image_memory: int = 1 << 30
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -98,19 +97,19 @@ class ReconstructionConfig:
             raise ValueError(f"initial_opacity must be between 0 and 1, got {self.initial_opacity:g}")
 
     def cap(self, device: torch.device) -> int:
-        """`max_gaussians` with nothing left open."""
+        """`max_gaussians`, with the default of the device."""
         if self.max_gaussians is not None:
             return self.max_gaussians
         return 3_000_000 if device.type == "cuda" else 40_000
 
     @property
     def is_long(self) -> bool:
-        """Whether opacities are reset and there is no warm-up, where the settings do not say."""
+        """Whether the defaults reset opacities and skip the warm-up."""
         return self.iterations >= LONG_TRAINING
 
     @property
     def warm_up_iterations(self) -> int:
-        """Iterations that run at half resolution."""
+        """Number of iterations at half resolution."""
         share = (0.0 if self.is_long else 0.3) if self.warm_up is None else self.warm_up
         return round(share * self.iterations)
 
@@ -122,7 +121,7 @@ class ReconstructionConfig:
         return tuple(default if weight is None else weight for weight in given)  # type: ignore[return-value]
 
     def rates(self, extent: float) -> dict[str, float]:
-        """Learning rates at the start by parameter (our names)."""
+        """Initial learning rates by parameter (our names)."""
         scale = self.rate_scale
         if scale is None:
             scale = min(3.0, max(1.0, (REFERENCE_ITERATIONS / self.iterations) ** (1 / 3)))

@@ -1,10 +1,9 @@
-"""The training of the Gaussians, step by step; it can be saved and resumed bit for bit."""
+"""The training of the Gaussians (section 3.1), step by step; it can be saved and resumed bit for bit."""
 
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,22 +16,31 @@ from lexsplat.reconstruction.adam import (
     optimizer_tensors,
     with_prefix,
 )
-from lexsplat.reconstruction.densification import REFERENCE_ITERATIONS, DensityControl, density_schedule
+from lexsplat.reconstruction.densification import (
+    REFERENCE_ITERATIONS,
+    DensityConfig,
+    DensityControl,
+    density_schedule,
+)
 from lexsplat.reconstruction.exposures import Exposures
 from lexsplat.reconstruction.settings import ReconstructionConfig
-from lexsplat.runtime.divergence import KEEP_EVERY, Guard
 from lexsplat.runtime.errors import TrainingError
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.memory import DEFAULT_MEMORY
+from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.training import run_training
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.reconstruction.photos import TrainingImages
+    from lexsplat.runtime.training import Checkpoint
 
 STAGE = "reconstruct"
 """Name of the stage in events."""
 EVENT_EVERY = 10
 """Iterations between two events."""
+PHOTO_BYTES_MAX = 1 << 30
+"""Upper limit of the memory for cached photos, whatever the budget."""
 GSPLAT_NAMES = {
     "means": "means",
     "quats": "quats",
@@ -41,79 +49,90 @@ GSPLAT_NAMES = {
     "sh0": "sh0",
     "shN": "shN",
 }
-"""Our names of the parameters, and those gsplat's strategies look for."""
+"""Names of the parameters here, and the names that gsplat's strategies expect."""
 
 
 class Reconstructor:
-    """A training that can be stepped, saved and resumed bit for bit.
+    """A reconstruction that can be stepped, saved and resumed bit for bit.
 
     Args:
-        scene: Views and split.
+        capture: Views and split.
         config: Settings.
-        points: Where Gaussians start, from `lexsplat.captures.sfm.triangulation.initial_points`.
+        points: Initial points, from `lexsplat.captures.sfm.triangulation.initial_points`.
         device: Where to train.
-        seed: Of the order of views and of density control.
+        seed: Seed of the view order and of density control.
+        memory: Total budget in bytes. Cached photos take a quarter of it, at most 1 GiB; the budget does not
+            affect the result.
 
     Raises:
         TrainingError: If there is no training view or no point.
     """
 
+    parameter_prefixes = ("parameters/", "exposures/")
+
     def __init__(
         self,
-        scene: Capture,
+        capture: Capture,
         config: ReconstructionConfig,
         points: InitialPoints,
         *,
         device: torch.device | str = "cpu",
         seed: int = 0,
+        memory: int = DEFAULT_MEMORY,
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
         self.config = config
         self.device = torch.device(device)
         self.steps_done = 0
-        self._views = {view.name: view for view in scene.train_views}
+        self._photo_bytes = min(PHOTO_BYTES_MAX, memory // 4)
+        self._views = {view.name: view for view in capture.train_views}
         self._names = sorted(self._views)
         halves = [view.camera.downscaled(2.0) for view in self._views.values()]
         self._can_shrink = all(min(half.width, half.height) >= SMALLEST_SIDE for half in halves)
         if not self._names:
             raise TrainingError(
-                scene.root, expected="at least one training view", found="none", remedy="hold out fewer views"
+                capture.root,
+                expected="at least one training view",
+                found="none",
+                remedy="hold out fewer views",
             )
-        self._extent = scene.extent
-        self._background = torch.tensor(scene.background, dtype=torch.float32, device=self.device)
+        self._extent = capture.extent
+        self._background = torch.tensor(capture.background, dtype=torch.float32, device=self.device)
         self._generator = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.int64)
-        self._recent_error = self._nothing_error = float("nan")
+        self._recent_error = self._background_error = float("nan")
         self._rate_factor = 1.0
         self._parameters = self._initial_parameters(points)
         self._optimizers = self._new_optimizers()
         self._exposures = None
         if config.exposure:
             self._exposures = Exposures(len(self._names), config.exposure_rate, self.device)
-        self._density = DensityControl(
+        schedule = density_schedule(
             config.strategy,
-            density_schedule(
-                config.strategy,
-                config.iterations,
-                every=config.densify_every,
-                minimum_every=config.densify_min_every,
-            ),
+            config.iterations,
+            every=config.densify_every,
+            minimum_every=config.densify_min_every,
+        )
+        rules = DensityConfig(
+            strategy=config.strategy,
+            schedule=schedule,
             extent=self._extent,
             max_gaussians=config.cap(self.device),
             grow_gradient=config.grow_gradient,
             min_opacity=config.min_opacity,
             reset_opacities=config.is_long if config.reset_opacities is None else config.reset_opacities,
             noise=config.noise,
-            seed=seed,
-            device=self.device,
         )
-        self._images: Any = None
+        self._density = DensityControl(rules, seed=seed, device=self.device)
+        self._images: TrainingImages | None = None
         self._images_shrink = 0.0
         self.last_view = ""
         """Name of the view of the last step."""
+        self.tracks_origins = False
+        """Whether `origins` is filled; joint training turns it on."""
         self.origins: Tensor | None = None
-        """If the last step changed the set of Gaussians: which Gaussian before it each one comes from ``[N]``."""
+        """If the last step changed the set of Gaussians: the previous index ``[N]`` of each one, or of its parent."""
 
     @property
     def done(self) -> bool:
@@ -121,8 +140,13 @@ class Reconstructor:
         return self.steps_done >= self.config.iterations
 
     @property
+    def total_steps(self) -> int:
+        """Number of iterations."""
+        return self.config.iterations
+
+    @property
     def rate_factor(self) -> float:
-        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.runtime.divergence`)."""
+        """Factor of all learning rates; halved whenever the training diverges (`lexsplat.runtime.training`)."""
         return self._rate_factor
 
     @rate_factor.setter
@@ -133,33 +157,33 @@ class Reconstructor:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Numbers for progress: PSNR of recent training views and the count of Gaussians."""
+        """PSNR of recent training views in dB, and the number of Gaussians."""
         psnr = -10.0 * math.log10(max(self._recent_error, 1e-12)) if self.steps_done else float("nan")
         return {"psnr": psnr, "gaussians": float(len(self._parameters["means"]))}
 
     def run(self, listener: Listener = silent, checkpoint: Checkpoint | None = None) -> None:
-        """Run the iterations that are left; ``checkpoint`` saves the training between them."""
-        total = self.config.iterations
-        guard = Guard(self, "reconstruction", every=KEEP_EVERY[self.device.type])
-        with nullcontext() if checkpoint is None else checkpoint.guarding():
-            while not self.done:
-                with guard:
-                    self.step()
-                    guard.after_step(self.done)
-                    if checkpoint is not None:
-                        checkpoint.after_step(self)
-                if self.steps_done % EVENT_EVERY == 0 or self.done:
-                    listener(Event(STAGE, self.steps_done, total, self.metrics))
+        """Run the remaining iterations; ``checkpoint`` resumes the training and saves it between iterations."""
+        run_training(
+            self,
+            stage=STAGE,
+            name="reconstruction",
+            every=EVENT_EVERY,
+            checkpoint=checkpoint,
+            listener=listener,
+        )
 
     def gaussians(self) -> Gaussians:
-        """The present Gaussians, without gradient history; they share memory with the training."""
+        """The present Gaussians without gradient history; they share memory with the training."""
         return self._as_gaussians().detach()
 
     def step(self) -> float:
-        """One iteration on one view; returns its loss.
+        """Run one iteration on one view.
+
+        Returns:
+            The loss; 0 where it was not read from the GPU (`_reads_loss`).
 
         Raises:
-            TrainingError: If the loss is no longer finite.
+            TrainingError: If the loss is not finite, the images diverge, or no Gaussian is left.
         """
         from lexsplat.reconstruction.image_losses import photometric_loss
         from lexsplat.rendering import render
@@ -179,7 +203,7 @@ class Reconstructor:
             image = torch.where(valid[..., None], image, target.image)
         loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularization()
         loss.backward()
-        value = loss.item() if self._checks_now() else 0.0
+        value = loss.item() if self._reads_loss() else 0.0
         if not math.isfinite(value):
             raise TrainingError(
                 "reconstruction",
@@ -187,7 +211,7 @@ class Reconstructor:
                 found=f"{value} at iteration {self.steps_done + 1}",
                 remedy="check the cameras, or lower the learning rates",
             )
-        self._follow(image, target.image)
+        self._update_errors(image, target.image)
         self._optimize()
         self._control_density(rendering.means2d, rendering.radii, (camera.width, camera.height))
         self.last_view = self._names[index]
@@ -202,14 +226,17 @@ class Reconstructor:
         return value
 
     def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
-        """Density control, and where it leaves each Gaussian: a number that is copied along with its parameters.
+        """Run density control and record the origins of the Gaussians if they are tracked.
 
-        Numbers are exact in float32 up to 16 million, more Gaussians than fit anywhere else.
+        To track them, an index that is never trained is copied, split and removed along with the parameters.
+        Indices are exact in float32 up to 16 million.
         """
-        numbers = torch.arange(len(self._parameters["means"]), dtype=torch.float32, device=self.device)
-        self._parameters["origins"] = torch.nn.Parameter(numbers, requires_grad=False)
-        self._optimizers["origins"] = Adam(self._parameters["origins"], 0.0)
-        changed = self._density.step(
+        tracked = self.tracks_origins and self._density.refines_at(self.steps_done)
+        if tracked:
+            indices = torch.arange(len(self._parameters["means"]), dtype=torch.float32, device=self.device)
+            self._parameters["origins"] = torch.nn.Parameter(indices, requires_grad=False)
+            self._optimizers["origins"] = Adam(self._parameters["origins"], 0.0)
+        self._density.step(
             self._parameters,
             self._optimizers,  # type: ignore[arg-type]
             self.steps_done,
@@ -218,16 +245,17 @@ class Reconstructor:
             image_size=image_size,
             means_learning_rate=self._means_rate(),
         )
-        del self._optimizers["origins"]
-        origins = self._parameters.pop("origins").detach().long()
-        self.origins = origins if changed else None
+        self.origins = None
+        if tracked:
+            del self._optimizers["origins"]
+            self.origins = self._parameters.pop("origins").detach().long()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything needed to go on bit for bit, as named tensors."""
+        """Everything needed to continue bit for bit, as named tensors."""
         tensors = {
             "steps_done": torch.tensor(self.steps_done),
             "recent_error": torch.tensor(self._recent_error, dtype=torch.float64),
-            "nothing_error": torch.tensor(self._nothing_error, dtype=torch.float64),
+            "nothing_error": torch.tensor(self._background_error, dtype=torch.float64),
             "rate_factor": torch.tensor(self.rate_factor, dtype=torch.float64),
             "views/order": self._order.clone(),
             "views/generator": self._generator.get_state(),
@@ -240,15 +268,19 @@ class Reconstructor:
             tensors.update(with_prefix("exposures/", self._exposures.state_tensors()))
         return tensors
 
-    def damage(self) -> str:
-        """What is wrong with the parameters, such as "NaN or Inf in means"; nothing where all is well."""
-        damage = self.gaussians().damage()
-        if not damage and self._exposures is not None and not bool(self._exposures.matrices.isfinite().all()):
+    def find_invalid(self) -> str:
+        """The first defect of the parameters, such as "NaN or Inf in means"; empty if there is none."""
+        invalid = self.gaussians().find_invalid()
+        if (
+            not invalid
+            and self._exposures is not None
+            and not bool(self._exposures.matrices.isfinite().all())
+        ):
             return "NaN or Inf in the exposures"
-        return damage
+        return invalid
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Go on where `state_dict` was called; scene, config and device must be the same.
+        """Continue where `state_dict` was called; capture, settings and device must be the same.
 
         Raises:
             ValueError: If an entry is missing or does not fit the others.
@@ -256,7 +288,7 @@ class Reconstructor:
         parameters = check_state(tensors, len(self._names), self.config.iterations)
         self.steps_done = int(tensors["steps_done"])
         self._recent_error = float(tensors["recent_error"])
-        self._nothing_error = float(tensors.get("nothing_error", math.nan))
+        self._background_error = float(tensors.get("nothing_error", math.nan))
         self._rate_factor = float(tensors.get("rate_factor", 1.0))
         self._order = tensors["views/order"].clone()
         self._generator.set_state(tensors["views/generator"])
@@ -275,7 +307,7 @@ class Reconstructor:
         points, colors = start.points, start.colors
         if len(points) == 0:
             raise TrainingError(
-                "reconstruction", expected="points to start from", found="none", remedy="check the cameras"
+                "reconstruction", expected="initial points", found="none", remedy="check the cameras"
             )
         cap = self.config.cap(self.device)
         if len(points) > cap:
@@ -312,20 +344,20 @@ class Reconstructor:
         return self._rates()["means"] * decay
 
     def _next_view(self) -> int:
-        """Views come in random permutations, so each is seen equally often."""
+        """Index of the next view; views follow random permutations, so each is visited equally often."""
         place = self.steps_done % len(self._names)
         if place == 0:
             self._order = torch.randperm(len(self._names), generator=self._generator)
         return int(self._order[place])
 
-    def _training_images(self) -> Any:
-        """The photos at the present resolution; those of the warm-up are dropped after it."""
+    def _training_images(self) -> TrainingImages:
+        """The photos at the present resolution; those of the warm-up are freed after it."""
         from lexsplat.reconstruction.photos import TrainingImages
 
         shrink = 2.0 if self.steps_done < self.config.warm_up_iterations and self._can_shrink else 1.0
-        if shrink != self._images_shrink:
+        if self._images is None or shrink != self._images_shrink:
             self._images = TrainingImages(
-                self._views.values(), memory=self.config.image_memory, shrink=shrink, device=self.device
+                self._views.values(), memory=self._photo_bytes, shrink=shrink, device=self.device
             )
             self._images_shrink = shrink
         return self._images
@@ -339,29 +371,29 @@ class Reconstructor:
             total = total + scale_weight * self._parameters["scales"].exp().mean() / self._extent
         return total
 
-    def _checks_now(self) -> bool:
-        """Reading the loss is free on a CPU; on CUDA it waits for the device: now and then, and at the end."""
+    def _reads_loss(self) -> bool:
+        """Whether this step reads its loss: always on a CPU, every few steps on CUDA, where reading synchronizes."""
         done = self.steps_done + 1
         return self.device.type == "cpu" or done % EVENT_EVERY == 0 or done == self.config.iterations
 
-    def _follow(self, image: Tensor, target: Tensor) -> None:
-        """Mean squared errors of recent views, and those that a picture of nothing but background would have.
+    def _update_errors(self, image: Tensor, target: Tensor) -> None:
+        """Update the running mean squared errors of the renderings and of the bare background.
 
         Raises:
-            TrainingError: If the pictures are much worse than that, which no healthy training is.
+            TrainingError: If the renderings are much worse than the background, which means divergence.
         """
-        if not self._checks_now():
+        if not self._reads_loss():
             return
         errors = torch.mean((image.detach() - target) ** 2), torch.mean((self._background - target) ** 2)
-        olds = self._recent_error, self._nothing_error
-        self._recent_error, self._nothing_error = (
+        olds = self._recent_error, self._background_error
+        self._recent_error, self._background_error = (
             float(error) if math.isnan(old) else 0.95 * old + 0.05 * float(error)
             for old, error in zip(olds, errors)
         )
-        if self._recent_error > 4 * self._nothing_error + 0.5:
+        if self._recent_error > 4 * self._background_error + 0.5:
             raise TrainingError(
                 "reconstruction",
-                expected="pictures that come closer to the photos",
+                expected="renderings that approach the photos",
                 found=f"a mean squared error of {self._recent_error:.3g} at iteration {self.steps_done + 1}",
                 remedy="check the cameras, or lower the learning rates",
             )
@@ -378,12 +410,12 @@ class Reconstructor:
 
 
 def check_state(tensors: dict[str, Tensor], views: int, iterations: int) -> dict[str, Tensor]:
-    """The parameters (our names) of a `Reconstructor.state_dict`, if all of it fits together.
+    """Validate a `Reconstructor.state_dict` and return its parameters by our names.
 
     Args:
-        tensors: What was saved.
+        tensors: The saved state.
         views: Number of training views.
-        iterations: Of the whole training.
+        iterations: Number of iterations of the whole training.
 
     Raises:
         ValueError: If an entry is missing or does not fit the others.
@@ -393,16 +425,16 @@ def check_state(tensors: dict[str, Tensor], views: int, iterations: int) -> dict
     if missing:
         raise ValueError(f"checkpoint lacks {', '.join(sorted(missing))}")
     parameters = {name: tensors[f"parameters/{name}"] for name in GSPLAT_NAMES}
-    Gaussians(**parameters, antialiased=False)  # raises if the shapes do not belong together
+    Gaussians(**parameters, antialiased=False)  # raises if the shapes are inconsistent
     if sorted(tensors["views/order"].tolist()) not in ([], list(range(views))):
-        raise ValueError("the order of views is of another capture")
+        raise ValueError("the view order belongs to another capture")
     if any(value.dtype != torch.float32 for value in parameters.values()):
         raise ValueError("parameters must be float32")
     statistics = [tensors[name] for name in ("density/grad2d", "density/count") if name in tensors]
     if any(value.shape != parameters["opacity_logits"].shape for value in statistics):
-        raise ValueError("the statistics of density control are of other Gaussians")
+        raise ValueError("the statistics of density control belong to other Gaussians")
     if not 0 <= int(tensors["steps_done"]) <= iterations:
-        raise ValueError(f"{int(tensors['steps_done'])} of {iterations} iterations")
+        raise ValueError(f"steps_done must be in 0..{iterations}, got {int(tensors['steps_done'])}")
     if not 0 < float(tensors.get("rate_factor", 1.0)) <= 1:
-        raise ValueError(f"learning rates times {float(tensors['rate_factor']):g}")
+        raise ValueError(f"rate_factor must be in (0, 1], got {float(tensors['rate_factor']):g}")
     return parameters

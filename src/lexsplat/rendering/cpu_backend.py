@@ -1,4 +1,4 @@
-"""The CPU rasterizer behind autograd: projection, shading, pairs and blending with their gradients."""
+"""The CPU rasterizer as autograd functions: projection, shading, tile pairs and blending with their gradients."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering.kernels import blending, code_weights, gradients, projection, spherical_harmonics
 from lexsplat.rendering.kernels.jit import parallel
 from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs
+from lexsplat.rendering.results import Projection
 
 TILE_GRAIN = 8
-"""Tiles a thread takes at a time."""
+"""Tiles per work item of a thread."""
 ENTRY_LIMIT = 1 << 24
-"""Numbers that `accumulate_codes` keeps between its two passes (64 MiB)."""
+"""Size of the buffer between the two passes of `accumulate_codes`, in float32 numbers (64 MiB)."""
 
 
 def camera_vector(camera: Camera, near: float) -> NDArray[np.float64]:
-    """The camera as the projection kernels read it."""
+    """The camera in the layout of the projection kernels: rotation, translation, intrinsics, size, near plane."""
     K, viewmat = camera.K, camera.viewmat
     intrinsics = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height, near]
     return np.concatenate([viewmat[:3, :3].ravel(), viewmat[:3, 3], intrinsics])
@@ -34,14 +35,14 @@ def _array(tensor: Tensor) -> NDArray[Any]:
 
 
 def _zeros(*shape: int) -> Tensor:
-    """Zeros from fresh pages: torch would fill them on its own threads, which then spin beside ours."""
+    """Zeros from fresh pages; ``torch.zeros`` would start torch's threads, which then spin beside ours."""
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 class _Project(torch.autograd.Function):
     """(means, quats, log_scales, opacity_logits) -> (means2d, conics, opacities, depths, radii, extents, means).
 
-    The means are handed on for shading, so that their two gradients meet in the kernel.
+    The means are also an output, which shading reads, so that both of their gradients meet in the backward kernel.
     """
 
     @staticmethod
@@ -77,7 +78,7 @@ class _Project(torch.autograd.Function):
 
 
 class _Shade(torch.autograd.Function):
-    """(means, sh0, shN) -> colors of the visible Gaussians."""
+    """(means, sh0, shN) -> colors ``[N, 3]`` of the visible Gaussians."""
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, sh0: Tensor, shN: Tensor, *constants: Any) -> Tensor:
@@ -104,8 +105,8 @@ class _Shade(torch.autograd.Function):
 class _Blend(torch.autograd.Function):
     """(means2d, conics, opacities, colors, features, background) -> (channels [H, W, C], alpha [H, W]).
 
-    The geometry is read from the pairs; the first three tensors only tell autograd where its gradients go.
-    Colors and alpha have a say in the geometry, features do not.
+    The geometry is read from the pairs; the first three tensors only receive its gradients. Gradients of colors and
+    alpha reach the geometry, gradients of features do not.
     """
 
     @staticmethod
@@ -159,7 +160,10 @@ class _Blend(torch.autograd.Function):
         )  # fmt: skip
         background = None
         if ctx.needs_input_grad[5]:
-            background = torch.einsum("hwc,hw->c", grad_image[..., :color_channels], 1 - alpha)
+            # NumPy sums on one thread: torch's order of addition depends on the number of threads.
+            factors = _array(grad_image[..., :color_channels]), _array(1 - alpha)
+            total = np.einsum("hwc,hw->c", *factors, dtype=np.float64)
+            background = torch.from_numpy(total.astype(np.float32))
         wanted = [g if ctx.needs_input_grad[i] else None for i, g in enumerate(outputs)]
         return (*wanted, background, None)
 
@@ -179,43 +183,68 @@ def _gather(pairs: TilePairs, *sources: Tensor | None) -> NDArray[np.float32]:
     return values
 
 
-def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
-    """Means2d, conics, opacities, depths, radii and extents of every Gaussian; the first three have gradients.
-
-    The last entry are the means again, for `shade`.
-    """
+def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
+    """Project every Gaussian; means2d, conics, opacities and means have gradients."""
     g = gaussians
     tensors = (g.means, g.quats, g.log_scales, g.opacity_logits)
-    return _Project.apply(*tensors, camera_vector(camera, near), g.antialiased)
+    return Projection(*_Project.apply(*tensors, camera_vector(camera, near), g.antialiased))
 
 
-def pairs_of(projected: tuple[Tensor, ...], camera: Camera) -> TilePairs:
-    """The pairs of a projection."""
-    means2d, conics, opacities, depths, radii, extents = (_array(t) for t in projected[:6])
-    return find_pairs(means2d, conics, opacities, extents, depths, radii, camera.width, camera.height)
+def find_tiles(projection: Projection, camera: Camera) -> TilePairs:
+    """The (tile, Gaussian) pairs of a projection, sorted by depth."""
+    p = projection
+    return find_pairs(
+        _array(p.means2d),
+        _array(p.conics),
+        _array(p.opacities),
+        _array(_present(p.extents)),
+        _array(p.depths),
+        _array(p.radii),
+        camera.width,
+        camera.height,
+    )
 
 
-def shade(gaussians: Gaussians, camera: Camera, projected: tuple[Tensor, ...], degree: int) -> Tensor:
-    """RGB ``[N, 3]`` of the visible Gaussians seen from the camera."""
+def shade(gaussians: Gaussians, camera: Camera, projection: Projection, degree: int) -> Tensor:
+    """RGB ``[N, 3]`` of the visible Gaussians as seen from the camera: max(0, SH + 0.5)."""
     eye = np.ascontiguousarray(camera.position)
-    return _Shade.apply(projected[6], gaussians.sh0, gaussians.shN, projected[4], eye, degree)
+    means = _present(projection.means)
+    return _Shade.apply(means, gaussians.sh0, gaussians.shN, projection.radii, eye, degree)
+
+
+def _present(tensor: Tensor | None) -> Tensor:
+    if tensor is None:
+        raise ValueError("the projection was made by another backend")
+    return tensor
 
 
 def blend(
-    projected: tuple[Tensor, ...],
+    projection: Projection,
     pairs: TilePairs,
     colors: Tensor | None,
     features: Tensor | None,
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Channels ``[H, W, C]`` and alpha ``[H, W]``."""
-    return _Blend.apply(*projected[:3], colors, features, background, pairs)
+    """Blend front to back.
+
+    Args:
+        projection: Receives the gradients of the geometry.
+        pairs: From `find_tiles`.
+        colors: RGB ``[N, 3]``; None renders none.
+        features: Further channels ``[N, C]``; None renders none.
+        background: RGB ``[3]`` behind the colors; None is black.
+
+    Returns:
+        Channels ``[H, W, 3 + C]`` and alpha ``[H, W]``.
+    """
+    p = projection
+    return _Blend.apply(p.means2d, p.conics, p.opacities, colors, features, background, pairs)
 
 
 def accumulate_codes(
-    projected: tuple[Tensor, ...], pairs: TilePairs, codes: NDArray[np.int32], num_codes: int, totals: Tensor
+    projection: Projection, pairs: TilePairs, codes: NDArray[np.int32], num_codes: int, totals: Tensor
 ) -> None:
-    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``; negative codes not."""
+    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``; negative codes are ignored."""
     tiles = pairs.tiles
     local = np.empty_like(codes)
     listed = np.empty((tiles, min(num_codes, blending.PIXELS)), np.int32)

@@ -1,7 +1,7 @@
 """The CUDA rasterizer: gsplat's kernels behind the same functions as `cpu_backend`.
 
-gsplat's parts are called one by one instead of its `rasterization`, so that projection and sorting are shared by
-the pass for color and the pass for features. The second one sees the geometry detached.
+gsplat's steps are called one by one instead of its `rasterization`, so that the color pass and the feature pass
+share projection and sorting. The feature pass receives the geometry detached.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering.results import Projection
 from lexsplat.runtime.errors import BackendError
 
 TILE = 16
 CHANNELS = 32
-"""Channels blended, and codes accumulated, at a time. Bounds memory to [N, 32] and [H, W, 32]; for gradients gsplat
-keeps the colors of 256 Gaussians in a block's shared memory, where 64 channels are too many for small cards."""
+"""Channels blended, and codes accumulated, at a time. This bounds memory to [N, 32] and [H, W, 32]. In the backward
+pass gsplat keeps the colors of 256 Gaussians in a block's shared memory; 64 channels do not fit on small cards."""
 CAMERAS = 4096
-"""Matrices kept on the device, so that rendering a view again waits for no copy."""
+"""Number of camera matrices cached on the device, so that rendering a view again needs no copy."""
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Who touches which tile, as gsplat keeps it.
+    """The Gaussians of each tile, in gsplat's layout.
 
     Args:
         width: Image width in pixels.
@@ -56,12 +57,12 @@ def _require_gsplat() -> None:
     except ImportError as error:
         raise BackendError("gsplat", found=str(error), remedy="pip install gsplat==1.5.3") from error
     found = "an installation without one"
-    # It may compile the extension when it is imported, and says so where our answers and JSON go.
+    # The import may compile the extension and print to standard output, which carries our JSON.
     first = "gsplat.cuda._backend" not in sys.modules
     try:
         with contextlib.redirect_stdout(sys.stderr) if first else contextlib.nullcontext():
             from gsplat.cuda._backend import _C
-    except Exception as error:  # whatever a compiler can end in
+    except Exception as error:  # a compiler can fail in any way
         _C, found = None, f"{type(error).__name__} {error}"[:200]
     if _C is None:
         raise BackendError(
@@ -73,26 +74,27 @@ def _require_gsplat() -> None:
 
 
 def _matrix(matrix: NDArray[np.float64], device: torch.device) -> Tensor:
-    """A camera's matrix ``[1, ...]`` on the device; it must not be changed."""
+    """A camera's matrix ``[1, ...]`` on the device; it is cached and must not be changed."""
     single = np.ascontiguousarray(matrix, dtype=np.float32)[None]
-    return _kept(single.tobytes(), single.shape, device)
+    return _cached(single.tobytes(), single.shape, device)
 
 
 @functools.lru_cache(CAMERAS)
-def _kept(content: bytes, shape: tuple[int, ...], device: torch.device) -> Tensor:
-    with torch.inference_mode(False):  # gsplat keeps it for gradients
+def _cached(content: bytes, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # gsplat saves it for the backward pass
         return torch.from_numpy(np.frombuffer(content, np.float32).reshape(shape).copy()).to(device)
 
 
-def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
-    """Means2d, conics, opacities, depths and radii ``[N, 2]`` of every Gaussian; the first three have gradients."""
+def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
+    """Project every Gaussian; means2d, conics and opacities have gradients."""
     _require_gsplat()
     from gsplat.cuda._wrapper import fully_fused_projection
 
     g = gaussians
     opacities = g.opacities
-    if len(g) == 0:  # gsplat divides by their number, which ends the process
-        return g.means[:, :2], g.means, opacities, g.means[:, 2].detach(), g.means.new_zeros(0, 2).int()
+    if len(g) == 0:  # gsplat divides by the number of Gaussians, which kills the process
+        none = g.means.new_zeros(0, 2).int()
+        return Projection(g.means[:, :2], g.means, opacities, g.means[:, 2].detach(), none)
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         g.means, None, g.quats, g.scales,
         _matrix(camera.viewmat, g.device), _matrix(camera.K, g.device), camera.width, camera.height,
@@ -100,29 +102,31 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, 
     )  # fmt: skip
     if compensations is not None:
         opacities = opacities * compensations[0]
-    return means2d[0], conics[0], opacities, depths[0].detach(), radii[0]
+    return Projection(means2d[0], conics[0], opacities, depths[0].detach(), radii[0])
 
 
-def pairs_of(projected: tuple[Tensor, ...], camera: Camera) -> TileLists:
-    """Tiles of each Gaussian, sorted by tile and depth."""
+def find_tiles(projection: Projection, camera: Camera) -> TileLists:
+    """The Gaussians of each tile, sorted by depth."""
     from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
 
-    means2d, _, _, depths, radii = projected
+    p = projection
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     with torch.no_grad():
-        _, keys, members = isect_tiles(means2d.detach()[None], radii[None], depths[None], TILE, columns, rows)
+        _, keys, members = isect_tiles(
+            p.means2d.detach()[None], p.radii[None], p.depths[None], TILE, columns, rows
+        )
         offsets = isect_offset_encode(keys, 1, columns, rows)
     return TileLists(camera.width, camera.height, offsets, members)
 
 
-def shade(gaussians: Gaussians, camera: Camera, projected: tuple[Tensor, ...], degree: int) -> Tensor:
-    """RGB ``[N, 3]`` of the visible Gaussians seen from the camera: max(0, SH + 0.5)."""
+def shade(gaussians: Gaussians, camera: Camera, projection: Projection, degree: int) -> Tensor:
+    """RGB ``[N, 3]`` of the visible Gaussians as seen from the camera: max(0, SH + 0.5)."""
     from gsplat.cuda._wrapper import spherical_harmonics
 
     eye = _matrix(camera.position, gaussians.device)
     coefficients = torch.cat([gaussians.sh0, gaussians.shN[:, : (degree + 1) ** 2 - 1]], 1)
     colors = spherical_harmonics(
-        degree, gaussians.means - eye, coefficients, masks=(projected[4] > 0).all(-1)
+        degree, gaussians.means - eye, coefficients, masks=(projection.radii > 0).all(-1)
     )
     return torch.clamp_min(colors + 0.5, 0.0)
 
@@ -147,15 +151,15 @@ def _rasterize(
 
 
 def blend(
-    projected: tuple[Tensor, ...],
+    projection: Projection,
     pairs: TileLists,
     colors: Tensor | None,
     features: Tensor | None,
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Channels ``[H, W, C]`` and alpha ``[H, W]``; colors (or alpha alone) first, features over deaf geometry."""
-    geometry = projected[:3]
-    deaf = tuple(t.detach() for t in geometry)
+    """Channels ``[H, W, C]`` and alpha ``[H, W]``: a color pass, then a feature pass over detached geometry."""
+    geometry = _geometry(projection)
+    detached = tuple(t.detach() for t in geometry)
     alone = not any(t.requires_grad for t in geometry)
     images = []
     alpha = None
@@ -163,10 +167,10 @@ def blend(
         image, alpha = _rasterize(geometry, pairs, colors, background)
         images.append(image)
     if features is not None and features.shape[1] > 0:
-        image, deaf_alpha = _rasterize(deaf, pairs, features, None)
+        image, detached_alpha = _rasterize(detached, pairs, features, None)
         images.append(image)
         if alpha is None and alone:
-            alpha = deaf_alpha
+            alpha = detached_alpha
     if alpha is None:
         _, alpha = _rasterize(geometry, pairs, geometry[2].detach()[:, None], None)
     if not images:
@@ -174,14 +178,18 @@ def blend(
     return (images[0] if len(images) == 1 else torch.cat(images, -1)), alpha
 
 
+def _geometry(projection: Projection) -> tuple[Tensor, Tensor, Tensor]:
+    return projection.means2d, projection.conics, projection.opacities
+
+
 def accumulate_codes(
-    projected: tuple[Tensor, ...], pairs: TileLists, codes: NDArray[np.int32], num_codes: int, totals: Tensor
+    projection: Projection, pairs: TileLists, codes: NDArray[np.int32], num_codes: int, totals: Tensor
 ) -> None:
     """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``.
 
-    It is the gradient of rendered features under one-hot codes, taken for a few channels at a time.
+    The weights are the gradient of rendered features under one-hot codes, computed a few channels at a time.
     """
-    deaf = tuple(t.detach() for t in projected[:3])
+    detached = tuple(t.detach() for t in _geometry(projection))
     wanted = torch.as_tensor(codes, device=totals.device).long()
     for first in range(0, num_codes, CHANNELS):
         channels = min(CHANNELS, num_codes - first)
@@ -192,6 +200,6 @@ def accumulate_codes(
         one_hot.scatter_(2, (wanted - first).clamp(0, channels - 1)[..., None], inside[..., None].float())
         with torch.enable_grad():
             features = torch.zeros(len(totals), channels, device=totals.device, requires_grad=True)
-            image, _ = _rasterize(deaf, pairs, features, None)
+            image, _ = _rasterize(detached, pairs, features, None)
             (gradient,) = torch.autograd.grad(image, features, one_hot)
         totals[:, first : first + channels] += gradient

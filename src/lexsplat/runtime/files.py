@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: the atomic rename, JSON and named tensors."""
+"""Files that are written completely or not at all: the atomic rename, JSON and named tensors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from threading import get_ident
@@ -21,20 +22,26 @@ from torch import Tensor
 from lexsplat.runtime.errors import FileFormatError
 
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.\d+\.tmp")
-"""Names made by `atomic_path`: .NAME.PROCESS.THREAD.tmp"""
+"""Names of temporary files: .NAME.PROCESS.THREAD.tmp"""
 
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its place when the block ends without an error.
+    """A temporary path beside ``path`` that replaces it when the block ends without an error.
 
-    Readers see the old file or the new one, never a part. The data reach the disk before the name changes. The
-    folder is made if it is not there; threads and processes may write the same file at once, the last one wins.
+    Readers see the old file or the new one, never a part. The data reach the disk before the name changes. Missing
+    folders are created. The file gets the permissions of the user's umask, whatever library wrote it. Threads and
+    processes may write the same file at once; the last one wins.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
     try:
+        temporary.touch()
+        permissions = stat.S_IMODE(
+            temporary.stat().st_mode
+        )  # the umask itself cannot be read without setting it
         yield temporary
+        os.chmod(temporary, permissions)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -43,9 +50,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def remove_left_overs(root: Path) -> None:
-    """Delete the temporary files below ``root`` of processes that were killed while they wrote.
+    """Delete the temporary files below ``root`` that killed processes left behind.
 
-    Files of processes that still run stay: a query may be writing while a build begins.
+    Files of running processes stay: a query may be writing while a build starts.
     """
     for path in root.rglob(".*.tmp"):
         match = _TEMPORARY.fullmatch(path.name)
@@ -58,7 +65,7 @@ def _is_running(process: int) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # it runs, for another user
+    except OSError:  # it runs as another user
         return True
     return True
 
@@ -67,10 +74,10 @@ _MAX_JSON_BYTES = 256 << 20
 
 
 def to_json(value: Any) -> Any:
-    """Plain JSON data from dataclasses, paths, tuples and numpy numbers.
+    """Plain JSON data from dataclasses, paths, tuples and numpy values.
 
     Raises:
-        TypeError: For anything that has no JSON form.
+        TypeError: If a value has no JSON form.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -88,7 +95,11 @@ def to_json(value: Any) -> Any:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write ``data`` as readable JSON. NaN and infinity are refused: they are not JSON."""
+    """Write ``data`` as indented JSON.
+
+    Raises:
+        ValueError: If it holds NaN or infinity, which are not JSON.
+    """
     text = json.dumps(to_json(data), indent=2, allow_nan=False, ensure_ascii=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
@@ -121,17 +132,17 @@ def read_json(path: Path, *, remedy: str = "") -> Any:
 
 
 PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".ckpt")
-"""Endings of files that may hold pickles. Loading one runs whatever its author put into it: we never do."""
+"""Suffixes of files that may hold pickles. Unpickling runs arbitrary code, so lexsplat never does it."""
 
 _DIGEST = "content"
-"""Metadata entry with a hash of the tensors; files without it, of other programs, are read as they are."""
+"""Metadata entry with a hash of the tensors; files of other programs lack it and are not checked."""
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write named tensors and string metadata as safetensors, with a hash of the tensors.
 
     Raises:
-        OSError: If they cannot be written, as on a full disk; what was there stays.
+        OSError: If they cannot be written, for example on a full disk; an existing file stays.
     """
     contiguous = {name: tensor.detach().to("cpu").contiguous() for name, tensor in tensors.items()}
     with atomic_path(path) as temporary:
@@ -139,7 +150,9 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path, metadata: Mapping[str, str]) -> None:
-    """``safetensors.torch.save_file`` that fails as every other way of writing a file does.
+    """``safetensors.torch.save_file`` with a reproducible header, and with ``OSError`` for failed writes.
+
+    Equal arguments give equal bytes: safetensors writes the metadata in random order, here they are sorted.
 
     Raises:
         OSError: If the file cannot be written.
@@ -153,20 +166,41 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, metadata: Mapping[st
         found = re.search(r"os error (\d+)", str(error))
         code = int(found[1]) if found else errno.EIO
         raise OSError(code, os.strerror(code), str(path)) from error
+    _sort_metadata(path)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Rewrite the header of a safetensors file in place, with sorted metadata.
+
+    The file starts with the length of the header as a 64-bit little-endian integer, followed by the header as JSON,
+    padded with spaces. Sorting does not change its length.
+
+    Raises:
+        FileFormatError: If the sorted header does not fit, which would be a change of the format.
+    """
+    with open(path, "r+b") as file:
+        length = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(length))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        content = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
+        if len(content) > length:
+            raise FileFormatError(path, expected=f"a header of {length} bytes", found=f"{len(content)} bytes")
+        file.seek(8)
+        file.write(content.ljust(length))
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors and the metadata of a safetensors file.
 
     Raises:
-        FileFormatError: If it is missing, truncated, not safetensors, or not what `write_tensors` wrote.
+        FileFormatError: If it is missing, truncated, not safetensors, or differs from what `write_tensors` wrote.
     """
     from safetensors import SafetensorError, safe_open
 
     refuse_pickle(path)
     try:
         with safe_open(path, framework="pt") as file:
-            # Copies: tensors inside the file start anywhere, and where a vector starts decides how it is summed.
+            # Copies, because tensors in the file are not aligned, and alignment affects the rounding of sums.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
             metadata = dict(file.metadata() or {})
     except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
@@ -177,25 +211,25 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     if written is not None and written != _digest(tensors):
         raise FileFormatError(
             path,
-            expected="the numbers that were written",
-            found="others: the file is damaged",
+            expected="the tensors that were written",
+            found="damaged content (the hash differs)",
             remedy="run the build again",
         )
     return tensors, metadata
 
 
 def refuse_pickle(path: Path) -> None:
-    """Refuse files that are pickles by their names, and say what to do instead.
+    """Refuse files whose suffix is that of a pickle.
 
     Raises:
-        FileFormatError: If it is one.
+        FileFormatError: If it is a pickle; the message names the alternative.
     """
     if path.suffix.lower() in PICKLES:
         raise FileFormatError(
             path,
             expected="safetensors, .npy, or for splats .ply",
-            found="a pickle, which can run any program when it is loaded",
-            remedy="open it where you trust it and save it with safetensors.torch.save_file, or export a .ply there",
+            found="a pickle, which can run arbitrary code when loaded",
+            remedy="open it where you trust it and save it with safetensors.torch.save_file, or export a .ply",
         )
 
 

@@ -119,8 +119,8 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
         numbers = {name: step.values.get(name) for name in ("rotation", "translation", "center")}
         arrays = {name: np.array(value, float) for name, value in numbers.items() if value is not None}
         changed = moved(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
-        if changed.damage():
-            raise ValueError(f"the move leads to {changed.damage()}")
+        if changed.find_invalid():
+            raise ValueError(f"the move leads to {changed.find_invalid()}")
     tensors: dict[str, Any] = {}
     for name, tensor in gaussians.tensors().items():
         tensors[name] = tensor.clone()

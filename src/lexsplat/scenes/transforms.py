@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.rotations import multiply_quaternions, quaternion_from_matrix
 from lexsplat.rendering.kernels.spherical_harmonics import basis_at
-from lexsplat.rendering.posing import multiplied
 
 _DIRECTIONS = 64
 
@@ -59,7 +59,9 @@ def moved(
     changed = replace(gaussians, means=means.float(), log_scales=gaussians.log_scales + math.log(scale))
     if np.allclose(turn, np.eye(3), atol=1e-12):
         return changed
-    quats = multiplied(_like(quaternion_of(turn), gaussians), gaussians.quats.double()).float()
+    quats = multiply_quaternions(
+        _like(quaternion_from_matrix(turn), gaussians), gaussians.quats.double()
+    ).float()
     return replace(changed, quats=quats, shN=rotated_harmonics(gaussians.shN, turn))
 
 
@@ -84,14 +86,6 @@ def rotated_harmonics(shN: Tensor, rotation: NDArray[np.float64]) -> Tensor:
         rows = shN[:, columns.start - 1 : columns.stop - 1].double()
         blocks.append(torch.einsum("ij,njc->nic", torch.from_numpy(matrix).to(rows), rows))
     return torch.cat(blocks, dim=1).float()
-
-
-def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """wxyz of a rotation matrix ``[3, 3]``, of unit length, w not negative."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])
 
 
 def _like(array: NDArray[np.float64], gaussians: Gaussians) -> Tensor:

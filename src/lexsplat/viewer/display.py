@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.rotations import quaternion_from_matrix
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.recording import looking_at, orbit
@@ -88,7 +89,7 @@ class Display:
                 thickness=1.5,
                 thickness_units="screen",
                 color=TEST_COLOR if view.split == "test" else TRAIN_COLOR,
-                wxyz=quaternion(camera.viewmat[:3, :3].T),
+                wxyz=quaternion_from_matrix(camera.viewmat[:3, :3].T),
                 position=camera.position,
                 visible=visible,
             )
@@ -142,7 +143,11 @@ class Display:
         extra: dict[str, Any] = {}
         if pose is not None:
             place, rotation = pose
-            extra = {"position": tuple(place), "wxyz": quaternion(rotation), "fov": client.camera.fov}
+            extra = {
+                "position": tuple(place),
+                "wxyz": quaternion_from_matrix(rotation),
+                "fov": client.camera.fov,
+            }
         width = max(2, round(height * client.camera.aspect / 2) * 2)
         return client.get_render(
             height,
@@ -208,14 +213,6 @@ def page_camera(client: viser.ClientHandle) -> Camera:
     viewmat[:3, 3] = -rotation.T @ np.asarray(camera.position, dtype=np.float64)
     K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(width, height, K, viewmat)
-
-
-def quaternion(rotation: NDArray) -> tuple[float, float, float, float]:
-    """A rotation ``[3, 3]`` as a unit quaternion, wxyz."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_quat()
-    return float(w), float(x), float(y), float(z)
 
 
 def _spacing(cameras: list[Camera]) -> float:

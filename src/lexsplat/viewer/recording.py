@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat.geometry.rotations import looking_along
+
 _FULL_TURN_GAP = 2 * np.pi / 3
 
 
@@ -75,10 +77,7 @@ def _turns(seen: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
 
 def looking_at(position: NDArray, target: NDArray, up: NDArray) -> NDArray[np.float64]:
     """Camera to world rotation ``[3, 3]``, OpenCV axes, of a camera that looks at ``target``."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
+    return looking_along(target - position, up).T
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:

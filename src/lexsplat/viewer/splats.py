@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.rotations import covariances
 
 BYTES_PER_SPLAT = 32
 """What one Gaussian costs on the wire, whatever changed of it (position, covariance, color and opacity)."""
@@ -85,11 +86,11 @@ class SplatBlocks:
 
     def _block(self, chosen: Gaussians, drawn: NDArray[np.int64], part: NDArray[np.int64]) -> Block:
         own = chosen.select(torch.from_numpy(part))
-        covariances = covariances_of(own) * (self.unit * self.growth) ** 2
+        scaled = covariances(own.quats, own.scales).numpy() * (self.unit * self.growth) ** 2
         return Block(
             index=drawn[part],
             centers=(own.means * self.unit).numpy(),
-            covariances=np.clip(covariances, -_HALF_MAX, _HALF_MAX),
+            covariances=np.clip(scaled, -_HALF_MAX, _HALF_MAX),
             opacities=own.opacities.numpy()[:, None],
         )
 
@@ -109,21 +110,6 @@ def level_of_detail(gaussians: Gaussians, budget: int) -> tuple[NDArray[np.int64
     kept = np.sort(np.argpartition(-coverage, budget - 1)[:budget])
     growth = float(np.sqrt(coverage.sum() / max(coverage[kept].sum(), 1e-30)))
     return kept, min(max(growth, 1.0), _MAX_GROWTH)
-
-
-def covariances_of(gaussians: Gaussians) -> NDArray[np.float32]:
-    """Covariances R S S^T R^T ``[N, 3, 3]``, world units squared."""
-    w, x, y, z = torch.nn.functional.normalize(gaussians.quats, dim=-1).unbind(-1)
-    rotation = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        dim=-2,
-    )
-    half = rotation * gaussians.scales[:, None, :]
-    return (half @ half.mT).numpy()
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:

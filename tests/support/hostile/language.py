@@ -49,7 +49,7 @@ def checkpoints() -> Reader:
     """A damaged checkpoint is reported and ignored; the training then starts from the beginning."""
     from lexsplat.language.methods.trained_settings import TrainedConfig
     from lexsplat.language.methods.trainer import FieldTrainer
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
     from support.language_scene import make_scene
 
     scene = make_scene(per_ball=2, views=1, width=8, height=6)

@@ -17,7 +17,7 @@ def reconstruction_checkpoints() -> Reader:
     from lexsplat.captures import load_capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
     from support.tiny_capture import write_capture
 
     config = ReconstructionConfig(iterations=10, max_gaussians=5, sh_degree=1, exposure=True)

@@ -28,6 +28,7 @@ from lexsplat.captures.readers.camera_files import (
     checked_name,
     checked_pose,
 )
+from lexsplat.geometry.rotations import matrix_from_quaternion
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", ".")
@@ -130,16 +131,9 @@ def _viewmat(
     quaternion: tuple[float, ...], translation: tuple[float, ...], name: str, origin: Path
 ) -> NDArray[np.float64]:
     """World to camera ``[4, 4]`` from COLMAP's quaternion (wxyz, normalized here) and translation."""
-    q = np.array(quaternion, dtype=np.float64)
-    with np.errstate(all="ignore"):  # damaged numbers overflow; `checked_pose` reports the image
-        q = q / np.linalg.norm(q)
-    w, x, y, z = q
     viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    with np.errstate(all="ignore"):  # damaged numbers overflow here; the check below names the image
+        viewmat[:3, :3] = matrix_from_quaternion(np.array(quaternion))
     viewmat[:3, 3] = translation
     return checked_pose(viewmat, name, origin)
 

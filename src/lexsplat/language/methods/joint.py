@@ -8,10 +8,10 @@ density control copies, splits or removes a Gaussian, its language goes with it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -24,9 +24,8 @@ from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.reconstruction import EVENT_EVERY, STAGE, Reconstructor
 from lexsplat.reconstruction.adam import below_prefix, with_prefix
-from lexsplat.runtime.checkpoints import Checkpoint
-from lexsplat.runtime.divergence import KEEP_EVERY, Guard
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.training import Checkpoint, run_training
 
 
 class JointTrainer:
@@ -44,6 +43,11 @@ class JointTrainer:
         ValueError: If there is no view, or a view has no index map.
     """
 
+    parameter_prefixes = (
+        *(f"geometry/{prefix}" for prefix in Reconstructor.parameter_prefixes),
+        *(f"language/{prefix}" for prefix in FieldTrainer.parameter_prefixes),
+    )
+
     def __init__(
         self,
         reconstructor: Reconstructor,
@@ -55,6 +59,7 @@ class JointTrainer:
         seed: int = 0,
     ) -> None:
         check_views(sorted(cameras), code_maps)
+        reconstructor.tracks_origins = True
         self.reconstructor, self.code_maps, self.codebook, self.seed = (
             reconstructor,
             code_maps,
@@ -65,6 +70,26 @@ class JointTrainer:
         self.cameras = {name: camera.downscaled(config.render_downscale) for name, camera in cameras.items()}
         self.language = FieldTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
         self._losses = {"loss": float("nan")}
+
+    @property
+    def device(self) -> torch.device:
+        """Where the training runs."""
+        return self.reconstructor.device
+
+    @property
+    def steps_done(self) -> int:
+        """Number of finished steps."""
+        return self.reconstructor.steps_done
+
+    @property
+    def total_steps(self) -> int:
+        """Number of steps of the whole training."""
+        return self.reconstructor.total_steps
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Those of the reconstruction, and the loss of the language."""
+        return {**self.reconstructor.metrics, "language": self._losses["loss"]}
 
     @property
     def done(self) -> bool:
@@ -93,33 +118,27 @@ class JointTrainer:
 
     @property
     def rate_factor(self) -> float:
-        """Factor of all learning rates (`lexsplat.runtime.divergence`)."""
+        """Factor of all learning rates (`lexsplat.runtime.training`)."""
         return self.reconstructor.rate_factor
 
     @rate_factor.setter
     def rate_factor(self, factor: float) -> None:
         self.reconstructor.rate_factor = self.language.rate_factor = factor
 
-    def damage(self) -> str:
-        """What is wrong with the parameters; nothing where all is well."""
-        return self.reconstructor.damage() or self.language.damage()
+    def find_invalid(self) -> str:
+        """The first defect of the parameters; empty if there is none."""
+        return self.reconstructor.find_invalid() or self.language.find_invalid()
 
     def run(self, listener: Listener = silent, checkpoint: Checkpoint | None = None) -> None:
-        """Run the iterations that are left."""
-        total = self.reconstructor.config.iterations
-        guard = Guard(self, "joint training", every=KEEP_EVERY[self.reconstructor.device.type])
-        losses = {"loss": float("nan")}
-        with nullcontext() if checkpoint is None else checkpoint.guarding():
-            while not self.done:
-                with guard:
-                    losses = self.step()
-                    guard.after_step(self.done)
-                    if checkpoint is not None:
-                        checkpoint.after_step(self)
-                done = self.reconstructor.steps_done
-                if done % EVENT_EVERY == 0 or self.done:
-                    metrics = {**self.reconstructor.metrics, "language": losses["loss"]}
-                    listener(Event(STAGE, done, total, metrics))
+        """Run the remaining steps; ``checkpoint`` resumes the training and saves it between steps."""
+        run_training(
+            self,
+            stage=STAGE,
+            name="joint training",
+            every=EVENT_EVERY,
+            checkpoint=checkpoint,
+            listener=listener,
+        )
 
     def result(self) -> tuple[Gaussians, TrainedField]:
         """The present Gaussians and their language."""

@@ -35,7 +35,7 @@ from lexsplat.rendering import accumulate_codes
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
 
 ROWS = 65_536
 """Gaussians handled at a time outside rendering."""

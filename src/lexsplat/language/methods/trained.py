@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import Camera
@@ -17,11 +18,11 @@ from lexsplat.language.fields import TrainedField
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.rendering import PreparedView, prepare
-from lexsplat.runtime.divergence import KEEP_EVERY, Guard
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.training import run_training
 
 if TYPE_CHECKING:
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
 
 __all__ = [
     "MASKED_CODE",
@@ -69,25 +70,70 @@ def train_field(
     names = sorted(cameras)
     check_views(names, code_maps)
     trainer = trainer or FieldTrainer(gaussians, codebook, config, seed=seed)
-    if checkpoint is not None:
-        checkpoint.resume(trainer)
     views = _prepare_views(trainer.gaussians, cameras, config)
-    guard = Guard(trainer, "language field", every=KEEP_EVERY[gaussians.device.type])
-    with nullcontext() if checkpoint is None else checkpoint.guarding():
-        while trainer.iteration < config.iterations:
-            with guard:
-                name = trainer.view_of_step(names)
-                camera, prepared = views[name]
-                losses = trainer.step(camera, code_maps[name], prepared=prepared)
-                done = trainer.iteration
-                if done % REPORT_EVERY == 0 or done == config.iterations:
-                    metrics = {key: float(value) for key, value in losses.items()}
-                    trainer.check_loss(metrics["loss"])
-                    listener(Event("language", done, config.iterations, metrics))
-                guard.after_step(done == config.iterations)
-                if checkpoint is not None:
-                    checkpoint.after_step(trainer)
+    run_training(
+        _FrozenGeometryTraining(trainer, names, views, code_maps),
+        stage="language",
+        name="language field",
+        every=REPORT_EVERY,
+        checkpoint=checkpoint,
+        listener=listener,
+    )
     return trainer.field
+
+
+class _FrozenGeometryTraining:
+    """A `FieldTrainer` with its views, as `run_training` steps it."""
+
+    parameter_prefixes = FieldTrainer.parameter_prefixes
+
+    def __init__(
+        self,
+        trainer: FieldTrainer,
+        names: list[str],
+        views: Mapping[str, tuple[Camera, PreparedView | None]],
+        code_maps: Mapping[str, NDArray[np.uint8]],
+    ) -> None:
+        self.trainer, self._names, self._views, self._code_maps = trainer, names, views, code_maps
+        self.metrics: dict[str, float] = {}
+
+    @property
+    def device(self) -> torch.device:
+        return self.trainer.gaussians.device
+
+    @property
+    def steps_done(self) -> int:
+        return self.trainer.iteration
+
+    @property
+    def total_steps(self) -> int:
+        return self.trainer.config.iterations
+
+    @property
+    def rate_factor(self) -> float:
+        return self.trainer.rate_factor
+
+    @rate_factor.setter
+    def rate_factor(self, factor: float) -> None:
+        self.trainer.rate_factor = factor
+
+    def step(self) -> None:
+        name = self.trainer.view_of_step(self._names)
+        camera, prepared = self._views[name]
+        losses = self.trainer.step(camera, self._code_maps[name], prepared=prepared)
+        done = self.trainer.iteration
+        if done % REPORT_EVERY == 0 or done == self.total_steps:  # reading losses synchronizes a GPU
+            self.metrics = {key: float(value) for key, value in losses.items()}
+            self.trainer.check_loss(self.metrics["loss"])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.trainer.state_dict()
+
+    def load_state_dict(self, state: dict[str, Tensor], /) -> None:
+        self.trainer.load_state_dict(state)
+
+    def find_invalid(self) -> str:
+        return self.trainer.find_invalid()
 
 
 def _prepare_views(

@@ -40,6 +40,8 @@ class FieldTrainer:
         field: A field to go on from; default is `TrainedField.initial`.
     """
 
+    parameter_prefixes = ("field.",)
+
     def __init__(
         self,
         gaussians: Gaussians,
@@ -53,7 +55,7 @@ class FieldTrainer:
         self.seed = seed
         self.iteration = 0
         self.rate_factor = 1.0
-        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.runtime.divergence`)."""
+        """Factor of all learning rates: halved whenever the training diverges (`lexsplat.runtime.training`)."""
         self._first_loss = math.nan
         self.generator = torch.Generator().manual_seed(seed)
         self.gaussians = gaussians.detach()
@@ -213,8 +215,8 @@ class FieldTrainer:
         state["first_loss"] = torch.tensor(self._first_loss, dtype=torch.float64)
         return {name: value.detach().clone() for name, value in state.items()}
 
-    def damage(self) -> str:
-        """What is wrong with the parameters; nothing where all is well."""
+    def find_invalid(self) -> str:
+        """The first invalid parameter; empty if there is none."""
         broken = [n for n, p in self.field.named_parameters() if not bool(torch.isfinite(p).all())]
         return f"NaN or Inf in {broken[0]}" if broken else ""
 

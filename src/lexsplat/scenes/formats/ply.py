@@ -175,7 +175,7 @@ def _gaussians_from_table(
     )
     if certain_opacities:
         gaussians.opacity_logits.clamp_(-20.0, 20.0)  # keeps NaN, which the check below finds
-    damage = gaussians.damage()
+    damage = gaussians.find_invalid()
     if damage:
         raise FileFormatError(path, expected="finite numbers", found=damage, remedy="make it again")
     return gaussians

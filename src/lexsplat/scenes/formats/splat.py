@@ -67,7 +67,7 @@ def read_splat(path: Path) -> Gaussians:
         sh0=((rgba[:, :3] - 0.5) / SH_C0)[:, None, :],
         shN=torch.zeros(len(table), 0, 3),
     )
-    damage = gaussians.damage()
+    damage = gaussians.find_invalid()
     if damage:
         raise FileFormatError(path, expected="positions and sizes of a scene", found=damage)
     return gaussians

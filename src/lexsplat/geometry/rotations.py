@@ -1,0 +1,114 @@
+"""Rotations: quaternions (wxyz), matrices, and the covariances of Gaussians.
+
+Functions on tensors are differentiable and take batches; functions on arrays compute in float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+def matrices_from_quaternions(quats: Tensor) -> Tensor:
+    """Rotation matrices ``[N, 3, 3]`` of quaternions ``[N, 4]``, wxyz of any length but 0."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """Covariances ``R S S^T R^T`` of Gaussians.
+
+    Args:
+        quats: Rotations ``[N, 4]``, wxyz of any length but 0.
+        scales: Standard deviations ``[N, 3]``, world units.
+
+    Returns:
+        ``[N, 3, 3]``, world units squared.
+    """
+    half = matrices_from_quaternions(quats) * scales[:, None, :]
+    return half @ half.transpose(1, 2)
+
+
+def multiply_quaternions(first: Tensor, second: Tensor) -> Tensor:
+    """Products of quaternions wxyz ``[..., 4]``: the rotation by ``second``, then by ``first``."""
+    w1, x1, y1, z1 = first.unbind(-1)
+    w2, x2, y2, z2 = second.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
+
+
+def differentiable_quaternion(rotation: Tensor) -> Tensor:
+    """Unit quaternion wxyz ``[4]`` of a rotation matrix ``[3, 3]``, differentiable.
+
+    Of the four equivalent formulas, the one with the largest divisor is used (Shepperd 1978).
+    """
+    m = rotation
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    # Row i is 4 q_i q: each of them is the quaternion, up to length and sign.
+    rows = torch.stack(
+        [
+            torch.stack([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
+            torch.stack([m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
+            torch.stack([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 + 2 * m[1, 1] - trace, m[1, 2] + m[2, 1]]),
+            torch.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 + 2 * m[2, 2] - trace]),
+        ]
+    )
+    best = rows[int(rows.detach().diagonal().argmax())]
+    return best / best.norm()
+
+
+def quaternion_from_matrix(rotation: NDArray) -> NDArray[np.float64]:
+    """Unit quaternion wxyz ``[4]`` of a rotation matrix ``[3, 3]``, with w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_quat(canonical=True)
+    return np.array([w, x, y, z])
+
+
+def matrix_from_quaternion(quaternion: NDArray) -> NDArray[np.float64]:
+    """Rotation matrix ``[3, 3]`` of a quaternion wxyz ``[4]``; NaN for one of length 0."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def rotation_about(axis: NDArray, degrees: float) -> NDArray[np.float64]:
+    """Rotation matrix ``[3, 3]`` by an angle about an axis ``[3]``, counterclockwise when the axis points at you."""
+    from scipy.spatial.transform import Rotation
+
+    unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    return np.asarray(Rotation.from_rotvec(unit * np.radians(degrees)).as_matrix(), dtype=np.float64)
+
+
+def looking_along(forward: NDArray, up: NDArray) -> NDArray[np.float64]:
+    """Rotation world to camera ``[3, 3]`` (OpenCV axes) of a camera that looks along a direction.
+
+    Args:
+        forward: Viewing direction ``[3]``, world, of any length but 0.
+        up: World direction that appears upwards ``[3]``; not parallel to ``forward``.
+    """
+    forward = np.asarray(forward, dtype=np.float64)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
