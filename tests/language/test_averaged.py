@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
     MeanFeatures,
@@ -121,14 +121,14 @@ def test_masked_pixels_count_for_nothing_also_within_a_cell_that_counts(small) -
 def test_a_small_bound_of_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_path) -> None:
     maps = random_features(small.cameras)
     whole = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
-    bounded = replace(FULL_SIZE, memory_bytes=memory)
-    heard = []
+    received = []
     found = average_features(
-        small.gaussians, small.cameras, maps, bounded, scratch=tmp_path / "new", listener=heard.append
-    )
+        small.gaussians, small.cameras, maps, FULL_SIZE,
+        memory=4 * memory, scratch=tmp_path / "new", listener=received.append,
+    )  # fmt: skip
     assert torch.equal(found.totals, whole.totals)
     np.testing.assert_allclose(np.asarray(found.means, float), np.asarray(whole.means, float), atol=1e-3)
-    assert (heard[-1].done, heard[-1].total) == ({1: 21, 30 * 4 * 67: 9, 30 * 4 * 70: 6}[memory],) * 2
+    assert (received[-1].done, received[-1].total) == ({1: 21, 30 * 4 * 67: 9, 30 * 4 * 70: 6}[memory],) * 2
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
 
 
@@ -139,7 +139,7 @@ def test_the_balls_get_their_codes_and_those_are_the_features_that_were_shown(sc
     assert field.codebook.dino is None
     ball = (field.codebook.clip @ scene.codebook.clip.T).argmax(1)  # that each code speaks of
     assert (ball[field.codes[:, 0].long()].numpy() == scene.labels).mean() > 0.97
-    renamed = LiftedField(
+    renamed = CodeField(
         scene.codebook, ball[field.codes.long()].to(torch.uint8), field.weights, field.uncertainties
     )
     assert label_accuracy(renamed, scene) > 0.97
@@ -262,7 +262,7 @@ def test_views_that_are_missing_or_of_another_dimension_are_told(small) -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"top": 0}, {"temperature": 0}, {"shortest_side": 0}, {"memory_bytes": 0}, {"min_visibility": -1}]
+    "bad", [{"top": 0}, {"temperature": 0}, {"shortest_side": 0}, {"min_visibility": -1}]
 )
 def test_bad_settings_are_refused(bad) -> None:
     with pytest.raises(ValueError, match="must"):

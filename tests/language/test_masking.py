@@ -1,6 +1,5 @@
 """Masked pixels have no say: not in pictures, features, codes, language or geometry, whatever is painted there."""
 
-import dataclasses
 import math
 import shutil
 
@@ -19,10 +18,9 @@ from lexsplat.features import FeatureConfig, FeatureMap, extract_features
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.language.code_maps import MASKED_CODE, MaskedCodeMaps, mark_masked_cells
-from lexsplat.language.methods.lifted import LiftedConfig, accumulate_histogram
+from lexsplat.language.methods import METHODS, FitRun, TrainingViews
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
-from lexsplat.pipeline.build import make_averaged_field
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.runtime.errors import CaptureError
@@ -131,27 +129,6 @@ def language():
     return scene, masked, wrong
 
 
-def test_lifted_histograms_hold_nothing_of_masked_pixels(language):
-    """The reference: each view's weights for the right half alone, from views that are the right half alone."""
-    scene, masked, _ = language
-    halves, codes = {}, {}
-    for name, camera in scene.cameras.items():
-        K = camera.K.copy()
-        K[0, 2] -= camera.width // 2
-        halves[name] = dataclasses.replace(camera, width=camera.width - camera.width // 2, K=K)
-        codes[name] = scene.code_maps[name][:, camera.width // 2 :]
-    config = LiftedConfig(top=5)
-    found = accumulate_histogram(scene.gaussians, scene.cameras, masked, 5, config)
-    expected = accumulate_histogram(scene.gaussians, halves, codes, 5, config)
-    # What lies far off the picture is projected a little differently in a narrower one.
-    assert torch.allclose(found.totals, expected.totals, rtol=1e-3, atol=2e-3)
-    assert (
-        0
-        < float(found.totals.sum())
-        < float(accumulate_histogram(scene.gaussians, scene.cameras, scene.code_maps, 5, config).totals.sum())
-    )
-
-
 def test_the_language_losses_send_nothing_to_masked_pixels(language):
     """Gradients of what is rendered, by torch itself: exactly zero where a pixel is masked, and not elsewhere."""
     scene, masked, _ = language
@@ -230,5 +207,6 @@ def test_a_gaussian_that_only_masked_pixels_show_gets_no_language(tmp_path):
     gaussians = gaussians_from_points(np.array(points), np.full((2, 3), 0.5), sh_degree=0, opacity=0.9)
     gaussians.log_scales.fill_(math.log(0.02))
     maps = {"a.png": FeatureMap(torch.eye(4)[:1].expand(12, 16, 4))}
-    field = make_averaged_field(gaussians, {"a.png": view}, maps, BuildConfig())
+    views = TrainingViews({"a.png": view}, features=maps)
+    field = METHODS["averaged"].fit(gaussians, views, BuildConfig(), FitRun())
     assert field.weights.sum(1).tolist() == pytest.approx([0.0, 1.0])

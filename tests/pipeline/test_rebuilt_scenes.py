@@ -10,6 +10,7 @@ import torch
 from conftest import QUICK_BUILD
 
 from lexsplat import cli, open_scene
+from lexsplat.language.methods.averaged import Averaged
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.folder import SceneFolder
@@ -134,7 +135,7 @@ def test_a_build_keeps_the_scene_until_the_new_one_is_whole(scene, tiny_capture,
         raise KeyboardInterrupt
 
     before = open_scene(scene, device="cpu").gaussians.means
-    monkeypatch.setattr("lexsplat.pipeline.build.make_averaged_field", stop)
+    monkeypatch.setattr(Averaged, "fit", stop)
     changed = [*QUICK_BUILD, "--seed", "5"]
     assert cli.main(["build", str(tiny_capture), "--output", str(scene), *changed]) == 130
     assert seen == ["previous"]

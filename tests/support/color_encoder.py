@@ -39,4 +39,4 @@ def install(patch):
     """Puts both in the place of the encoders that are loaded, by `pytest.MonkeyPatch`; no model is looked for."""
     patch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColorClip())
     patch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColorDino())
-    patch.setattr("lexsplat.pipeline.build.model_folder", lambda *_: None)
+    patch.setattr("lexsplat.pipeline.encoding.model_folder", lambda *_: None)

@@ -159,7 +159,7 @@ class FeatureConfig:
             given |= {"crop_sizes", "crop_strides"}
         return dataclasses.replace(suited, **{name: getattr(self, name) for name in given})
 
-    def decisive(self, use_dino: bool) -> FeatureConfig:
+    def result_settings(self, use_dino: bool) -> FeatureConfig:
         """The same with those at their defaults that decide nothing: memory, the other mode's, an unused DINO's."""
         usual = FeatureConfig()
         unused = {"memory", *(_RANDOM if self.mode == "grid" else _GRID)}
@@ -177,6 +177,7 @@ def extract_features(
     config: FeatureConfig | None = None,
     *,
     cache_dir: Path,
+    memory: int | None = None,
     listener: Listener = silent,
 ) -> FeatureMaps:
     """Extract and store the features of every view; views already stored with these settings cost nothing.
@@ -190,6 +191,7 @@ def extract_features(
         dino: Dense features beside CLIP; None for CLIP alone.
         config: Settings; None for the defaults.
         cache_dir: Folder of the cache; files of other settings or scenes may lie there too.
+        memory: Host memory in bytes; None takes that of the settings.
         listener: Hears of stage "features" after every view.
 
     Returns:
@@ -201,6 +203,8 @@ def extract_features(
         ModelError: If patches are to speak and the encoder's cannot be read.
     """
     config = config or FeatureConfig()
+    if memory is not None:
+        config = dataclasses.replace(config, memory=memory)
     cache_dir = Path(cache_dir)
     entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in scene.views.items()}
     missing = [name for name, entry in entries.items() if not entry.is_complete()]

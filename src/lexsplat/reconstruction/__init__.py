@@ -62,7 +62,7 @@ def reconstruct(
 
     check_gaussians(config, device, memory)
     points = initial_points(scene, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
-    trainer = Reconstructor(scene, config, points, device=device, seed=seed)
+    trainer = Reconstructor(scene, config, points, device=device, seed=seed, memory=memory)
     if checkpoint is not None:
         checkpoint.resume(trainer)
     trainer.run(listener, checkpoint)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -66,9 +67,12 @@ class Reconstructor:
         *,
         device: torch.device | str = "cpu",
         seed: int = 0,
+        memory: int | None = None,
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
+        if memory is not None:
+            config = replace(config, image_memory=min(config.image_memory, memory // 4))
         self.config = config
         self.device = torch.device(device)
         self.steps_done = 0

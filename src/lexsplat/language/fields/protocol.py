@@ -1,4 +1,4 @@
-"""What queries, evaluation and export need of a language field, whatever made it."""
+"""The interface of a language field, whichever method made it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from lexsplat.geometry.gaussians import Gaussians
 
 @runtime_checkable
 class LanguageField(Protocol):
-    """What queries, evaluation and export need of a field, whatever made it."""
+    """Language on N Gaussians, as queries, evaluation and export use it.
+
+    Attributes:
+        method: Name of the method that made the field.
+        codebook: The discrete feature space S with K codes.
+    """
 
     method: str
     codebook: Codebook
@@ -24,25 +29,29 @@ class LanguageField(Protocol):
         ...
 
     def code_probabilities(self) -> Tensor:
-        """Distribution over codes of every Gaussian ``[N, K]``: rows sum to 1, or 0 if nothing is known."""
+        """Distribution over codes of every Gaussian ``[N, K]``; rows sum to 1, or to 0 for unseen Gaussians."""
         ...
 
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """Distribution over codes at every pixel ``[H, W, K]``."""
         ...
 
+    def scores(self, table: Tensor) -> Tensor:
+        """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``."""
+        ...
+
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
-        """Per pixel sum over codes of p_k table[k]: ``[K, P]`` to ``[H, W, P]``."""
+        """Sum over codes of p_k table[k] at every pixel: ``[K, P]`` to ``[H, W, P]``."""
         ...
 
     def select(self, index: Tensor) -> LanguageField:
-        """The language of the Gaussians named by a mask or an index ``[M]``, as `Gaussians.select` orders them."""
+        """The field of some Gaussians, by mask ``[N]`` or indices ``[M]``, in the order of `Gaussians.select`."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything by name, for safetensors."""
+        """All tensors by name, for safetensors."""
         ...
 
     def metadata(self) -> dict[str, str]:
-        """What is not a tensor, for the header of the safetensors file."""
+        """Everything that is not a tensor, for the header of the safetensors file."""
         ...

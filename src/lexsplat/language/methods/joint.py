@@ -48,7 +48,7 @@ class JointTrainer:
         self,
         reconstructor: Reconstructor,
         cameras: Mapping[str, Camera],
-        code_maps: Mapping[str, NDArray[np.uint8]],
+        code_maps: Mapping[str, NDArray[np.integer]],
         codebook: Codebook,
         config: TrainedConfig,
         *,

@@ -84,7 +84,7 @@ class FieldTrainer:
         return torch.optim.AdamW(groups, betas=(0.9, 0.999))
 
     def step(
-        self, camera: Camera, code_map: NDArray[np.uint8] | Tensor, *, prepared: PreparedView | None = None
+        self, camera: Camera, code_map: NDArray[np.integer] | Tensor, *, prepared: PreparedView | None = None
     ) -> dict[str, Tensor]:
         """One step on one view.
 
