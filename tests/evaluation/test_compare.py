@@ -127,7 +127,7 @@ def test_unknown_methods_are_refused_before_any_work(tiny_capture, tmp_path):
 def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, monkeypatch):
     color_encoder.install(monkeypatch)
     folder, _ = compared
-    for part in ("scene", "codebooks", "runs"):
+    for part in ("scene", "runs"):
         shutil.copytree(folder / part, tmp_path / part)
     before = rows_of(folder)["averaged"]
     comparison.compare(

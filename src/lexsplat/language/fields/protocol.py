@@ -1,4 +1,4 @@
-"""The interface of a language field, whichever method made it."""
+"""The interface of every language field, whichever method made it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from lexsplat.geometry.gaussians import Gaussians
 
 @runtime_checkable
 class LanguageField(Protocol):
-    """Language on N Gaussians, as queries, evaluation and export use it.
+    """The language of N Gaussians: a distribution over the K codes of a codebook for each of them.
 
-    Attributes:
-        method: Name of the method that made the field.
-        codebook: The discrete feature space S with K codes.
+    Queries, evaluation and export use nothing else of a field.
     """
 
     method: str
@@ -29,23 +27,26 @@ class LanguageField(Protocol):
         ...
 
     def code_probabilities(self) -> Tensor:
-        """Distribution over codes of every Gaussian ``[N, K]``; rows sum to 1, or to 0 for unseen Gaussians."""
+        """Distribution over codes of every Gaussian ``[N, K]``; rows sum to 1, or to 0 where nothing is known."""
+        ...
+
+    def scores(self, table: Tensor) -> Tensor:
+        """Expected table entry of every Gaussian, the sum over codes of p_k table[k]: ``[K, P]`` to ``[N, P]``.
+
+        ``[N, K]`` is never held.
+        """
         ...
 
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """Distribution over codes at every pixel ``[H, W, K]``."""
         ...
 
-    def scores(self, table: Tensor) -> Tensor:
-        """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``."""
-        ...
-
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
-        """Sum over codes of p_k table[k] at every pixel: ``[K, P]`` to ``[H, W, P]``."""
+        """Expected table entry at every pixel, the sum over codes of p_k table[k]: ``[K, P]`` to ``[H, W, P]``."""
         ...
 
     def select(self, index: Tensor) -> LanguageField:
-        """The field of some Gaussians, by mask ``[N]`` or indices ``[M]``, in the order of `Gaussians.select`."""
+        """The language of the Gaussians given by a mask ``[N]`` or an index ``[M]``, as `Gaussians.select`."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:

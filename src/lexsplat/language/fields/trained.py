@@ -28,9 +28,6 @@ DECODER_WIDTHS = (128, 256)
 INITIAL_UNCERTAINTY = 0.01
 """Start of u in the authors' code. The paper starts at 0, which a sigmoid never reaches."""
 
-PROBABILITY_ROWS = 4 * BLOCK_ROWS
-"""Gaussians whose distributions ``[n, K]`` are held at a time."""
-
 
 class TrainedField(nn.Module):
     """The paper's language field: s_G and u on the Gaussians, D_MLP, and the smoothing MLP.
@@ -117,25 +114,25 @@ class TrainedField(nn.Module):
 
     @torch.no_grad()
     def code_probabilities(self) -> Tensor:
-        """softmax(D_MLP(s_G)) ``[N, K]``: Eq. 8 for each Gaussian by itself."""
-        return self._decoded(self.semantics)
+        """softmax(D_MLP(s_G)): what each Gaussian would show alone ``[N, K]``."""
+        return self._probabilities(self.semantics)
+
+    @torch.no_grad()
+    def scores(self, table: Tensor) -> Tensor:
+        """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``, in blocks of Gaussians."""
+        check_table(table, self.codebook)
+        table = table.to(self.semantics)
+        return torch.cat([self._probabilities(rows) @ table for rows in self.semantics.split(4 * BLOCK_ROWS)])
+
+    def _probabilities(self, semantics: Tensor) -> Tensor:
+        """Decoded distributions ``[M, K]`` of rows ``[M, 8]``."""
+        return torch.cat([self.decode(rows).softmax(-1) for rows in semantics.split(BLOCK_ROWS)])
 
     @torch.no_grad()
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """Eq. 8 ``[H, W, K]``. Every pixel sums to 1, also where no Gaussian is drawn (there s is 0)."""
         semantics, _ = self.render_semantics(gaussians, camera)
-        return self._decoded(semantics.flatten(0, 1)).unflatten(0, semantics.shape[:2])
-
-    def _decoded(self, semantics: Tensor) -> Tensor:
-        """softmax(D_MLP(s)) in blocks: ``[M, 8]`` to ``[M, K]``."""
-        return torch.cat([self.decode(rows).softmax(-1) for rows in semantics.split(BLOCK_ROWS)])
-
-    @torch.no_grad()
-    def scores(self, table: Tensor) -> Tensor:
-        """Sum over codes of `code_probabilities` times ``table[K, P]``: ``[N, P]``, without holding ``[N, K]``."""
-        check_table(table, self.codebook)
-        table = table.to(self.semantics)
-        return torch.cat([self._decoded(rows) @ table for rows in self.semantics.split(PROBABILITY_ROWS)])
+        return self._probabilities(semantics.flatten(0, 1)).unflatten(0, semantics.shape[:2])
 
     @torch.no_grad()
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
