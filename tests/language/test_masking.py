@@ -1,4 +1,4 @@
-"""Masked pixels have no say: not in pictures, features, codes, language or geometry, whatever is painted there."""
+"""Masked pixels do not affect images, features, codes, language or geometry, whatever their colors."""
 
 import math
 import shutil
@@ -50,7 +50,7 @@ def masked_capture(folder, camera: dict, *, paint: int | None, mask: bool = True
 
 @pytest.mark.parametrize("camera", [PINHOLE, DISTORTED], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("size", [None, (64, 48), (32, 24), (23, 17), (96, 72)])
-def test_pictures_do_not_depend_on_masked_pixels_and_valid_ones_only_on_the_photo(tmp_path, camera, size):
+def test_masked_pixels_do_not_affect_images(tmp_path, camera, size):
     plain, painted, free = (
         masked_capture(tmp_path / name, camera, paint=paint, mask=mask).views["b.png"]
         for name, paint, mask in (("plain", None, True), ("painted", 7, True), ("free", None, False))
@@ -63,7 +63,7 @@ def test_pictures_do_not_depend_on_masked_pixels_and_valid_ones_only_on_the_phot
     assert not np.array_equal(free.load_image(size), plain.load_image(size))
 
 
-def test_the_hole_has_the_mean_color_of_the_rest():
+def test_masked_pixels_have_the_mean_color_of_the_others():
     image = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
     valid = np.random.default_rng(1).random((6, 8)) > 0.4
     result = filled(image, valid)
@@ -102,7 +102,7 @@ def test_features_codebook_and_codes_do_not_depend_on_masked_pixels(tmp_path):
     )
 
 
-def test_index_maps_keep_the_code_of_their_cell_where_pixels_count(tmp_path):
+def test_index_maps_keep_the_codes_of_unmasked_pixels(tmp_path):
     views = masked_capture(tmp_path, PINHOLE, paint=None).views
     coarse = np.random.default_rng(0).integers(0, 200, (24, 32)).astype(np.uint8)
     maps = MaskedCodeMaps({"a.png": coarse, "elsewhere": coarse}, views)
@@ -129,7 +129,7 @@ def language():
     return scene, masked, wrong
 
 
-def test_the_language_losses_send_nothing_to_masked_pixels(language):
+def test_language_losses_have_no_gradient_at_masked_pixels(language):
     """Gradients of what is rendered, by torch itself: exactly zero where a pixel is masked, and not elsewhere."""
     scene, masked, _ = language
     trainer = FieldTrainer(scene.gaussians, scene.codebook, TrainedConfig(pixel_sample=0))
@@ -165,7 +165,7 @@ def halves(tiny_capture, tmp_path_factory):
     return scenes
 
 
-def test_geometry_is_bit_for_bit_the_same_whatever_is_painted_under_the_mask(halves):
+def test_geometry_does_not_depend_on_masked_pixels(halves):
     points = initial_points(halves["plain"])
     config = ReconstructionConfig(
         iterations=10, sh_degree=1, max_gaussians=1300, densify_min_every=5, warm_up=0.4
@@ -184,7 +184,7 @@ def test_geometry_is_bit_for_bit_the_same_whatever_is_painted_under_the_mask(hal
         )
 
 
-def test_masks_that_fit_no_photo_are_told(tmp_path, caplog):
+def test_masks_without_a_photo_are_reported(tmp_path, caplog):
     masked_capture(tmp_path, PINHOLE, paint=None)
     Image.new("L", (64, 48)).save(tmp_path / "masks" / "nobody.png")
     Image.new("L", (64, 48)).save(tmp_path / "masks" / "a.png.jpg")
@@ -197,7 +197,7 @@ def test_masks_that_fit_no_photo_are_told(tmp_path, caplog):
         load_capture(tmp_path)
 
 
-def test_a_gaussian_that_only_masked_pixels_show_gets_no_language(tmp_path):
+def test_a_gaussian_seen_in_masked_pixels_only_has_no_language(tmp_path):
     """Every cell has a feature, those of the hole too; behind its middle lies a small Gaussian."""
     view = masked_capture(tmp_path, PINHOLE, paint=None).views["a.png"]
     camera, points = view.camera, []
