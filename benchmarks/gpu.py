@@ -37,7 +37,7 @@ from render import three_shells
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.language.fields import LanguageField, LiftedField, TrainedField
+from lexsplat.language.fields import CodeField, LanguageField, TrainedField
 from lexsplat.queries.relevancy import code_relevancy, probability_relevancy
 from lexsplat.reconstruction.adam import Adam
 from lexsplat.reconstruction.image_losses import photometric_loss, ssim_target
@@ -55,7 +55,7 @@ def cameras_around(count: int, width: int, height: int) -> list[Camera]:
     return [look_at(eye, np.zeros(3), up, width, height, 2 * math.atan(120 / 280)) for eye in eyes]
 
 
-def random_fields(gaussians: Gaussians) -> tuple[LiftedField, TrainedField]:
+def random_fields(gaussians: Gaussians) -> tuple[CodeField, TrainedField]:
     """Language of no meaning but of full size."""
     generator = torch.Generator().manual_seed(0)
     unit = torch.nn.functional.normalize(torch.randn(CODES, DIMENSION, generator=generator), dim=-1)
@@ -64,7 +64,7 @@ def random_fields(gaussians: Gaussians) -> tuple[LiftedField, TrainedField]:
     codes = torch.randint(0, CODES, (count, 4), generator=generator).byte().to(gaussians.device)
     weights = torch.rand(count, 4, generator=generator).to(gaussians.device)
     uncertain = torch.zeros(count, device=gaussians.device)
-    lifted = LiftedField(codebook, codes, weights / weights.sum(1, keepdim=True), uncertain)
+    lifted = CodeField(codebook, codes, weights / weights.sum(1, keepdim=True), uncertain)
     return lifted, TrainedField.initial(gaussians, codebook, generator=generator)
 
 

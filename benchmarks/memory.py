@@ -77,18 +77,19 @@ def extract(capture: Path, memory: str) -> dict[str, float]:
     """The feature stage at full size; GiB and seconds."""
     from lexsplat.captures import load_capture
     from lexsplat.features.encoders import load_clip, load_dino
-    from lexsplat.pipeline.build import feature_maps
     from lexsplat.pipeline.config import BuildConfig
+    from lexsplat.pipeline.encoding import Encoders, feature_maps
 
     load_clip("bundled"), load_dino("bundled")
     bare = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     scene = load_capture(capture)
     view = next(iter(scene.views.values()))
     config = BuildConfig(clip="bundled", dino="bundled", memory=memory, downscale=1.0)
-    config = config.resolved("cpu", view.capture_size).within_memory()
+    config = config.resolved("cpu", view.capture_size)
     with tempfile.TemporaryDirectory() as cache:
         start = time.perf_counter()
-        maps, _ = feature_maps(scene, config, Path(cache), "cpu")
+        encoders = Encoders(config.clip, config.dino, "cpu")
+        maps = feature_maps(scene, config, encoders, Path(cache))
         for name in maps:
             maps[name]
         seconds = time.perf_counter() - start

@@ -55,7 +55,7 @@ def make_inputs(width, height, codes, prompts):
 
 
 def sparse_scores(codes, weights, table):
-    """Scores of Gaussians that carry four codes each, as `LiftedField.scores` computes them."""
+    """Scores of Gaussians that carry four codes each, as `CodeField.scores` computes them."""
     total = weights.new_zeros(len(codes), table.shape[1])
     for column in range(codes.shape[1]):
         total.addcmul_(weights[:, column, None], table[codes[:, column]])

@@ -23,7 +23,7 @@ import lexsplat
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
@@ -69,7 +69,7 @@ def synthetic(count: int) -> Scene:
     cell = ((points[:, 0] + 5) * 12.7).long().clamp(0, 127)
     codes = torch.stack([cell, (cell + 1) % 128, (cell + 2) % 128, (cell + 3) % 128], 1).to(torch.uint8)
     weights = torch.tensor([0.7, 0.1, 0.1, 0.1]).expand(count, 4).contiguous()
-    field = LiftedField(codebook, codes, weights, torch.rand(count, generator=g))
+    field = CodeField(codebook, codes, weights, torch.rand(count, generator=g))
     cameras = [
         look_at(np.array([np.cos(a), np.sin(a), 0.2]), np.array([4 * np.cos(a), 4 * np.sin(a), 0]),
                 np.array([0, 0, 1.0]), 320, 240, 0.9)

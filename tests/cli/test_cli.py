@@ -40,7 +40,7 @@ def test_build_writes_the_scene_folder_of_the_design(built):
 def test_a_language_made_of_codes_of_the_views_leaves_their_index_maps(built, tiny_capture, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(built, copy)
-    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "lifted"]) == 0
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "trained"]) == 0
     record = json.loads((copy / "scene.json").read_text())
     assert set(record["stages"]) == {"reconstruct", "features", "codebook", "language"}
     assert list((copy / "checkpoints" / "features").glob("*.dino.*"))
@@ -62,8 +62,7 @@ def test_a_changed_setting_redoes_only_what_it_touches(built, tiny_capture, tmp_
     shutil.copytree(built, copy)
     before = modified(copy)
     # Features are averaged: no other way to the language, nor how much is kept in memory, has a part in it.
-    idle = ["--trained.no-use-smoothing", "--tuning.iterations", "9", "--averaged.memory-bytes", "999999"]
-    idle += ["--lifted.top", "3", "--features.dino-stride", "9"]
+    idle = ["--trained.no-use-smoothing", "--features.dino-stride", "9"]
     idle += ["--features.random-crops", "7", "--memory", "3GB"]
     assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, *idle]) == 0
     after = modified(copy)
@@ -155,13 +154,12 @@ def test_an_edit_by_words_is_undone_done_again_saved_and_the_new_scene_answers_r
     assert without < 0.67 * with_ball, "what stood behind answers less"
 
 
-@pytest.mark.parametrize("method", ["lifted", "lifted+tuned"])
-def test_every_method_makes_a_scene_that_answers(built, tiny_capture, tmp_path, method):
+def test_a_trained_language_makes_a_scene_that_answers(built, tiny_capture, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(built, copy)
-    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", method]) == 0
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "trained"]) == 0
     scene = open_scene(copy, device="cpu")
-    assert scene.field.method == method
+    assert scene.field.method == "trained"
     relevancy = scene.relevancy(["red apple"], "view_02")
     assert relevancy.shape == (1, 72, 96)
     assert float(relevancy.max()) > float(relevancy.min())
@@ -271,7 +269,7 @@ def test_an_unknown_model_says_the_three_ways_to_get_one(tiny_capture, tmp_path,
         "--dino",
         "nobody/nothing",
         "--method",
-        "lifted",
+        "trained",
     ]
     fails_in_one_line(capsys, arguments, "nobody/nothing", "--dino bundled")
     assert not (output / "gaussians.ply").exists(), "it is told before the long part"

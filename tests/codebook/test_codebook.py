@@ -144,7 +144,7 @@ def test_load_balancing_loss_is_supplement_a(temperature: float) -> None:
     assert float(load_balancing_loss(scores, temperature)) == pytest.approx(expected, rel=1e-12)
 
 
-def test_load_balancing_gradient_leaves_the_counts_alone_and_disfavors_the_used_code() -> None:
+def test_load_balancing_gradient_disfavors_the_used_code() -> None:
     scores = torch.zeros(10, 2, dtype=torch.float64)
     scores[:, 0] = 0.2
     scores.requires_grad_()
@@ -273,7 +273,7 @@ def test_held_out_views_take_no_part_in_the_fit() -> None:
     torch.testing.assert_close(second.clip, first.clip, rtol=0, atol=0)
 
 
-def test_fit_is_the_same_for_the_same_seed_and_ignores_global_randomness() -> None:
+def test_the_fit_depends_on_the_seed_only() -> None:
     maps, _ = clustered_maps(5)
     config = CodebookConfig(num_codes=6, steps=5, batch_size=32)
     torch.manual_seed(1)
@@ -284,7 +284,7 @@ def test_fit_is_the_same_for_the_same_seed_and_ignores_global_randomness() -> No
     assert torch.equal(first.dino, second.dino)
 
 
-def test_fit_and_assignment_are_the_same_to_the_last_bit_on_any_number_of_threads() -> None:
+def test_fit_and_assignment_are_bit_identical_on_any_number_of_threads() -> None:
     # Batches so large that torch would spread them over its threads.
     generator = torch.Generator().manual_seed(8)
     maps = {
@@ -344,7 +344,7 @@ def test_code_usage_counts_cells_and_leaves_ignored_ones_out() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 257, 1000])
-def test_more_codes_than_a_byte_holds_is_an_error_that_says_so(count: int) -> None:
+def test_more_codes_than_a_byte_holds_are_refused(count: int) -> None:
     with pytest.raises(ValueError, match="1 to 256 because an index map holds one byte"):
         CodebookConfig(num_codes=count)
 
@@ -367,9 +367,9 @@ def test_tensors_round_trip(with_dino: bool) -> None:
 def test_bad_input_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one training view"):
         fit_codebook({}, [], CodebookConfig())
-    with pytest.raises(ValueError, match="features of v have a number that is not finite"):
+    with pytest.raises(ValueError, match="features of v: NaN or infinity"):
         fit_codebook({"v": Map(torch.full((2, 2, 3), torch.nan))}, ["v"], CodebookConfig(num_codes=2))
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match="NaN or infinity"):
         Codebook(torch.full((2, 3), torch.inf))
     with pytest.raises(ValueError, match="fitted with DINO"):
         Codebook(torch.ones(2, 3), torch.ones(2, 3)).assign(Map(torch.ones(1, 1, 3)))

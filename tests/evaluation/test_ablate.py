@@ -1,4 +1,4 @@
-"""The ablation on a tiny capture: what is shared, what is switched off, and going on after a stop."""
+"""The ablation on a tiny capture: what is shared, what is switched off, and resuming."""
 
 import csv
 import json
@@ -15,6 +15,9 @@ from support.report_pages import Page
 from lexsplat import cli
 from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
+from lexsplat.language.methods import METHODS
+from lexsplat.language.methods.averaged import Averaged
+from lexsplat.language.methods.trained import Trained
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import read_tensors, write_tensors
@@ -37,12 +40,26 @@ def ablated(tiny_capture, tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def fits(monkeypatch):
+    """Every fit of a method: the training views, settings and run it receives."""
+    received = []
+    for method in (Averaged, Trained):
+
+        def fit(self, gaussians, views, config, run, *, original=method.fit):
+            received.append((views, config, run))
+            return original(self, gaussians, views, config, run)
+
+        monkeypatch.setattr(method, "fit", fit)
+    return received
+
+
 def rows_of(folder):
     with (folder / "ablation.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def test_every_row_of_the_papers_table_switches_off_what_it_says():
+def test_every_row_of_the_papers_table_switches_off_its_part():
     config = BuildConfig(method="trained")
     assert ablation.changed(config, "full") == config
     assert not ablation.changed(config, "w/o DINO").codebook.use_dino
@@ -57,46 +74,56 @@ def test_every_row_of_the_papers_table_switches_off_what_it_says():
         ablation.changed(config, "w/o everything")
 
 
-def test_a_lifted_field_is_ablated_in_its_quantization_only():
-    assert ablation.variants_of("lifted") == ("w/o DINO", "w/o L_lb", "with neighbors", "one code", "full")
+def test_each_method_has_the_variants_that_change_it():
     table_2 = ("w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full")
-    assert ablation.variants_of("trained") == table_2
-    assert ablation.variants_of("lifted+tuned") == tuple(ablation.VARIANTS)
-    config = BuildConfig(method="lifted")
-    assert ablation.changed(config, "with neighbors").lifted.use_smoothing
-    assert ablation.changed(config, "one code").lifted.top == 1
+    assert tuple(METHODS["trained"].variants) == table_2
+    assert tuple(METHODS["averaged"].variants) == ("one code", "full")
+    assert set(ablation.VARIANTS) == {*table_2, "one code"}
+    assert ablation.changed(BuildConfig(), "one code").averaged.top == 1
+    with pytest.raises(ValueError, match="averaged"):
+        ablation.changed(BuildConfig(), "w/o MLP")
 
 
-def test_several_methods_stand_beside_each_other_with_wrong_labels(
-    ablated, tiny_capture, tmp_path, monkeypatch
+def test_a_variant_that_no_method_has_is_refused_before_any_work(tiny_capture, tmp_path):
+    for methods in (("averaged",), ("trained", "averaged")):
+        with pytest.raises(ValueError, match="with neighbors"):
+            ablation.ablate(
+                tiny_capture, tmp_path / "a", CONFIG, methods=methods, variants=("with neighbors",)
+            )
+    with pytest.raises(ValueError, match="averaged"):
+        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, methods=("averaged",), variants=("w/o MLP",))
+    with pytest.raises(ValueError, match="lifted"):
+        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, methods=("lifted",))
+    assert not (tmp_path / "a").exists()
+
+
+def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
+    ablated, tiny_capture, tmp_path, fits, caplog
 ):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
-    seen, original = [], ablation.make_field
-    monkeypatch.setattr(ablation, "make_field", lambda *a: seen.append(a[2]) or original(*a))
+    methods = ("trained", "averaged")
     rows = ablation.ablate(
-        tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=("trained", "lifted"), variants=("full", "one code"),
+        tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=methods, variants=("full", "one code"),
         wrong_labels=0.3,
     )  # fmt: skip
-    assert [row["name"] for row in rows] == ["trained: full", "lifted: full", "lifted: one code"]
+    assert [row["name"] for row in rows] == ["trained: full", "averaged: full", "averaged: one code"]
+    assert "trained has no variant 'one code': the row is left out" in caplog.text
     assert all(row["language_seconds"][0] > 0 and row["storage_bytes"][0] > 0 for row in rows)
-    clean = ablation.ablate(
-        tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=("trained", "lifted"), variants=("full",)
-    )  # other labels are other runs: they are measured anew
-    assert len(seen) == 5
-    name = next(iter(seen[0]))
-    assert 0.1 < np.mean(seen[0][name] != seen[3][name]) < 0.35
+    clean = ablation.ablate(tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=methods, variants=("full",))
+    assert len(fits) == 5, "other labels are other runs"
+    wrong, right = fits[0][0].code_maps, fits[3][0].code_maps
+    name = next(iter(wrong))
+    assert 0.1 < np.mean(wrong[name] != right[name]) < 0.35
     assert rows[1]["mAP"] != clean[1]["mAP"]
 
 
-def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, monkeypatch):
+def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
-    made, original = [], ablation.make_field
-    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(1) or original(*a))
     rows = ablation.ablate(
         tiny_capture, tmp_path, CONFIG, seeds=(0, 1), variants=("full",), forms=("feature", "code")
     )
     assert [row["name"] for row in rows] == ["full, feature", "full, code"]
-    assert len(made) == 2, "one for each seed"
+    assert len(fits) == 2, "one for each seed"
     for form in ("feature", "code"):
         record = json.loads((tmp_path / "runs" / f"full__{form}" / "seed-0.json").read_text())
         assert record["metrics"]["language"]["form"] == form
@@ -125,7 +152,7 @@ def test_wrong_labels_differ_in_every_view_and_keep_their_share():
 
 def test_the_tables_have_all_rows_with_mean_and_spread(ablated):
     rows = rows_of(ablated)
-    assert [row["name"] for row in rows] == list(ablation.variants_of("trained"))
+    assert [row["name"] for row in rows] == list(METHODS["trained"].variants)
     assert all(row["runs"] == "2" for row in rows)
     record = json.loads((ablated / "ablation.json").read_text())
     values = [run["auto"]["mIoU"] for run in record["runs"]["full"]]
@@ -137,7 +164,7 @@ def test_the_tables_have_all_rows_with_mean_and_spread(ablated):
 
 
 def test_the_report_has_mean_and_spread_and_the_pictures_of_the_first_seed(ablated):
-    text = (ablated / "report.html").read_text(encoding="utf-8")
+    text = (ablated / "ablation.html").read_text(encoding="utf-8")
     rows = {row[0]: row for row in reversed(Page(text).rows) if row}
     values = [float(entry["mIoU"]) for entry in rows_of(ablated) if entry["name"] == "w/o MLP"]
     assert rows["w/o MLP"][3].startswith(f"{values[0]:.3f} ± ")
@@ -164,21 +191,15 @@ def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_captur
     assert rows[0]["host_bytes"][0] in (None, 10**15)
 
 
-def test_memory_granted_bounds_codebook_and_language(ablated, tiny_capture, tmp_path, monkeypatch):
-    from lexsplat.evaluation import experiments
-
+def test_codebook_and_language_receive_the_memory_budget(ablated, tiny_capture, tmp_path, monkeypatch, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
-    granted = []
-    fit, field = experiments.fit_codebook, ablation.make_field
+    granted, fit = [], experiments.fit_codebook
     monkeypatch.setattr(
         experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
     )
-    monkeypatch.setattr(
-        ablation, "make_field", lambda *a: granted.append(a[4].trained.memory_bytes) or field(*a)
-    )
     config = replace(CONFIG, memory="800MB")
     ablation.ablate(tiny_capture, tmp_path, config, seeds=(0,), variants=("full",))
-    assert granted == [parse_bytes("800MB"), parse_bytes("200MB")]
+    assert [*granted, fits[0][2].memory] == [parse_bytes("800MB")] * 2
 
 
 def test_seeds_differ_and_the_gaussians_are_shared(ablated):
@@ -187,17 +208,15 @@ def test_seeds_differ_and_the_gaussians_are_shared(ablated):
     assert full[0]["metrics"]["language"] != full[1]["metrics"]["language"]
 
 
-def test_a_stopped_ablation_goes_on_with_what_is_missing(ablated, tiny_capture, monkeypatch):
+def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_capture, fits):
     before = rows_of(ablated)
     missing = ablated / "runs" / "w_o_MLP" / "seed-1.json"
     language = json.loads(missing.read_text())["metrics"]["language"]
     missing.unlink()
     (ablated / "runs" / "full" / "seed-0.json").write_text("{")  # damaged
     next((ablated / "codebooks").glob("*.safetensors")).write_bytes(b"damaged")
-    made, original = [], ablation.make_field
-    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(a[4].seed) or original(*a))
     ablation.ablate(tiny_capture, ablated, CONFIG, seeds=(0, 1))
-    assert made == [0, 1], "only what is missing is made"
+    assert [run.seed for _, _, run in fits] == [0, 1]
     again = json.loads(missing.read_text())["metrics"]["language"]
     assert again == language, "the same seed gives the same numbers"
     assert [row["name"] for row in rows_of(ablated)] == [row["name"] for row in before]
@@ -206,17 +225,14 @@ def test_a_stopped_ablation_goes_on_with_what_is_missing(ablated, tiny_capture, 
         assert values[0] == values[1], name
 
 
-def test_another_program_measures_anew_what_the_one_before_kept(ablated, tiny_capture, tmp_path, monkeypatch):
-    """A method that was mended must not show the numbers of the broken one under today's versions."""
+def test_another_version_of_the_code_measures_again(ablated, tiny_capture, tmp_path, monkeypatch, fits):
     output = shutil.copytree(ablated, tmp_path / "ablated")
     monkeypatch.setattr(experiments, "code_identity", lambda: "another")
-    made, original = [], ablation.make_field
-    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(a[4].seed) or original(*a))
     ablation.ablate(tiny_capture, output, CONFIG, variants=("full",), seeds=(0,))
-    assert made == [0]
+    assert [run.seed for _, _, run in fits] == [0]
 
 
-def test_wrong_wishes_are_told_before_anything_is_made(tiny_capture, tmp_path):
+def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="seed"):
         ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, seeds=())
     with pytest.raises(ValueError, match="variants"):
@@ -225,17 +241,13 @@ def test_wrong_wishes_are_told_before_anything_is_made(tiny_capture, tmp_path):
 
 
 def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
-    from lexsplat.evaluation import experiments
-
     empty = experiments.Annotations("segmentations", tiny_capture, {})
     monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
         ablation.ablate(tiny_capture, ablated, replace(CONFIG, seed=0))
 
 
-def test_truth_from_elsewhere_is_asked_in_the_words_of_either_list_and_runs_are_kept_for_equal_truth_only(
-    tiny_capture, tmp_path, monkeypatch
-):
+def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp_path, fits):
     capture, ground_truth = tmp_path / "counter", tmp_path / "ground_truth"
     shutil.copytree(tiny_capture, capture)
     for folder in (
@@ -245,38 +257,36 @@ def test_truth_from_elsewhere_is_asked_in_the_words_of_either_list_and_runs_are_
         for old, new in (("red apple", "stale bread"), ("blue ball", "blue ball")):
             mask = Image.open(folder / f"{old}.png")
             mask.save(ground_truth / folder.name / f"{new}.png", compress_level=0)
-    made, original = [], ablation.make_field
-    monkeypatch.setattr(ablation, "make_field", lambda *a: made.append(1) or original(*a))
 
-    def measure(**wishes):
-        before = len(made)
+    def measure(**options):
+        before = len(fits)
         rows = ablation.ablate(
-            capture, tmp_path / "out", CONFIG, seeds=(0,), methods=("lifted",), variants=("full",), **wishes
+            capture, tmp_path / "out", CONFIG, seeds=(0,), methods=("trained",), variants=("full",), **options
         )
         record = json.loads((tmp_path / "out" / "ablation.json").read_text())
         return (
             list(record["per_prompt"]["full"][0]),
-            len(made) - before,
+            len(fits) - before,
             rows[0]["mAP"][0],
             record["ground_truth"],
         )
 
     released = measure(masks=ground_truth, prompt_list="released")
-    assert released[:2] == (["stale bread"], 1), "the blue ball is in no list"
+    assert released[:2] == (["stale bread"], 1), "no list has the blue ball"
     assert released[3] == {"folder": str(ground_truth), "layout": "segmentations", "prompt_list": "released"}
     assert measure(masks=ground_truth, prompt_list="paper")[:2] == (["stable bread"], 1)
     everything = measure(masks=ground_truth)
     assert everything[:2] == (["blue ball", "stale bread"], 1)
     moved = ground_truth.rename(tmp_path / "moved")
     assert measure(masks=moved)[:3] == (everything[0], 0, everything[2]), (
-        "equal ground truth elsewhere is no other truth"
+        "equal ground truth in another folder is the same"
     )
     for path in moved.rglob("stale bread.png"):
         size = path.stat().st_size
         Image.fromarray(255 - np.asarray(Image.open(path))).save(path, compress_level=0)
         assert path.stat().st_size == size
     redrawn = measure(masks=moved)
-    assert redrawn[1] == 1, "other masks of the same names and sizes are other truth"
+    assert redrawn[1] == 1, "other masks with the same names and sizes are other ground truth"
     assert redrawn[2] != everything[2]
     own = measure()
     assert own[:2] == (["blue ball", "red apple"], 1)
@@ -286,30 +296,28 @@ def test_truth_from_elsewhere_is_asked_in_the_words_of_either_list_and_runs_are_
 
 @pytest.mark.parametrize("command", ["ablate", "compare"])
 @pytest.mark.parametrize(
-    ("wish", "told"),
+    ("option", "message"),
     [(("--prompt-list", "paper"), "bonsai, counter"), (("--masks", "nowhere"), "no such folder")],
 )
-def test_truth_that_cannot_be_had_is_told_before_anything_is_made(
-    tiny_capture, tmp_path, capsys, command, wish, told
+def test_unavailable_ground_truth_is_refused_before_any_work(
+    tiny_capture, tmp_path, capsys, command, option, message
 ):
     output = tmp_path / "out"
-    assert cli.main([command, str(tiny_capture), "--output", str(output), *wish]) == 1
-    assert told in capsys.readouterr().err
+    assert cli.main([command, str(tiny_capture), "--output", str(output), *option]) == 1
+    assert message in capsys.readouterr().err
     assert not output.exists()
 
 
 @pytest.mark.parametrize("command", ["ablate", "compare"])
-def test_the_command_line_hands_on_which_truth_and_protocols_are_meant(
-    tiny_capture, tmp_path, monkeypatch, command
-):
+def test_the_command_line_passes_ground_truth_and_protocols(tiny_capture, tmp_path, monkeypatch, command):
     from lexsplat.evaluation import compare as comparison
 
     module = {"ablate": ablation, "compare": comparison}[command]
-    wishes = {}
-    monkeypatch.setattr(module, command, lambda *a, **k: wishes.update(k) or [])
+    options = {}
+    monkeypatch.setattr(module, command, lambda *a, **k: options.update(k) or [])
     arguments = ["--masks", str(tmp_path), "--prompt-list", "released"]
     arguments += ["--protocols", "strict", "lerf-2d"] if command == "compare" else []
     assert cli.main([command, str(tiny_capture), "--output", str(tmp_path / "out"), *arguments]) == 0
-    assert (wishes["masks"], wishes["prompt_list"]) == (tmp_path, "released")
+    assert (options["masks"], options["prompt_list"]) == (tmp_path, "released")
     if command == "compare":
-        assert wishes["protocols"] == ("strict", "lerf-2d")
+        assert options["protocols"] == ("strict", "lerf-2d")

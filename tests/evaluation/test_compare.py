@@ -29,7 +29,7 @@ def compared(tiny_capture, tmp_path_factory):
         patch.setattr(
             comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
         )
-        methods = ("lifted", "lifted-feature", *comparison.BASELINES)
+        methods = ("averaged", "averaged-feature", *comparison.BASELINES)
         comparison.compare(tiny_capture, folder, CONFIG, methods=methods, lpips=False)
         start = time.perf_counter()
         comparison.compare(tiny_capture, folder, CONFIG, methods=methods, lpips=False)
@@ -45,7 +45,7 @@ def rows_of(folder):
 def test_every_method_has_a_row_with_the_columns_of_the_papers_table(compared):
     folder, _ = compared
     rows = rows_of(folder)
-    assert list(rows) == ["lifted", "lifted-feature", "dff", "lerf", "3dovs", "nearest"]
+    assert list(rows) == ["averaged", "averaged-feature", "dff", "lerf", "3dovs", "nearest"]
     columns = (
         "psnr",
         "ssim",
@@ -66,34 +66,34 @@ def test_every_method_has_a_row_with_the_columns_of_the_papers_table(compared):
         assert name in heading
 
 
-def test_pictures_are_the_same_for_all_and_only_nearest_has_nothing_in_3d(compared):
+def test_all_have_the_same_images_and_only_nearest_has_no_3d(compared):
     rows = rows_of(compared[0])
     assert len({row["psnr"] for row in rows.values()}) == 1
     assert {name for name, row in rows.items() if not row["lerf_3d_mIoU"]} == {"nearest"}
 
 
-def test_codes_take_less_room_than_raw_features(compared):
+def test_storage_is_that_of_each_baseline(compared):
     rows = rows_of(compared[0])
     assert float(rows["lerf"]["storage_bytes"]) > float(rows["dff"]["storage_bytes"])
 
 
-def test_forms_are_those_of_the_names_and_a_second_run_measures_nothing(compared):
+def test_forms_follow_the_names(compared):
     folder, _ = compared
     forms = {}
     for path in (folder / "runs").glob("*/seed-0.json"):
         stored = json.loads(path.read_text())
         forms[stored["name"]] = stored["metrics"]["language"]["form"]
-    assert forms["lifted-feature"] == "feature"
-    assert forms["lifted"] == "code"
+    assert forms["averaged-feature"] == "feature"
+    assert forms["averaged"] == "code"
     stages = json.loads((folder / "runs" / "dff" / "seed-0.json").read_text())["metrics"]["speed"][
         "stage_seconds"
     ]
     assert set(stages) == {"reconstruct", "features", "dff"}
 
 
-def test_the_report_shows_every_method_beside_the_others_and_loads_nothing(compared):
+def test_the_report_shows_every_method_and_loads_nothing(compared):
     folder, _ = compared
-    text = (folder / "report.html").read_text(encoding="utf-8")
+    text = (folder / "comparison.html").read_text(encoding="utf-8")
     page = Page(text)
     assert not {"script", "link", "iframe"} & set(page.tags)
     assert not re.search(r"https?:|@import|srcset", text)
@@ -118,23 +118,23 @@ def test_the_report_shows_every_method_beside_the_others_and_loads_nothing(compa
     assert {"seeds", "cpu", "versions"} <= {row[0] for row in rows}
 
 
-def test_unknown_methods_are_refused_before_anything_is_made(tiny_capture, tmp_path):
+def test_unknown_methods_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="nerf"):
         comparison.compare(tiny_capture, tmp_path / "a", CONFIG, methods=("nerf",))
     assert not (tmp_path / "a").exists()
 
 
-def test_protocols_are_those_asked_for_and_measured_anew(compared, tiny_capture, tmp_path, monkeypatch):
+def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, monkeypatch):
     color_encoder.install(monkeypatch)
     folder, _ = compared
-    for part in ("scene", "codebooks", "runs"):
+    for part in ("scene", "runs"):
         shutil.copytree(folder / part, tmp_path / part)
-    before = rows_of(folder)["lifted"]
+    before = rows_of(folder)["averaged"]
     comparison.compare(
-        tiny_capture, tmp_path, CONFIG, methods=("lifted",), lpips=False, protocols=("lerf-2d",)
+        tiny_capture, tmp_path, CONFIG, methods=("averaged",), lpips=False, protocols=("lerf-2d",)
     )
     (row,) = rows_of(tmp_path).values()
-    language = json.loads((tmp_path / "runs" / "lifted" / "seed-0.json").read_text())["metrics"]["language"]
+    language = json.loads((tmp_path / "runs" / "averaged" / "seed-0.json").read_text())["metrics"]["language"]
     assert "lerf_2d" in language
     assert not {"official", "lerf_3d"} & set(language)
     assert row["mIoU"] == before["mIoU"], "strict is always measured, with the same result"
@@ -143,7 +143,7 @@ def test_protocols_are_those_asked_for_and_measured_anew(compared, tiny_capture,
     assert not (tmp_path / "a").exists()
 
 
-def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_capture, tmp_path, monkeypatch):
+def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_path, monkeypatch):
     shutil.copytree(compared[0] / "scene", tmp_path / "scene")
     color_encoder.install(monkeypatch)
     monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=0))
@@ -160,7 +160,7 @@ def test_memory_granted_bounds_what_the_compared_methods_keep(compared, tiny_cap
     assert granted == [parse_bytes("200MB")] * 3
 
 
-def test_the_scenes_that_ship_have_names_and_the_demos_settings(tmp_path, monkeypatch):
+def test_bundled_captures_have_names_and_the_settings_of_the_demo(tmp_path, monkeypatch):
     from lexsplat.evaluation.demo import DEMO_CONFIG
     from lexsplat.pipeline.config import BuildConfig
 
@@ -177,7 +177,7 @@ def test_the_scenes_that_ship_have_names_and_the_demos_settings(tmp_path, monkey
 
 
 @pytest.mark.parametrize("command", ["ablate", "compare"])
-def test_the_command_line_explains_itself_and_refuses_no_seeds(command, capsys):
+def test_the_command_line_has_help_and_refuses_no_seeds(command, capsys):
     from lexsplat import cli
 
     with pytest.raises(SystemExit) as stopped:

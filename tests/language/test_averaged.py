@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
     MeanFeatures,
@@ -65,7 +65,7 @@ def reference(gaussians, cameras, maps) -> tuple[np.ndarray, np.ndarray]:
     return sums, totals
 
 
-def test_each_gaussian_has_the_mean_of_the_features_it_has_a_share_in(small) -> None:
+def test_each_gaussian_has_the_weighted_mean_of_its_features(small) -> None:
     maps = random_features(small.cameras)
     found = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
     sums, totals = reference(small.gaussians, small.cameras, maps)
@@ -76,7 +76,7 @@ def test_each_gaussian_has_the_mean_of_the_features_it_has_a_share_in(small) -> 
     )  # half precision
 
 
-def test_cells_without_a_feature_count_for_nothing(small) -> None:
+def test_cells_without_a_feature_are_ignored(small) -> None:
     maps = random_features(small.cameras)
     for name, found in maps.items():
         found.clip[:, :9] = 0
@@ -88,7 +88,7 @@ def test_cells_without_a_feature_count_for_nothing(small) -> None:
     np.testing.assert_allclose(found.means[seen], sums[seen] / totals[seen, None], atol=2e-3)
 
 
-def test_masked_pixels_count_for_nothing_also_within_a_cell_that_counts(small) -> None:
+def test_masked_pixels_are_ignored_also_within_a_cell(small) -> None:
     """Cells of 4 x 3 pixels; the mask ends in the middle of some."""
     coarse = {
         name: FeatureMap(normalize(torch.randn(5, 5, 7, generator=torch.Generator().manual_seed(0)), dim=-1))
@@ -118,34 +118,34 @@ def test_masked_pixels_count_for_nothing_also_within_a_cell_that_counts(small) -
 
 
 @pytest.mark.parametrize("memory", [1, 30 * 4 * 67, 30 * 4 * 70])
-def test_a_small_bound_of_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_path) -> None:
+def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_path) -> None:
     maps = random_features(small.cameras)
     whole = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
-    bounded = replace(FULL_SIZE, memory_bytes=memory)
-    heard = []
+    received = []
     found = average_features(
-        small.gaussians, small.cameras, maps, bounded, scratch=tmp_path / "new", listener=heard.append
-    )
+        small.gaussians, small.cameras, maps, FULL_SIZE,
+        memory=4 * memory, scratch=tmp_path / "new", listener=received.append,
+    )  # fmt: skip
     assert torch.equal(found.totals, whole.totals)
     np.testing.assert_allclose(np.asarray(found.means, float), np.asarray(whole.means, float), atol=1e-3)
-    assert (heard[-1].done, heard[-1].total) == ({1: 21, 30 * 4 * 67: 9, 30 * 4 * 70: 6}[memory],) * 2
+    assert (received[-1].done, received[-1].total) == ({1: 21, 30 * 4 * 67: 9, 30 * 4 * 70: 6}[memory],) * 2
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
 
 
-def test_the_balls_get_their_codes_and_those_are_the_features_that_were_shown(scene) -> None:
+def test_known_labels_and_features_are_recovered(scene) -> None:
     maps = features_of_codes(scene.code_maps, scene.codebook)
     found = average_features(scene.gaussians, scene.cameras, maps, AveragedConfig())
     field = field_from_means(found, replace(CODES, num_codes=20), AveragedConfig())
     assert field.codebook.dino is None
     ball = (field.codebook.clip @ scene.codebook.clip.T).argmax(1)  # that each code speaks of
     assert (ball[field.codes[:, 0].long()].numpy() == scene.labels).mean() > 0.97
-    renamed = LiftedField(
+    renamed = CodeField(
         scene.codebook, ball[field.codes.long()].to(torch.uint8), field.weights, field.uncertainties
     )
     assert label_accuracy(renamed, scene) > 0.97
 
 
-def test_a_thing_of_few_pixels_keeps_a_code_of_its_own_where_views_disagree_at_random(scene) -> None:
+def test_an_object_keeps_its_code_despite_random_disagreement(scene) -> None:
     """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still says what it is."""
     generator = np.random.default_rng(1)
     wrong = {
@@ -164,7 +164,7 @@ def test_a_thing_of_few_pixels_keeps_a_code_of_its_own_where_views_disagree_at_r
     )
 
 
-def test_a_gaussian_that_no_view_shows_says_nothing(scene) -> None:
+def test_a_gaussian_that_no_view_shows_has_no_language(scene) -> None:
     hidden = scene.gaussians.map(lambda tensor: torch.cat([tensor, tensor[:1]]))
     hidden.means[-1] = torch.tensor([50.0, 0.0, 50.0])
     maps = features_of_codes(scene.code_maps, scene.codebook)
@@ -195,7 +195,7 @@ def test_weights_are_the_softmax_of_the_cosines_by_hand() -> None:
     np.testing.assert_allclose(field.uncertainties.numpy(), expected, atol=1e-5)
 
 
-def test_the_number_of_threads_changes_no_bit_of_what_is_averaged() -> None:
+def test_averages_are_bit_identical_on_any_number_of_threads() -> None:
     gaussians, camera = random_gaussians(20_000, 0, scale=0.02), front_camera(160, 120)
     maps = random_features({"a": camera}, dimensions=70)
     results = []
@@ -210,7 +210,7 @@ def test_the_number_of_threads_changes_no_bit_of_what_is_averaged() -> None:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other))
 
 
-def test_views_are_taken_at_the_size_of_their_maps_and_weights_are_cells_all_the_same(scene) -> None:
+def test_weights_do_not_depend_on_the_size_of_the_views(scene) -> None:
     """Half of the size gives nearly the same means; without the mip filter views stay as they are."""
     cameras = {name: camera.downscaled(0.25) for name, camera in scene.cameras.items()}  # four times as large
     maps = features_of_codes(scene.code_maps, scene.codebook)
@@ -229,7 +229,7 @@ def test_views_are_taken_at_the_size_of_their_maps_and_weights_are_cells_all_the
     assert torch.equal(first.totals, second.totals)
 
 
-def test_a_sample_of_gaussians_that_does_not_fit_is_refused_with_one_that_does() -> None:
+def test_a_sample_that_does_not_fit_is_refused_with_one_that_does() -> None:
     found = MeanFeatures(np.ones((5000, 64), np.float16), torch.ones(5000))
     with pytest.raises(MemoryBudgetError, match=r"sample-size \d+") as refusal:
         field_from_means(found, CODES, AveragedConfig(), memory=2_000_000)
@@ -241,14 +241,14 @@ def test_a_sample_of_gaussians_that_does_not_fit_is_refused_with_one_that_does()
     field_from_means(found, replace(CODES, sample_size=fits), AveragedConfig(), memory=2_000_000)
 
 
-def test_codes_out_of_range_are_no_features(scene) -> None:
+def test_codes_out_of_range_give_zero_features(scene) -> None:
     codes = np.array([[0, 4], [255, -1]], np.int16)
     found = features_of_codes({"a": codes}, scene.codebook)["a"].clip
     assert torch.equal(found[0], scene.codebook.clip[[0, 4]])
     assert float(found[1].abs().sum()) == 0
 
 
-def test_views_that_are_missing_or_of_another_dimension_are_told(small) -> None:
+def test_missing_views_and_other_dimensions_are_refused(small) -> None:
     maps = random_features(small.cameras)
     with pytest.raises(ValueError, match="no training view"):
         average_features(small.gaussians, {}, maps, FULL_SIZE)
@@ -262,7 +262,7 @@ def test_views_that_are_missing_or_of_another_dimension_are_told(small) -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"top": 0}, {"temperature": 0}, {"shortest_side": 0}, {"memory_bytes": 0}, {"min_visibility": -1}]
+    "bad", [{"top": 0}, {"temperature": 0}, {"shortest_side": 0}, {"min_visibility": -1}]
 )
 def test_bad_settings_are_refused(bad) -> None:
     with pytest.raises(ValueError, match="must"):

@@ -13,8 +13,8 @@ from torch import nn
 
 from lexsplat.language.fields import (
     INITIAL_UNCERTAINTY,
+    CodeField,
     LanguageField,
-    LiftedField,
     SmoothingMLP,
     TrainedField,
     field_from_tensors,
@@ -41,7 +41,7 @@ def make_trained(scene, **options) -> TrainedField:
     return field
 
 
-def make_lifted(scene, columns: int = 4) -> LiftedField:
+def make_coded(scene, columns: int = 4) -> CodeField:
     rng = np.random.default_rng(0)
     count = len(scene.gaussians)
     codes = np.stack([rng.permutation(scene.codebook.num_codes)[:columns] for _ in range(count)]).astype(
@@ -50,7 +50,7 @@ def make_lifted(scene, columns: int = 4) -> LiftedField:
     weights = rng.random((count, columns))
     weights /= weights.sum(1, keepdims=True)
     weights[3] = 0
-    return LiftedField(
+    return CodeField(
         scene.codebook, torch.tensor(codes), torch.tensor(weights), torch.tensor(rng.random(count))
     )
 
@@ -181,8 +181,8 @@ def test_smoothing_gradients_never_reach_the_places(scene) -> None:
     assert smoother.layers[0].weight.grad.abs().sum() > 0
 
 
-def test_lifted_field_renders_its_distributions(scene) -> None:
-    field = make_lifted(scene)
+def test_a_code_field_renders_its_distributions(scene) -> None:
+    field = make_coded(scene)
     dense = np.zeros((len(scene.gaussians), 70))
     for n in range(len(dense)):
         for code, weight in zip(field.codes[n].tolist(), field.weights[n].tolist()):
@@ -192,7 +192,7 @@ def test_lifted_field_renders_its_distributions(scene) -> None:
     np.testing.assert_allclose(found, rendered_by_definition(scene, "view1", dense), atol=1e-5)
 
 
-@pytest.mark.parametrize("make", [make_trained, make_lifted])
+@pytest.mark.parametrize("make", [make_trained, make_coded])
 def test_rendered_scores_are_the_table_applied_to_the_probabilities(scene, make) -> None:
     field, camera = make(scene), scene.cameras["view0"]
     table = torch.rand(70, 3, generator=generator(3))
@@ -201,15 +201,33 @@ def test_rendered_scores_are_the_table_applied_to_the_probabilities(scene, make)
     torch.testing.assert_close(scores, probabilities @ table, rtol=0, atol=1e-5)
 
 
-def test_lifted_scores_rendered_are_the_rendering_of_the_3d_scores(scene) -> None:
-    field = make_lifted(scene)
+def test_scores_of_a_code_field_render_as_its_3d_scores(scene) -> None:
+    field = make_coded(scene)
     table = torch.rand(70, 40, generator=generator(3))
     in_space = (field.code_probabilities() @ table).double().numpy()
     found = field.render_scores(scene.gaussians, scene.cameras["view0"], table)
     np.testing.assert_allclose(found, rendered_by_definition(scene, "view0", in_space), atol=1e-5)
 
 
-@pytest.mark.parametrize("make", [make_trained, make_lifted])
+@pytest.mark.parametrize("make", [make_trained, make_coded])
+def test_scores_are_the_table_applied_to_the_probabilities_of_each_gaussian(scene, make) -> None:
+    field, table = make(scene), torch.rand(70, 3, generator=generator(3))
+    torch.testing.assert_close(field.scores(table), field.code_probabilities() @ table, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match=r"table must be \[70, P\]"):
+        field.scores(torch.ones(3, 1))
+
+
+@pytest.mark.parametrize("method", ["lifted", "averaged", "lifted+tuned", "trained"])
+def test_stored_fields_of_earlier_versions_open(scene, method) -> None:
+    field = make_trained(scene) if method in ("lifted+tuned", "trained") else make_coded(scene)
+    kind = "trained" if isinstance(field, TrainedField) else "lifted"
+    metadata = {"kind": kind, "method": method, "dropped": "0.0312"}
+    again = field_from_tensors(field.tensors(), metadata)
+    assert type(again) is type(field)
+    assert again.method == method
+
+
+@pytest.mark.parametrize("make", [make_trained, make_coded])
 def test_a_field_survives_a_safetensors_file(scene, make, tmp_path) -> None:
     field = make(scene)
     field.method = "renamed"
@@ -238,11 +256,9 @@ def test_settings_of_a_trained_field_are_stored(scene) -> None:
 def test_bad_input_is_refused(scene) -> None:
     book = make_codebook(3)
     with pytest.raises(ValueError, match="code 3 is not in a codebook of 3"):
-        LiftedField(book, torch.tensor([[3]], dtype=torch.uint8), torch.ones(1, 1), torch.zeros(1))
+        CodeField(book, torch.tensor([[3]], dtype=torch.uint8), torch.ones(1, 1), torch.zeros(1))
     with pytest.raises(ValueError, match="uint8"):
-        LiftedField(book, torch.tensor([[1]]), torch.ones(1, 1), torch.zeros(1))
-    with pytest.raises(ValueError, match=r"table must be \[70, P\]"):
-        make_lifted(scene).scores(torch.ones(3, 1))
+        CodeField(book, torch.tensor([[1]]), torch.ones(1, 1), torch.zeros(1))
     with pytest.raises(ValueError, match="neither semantics"):
         field_from_tensors({})
     tensors = make_trained(scene).tensors()

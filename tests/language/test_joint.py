@@ -42,7 +42,7 @@ def trainer(scene, points, strategy="default") -> JointTrainer:
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_geometry_comes_out_bit_for_bit_as_without_language(scene, points, strategy):
+def test_language_does_not_change_geometry(scene, points, strategy):
     joint = trainer(scene, points, strategy)
     joint.run()
     gaussians, field = joint.result()
@@ -54,7 +54,7 @@ def test_geometry_comes_out_bit_for_bit_as_without_language(scene, points, strat
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_language_goes_where_density_control_takes_its_gaussian(scene, points, strategy):
+def test_language_follows_density_control(scene, points, strategy):
     joint = trainer(scene, points, strategy)
     changes = 0
     while not joint.done:
@@ -76,7 +76,7 @@ def test_language_goes_where_density_control_takes_its_gaussian(scene, points, s
     assert changes > 2
 
 
-def test_a_joint_training_that_was_stopped_goes_on_bit_for_bit(scene, points, tmp_path):
+def test_a_resumed_joint_training_is_bit_identical(scene, points, tmp_path):
     whole = trainer(scene, points)
     whole.run()
 

@@ -1,6 +1,5 @@
-"""Masked pixels have no say: not in pictures, features, codes, language or geometry, whatever is painted there."""
+"""Masked pixels do not affect images, features, codes, language or geometry, whatever their colors."""
 
-import dataclasses
 import math
 import shutil
 
@@ -19,10 +18,9 @@ from lexsplat.features import FeatureConfig, FeatureMap, extract_features
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.language.code_maps import MASKED_CODE, MaskedCodeMaps, mark_masked_cells
-from lexsplat.language.methods.lifted import LiftedConfig, accumulate_histogram
+from lexsplat.language.methods import METHODS, FitRun, TrainingViews
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
-from lexsplat.pipeline.build import make_averaged_field
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.runtime.errors import CaptureError
@@ -52,7 +50,7 @@ def masked_capture(folder, camera: dict, *, paint: int | None, mask: bool = True
 
 @pytest.mark.parametrize("camera", [PINHOLE, DISTORTED], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("size", [None, (64, 48), (32, 24), (23, 17), (96, 72)])
-def test_pictures_do_not_depend_on_masked_pixels_and_valid_ones_only_on_the_photo(tmp_path, camera, size):
+def test_masked_pixels_do_not_affect_images(tmp_path, camera, size):
     plain, painted, free = (
         masked_capture(tmp_path / name, camera, paint=paint, mask=mask).views["b.png"]
         for name, paint, mask in (("plain", None, True), ("painted", 7, True), ("free", None, False))
@@ -65,7 +63,7 @@ def test_pictures_do_not_depend_on_masked_pixels_and_valid_ones_only_on_the_phot
     assert not np.array_equal(free.load_image(size), plain.load_image(size))
 
 
-def test_the_hole_has_the_mean_color_of_the_rest():
+def test_masked_pixels_have_the_mean_color_of_the_others():
     image = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
     valid = np.random.default_rng(1).random((6, 8)) > 0.4
     result = filled(image, valid)
@@ -104,7 +102,7 @@ def test_features_codebook_and_codes_do_not_depend_on_masked_pixels(tmp_path):
     )
 
 
-def test_index_maps_keep_the_code_of_their_cell_where_pixels_count(tmp_path):
+def test_index_maps_keep_the_codes_of_unmasked_pixels(tmp_path):
     views = masked_capture(tmp_path, PINHOLE, paint=None).views
     coarse = np.random.default_rng(0).integers(0, 200, (24, 32)).astype(np.uint8)
     maps = MaskedCodeMaps({"a.png": coarse, "elsewhere": coarse}, views)
@@ -131,28 +129,7 @@ def language():
     return scene, masked, wrong
 
 
-def test_lifted_histograms_hold_nothing_of_masked_pixels(language):
-    """The reference: each view's weights for the right half alone, from views that are the right half alone."""
-    scene, masked, _ = language
-    halves, codes = {}, {}
-    for name, camera in scene.cameras.items():
-        K = camera.K.copy()
-        K[0, 2] -= camera.width // 2
-        halves[name] = dataclasses.replace(camera, width=camera.width - camera.width // 2, K=K)
-        codes[name] = scene.code_maps[name][:, camera.width // 2 :]
-    config = LiftedConfig(top=5)
-    found = accumulate_histogram(scene.gaussians, scene.cameras, masked, 5, config)
-    expected = accumulate_histogram(scene.gaussians, halves, codes, 5, config)
-    # What lies far off the picture is projected a little differently in a narrower one.
-    assert torch.allclose(found.totals, expected.totals, rtol=1e-3, atol=2e-3)
-    assert (
-        0
-        < float(found.totals.sum())
-        < float(accumulate_histogram(scene.gaussians, scene.cameras, scene.code_maps, 5, config).totals.sum())
-    )
-
-
-def test_the_language_losses_send_nothing_to_masked_pixels(language):
+def test_language_losses_have_no_gradient_at_masked_pixels(language):
     """Gradients of what is rendered, by torch itself: exactly zero where a pixel is masked, and not elsewhere."""
     scene, masked, _ = language
     trainer = FieldTrainer(scene.gaussians, scene.codebook, TrainedConfig(pixel_sample=0))
@@ -188,7 +165,7 @@ def halves(tiny_capture, tmp_path_factory):
     return scenes
 
 
-def test_geometry_is_bit_for_bit_the_same_whatever_is_painted_under_the_mask(halves):
+def test_geometry_does_not_depend_on_masked_pixels(halves):
     points = initial_points(halves["plain"])
     config = ReconstructionConfig(
         iterations=10, sh_degree=1, max_gaussians=1300, densify_min_every=5, warm_up=0.4
@@ -207,7 +184,7 @@ def test_geometry_is_bit_for_bit_the_same_whatever_is_painted_under_the_mask(hal
         )
 
 
-def test_masks_that_fit_no_photo_are_told(tmp_path, caplog):
+def test_masks_without_a_photo_are_reported(tmp_path, caplog):
     masked_capture(tmp_path, PINHOLE, paint=None)
     Image.new("L", (64, 48)).save(tmp_path / "masks" / "nobody.png")
     Image.new("L", (64, 48)).save(tmp_path / "masks" / "a.png.jpg")
@@ -220,7 +197,7 @@ def test_masks_that_fit_no_photo_are_told(tmp_path, caplog):
         load_capture(tmp_path)
 
 
-def test_a_gaussian_that_only_masked_pixels_show_gets_no_language(tmp_path):
+def test_a_gaussian_seen_in_masked_pixels_only_has_no_language(tmp_path):
     """Every cell has a feature, those of the hole too; behind its middle lies a small Gaussian."""
     view = masked_capture(tmp_path, PINHOLE, paint=None).views["a.png"]
     camera, points = view.camera, []
@@ -230,5 +207,6 @@ def test_a_gaussian_that_only_masked_pixels_show_gets_no_language(tmp_path):
     gaussians = gaussians_from_points(np.array(points), np.full((2, 3), 0.5), sh_degree=0, opacity=0.9)
     gaussians.log_scales.fill_(math.log(0.02))
     maps = {"a.png": FeatureMap(torch.eye(4)[:1].expand(12, 16, 4))}
-    field = make_averaged_field(gaussians, {"a.png": view}, maps, BuildConfig())
+    views = TrainingViews({"a.png": view}, features=maps)
+    field = METHODS["averaged"].fit(gaussians, views, BuildConfig(), FitRun())
     assert field.weights.sum(1).tolist() == pytest.approx([0.0, 1.0])

@@ -55,7 +55,7 @@ def test_a_pixel_takes_the_cell_its_center_lies_in(rows: int, columns: int, heig
         assert code == row * columns + column
 
 
-def test_training_recovers_known_labels_and_leaves_geometry_bit_for_bit(scene) -> None:
+def test_training_recovers_known_labels_and_keeps_geometry(scene) -> None:
     before = {name: tensor.clone() for name, tensor in scene.gaussians.tensors().items()}
     events: list[Event] = []
     field = train(scene, QUICK, listener=events.append)
@@ -110,7 +110,7 @@ def test_a_full_step_has_the_loss_of_equation_15(scene, released: bool) -> None:
     assert float(losses["loss"]) == pytest.approx(0.9 * semantic + 0.4 * smoothing, rel=1e-4)
 
 
-def test_the_same_seed_gives_the_same_field_whatever_the_global_state(scene) -> None:
+def test_the_field_depends_on_the_seed_only(scene) -> None:
     config = replace(QUICK, iterations=6)
     torch.manual_seed(1)
     first = train(scene, config, seed=3).tensors()
@@ -121,7 +121,7 @@ def test_the_same_seed_gives_the_same_field_whatever_the_global_state(scene) -> 
     assert not torch.equal(first["semantics"], other["semantics"])
 
 
-def test_a_stopped_training_goes_on_as_if_never_stopped(scene, tmp_path) -> None:
+def test_a_resumed_training_is_bit_identical(scene, tmp_path) -> None:
     config = replace(QUICK, iterations=20)
     whole = train(scene, config, seed=5)
 

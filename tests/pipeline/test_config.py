@@ -1,4 +1,4 @@
-"""Settings: sizes in words, and what is chosen where nothing is said."""
+"""Settings of a build: sizes as text, and what is chosen for open settings."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from lexsplat.features import FeatureConfig
 from lexsplat.language.methods.averaged import AveragedConfig
-from lexsplat.language.methods.lifted import LiftedConfig, TuningConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.pipeline.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig
@@ -22,25 +21,25 @@ from lexsplat.runtime.memory import parse_bytes
     ("text", "count"),
     [("4GB", 4 << 30), ("512 MiB", 512 << 20), ("1.5g", 3 << 29), ("1000", 1000), ("2tb", 2 << 40)],
 )
-def test_sizes_are_read_as_people_write_them(text, count):
+def test_sizes_are_read_with_their_units(text, count):
     assert parse_bytes(text) == count
 
 
 @pytest.mark.parametrize("text", ["", "0", "GB", "-1GB", "4 GBs", "1e9", "lots"])
-def test_what_is_no_size_is_refused(text):
+def test_invalid_sizes_are_refused(text):
     with pytest.raises(ValueError, match="like 4GB"):
         parse_bytes(text)
 
 
 @given(width=st.integers(1, 20_000), height=st.integers(1, 20_000))
-def test_photos_are_never_enlarged_and_end_near_the_size_that_suits_the_device(width, height):
+def test_photos_are_never_enlarged_and_suit_the_device(width, height):
     resolved = BuildConfig().resolved("cpu", (width, height))
     assert resolved.downscale >= 1
     pixels = width * height / resolved.downscale**2
     assert pixels <= CPU_PIXELS * 1.8  # factors are whole halves
 
 
-def test_what_is_given_is_not_overruled():
+def test_given_settings_are_kept():
     config = BuildConfig(downscale=3.0, iterations=77, features=FeatureConfig(map_cells=9))
     resolved = config.resolved("cpu", (4000, 3000))
     assert (resolved.downscale, resolved.iterations, resolved.reconstruction.iterations) == (3.0, 77, 77)
@@ -60,62 +59,73 @@ def test_features_suit_the_encoder_and_the_device():
 
 
 @pytest.mark.parametrize(("clip", "suited"), [("bundled", "bundled"), ("some/clip", "sparse")])
-def test_one_setting_of_the_features_leaves_the_others_as_they_suit(clip, suited):
+def test_one_given_feature_setting_leaves_the_others_as_they_suit(clip, suited):
     suited = getattr(FeatureConfig, suited)()
-    random = {"mode": "random", "crop_tokens": None}  # whose crops speak as wholes
+    random = {"mode": "random", "crop_tokens": None}  # random crops have no patch tokens
     for change in ({"dino_facet": "token"}, random, {"map_cells": 9}, {"seed": 3}, {"crop_tokens": "class"}):
         config = BuildConfig(clip=clip, features=FeatureConfig(**change)).resolved("cpu", (10, 10))
         assert config.features == replace(suited, **change)
         assert config.resolved("cpu", (10, 10)) == config
-    sizes = (0.1,) * len(FeatureConfig().crop_sizes)  # their strides are the usual ones, and stay
+    sizes = (0.1,) * len(FeatureConfig().crop_sizes)  # with the default strides
     config = BuildConfig(clip=clip, features=FeatureConfig(crop_sizes=sizes)).resolved("cpu", (10, 10))
     strides = FeatureConfig().crop_strides
     assert config.features == replace(suited, crop_sizes=sizes, crop_strides=strides)
 
 
-def test_steps_set_in_the_part_they_belong_to_are_taken():
+def test_iterations_of_the_reconstruction_settings_are_taken():
     given = BuildConfig(reconstruction=ReconstructionConfig(iterations=50))
     assert given.resolved("cpu", (10, 10)).reconstruction.iterations == 50
     both = replace(given, iterations=60)
     assert both.resolved("cpu", (10, 10)).reconstruction.iterations == 60
 
 
-def test_fingerprints_hold_what_decides_a_result_and_nothing_else():
+def test_result_settings_ignore_everything_that_does_not_affect_the_result():
     config = BuildConfig()
     idle = [
+        replace(config, memory="1GB"),
+        replace(config, checkpoint_seconds=1.0),
         replace(config, features=FeatureConfig(random_crops=9)),
         replace(config, trained=TrainedConfig(iterations=9)),
-        replace(config, tuning=TuningConfig(iterations=9)),
-        replace(config, lifted=LiftedConfig(top=3)),
-        replace(config, averaged=AveragedConfig(memory_bytes=9)),
         replace(config, features=FeatureConfig(dino_stride=9)),
         replace(config, features=FeatureConfig(crop_tokens="class")),
     ]
-    assert all(other.decisive() == config.decisive() for other in idle)
+    assert all(other.result_settings() == config.result_settings() for other in idle)
     touched = [
         replace(config, features=FeatureConfig(map_cells=9)),
         replace(config, features=FeatureConfig(crop_tokens="both")),
         replace(config, features=FeatureConfig(mode="random")),
         replace(config, averaged=AveragedConfig(top=3)),
-        replace(config, method="lifted+tuned"),
+        replace(config, method="trained"),
     ]
-    assert all(other.decisive() != config.decisive() for other in touched)
-    random = replace(config, features=FeatureConfig(mode="random", random_crops=9))
-    assert random.decisive() != replace(random, features=FeatureConfig(mode="random")).decisive()
-    lifted = replace(config, method="lifted")
-    assert replace(lifted, averaged=AveragedConfig(top=3)).decisive() == lifted.decisive()
-    assert replace(lifted, lifted=LiftedConfig(top=3)).decisive() != lifted.decisive()
-    assert replace(lifted, lifted=LiftedConfig(memory_bytes=9)).decisive() == lifted.decisive()
-    assert replace(lifted, features=FeatureConfig(dino_stride=9)).decisive() != lifted.decisive()
-    trained = replace(config, method="trained")
-    assert replace(trained, lifted=LiftedConfig(top=3)).decisive() == trained.decisive()
+    assert all(other.result_settings() != config.result_settings() for other in touched)
+
+
+def test_result_settings_keep_the_features_that_take_part():
+    random = BuildConfig(features=FeatureConfig(mode="random", random_crops=9))
+    other = replace(random, features=FeatureConfig(mode="random"))
+    assert random.result_settings() != other.result_settings()
+    trained = BuildConfig(method="trained")
+    coarse = replace(trained, features=FeatureConfig(dino_stride=9))
+    assert coarse.result_settings() != trained.result_settings(), (
+        "the codebook is fitted to DINO features too"
+    )
+    without = replace(trained, dino="none")
+    coarse = replace(without, features=FeatureConfig(dino_stride=9))
+    assert coarse.result_settings() == without.result_settings()
+
+
+def test_result_settings_keep_those_of_the_chosen_method_only():
+    trained = BuildConfig(method="trained")
+    assert replace(trained, averaged=AveragedConfig(top=3)).result_settings() == trained.result_settings()
     longer = replace(trained, trained=TrainedConfig(iterations=9))
-    assert longer.decisive() != trained.decisive()
-    both = replace(config, method="lifted+tuned")
-    for part in ({"lifted": LiftedConfig(top=3)}, {"tuning": TuningConfig(iterations=9)}):
-        assert replace(both, **part).decisive() != both.decisive()
-    plain = replace(lifted, dino="none")
-    assert replace(plain, features=FeatureConfig(dino_stride=9)).decisive() == plain.decisive()
+    assert longer.result_settings() != trained.result_settings()
+
+
+def test_unknown_methods_and_impossible_joint_training_are_refused():
+    with pytest.raises(ValueError, match="averaged, trained"):
+        BuildConfig(method="lifted")
+    with pytest.raises(ValueError, match="needs method trained, got 'averaged'"):
+        BuildConfig(joint=True)
 
 
 def test_resolving_twice_changes_nothing():
@@ -124,7 +134,7 @@ def test_resolving_twice_changes_nothing():
     assert replace(once, seed=1) != once
 
 
-def test_cuda_where_there_is_none_is_told_in_one_line(monkeypatch):
+def test_a_missing_cuda_device_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_device("auto") == "cpu"
     with pytest.raises(BackendError, match="use --device cpu"):

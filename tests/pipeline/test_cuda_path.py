@@ -33,7 +33,6 @@ from lexsplat.language.methods.averaged import (
     field_from_means,
 )
 from lexsplat.language.methods.joint import JointTrainer
-from lexsplat.language.methods.lifted import LiftedConfig, TuningConfig, lift, tune
 from lexsplat.language.methods.trained import train_field
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
@@ -164,29 +163,21 @@ def test_features_and_codes_on_the_gpu(pretended_gpu, scene, clip_folder, tmp_pa
 # -- language
 
 
-@pytest.mark.parametrize("options", [{}, {"use_smoothing": True, "memory_bytes": 2000}])
-def test_lifting_on_the_gpu_finds_the_same_codes(pretended_gpu, balls, options):
-    config = LiftedConfig(**options)
-    here, there = (
-        lift(balls.gaussians.to(d), balls.cameras, balls.code_maps, balls.codebook.to(d), config)
-        for d in ("cpu", "cuda")
-    )
-    assert devices(there.tensors().values()) - {"cpu"} == {"cuda:0"}
-    torch.testing.assert_close(there.code_probabilities().cpu(), here.code_probabilities(), atol=0.02, rtol=0)
-    again = field_from_tensors({n: t.cpu() for n, t in there.tensors().items()}, there.metadata())
-    assert torch.equal(again.codes, there.codes.cpu())
-
-
-@pytest.mark.parametrize("options", [{}, {"memory_bytes": 9000}])
-def test_averaging_on_the_gpu_finds_the_same_means_and_codes(pretended_gpu, balls, options):
-    config = AveragedConfig(**options)
+@pytest.mark.parametrize("memory", [4 << 30, 4 * 9000])
+def test_averaging_on_the_gpu_finds_the_same_means_and_codes(pretended_gpu, balls, memory):
+    config = AveragedConfig()
     maps = features_of_codes(balls.code_maps, balls.codebook)
-    found = {d: average_features(balls.gaussians.to(d), balls.cameras, maps, config) for d in ("cpu", "cuda")}
+    found = {
+        d: average_features(balls.gaussians.to(d), balls.cameras, maps, config, memory=memory)
+        for d in ("cpu", "cuda")
+    }
     means = [torch.from_numpy(np.asarray(mean.means, np.float32)) for mean in found.values()]
     torch.testing.assert_close(means[1], means[0], atol=0.01, rtol=0)
     settings = CodebookConfig(num_codes=8, sample_size=50)
     field = field_from_means(found["cuda"], settings, config)
     assert devices(field.tensors().values()) - {"cpu"} == {"cuda:0"}
+    stored = field_from_tensors({n: t.cpu() for n, t in field.tensors().items()}, field.metadata())
+    assert torch.equal(stored.codes, field.codes.cpu())
     same = [dataclasses.replace(found["cpu"], means=found["cuda"].means, totals=found["cuda"].totals.cpu())]
     assert torch.equal(field_from_means(same[0], settings, config).codes, field.codes.cpu())
 
@@ -212,14 +203,6 @@ def test_a_step_of_the_language_training_never_waits_for_the_gpu(pretended_gpu, 
     pretended_gpu.clear()
     trainer.step(camera, balls.code_maps[name], prepared=prepared)
     assert not pretended_gpu, pretended_gpu
-
-
-def test_tuning_on_the_gpu(pretended_gpu, balls):
-    gaussians, codebook = balls.gaussians.to("cuda"), balls.codebook.to("cuda")
-    lifted = lift(gaussians, balls.cameras, balls.code_maps, codebook, LiftedConfig())
-    config = TuningConfig(fit_steps=60, batch_size=32, iterations=2)
-    field = tune(lifted, gaussians, balls.cameras, balls.code_maps, config, LANGUAGE)
-    assert devices(field.parameters()) == {"cuda:0"}
 
 
 def test_joint_training_on_the_gpu(pretended_gpu, scene, points):

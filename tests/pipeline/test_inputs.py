@@ -70,7 +70,7 @@ def test_photos_alone_become_a_scene_of_upright_views(photos, scene):
     assert_same_up_to_a_similarity([views[f"{index}.jpg"].camera for index in range(COUNT)], room_cameras())
 
 
-def test_the_photos_truth_and_masks_are_found_again(photos, scene, tmp_path):
+def test_reloading_finds_photos_ground_truth_and_masks(photos, scene, tmp_path):
     capture = reload_capture(SceneFolder.open(scene))
     assert len(capture.views) == COUNT
     assert capture.test_names == ("3.jpg",)
@@ -82,7 +82,7 @@ def test_the_photos_truth_and_masks_are_found_again(photos, scene, tmp_path):
     assert reload_capture(SceneFolder.open(scene), moved).root == moved
 
 
-def test_building_again_places_no_photo_again_until_a_setting_changes(photos, scene, tmp_path):
+def test_photos_are_registered_once_until_a_setting_changes(photos, scene, tmp_path):
     copy = shutil.copytree(scene, tmp_path / "copy")
     model = copy / "poses" / "sparse" / "0" / "images.bin"
     before = model.stat().st_mtime_ns

@@ -11,7 +11,7 @@ from lexsplat.pipeline.provenance import model_identity, write_provenance
 from lexsplat.scenes.folder import SceneFolder
 
 
-def test_a_model_folder_is_found_again_from_any_folder(tmp_path, monkeypatch):
+def test_a_model_folder_is_found_from_any_working_folder(tmp_path, monkeypatch):
     write_transforms(tmp_path / "capture", ["a.png", "b.png"])
     (tmp_path / "models" / "clip").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
@@ -25,7 +25,7 @@ def test_a_model_folder_is_found_again_from_any_folder(tmp_path, monkeypatch):
     assert (recorded["clip"], recorded["dino"]) == ("some/name", "bundled")
 
 
-def test_a_folder_in_the_home_folder_is_known_by_its_files(tmp_path, monkeypatch):
+def test_a_model_folder_is_identified_by_its_files(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "config.json").write_text("{}")

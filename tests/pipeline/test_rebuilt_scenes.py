@@ -1,4 +1,4 @@
-"""Questions to a scene while it is rebuilt: the old answer or the new one, never a mix of both, and never none."""
+"""Queries to a scene during a rebuild: the old answer or the new one, never a mix, never none."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from conftest import QUICK_BUILD
 
 from lexsplat import cli, open_scene
+from lexsplat.language.methods.averaged import Averaged
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.folder import SceneFolder
@@ -22,9 +23,9 @@ def scene(built, tmp_path):
 
 
 class Builder:
-    """Makes another version of a scene, as a build does: each has its own Gaussians, language, and fingerprints.
+    """Makes versions of a scene as a build does, each with its own Gaussians, language and fingerprints.
 
-    All versions have as many Gaussians, so that numbers alone give no mix away.
+    All have the same number of Gaussians, so that shapes alone do not reveal a mix.
     """
 
     def __init__(self, root) -> None:
@@ -60,7 +61,7 @@ def version_of(scene, start) -> tuple[int, int]:
     return round(moved), round(float(scene.field.uncertainties.mean()))
 
 
-def test_while_a_scene_is_rebuilt_the_one_before_answers(scene):
+def test_the_previous_scene_answers_during_a_rebuild(scene):
     builder = Builder(scene)
     builder.begin(1)
     builder.end(1)
@@ -73,7 +74,7 @@ def test_while_a_scene_is_rebuilt_the_one_before_answers(scene):
     assert not list(scene.glob("*previous*"))
 
 
-def test_gaussians_that_change_while_a_scene_is_opened_are_noticed(scene, monkeypatch):
+def test_gaussians_that_change_during_opening_are_detected(scene, monkeypatch):
     builder = Builder(scene)
     builder.begin(1)
     builder.end(1)
@@ -90,7 +91,7 @@ def test_gaussians_that_change_while_a_scene_is_opened_are_noticed(scene, monkey
     assert begun
 
 
-def test_without_the_scene_before_it_a_mix_is_refused_in_one_line(scene):
+def test_without_a_previous_scene_a_partial_rebuild_is_refused(scene):
     builder = Builder(scene)
     builder.begin(1)
     shutil.rmtree(scene / "previous")  # as if the folder was copied without it
@@ -98,13 +99,13 @@ def test_without_the_scene_before_it_a_mix_is_refused_in_one_line(scene):
         open_scene(scene, device="cpu")
 
 
-def test_what_is_kept_is_as_open_to_others_as_the_scene_itself(scene):
+def test_the_previous_scene_has_the_permissions_of_the_scene(scene):
     scene.chmod(0o755)
     keep_previous(SceneFolder.open(scene))
     assert (scene / "previous").stat().st_mode & 0o777 == 0o755
 
 
-def test_a_build_that_stopped_half_way_leaves_the_last_whole_scene(scene):
+def test_an_interrupted_build_leaves_the_last_complete_scene(scene):
     builder = Builder(scene)
     builder.begin(1)
     builder.end(1)
@@ -116,7 +117,7 @@ def test_a_build_that_stopped_half_way_leaves_the_last_whole_scene(scene):
     assert version_of(open_scene(scene, device="cpu"), builder.start) == (1, 1)
 
 
-def test_what_is_about_to_be_replaced_is_neither_measured_nor_changed(scene, capsys):
+def test_a_scene_being_rebuilt_is_neither_evaluated_nor_edited(scene, capsys):
     builder = Builder(scene)
     builder.begin(1)
     for command in (["evaluate"], ["edit"]):
@@ -126,7 +127,7 @@ def test_what_is_about_to_be_replaced_is_neither_measured_nor_changed(scene, cap
     assert cli.main(["query", str(scene), "red ball", "--json"]) == 0
 
 
-def test_a_build_keeps_the_scene_until_the_new_one_is_whole(scene, tiny_capture, monkeypatch):
+def test_a_build_keeps_the_previous_scene_until_it_is_complete(scene, tiny_capture, monkeypatch):
     seen = []
 
     def stop(*_, **__):
@@ -134,7 +135,7 @@ def test_a_build_keeps_the_scene_until_the_new_one_is_whole(scene, tiny_capture,
         raise KeyboardInterrupt
 
     before = open_scene(scene, device="cpu").gaussians.means
-    monkeypatch.setattr("lexsplat.pipeline.build.make_averaged_field", stop)
+    monkeypatch.setattr(Averaged, "fit", stop)
     changed = [*QUICK_BUILD, "--seed", "5"]
     assert cli.main(["build", str(tiny_capture), "--output", str(scene), *changed]) == 130
     assert seen == ["previous"]

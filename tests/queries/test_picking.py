@@ -6,7 +6,7 @@ import torch
 from support.language_scene import CENTERS, RADIUS, make_scene
 
 from lexsplat.geometry.cameras import look_at
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.queries.picking import Hit, field_scores, likeness_to, select_hit, surface_at
 from lexsplat.runtime.errors import QueryError
 
@@ -22,7 +22,7 @@ def scene():
 def field(scene):
     codes = torch.from_numpy(scene.labels.astype(np.uint8))[:, None]
     count = len(scene.labels)
-    return LiftedField(scene.codebook, codes, torch.ones(count, 1), torch.zeros(count))
+    return CodeField(scene.codebook, codes, torch.ones(count, 1), torch.zeros(count))
 
 
 def click(scene, number) -> tuple[Hit, np.ndarray]:
@@ -45,7 +45,7 @@ def test_a_click_selects_the_ball_that_is_seen_there(scene, field, number):
 
 def test_two_things_of_one_meaning_are_told_apart_by_where_the_click_was(scene):
     codes = torch.from_numpy(np.where(scene.labels == 1, 0, scene.labels).astype(np.uint8))[:, None]
-    same = LiftedField(scene.codebook, codes, torch.ones(len(codes), 1), torch.zeros(len(codes)))
+    same = CodeField(scene.codebook, codes, torch.ones(len(codes), 1), torch.zeros(len(codes)))
     chosen = select_hit(click(scene, 1)[0], scene.gaussians, same, scene.cameras)
     assert np.array_equal(chosen.mask.numpy(), scene.labels == 1)
 
@@ -58,7 +58,7 @@ def test_likeness_is_the_cosine_of_features(scene, field):
 
 def test_scores_in_blocks_are_the_dense_product(field):
     class Plain:
-        """A field without the shortcut of lifted ones."""
+        """A field without scores of its own."""
 
         def __init__(self, inner):
             self.inner, self.uncertainties = inner, inner.uncertainties

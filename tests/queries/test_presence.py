@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.language_scene import make_scene
 
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.queries.presence import (
     Calibration,
     Evidence,
@@ -24,7 +24,7 @@ def parts():
     """A scene of five directions in a space of 12; references and negatives in directions of their own."""
     made = make_scene(per_ball=100)
     g = torch.Generator().manual_seed(3)
-    field = LiftedField(
+    field = CodeField(
         made.codebook,
         torch.from_numpy(made.labels).to(torch.uint8)[:, None],
         torch.ones(500, 1),

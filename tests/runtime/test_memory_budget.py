@@ -106,21 +106,8 @@ def test_the_limit_is_one_that_bites(large_capture, tmp_path):
     assert "error: " in done.stderr.splitlines()[-1]
 
 
-def test_memory_bounds_the_store_of_every_stage_and_no_setting_that_decides_a_result():
-    config = BuildConfig(memory="400MB")
-    bounded = config.within_memory()
-    quarter = 100 * MEGABYTE
-    assert bounded.trained.memory_bytes == quarter
-    assert bounded.lifted.memory_bytes == quarter
-    assert bounded.averaged.memory_bytes == quarter
-    again = replace(
-        bounded,
-        trained=config.trained,
-        lifted=config.lifted,
-        averaged=config.averaged,
-        features=config.features,
-    )
-    assert again == config
+def test_memory_does_not_affect_the_result():
+    assert BuildConfig(memory="400MB").result_settings() == BuildConfig().result_settings()
 
 
 # -- structure from motion, triangulation, giant photos, the codebook: each by itself under a hard limit

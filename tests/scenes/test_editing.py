@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.language_scene import make_scene
 
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor, Motion, Step, recolored
@@ -27,7 +27,7 @@ def base():
         made.gaussians, shN=torch.randn(150, 3, 3, generator=torch.Generator().manual_seed(0)) * 0.1
     )
     codes = torch.from_numpy(made.labels.astype(np.uint8))[:, None]
-    field = LiftedField(made.codebook, codes, torch.ones(150, 1), torch.linspace(0, 1, 150))
+    field = CodeField(made.codebook, codes, torch.ones(150, 1), torch.linspace(0, 1, 150))
     views = {name: StoredView(name, camera, "train") for name, camera in made.cameras.items()}
     return Scene(gaussians, field, views, "bundled"), made.labels
 

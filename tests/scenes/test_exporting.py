@@ -148,7 +148,7 @@ def test_splats_of_another_program_get_language_and_keep_their_geometry(
     assert len(foreign) == len(original)
     shutil.copytree(built / "checkpoints", scene / "checkpoints")
     arguments = ["language", str(tiny_capture), "--output", str(scene), "--splats", str(file)]
-    assert cli.main([*arguments, *QUICK, "--method", "lifted"]) == 0
+    assert cli.main([*arguments, *QUICK, "--method", "trained"]) == 0
     made = open_scene(scene)
     assert torch.equal(made.gaussians.means, foreign.means)
     assert "splats" in json.loads((scene / "scene.json").read_text())["stages"]["reconstruct"]

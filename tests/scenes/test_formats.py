@@ -14,7 +14,7 @@ from lexsplat.codebook import Codebook
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.runtime.errors import BackendError, FileFormatError
 from lexsplat.scenes.formats.compressed import COMPRESSED, read_compressed, write_compressed
 from lexsplat.scenes.formats.gltf import write_glb
@@ -30,7 +30,7 @@ def language(count: int, codes_each: int = 3, num_codes: int = 6):
     codes = torch.stack([torch.randperm(num_codes, generator=g)[:codes_each] for _ in range(count)])
     weights = torch.rand(count, codes_each, generator=g).sort(dim=1, descending=True).values
     codebook = Codebook(torch.randn(num_codes, 8, generator=g), torch.randn(num_codes, 5, generator=g))
-    field = LiftedField(
+    field = CodeField(
         codebook,
         codes.to(torch.uint8),
         weights / weights.sum(1, keepdim=True),

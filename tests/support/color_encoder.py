@@ -39,4 +39,4 @@ def install(patch):
     """Replace the loaded encoders with both, by `pytest.MonkeyPatch`."""
     patch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColorClip())
     patch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColorDino())
-    patch.setattr("lexsplat.pipeline.build.model_folder", lambda *_: None)
+    patch.setattr("lexsplat.pipeline.encoding.model_folder", lambda *_: None)

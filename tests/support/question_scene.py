@@ -6,7 +6,7 @@ import torch
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 
 
 def texts(count, dim, seed):
@@ -15,7 +15,7 @@ def texts(count, dim, seed):
     )
 
 
-def lifted_cloud() -> tuple[LiftedField, Gaussians, Camera]:
+def lifted_cloud() -> tuple[CodeField, Gaussians, Camera]:
     """Gaussians in a cloud with random codes, some with none, and a camera that sees past them."""
     rng = np.random.default_rng(0)
     gaussians = gaussians_from_points(
@@ -27,6 +27,6 @@ def lifted_cloud() -> tuple[LiftedField, Gaussians, Camera]:
     weights = weights / weights.sum(1, keepdim=True)
     weights[:20] = 0
     codes = torch.stack([torch.randperm(12, generator=generator)[:4] for _ in range(150)]).to(torch.uint8)
-    field = LiftedField(Codebook(texts(12, 16, 2)), codes, weights, torch.zeros(150))
+    field = CodeField(Codebook(texts(12, 16, 2)), codes, weights, torch.zeros(150))
     camera = look_at(np.array([0, -4, 0.5]), np.zeros(3), np.array([0, 0, 1.0]), 48, 36, 0.9)
     return field, gaussians, camera

@@ -77,7 +77,7 @@ def evaluated(views=3):
     metrics = Metrics(
         quality={"psnr": 31.234, "ssim": 0.912, "lpips": None, "lpips_reason": "not <installed>",
                  "per_view": {name: {"psnr": 31.234, "ssim": 0.912, "lpips": None} for name in pairs}},
-        language={"form": "feature", "method": "lifted", **summarize_language(pairs, thresholds)},
+        language={"form": "feature", "method": "averaged", **summarize_language(pairs, thresholds)},
         speed={"render_fps": 12.34, "rgb_fps": 20.0, "query_ms": 9.87, "stage_seconds": {"language": 3.5}},
         size={"gaussians": 12345, "language_bytes": 150_000, "gaussian_bytes": 2_500_000,
               "peak_rss_bytes": 1_200_000_000, "peak_gpu_bytes": None},

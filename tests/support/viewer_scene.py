@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from lexsplat.codebook import Codebook
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
@@ -41,7 +41,7 @@ def ball_scene(per_ball: int = 300) -> tuple[BallScene, LanguageScene]:
     words[:, 31] = 0.6
     codebook = Codebook(words, torch.eye(5, 8))
     count = len(ground_truth.labels)
-    field = LiftedField(
+    field = CodeField(
         codebook,
         torch.from_numpy(ground_truth.labels.astype(np.uint8))[:, None],
         torch.ones(count, 1),

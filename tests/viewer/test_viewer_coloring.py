@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 from support.language_scene import make_codebook, make_scene
 
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
 from lexsplat.queries.heatmaps import colorize
 from lexsplat.viewer.coloring import (
     MODES,
@@ -36,7 +36,7 @@ def field(scene):
     codes = torch.from_numpy(np.stack([scene.labels, (scene.labels + 1) % 5], 1)).to(torch.uint8)
     weights = torch.stack([main, 1 - main], 1)
     weights[-1] = 0
-    return LiftedField(scene.codebook, codes, weights, torch.linspace(0, 1, count))
+    return CodeField(scene.codebook, codes, weights, torch.linspace(0, 1, count))
 
 
 def layer(scene, ball: int, **options) -> Layer:
@@ -130,7 +130,7 @@ def test_what_says_nothing_is_gray(scene, field):
 
 
 def test_a_field_of_one_meaning_has_a_language_picture(scene):
-    same = LiftedField(scene.codebook, torch.zeros(9, 1, dtype=torch.uint8), torch.ones(9, 1), torch.zeros(9))
+    same = CodeField(scene.codebook, torch.zeros(9, 1, dtype=torch.uint8), torch.ones(9, 1), torch.zeros(9))
     assert language_colors(same).shape == (9, 3)
 
 

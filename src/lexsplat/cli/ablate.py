@@ -10,7 +10,8 @@ import tyro
 
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import PromptListName, Settings, check_seeds, print_json_file
-from lexsplat.pipeline.config import BuildConfig, LanguageMethod
+from lexsplat.language.methods import MethodName
+from lexsplat.pipeline.config import BuildConfig
 
 
 @dataclasses.dataclass
@@ -18,7 +19,7 @@ class Ablate:
     """Measure the method without its parts, as in the paper's Table 2, over several seeds.
 
     Gaussians and features are made once, codebooks once a setting and seed. Writes ablation.json, .csv, .tex and
-    report.html. Run it again with the same output to go on where it stopped.
+    .html. Run it again with the same output to go on where it stopped.
 
     Args:
         capture: Folder with photos, cameras and masks; "demo" or "second" for the scenes that ship.
@@ -48,13 +49,12 @@ class Ablate:
             "w/o u_G",
             "w/o MLP",
             "w/o u_G & MLP",
-            "with neighbors",
             "one code",
             "full",
         ],
         ...,
     ] = ()
-    methods: tuple[LanguageMethod, ...] = ()
+    methods: tuple[MethodName, ...] = ()
     wrong_labels: float = 0.0
     masks: Path | None = None
     prompt_list: PromptListName | None = None
@@ -97,4 +97,4 @@ class Ablate:
             print_json_file(self.output / "ablation.json")
             return
         print(format_rows(rows, ablation.COLUMNS))
-        print(f"{self.output}: ablation.json, ablation.csv, ablation.tex, report.html")
+        print(f"{self.output}: ablation.json, ablation.csv, ablation.tex, ablation.html")

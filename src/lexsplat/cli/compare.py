@@ -25,7 +25,7 @@ class Compare:
     """Measure several methods on the same Gaussians and the same features, in the columns of the paper's Table 1.
 
     Ours, and what the paper compares with, rebuilt from the ideas of their papers (docs/evaluation.md says how).
-    Writes comparison.json, .csv, .tex and report.html. Run it again with the same output to go on where it stopped.
+    Writes comparison.json, .csv, .tex and .html. Run it again with the same output to go on where it stopped.
 
     Args:
         capture: Folder with photos, cameras and masks; "demo" or "second" for the scenes that ship.
@@ -46,11 +46,10 @@ class Compare:
     output: Path
     methods: tuple[
         Literal[
-            "averaged", "averaged-feature", "lifted", "lifted-feature", "trained", "trained-feature",
-            "lifted+tuned", "lifted+tuned-feature", "dff", "lerf", "3dovs", "nearest",
+            "averaged", "averaged-feature", "trained", "trained-feature", "dff", "lerf", "3dovs", "nearest",
         ],
         ...,
-    ] = ("averaged", "lifted", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
+    ] = ("averaged", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
     seeds: tuple[int, ...] = (0,)
     masks: Path | None = None
     prompt_list: PromptListName | None = None
@@ -86,4 +85,4 @@ class Compare:
             print_json_file(self.output / "comparison.json")
             return
         print(format_rows(rows))
-        print(f"{self.output}: comparison.json, comparison.csv, comparison.tex, report.html")
+        print(f"{self.output}: comparison.json, comparison.csv, comparison.tex, comparison.html")

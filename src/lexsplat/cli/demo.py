@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from lexsplat.cli.options import Device, print_evaluation
-from lexsplat.pipeline.config import BuildConfig, LanguageMethod
+from lexsplat.language.methods import MethodName
+from lexsplat.pipeline.config import BuildConfig
 
 
 @dataclasses.dataclass
@@ -29,7 +30,7 @@ class Demo:
 
     output: Path = Path("output/demo")
     scene: Literal["tabletop", "second"] = "tabletop"
-    method: LanguageMethod | None = None
+    method: MethodName | None = None
     device: Device = "auto"
     seed: int = 0
     iterations: int | None = None

@@ -1,11 +1,10 @@
 """Quantization of language features: Eq. 2 to 7 of the paper and its supplement A.
 
-A scene holds few meanings, so its hybrid features F = F_CLIP (+) F_DINO (Eq. 2) are replaced by the nearest
-of K codes (the paper calls this number N). The codebook is fitted first and every view is assigned
-afterwards, in one pass with the finished codes. Held-out views take no part in the fit.
+A scene has few distinct meanings, so its hybrid features F = F_CLIP (+) F_DINO (Eq. 2) are replaced by the nearest
+of K codes (N in the paper). The codebook is fitted first; then every view is assigned in one pass with the final
+codes. Held-out views take no part in the fit.
 
-Equations 1 to 15 are counted through the main text of the paper; supplement A describes the load-balancing
-loss.
+Equations are numbered 1 to 15 through the main text of the paper; supplement A describes the load-balancing loss.
 """
 
 from lexsplat.codebook.assignment import CodeUsage, assign_code_maps, code_usage

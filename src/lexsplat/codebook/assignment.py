@@ -1,4 +1,4 @@
-"""Index maps of views, and how they use the codes."""
+"""Index maps of views, and statistics of the codes in them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def assign_code_maps(
     *,
     listener: Listener = silent,
 ) -> dict[str, NDArray[np.uint8]]:
-    """The one assignment pass: an index map ``[h, w]`` uint8 for every named view (default: all)."""
+    """An index map ``[h, w]`` uint8 for every named view (default: all), in one pass."""
     chosen = list(feature_maps if names is None else names)
     code_maps = {}
     for done, name in enumerate(chosen, start=1):
@@ -35,13 +35,12 @@ def assign_code_maps(
 
 @dataclass(frozen=True)
 class CodeUsage:
-    """How the codes are used by index maps.
+    """How index maps use the codes.
 
     Args:
         counts: Cells per code ``[K]``.
         used: Codes with at least one cell.
-        perplexity: exp of the entropy of the counts, 1 to K: how many codes would be as informative if used
-            alike.
+        perplexity: exp of the entropy of the counts, 1 to K: the effective number of codes.
     """
 
     counts: NDArray[np.int64]
@@ -50,7 +49,7 @@ class CodeUsage:
 
 
 def code_usage(code_maps: Iterable[NDArray[np.uint8]], num_codes: int) -> CodeUsage:
-    """Utilisation of the codes over index maps ``[h, w]``; indices from K on (ignored cells) do not count."""
+    """Use of the codes over index maps ``[h, w]``; indices of K and above (ignored cells) do not count."""
     counts = np.zeros(num_codes, dtype=np.int64)
     for code_map in code_maps:
         counts += np.bincount(np.asarray(code_map).ravel(), minlength=MAX_CODES)[:num_codes]

@@ -1,7 +1,6 @@
-"""Fitting the codes: a bounded sample of features, k-means for a start, then gradient steps on Eq. 7.
+"""Fitting the codes: a bounded sample of features, a k-means start, then gradient steps on Eq. 7.
 
-The fit runs on one thread, and no gradient is gathered by several at once: the same seed gives the same codes to the
-last bit, however busy the machine is and however many cores it has.
+The fit runs on one thread, so the same seed gives bit-identical codes on any number of cores.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from lexsplat.features import FeatureMap
 
 _SMALL_BLOCK = 1024
-"""Features at a time where several copies of them are made."""
+"""Features handled at a time if several copies of them are held."""
 
 
 @one_thread()
@@ -41,20 +40,20 @@ def fit_codebook(
 ) -> Codebook:
     """Fit the discrete feature space S by Eq. 7 to a bounded sample of the named views.
 
-    The codes come back with halves of unit length: only their directions enter Eq. 4 and 5.
+    Both halves of every code are normalized: only their directions enter Eq. 4 and 5.
 
     Args:
-        feature_maps: Dense features by view name; only `names` are read, one at a time.
+        feature_maps: Dense features by view name; only those of `names` are read, one at a time.
         names: Training views.
         config: Settings.
-        seed: Of the sample, the start and the batches.
-        device: Where the fit runs and the codebook lies.
-        memory: Bytes that the sample and the fit may take, three quarters of which are theirs: the rest is for maps.
-        listener: Hears of stage "codebook", with the mean CLIP cosine between features and codes at the end.
+        seed: Seed of the sample, the start and the batches.
+        device: Device of the fit and of the codebook.
+        memory: Host memory in bytes, three quarters of which the sample and the fit may take; the rest is for maps.
+        listener: Receives events of stage "codebook"; the last has the mean CLIP cosine between features and codes.
 
     Raises:
-        ValueError: If `names` is empty, or a feature is not finite.
-        TrainingError: If the loss stops being finite.
+        ValueError: If `names` is empty, or a feature is NaN or infinite.
+        TrainingError: If the loss becomes NaN or infinite.
         MemoryBudgetError: If the sample does not fit into ``memory``.
     """
     if not names:
@@ -106,14 +105,13 @@ def sample_features(
     *,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor | None]:
-    """At most ``config.sample_size`` unit features of the named views, as many from each.
+    """At most ``config.sample_size`` unit features, equally many from each of the named views.
 
     Returns:
-        CLIP parts ``[M, Dc]`` and DINO parts ``[M, Dd]``, or None without DINO. All-zero features are left
-        out.
+        CLIP parts ``[M, Dc]``, and DINO parts ``[M, Dd]`` or None. Features that are zero are left out.
 
     Raises:
-        ValueError: If a feature is not finite, or none is left.
+        ValueError: If a feature is NaN or infinite, or all are zero.
     """
     quota = -(-config.sample_size // len(names))
     clips, dinos = _Rows(quota, len(names)), _Rows(quota, len(names))
@@ -125,26 +123,26 @@ def sample_features(
         if config.use_dino and feature_map.dino is not None:
             finite = dinos.add(torch.as_tensor(feature_map.dino).flatten(0, 1)[rows]) and finite
         if not finite:
-            raise ValueError(f"features of {name} have a number that is not finite")
+            raise ValueError(f"features of {name}: NaN or infinity")
     if dinos.count not in (0, clips.count):
         raise ValueError("some views have DINO features and some have none")
     keep = (clips.rows().norm(dim=-1) > 0).nonzero()[:, 0]
     if len(keep) == 0:
-        raise ValueError("the training views have no features that are not zero")
+        raise ValueError("all features of the training views are zero")
     if len(keep) > config.sample_size:
         keep = keep[torch.randperm(len(keep), generator=generator)[: config.sample_size]]
     return clips.take(keep), dinos.take(keep) if dinos.count else None
 
 
 class _Rows:
-    """Vectors that come in parts, put where they stay: joining parts at the end would take twice the memory."""
+    """Vectors collected part by part in one store; concatenating the parts would take twice the memory."""
 
     def __init__(self, quota: int, views: int) -> None:
         self._most, self._views = quota * views, views
         self._store, self.count = torch.empty(0, 0), 0
 
     def add(self, part: Tensor) -> bool:
-        """Append rows ``[n, D]``; says whether they are finite."""
+        """Append rows ``[n, D]``; returns whether all are finite."""
         if not self.count:
             self._store = torch.empty(min(self._most, self._views * len(part)), part.shape[1])
         if self.count + len(part) > len(self._store):  # maps of several sizes
@@ -160,7 +158,7 @@ class _Rows:
         return self._store[: self.count]
 
     def take(self, keep: Tensor) -> Tensor:
-        """The rows ``keep``, of unit length; the store is given up."""
+        """The normalized rows ``keep``; frees the store."""
         whole = len(keep) == self.count and bool((keep.diff() == 1).all())
         kept = self.rows() if whole else self.rows()[keep]
         self._store = torch.empty(0, 0)
@@ -168,10 +166,10 @@ class _Rows:
 
 
 def _check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory: int) -> None:
-    """Refuse a sample of ``views`` maps like the first that does not fit into three quarters of the memory.
+    """Refuse a sample of ``views`` maps of the size of ``first`` that needs more than three quarters of the memory.
 
     Raises:
-        MemoryBudgetError: With the sample size that would.
+        MemoryBudgetError: With a sample size that fits.
     """
     cells, dimensions = first.clip.shape[0] * first.clip.shape[1], first.clip.shape[-1]
     if config.use_dino and first.dino is not None:
@@ -194,9 +192,8 @@ def spherical_kmeans(
 ) -> tuple[Tensor, Tensor | None]:
     """k-means for the similarity of Eq. 4, with k-means++ seeds.
 
-    The normalized sum of a cluster's unit vectors, half by half, minimizes Eq. 5 for a given assignment, so
-    every iteration lowers L_cos. A cluster left without features restarts at the feature that is served
-    worst.
+    The sum of a cluster's unit vectors, normalized half by half, minimizes Eq. 5 for a given assignment, so every
+    iteration lowers L_cos. An empty cluster restarts at the feature with the lowest similarity to its code.
 
     Returns:
         Codes ``[K, Dc]`` and ``[K, Dd]`` (or None), unit length.
@@ -224,13 +221,13 @@ def spherical_kmeans(
 
 
 def _uniform_codes(features: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
-    """The authors' start, uniform(-1/K, 1/K), on the device of the features."""
+    """The start of the authors' code: uniform(-1/K, 1/K)."""
     unit = torch.rand(num_codes, features.shape[1], generator=generator) * 2 - 1
     return (unit / num_codes).to(features.device)
 
 
 def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
-    """k-means++: the next seed is drawn in proportion to the squared distance from the seeds so far."""
+    """k-means++ seeds: each is drawn in proportion to the squared distance to the nearest earlier seed."""
     count = len(joint)
     seeds = [int(torch.randint(count, (1,), generator=generator))]
     blocks = (joint[i : i + _SMALL_BLOCK] for i in range(0, count, _SMALL_BLOCK))
@@ -247,7 +244,7 @@ def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> 
 
 
 def _nearest(joint: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
-    """Best similarity and its index for every row, in blocks."""
+    """Highest similarity and its index for every row, in blocks."""
     parts = [(joint[i : i + BLOCK_ROWS] @ centers.T).max(-1) for i in range(0, len(joint), BLOCK_ROWS)]
     return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
 

@@ -1,4 +1,4 @@
-"""What a good codebook is: Eq. 5 to 7 and supplement A."""
+"""Losses of the codebook: Eq. 5 to 7 and supplement A."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def cosine_loss(
 def load_balancing_loss(similarities: Tensor, temperature: float = 1.0) -> Tensor:
     """Eq. 6 and supplement A: sum_N r * p.
 
-    r is the share of features whose best code is i (a count, without gradient), p the mean softmax
-    probability of code i. The minimum 1 / K is reached where all codes are used alike.
+    r_i is the share of features whose best code is i (a count, without gradient), p_i the mean softmax probability
+    of code i. The minimum is 1 / K, where all codes are used equally.
 
     Args:
         similarities: D(F_i, S) of a batch ``[M, K]``.
-        temperature: The similarities are divided by it before the softmax; the paper has 1.
+        temperature: Divides the similarities before the softmax; 1 in the paper.
     """
     num_codes = similarities.shape[-1]
     chosen = similarities.argmax(-1)
@@ -56,10 +56,10 @@ def quantization_loss(
 ) -> Tensor:
     """Eq. 7: lambda_cos L_cos + lambda_lb L_lb for a batch of features.
 
-    The index m is the argmax of Eq. 4 and has no gradient; the gradient reaches the codes through Eq. 3 and
-    the softmax. Eq. 5 of the chosen codes (`cosine_loss`) is 1 + lambda_DINO less the similarity that chose them, so
-    no row of the codebook is gathered: the gradient of a gather is a sum over the features of a code, which torch's
-    threads add up in the order in which they happen to run.
+    The index m is the argmax of Eq. 4 and has no gradient; the gradient reaches the codes through Eq. 3 and the
+    softmax. Eq. 5 of the chosen codes (`cosine_loss`) is 1 + lambda_DINO minus the similarity by which they were
+    chosen, so no row of the codebook is gathered. The gradient of a gather would be a scatter-add, which torch sums
+    in an order that depends on its threads.
     """
     scores = similarity(clip, dino, code_clip, code_dino, config.lambda_dino)
     chosen = scores.detach().argmax(-1, keepdim=True)

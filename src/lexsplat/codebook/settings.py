@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 MAX_CODES = 256
-"""An index map holds one byte a pixel."""
+"""Most codes of a codebook: an index map has one byte a pixel."""
 
 
 @dataclass(frozen=True)
@@ -17,18 +17,17 @@ class CodebookConfig:
         num_codes: Size K of the discrete feature space, 1 to 256. The paper uses 128 (bonsai 64, kitchen 32).
         lambda_dino: Weight of the DINO cosine in Eq. 4 and 5.
         lambda_cos: Weight of the cosine loss in Eq. 7.
-        lambda_lb: Weight of the load-balancing loss in Eq. 7 (the authors' code has 1).
+        lambda_lb: Weight of the load-balancing loss in Eq. 7 (1 in the authors' code).
         use_dino: Off is the paper's ablation "w/o DINO".
         load_balancing: Off is the paper's ablation "w/o L_lb".
-        temperature: Of the softmax in supplement A; the paper has 1.
-        init: "kmeans" starts from spherical k-means, "uniform" from uniform(-1/K, 1/K) as the authors' code
-            does.
-        kmeans_iterations: Lloyd iterations of the k-means start.
+        temperature: Temperature of the softmax in supplement A; 1 in the paper.
+        init: Start of the fit: "kmeans" is spherical k-means, "uniform" uniform(-1/K, 1/K) as in the authors' code.
+        kmeans_iterations: Lloyd iterations of k-means.
         steps: Gradient steps on Eq. 7 after the start.
-        learning_rate: Of AdamW in these steps.
-        weight_decay: Of AdamW in these steps.
-        batch_size: Feature vectors per gradient step.
-        sample_size: At most so many feature vectors are looked at, spread evenly over the training views.
+        learning_rate: Learning rate of AdamW in these steps.
+        weight_decay: Weight decay of AdamW in these steps.
+        batch_size: Feature vectors of a gradient step.
+        sample_size: Most feature vectors in the sample, equally many from each training view.
     """
 
     num_codes: int = 128
@@ -49,7 +48,7 @@ class CodebookConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.num_codes <= MAX_CODES:
             raise ValueError(
-                f"num_codes must be 1 to {MAX_CODES} because an index map holds one byte a pixel, "
+                f"num_codes must be 1 to {MAX_CODES} because an index map has one byte a pixel, "
                 f"got {self.num_codes}"
             )
         if self.init not in ("kmeans", "uniform"):
@@ -62,7 +61,7 @@ class CodebookConfig:
             )
 
     def as_in_paper(self) -> CodebookConfig:
-        """The same weights with the fit of the paper: gradient steps on Eq. 7 from a random start."""
+        """The paper's fit with the same loss weights: gradient steps on Eq. 7 from a random start."""
         return replace(
             self, init="uniform", steps=2000, learning_rate=1e-4, weight_decay=0.01, batch_size=16_384
         )

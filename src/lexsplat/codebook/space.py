@@ -1,4 +1,4 @@
-"""The discrete feature space S and how features are compared with it (Eq. 2 to 4)."""
+"""The discrete feature space S, and the similarity between features and codes (Eq. 2 to 4)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from lexsplat.features import FeatureMap
 
 BLOCK_ROWS = 16_384
-"""Feature vectors handled at a time, which bounds the memory of a similarity matrix."""
+"""Feature vectors handled at a time, to bound the memory of a similarity matrix."""
 
 
 def similarity(
@@ -29,10 +29,10 @@ def similarity(
     """Eq. 4: D(F, f_i) = cos<F_CLIP, f_i_CLIP> + lambda_DINO cos<F_DINO, f_i_DINO>.
 
     Args:
-        clip: CLIP parts of M features ``[M, Dc]``; any length, zero vectors have cosine 0.
+        clip: CLIP parts of M features ``[M, Dc]`` of any length; zero vectors have cosine 0.
         dino: DINO parts ``[M, Dd]``, or None.
         code_clip: CLIP parts of the codes ``[K, Dc]``.
-        code_dino: DINO parts of the codes ``[K, Dd]``, or None to compare by CLIP only.
+        code_dino: DINO parts of the codes ``[K, Dd]``, or None to compare CLIP parts only.
         lambda_dino: Weight of the DINO cosine.
 
     Returns:
@@ -74,7 +74,7 @@ class Codebook:
         lambda_dino: Weight of the DINO cosine in Eq. 4.
 
     Raises:
-        ValueError: If there are more than 256 codes, shapes disagree, or a number is not finite.
+        ValueError: If there are more than 256 codes, shapes disagree, or a value is NaN or infinite.
     """
 
     clip: Tensor
@@ -88,7 +88,7 @@ class Codebook:
             raise ValueError(f"DINO codes must be [{len(self.clip)}, D], got {list(self.dino.shape)}")
         for part in (self.clip, self.dino):
             if part is not None and not (part.is_floating_point() and bool(torch.isfinite(part).all())):
-                raise ValueError("the codebook has a number that is not finite")
+                raise ValueError("NaN or infinity in the codebook")
         if not math.isfinite(self.lambda_dino):
             raise ValueError(f"lambda_dino must be finite, got {self.lambda_dino}")
 
@@ -110,11 +110,11 @@ class Codebook:
     def assign(self, feature_map: FeatureMap) -> NDArray[np.uint8]:
         """Index map M of one view: the most similar code of every cell (Eq. 4), ``[h, w]`` uint8.
 
-        Ties go to the lower index. A cell whose CLIP feature is zero, about which nothing is known, holds 255 where
-        that is no code. Works in blocks of cells.
+        Ties go to the lower index. A cell whose CLIP feature is zero has no meaning and holds 255, unless 255 is a
+        code. Computed in blocks of cells.
         """
         height, width = feature_map.clip.shape[:2]
-        with one_thread():  # the last bit of a similarity may decide between two codes
+        with one_thread():  # the last bit of a similarity can decide between two codes
             indices = []
             for clip, dino in _blocks(feature_map, self.clip.device, self.dino is not None):
                 found = self.similarity(clip, dino).argmax(-1)
@@ -130,7 +130,7 @@ class Codebook:
         )
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything by name, for safetensors."""
+        """All tensors by name, for safetensors."""
         stored = {"clip": self.clip, "lambda_dino": torch.tensor(self.lambda_dino, dtype=torch.float64)}
         if self.dino is not None:
             stored["dino"] = self.dino
@@ -141,7 +141,7 @@ class Codebook:
         """The inverse of `tensors`.
 
         Raises:
-            ValueError: If a tensor is missing or of the wrong shape.
+            ValueError: If a tensor is missing or has the wrong shape.
         """
         missing = {"clip", "lambda_dino"} - set(tensors)
         if missing:

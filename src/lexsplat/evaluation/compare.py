@@ -1,4 +1,4 @@
-"""``lexsplat compare``: several methods on the same Gaussians and features, in the columns of the paper's Table 1."""
+"""``lexsplat compare``: several methods on the same Gaussians and features, as in Table 1 of the paper."""
 
 from __future__ import annotations
 
@@ -11,31 +11,29 @@ from typing import Any
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.evaluation import PROTOCOLS, EvaluationConfig, baselines
 from lexsplat.evaluation.ablate import in_form, language_settings, make_language
-from lexsplat.evaluation.experiments import Bench, Results, with_seed
+from lexsplat.evaluation.experiments import Bench, Made, Results
 from lexsplat.evaluation.methods import Method
-from lexsplat.language.fields import LanguageField
+from lexsplat.language import methods as language
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import embed_prompts
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Listener, silent
 
-OURS = ("averaged", "lifted", "trained", "lifted+tuned")
-"""Our fields; with "-feature" behind, answered in the paper's form of relevancy."""
+OURS = language.names()
+"""Our methods. With the suffix "-feature" they answer in the paper's form of relevancy."""
 
 BASELINES = ("dff", "lerf", "3dovs", "nearest")
-"""What the paper compares with, and the sanity line without 3D."""
+"""The methods that the paper compares with, and "nearest", a lower bound without 3D."""
 
 METHODS = (*OURS, *(f"{name}-feature" for name in OURS), *BASELINES)
-
-Made = tuple[LanguageField | Method, dict[str, float]]
+"""Everything that can be compared."""
 
 
 def compare(
-    capture: Path,
+    source: Path,
     output: Path,
     config: BuildConfig,
     *,
-    methods: Sequence[str] = ("averaged", "lifted", "trained-feature", *BASELINES),
+    methods: Sequence[str] = ("averaged", "trained-feature", *BASELINES),
     seeds: Sequence[int] = (0,),
     lpips: bool = True,
     masks: Path | None = None,
@@ -43,23 +41,23 @@ def compare(
     protocols: Sequence[str] = PROTOCOLS,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
-    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``report.html`` into ``output``.
+    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
 
-    A stopped run goes on where it was; the tables are written anew after every run. Memory is the peak while a
-    method's language is made, where the system can tell (Linux), and includes what the process holds anyway;
-    storage is what has to be kept to answer; training time is reconstruction, features and language.
+    An interrupted command resumes where it stopped; the tables are rewritten after every run. Memory is the peak of
+    the process while a method's language is made (Linux only); storage is what a scene must keep to answer;
+    training time is reconstruction, features and language.
 
     Args:
-        capture: Folder with photos, cameras and masks.
-        output: Where everything goes.
+        source: Folder with photos, cameras and masks.
+        output: Folder for everything that is written.
         config: Settings; ``config.seed`` is the seed of the Gaussians.
         methods: Names out of `METHODS`.
-        seeds: Seeds of codebook and language; one is enough for methods without chance.
+        seeds: Seeds of codebook and language; one is enough for deterministic methods.
         lpips: Measure LPIPS if it is installed.
-        masks: Folder with the ground truth in any layout of `scenes.annotations`, if not the capture's own.
-        prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
+        masks: Folder with ground truth in any layout of `lexsplat.captures.ground_truth`; None takes the capture's.
+        prompt_list: Use the prompts of the paper or of the released code, for captures named like its scenes.
         protocols: Names out of `evaluation.PROTOCOLS`; "strict" is always measured.
-        listener: Told how far each stage is.
+        listener: Receives progress events.
 
     Returns:
         Rows as `report.table_rows` makes them.
@@ -72,7 +70,7 @@ def compare(
     if unknown or not methods or not seeds:
         raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown) or 'too few'}")
     evaluation = EvaluationConfig(lpips=lpips, protocols=tuple(protocols))
-    bench = Bench(capture, output, config, evaluation, listener, masks=masks, prompt_list=prompt_list)
+    bench = Bench(source, output, config, evaluation, listener, masks=masks, prompt_list=prompt_list)
     shared = bench.evaluation
     results = Results(bench, "comparison", methods, seeds)
     for seed in seeds:
@@ -84,10 +82,10 @@ def compare(
 
 
 def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[], Made]]:
-    """What a method depends on, and how it is made."""
+    """The settings a method depends on, and a function that makes its language."""
     own = name.removesuffix("-feature")
     if own in OURS:
-        config = with_seed(replace(bench.config, method=own), seed)  # type: ignore[arg-type]
+        config = replace(bench.config, method=own, seed=seed)  # type: ignore[arg-type]
         return language_settings(config), lambda: make_language(bench, config)
     settings = {
         "dff": baselines.DffConfig(),
@@ -100,9 +98,9 @@ def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[],
 
 
 def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
-    scene, maps = bench.scene, bench.maps
-    training: Mapping[str, Any] = {view: scene.views[view].camera for view in scene.train_names}
-    memory = parse_bytes(bench.config.memory)
+    views, maps = bench.capture.views, bench.maps
+    training: Mapping[str, Any] = {name: views[name].camera for name in bench.capture.train_names}
+    memory = bench.memory
     data = baselines.TrainingData(bench.gaussians, training, maps, bench.level_maps)
     start = time.perf_counter()
     found: Method
@@ -118,5 +116,5 @@ def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
             data, classes, settings, seed=seed, memory=memory, listener=bench.listener
         )
     else:
-        found = baselines.ViewFeatures({view: v.camera for view, v in scene.views.items()}, maps)
+        found = baselines.ViewFeatures({view: v.camera for view, v in views.items()}, maps)
     return found, {name: time.perf_counter() - start}

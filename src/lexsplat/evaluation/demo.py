@@ -1,4 +1,4 @@
-"""``lexsplat demo``: the whole system on a scene and encoders that ship with the package."""
+"""``lexsplat demo``: the whole system on a bundled capture with bundled encoders."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 from lexsplat.codebook import CodebookConfig
 from lexsplat.evaluation.scenes import evaluate_scene
+from lexsplat.language.methods import MethodName
 from lexsplat.pipeline.build import build
-from lexsplat.pipeline.config import BuildConfig, LanguageMethod
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.scene import open_scene
 
@@ -19,7 +20,7 @@ SCENES = Path(__file__).resolve().parents[1] / "demo" / "scenes"
 """Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
 
 DEMO_CONFIG = BuildConfig(clip="bundled", dino="bundled", codebook=CodebookConfig(num_codes=256))
-"""Settings of the demo; docs/results.md says on which views which setting was chosen."""
+"""Settings of the demo; docs/results.md states on which views each setting was chosen."""
 
 
 def demo_capture(scene: SceneName = "tabletop") -> Path:
@@ -31,22 +32,22 @@ def run_demo(
     output: Path,
     *,
     scene: SceneName = "tabletop",
-    method: LanguageMethod | None = None,
+    method: MethodName | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     seed: int = 0,
     iterations: int | None = None,
     listener: Listener = silent,
 ) -> dict[str, Any]:
-    """Build the bundled scene and evaluate it on its held-out views.
+    """Build a bundled capture and evaluate the scene on its held-out views.
 
     Args:
-        output: The scene folder to make or to go on with.
-        scene: Which bundled capture.
-        method: How language gets into the Gaussians; none takes the default.
-        device: Where to compute.
+        output: Scene folder to make or to resume.
+        scene: Name of the bundled capture.
+        method: Method of the language; None takes the default.
+        device: Device to compute on.
         seed: Seed of all randomness.
-        iterations: Reconstruction steps; none takes what suits the device.
-        listener: Told how far each stage is.
+        iterations: Reconstruction steps; None takes what suits the device.
+        listener: Receives progress events.
 
     Returns:
         The content of ``metrics.json``.

@@ -1,4 +1,4 @@
-"""Index maps as the training reads them: a code for each pixel, also from a map coarser than the image.
+"""Index maps as training reads them: a code for every pixel of a view, also if the map is coarser than the view.
 
 Cell j of w covers the pixels whose centers lie in [j W / w, (j + 1) W / w).
 """
@@ -16,30 +16,34 @@ from lexsplat.captures.capture import View
 from lexsplat.codebook import MAX_CODES
 
 MASKED_CODE = MAX_CODES
-"""Index of a pixel that takes no part in any loss: above those of every codebook."""
+"""Index of a pixel that no loss uses; it is above the codes of every codebook."""
 
 
 def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -> Tensor:
-    """Codes of the cells in which the centers of pixels lie.
+    """Codes of the cells that contain the centers of the given pixels.
 
     Args:
         code_map: Index map ``[h, w]``.
-        height: Of the image the pixels belong to.
-        width: Of that image.
-        pixels: Flat indices into it, row by row ``[M]``.
+        height: Height of the image that the pixels belong to.
+        width: Width of that image.
+        pixels: Row-major indices into it ``[M]``.
 
     Returns:
         Codes ``[M]`` int64.
     """
     rows, columns = code_map.shape
-    # (p + 1/2) h / H in integers, so that no rounding moves a pixel to the neighboring cell.
+    # (p + 1/2) h / H in integers: rounding cannot move a pixel to the neighboring cell.
     row = (2 * (pixels // width) + 1) * rows // (2 * height)
     column = (2 * (pixels % width) + 1) * columns // (2 * width)
     return code_map[row, column].long()
 
 
 def check_views(names: list[str], code_maps: Mapping[str, object]) -> None:
-    """Raises ValueError if there is no view or one has no index map."""
+    """Refuse training views without index maps or feature maps.
+
+    Raises:
+        ValueError: If there is no view, or a view has no map.
+    """
     if not names:
         raise ValueError("no training view")
     missing = [name for name in names if name not in code_maps]
@@ -52,12 +56,12 @@ def check_views(names: list[str], code_maps: Mapping[str, object]) -> None:
 class MaskedCodeMaps(Mapping[str, Any]):
     """Index maps of training views in which masked pixels have the code `MASKED_CODE`.
 
-    Maps of views without a mask are handed out as they are, ``[h, w]`` uint8; those of masked views at the size of
-    the view's camera, ``[H, W]`` int16, made at every call from a bit a pixel.
+    Maps of views without a mask are returned unchanged, ``[h, w]`` uint8. Maps of masked views have the size of the
+    view's camera, ``[H, W]`` int16; they are computed on each access from a mask of one bit a pixel.
 
     Args:
         code_maps: Index maps by view name.
-        views: The views, with their masks.
+        views: Views by name, with their masks.
 
     Raises:
         CaptureError: If a mask cannot be read.
@@ -77,7 +81,7 @@ class MaskedCodeMaps(Mapping[str, Any]):
             return codes
         bits, (height, width) = self._bits[name]
         valid = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
-        # The cell in which a pixel's center lies, in integers so that none is moved by rounding.
+        # As in `codes_at_pixels`.
         rows = (2 * np.arange(height) + 1) * codes.shape[0] // (2 * height)
         columns = (2 * np.arange(width) + 1) * codes.shape[1] // (2 * width)
         return np.where(valid, codes[rows[:, None], columns].astype(np.int16), np.int16(MASKED_CODE))
@@ -90,7 +94,7 @@ class MaskedCodeMaps(Mapping[str, Any]):
 
 
 def mark_masked_cells(code_map: NDArray[np.uint8], view: View, num_codes: int) -> NDArray[np.uint8]:
-    """An index map ``[h, w]`` as it is stored: cells without any pixel that counts hold 255 where that is no code."""
+    """An index map ``[h, w]`` as it is stored: fully masked cells hold 255, unless 255 is a code."""
     share = view.valid_share((code_map.shape[1], code_map.shape[0]))
     if share is None or num_codes >= MAX_CODES:
         return code_map

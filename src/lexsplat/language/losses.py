@@ -1,7 +1,6 @@
-"""Losses of the language field: Eq. 9 to 12, 14 and 15 of the paper (image losses are in
-``image_losses.py``).
+"""Losses of the language field: Eq. 9 to 12, 14 and 15 of the paper.
 
-All are means over pixels or Gaussians, so that a random sample of them estimates the full loss without bias.
+All are means over pixels or Gaussians, so a random sample of them is an unbiased estimate of the full loss.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ UncertaintyForm = Literal["linear", "log"]
 SmoothingWeight = Literal["max", "linear"]
 
 LOG_MARGIN = 1e-4
-"""-log(1 - U) is infinite at U = 1, which float32 rendering can reach; U is clamped this far below it."""
+"""U is clamped to 1 minus this: -log(1 - U) is infinite at U = 1, which float32 rendering can reach."""
 
 
 def cross_entropy_loss(logits: Tensor, codes: Tensor, uncertainties: Tensor | None = None) -> Tensor:
     """Eq. 9, or Eq. 10 with uncertainties: mean of CE(M_hat, M) (1 - R_u).
 
-    The softmax of Eq. 8 is inside. The gradient of Eq. 10 reaches the uncertainties: where the codes of
-    several views disagree, CE stays high and u grows.
+    It includes the softmax of Eq. 8. The gradient of Eq. 10 reaches the uncertainties: if the codes of several views
+    disagree, CE stays high and u grows.
 
     Args:
         logits: Decoder outputs before the softmax ``[M, K]``.
@@ -45,12 +44,12 @@ def cross_entropy_loss(logits: Tensor, codes: Tensor, uncertainties: Tensor | No
 
 
 def uncertainty_loss(uncertainties: Tensor, form: UncertaintyForm = "linear") -> Tensor:
-    """Eq. 11: mean of the rendered uncertainty R_u, which keeps u from growing everywhere.
+    """Eq. 11: mean of the rendered uncertainty R_u, which keeps u low.
 
     Args:
         uncertainties: R_u ``[...]`` in 0..1.
-        form: "linear" is the paper's. "log" is the authors' code, mean of -log(1 - R_u): together with Eq. 10
-            it has the stationary point U = 1 - 1 / CE, where the linear form drives U to 0 or 1.
+        form: "linear" is the paper's. "log" is that of the authors' code, the mean of -log(1 - R_u). With Eq. 10 it
+            has the stationary point U = 1 - 1 / CE; the linear form drives U to 0 or 1.
     """
     if form == "linear":
         return uncertainties.mean()
@@ -75,19 +74,18 @@ def smoothing_loss(
     weight: SmoothingWeight = "max",
     squared: bool = False,
 ) -> Tensor:
-    """Eq. 14: ||s_MLP - s_G*|| + max(u_G*, w_s) ||s_MLP* - s_G||, averaged over the Gaussians; * stops the
-    gradient.
+    """Eq. 14: mean of ||s_MLP - s_G*|| + max(u_G*, w_s) ||s_MLP* - s_G|| over the Gaussians; * stops the gradient.
 
-    The first term teaches the MLP what the Gaussians carry, the second pulls the Gaussians to it, uncertain
-    ones more. The uncertainties get no gradient.
+    The first term fits the MLP to the Gaussians. The second pulls the Gaussians towards the MLP, uncertain ones more.
+    No gradient reaches the uncertainties.
 
     Args:
-        smoothed: Output of the MLP, s_MLP ``[N, S]`` (Eq. 13).
+        smoothed: Outputs of the MLP, s_MLP ``[N, S]`` (Eq. 13).
         semantics: s_G ``[N, S]``.
         uncertainties: u_G ``[N]`` in 0..1.
         min_weight: w_s, the least weight of the second term.
-        weight: "max" is the paper's; "linear" is the authors' code, (1 - u) w_s + u.
-        squared: Squared norms, as in the authors' code.
+        weight: "max" is the paper's; "linear" is that of the authors' code, (1 - u) w_s + u.
+        squared: Use squared norms, as the authors' code does.
     """
     fixed = uncertainties.detach()
     if weight == "max":

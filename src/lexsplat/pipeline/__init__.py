@@ -1,1 +1,1 @@
-"""From a capture to a scene: settings, stages, provenance."""
+"""From a capture to a scene: settings, inputs, stages, provenance."""

@@ -1,4 +1,4 @@
-"""All settings of a build in one place; each stage owns and documents its part."""
+"""All settings of a build; each stage documents its own part."""
 
 from __future__ import annotations
 
@@ -13,66 +13,57 @@ from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureConfig
 from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.geometry.world import World, parse_vector
+from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.language.methods.averaged import AveragedConfig
-from lexsplat.language.methods.lifted import LiftedConfig, TuningConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction import ReconstructionConfig
 from lexsplat.runtime.device import check_seed
 from lexsplat.runtime.memory import parse_bytes
 
 CPU_PIXELS = 80_000
-"""Working image size on a CPU when no downscale is given: about 320x240."""
+"""Pixels of the working images on a CPU if no downscale is given: about 320x240."""
 CUDA_PIXELS = 2_000_000
-"""Working image size on CUDA when no downscale is given: 1600 pixels wide at 4:3, as 3DGS does."""
+"""Pixels of the working images on CUDA if no downscale is given: 1600 wide at 4:3, as in 3DGS."""
 CPU_ITERATIONS = 3_000
-"""Reconstruction steps on a CPU when none are given."""
+"""Reconstruction steps on a CPU if none are given."""
 CUDA_ITERATIONS = 30_000
-"""Reconstruction steps on CUDA when none are given: the paper's number."""
-
-
-LanguageMethod = Literal["averaged", "trained", "lifted", "lifted+tuned"]
-"""Ways to language on the Gaussians."""
+"""Reconstruction steps on CUDA if none are given, as in the paper."""
 
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """Everything that decides what a build makes.
+    """Settings of a build.
 
     Args:
-        clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled" (small, made by us,
-            knows only scenes like the demo).
-        dino: Dense encoder, in the same way, or "none" (the paper's ablation without DINO).
-        device: "auto" takes CUDA where there is a GPU.
+        clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled" (small, for scenes like the
+            demo).
+        dino: Dense encoder: a name, a folder, "bundled", or "none".
+        device: Device to compute on; "auto" takes CUDA if there is a GPU.
         seed: Seed of all randomness.
-        features_from: Folder with features made by another program, one array a view, in place of our own
-            (docs/captures.md); of the encoders only the words of `clip` are used then.
-        memory: Host memory that photos, features and projections kept by any stage may take, such as "4GB"; beside
-            it comes what the libraries, the encoders and the Gaussians themselves need (docs/conventions.md).
-        checkpoint_seconds: Seconds between two savings of a training that is under way.
-        downscale: Factor by which photos are made smaller for reconstruction and language; none chooses one
-            that suits the device.
-        iterations: Reconstruction steps; none means 30,000 on CUDA and 3,000 on a CPU.
-        frames: How many frames a video is sampled to.
-        test_every: Every n-th view is held out where the capture does not say which (0 holds out none).
-        up: Direction away from the ground in the cameras' axes, as "x,y,z"; none takes it from how the cameras were
-            held.
-        method: "averaged" puts the features of all views on each Gaussian and quantizes them there: the best by our
-            measurements (docs/results.md). "lifted" computes each Gaussian's codes from those of the views, as fast.
-            "trained" is the paper's optimization, "lifted+tuned" starts the paper's field from the lifted one.
-        joint: Train language together with geometry from the first step, as the authors' code does (with
-            method "trained"; its steps are then those of the reconstruction).
-        poses: Structure from motion, for photos without cameras and videos.
+        features_from: Folder with features of another program, one array a view (docs/captures.md). CLIP is then
+            used for prompts only.
+        memory: Host memory for photos, features and projections, such as "4GB". Libraries, encoders and Gaussians
+            come on top (docs/conventions.md).
+        checkpoint_seconds: Seconds between two checkpoints of a training.
+        downscale: Factor by which photos are reduced for reconstruction and language; by default what suits the
+            device.
+        iterations: Reconstruction steps; by default 30,000 on CUDA and 3,000 on a CPU.
+        frames: Number of frames sampled from a video.
+        test_every: Every n-th view is held out if the capture does not list held-out views; 0 holds out none.
+        up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras.
+        method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in
+            docs/results.md); "trained" is the optimization of the paper.
+        joint: Train language together with geometry, as the authors' code does; needs method "trained".
+        poses: Structure from motion, for photos without cameras and for videos.
         reconstruction: Geometry and appearance.
-        features: Dense CLIP and DINO features. What is left at its default takes the value that suits the encoder and
-            the device; `scene.json` has the values that were taken.
+        features: Dense CLIP and DINO features. Settings left at their default take the value that suits the encoder
+            and the device; `scene.json` records it.
         codebook: Quantization.
-        averaged: Features of all views on the Gaussians, and codes for them.
-        trained: Training of the language field.
-        lifted: Computing the language field from the codes of the views.
-        tuning: From the lifted field to the paper's form.
+        averaged: Method "averaged".
+        trained: Method "trained".
 
     Raises:
-        ValueError: If a number makes no sense.
+        ValueError: If a value is out of range.
     """
 
     clip: str = DEFAULT_CLIP
@@ -87,7 +78,7 @@ class BuildConfig:
     frames: int = DEFAULT_FRAMES
     test_every: int = 8
     up: str | None = None
-    method: LanguageMethod = "averaged"
+    method: MethodName = "averaged"
     joint: bool = False
     poses: PoseConfig = field(default_factory=PoseConfig)
     reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
@@ -95,19 +86,20 @@ class BuildConfig:
     codebook: CodebookConfig = field(default_factory=CodebookConfig)
     averaged: AveragedConfig = field(default_factory=AveragedConfig)
     trained: TrainedConfig = field(default_factory=TrainedConfig)
-    lifted: LiftedConfig = field(default_factory=LiftedConfig)
-    tuning: TuningConfig = field(default_factory=TuningConfig)
 
     def __post_init__(self) -> None:
         for encoder in ("clip", "dino"):
-            if getattr(self, encoder) == "embedded":  # the word before "bundled"
+            if getattr(self, encoder) == "embedded":  # alias of earlier versions
                 object.__setattr__(self, encoder, "bundled")
         parse_bytes(self.memory)
         check_seed(self.seed)
         if self.downscale is not None and not 0 < self.downscale < 1e6:
             raise ValueError(f"downscale must be positive, got {self.downscale:g}")
-        if self.joint and self.method != "trained":
-            raise ValueError(f'joint training needs method "trained", got {self.method!r}')
+        if self.method not in METHODS:
+            raise ValueError(f"method must be one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.joint and not METHODS[self.method].trains_jointly:
+            joint = [name for name, method in METHODS.items() if method.trains_jointly]
+            raise ValueError(f"joint training needs method {' or '.join(joint)}, got {self.method!r}")
         if not self.checkpoint_seconds >= 0:
             raise ValueError(f"checkpoint_seconds must be at least 0, got {self.checkpoint_seconds:g}")
         if self.iterations is not None and self.iterations < 1:
@@ -119,56 +111,26 @@ class BuildConfig:
         if self.test_every < 0 or self.test_every == 1:
             raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {self.test_every}")
 
-    def within_memory(self) -> BuildConfig:
-        """The same settings with the store of every stage bounded by a quarter of `memory`.
+    def result_settings(self) -> BuildConfig:
+        """These settings with everything that does not affect the result at its default, for fingerprints.
 
-        What does not fit is read or computed again when it is needed: results do not depend on the bound.
+        Memory, checkpoints, settings of methods that are not used, and features that take no part.
         """
-        whole = parse_bytes(self.memory)
-        projections = min(self.trained.memory_bytes, whole // 4)
-        histogram = max(1, min(self.lifted.memory_bytes, whole // 4))
-        return replace(
-            self,
-            trained=replace(self.trained, memory_bytes=projections),
-            averaged=replace(self.averaged, memory_bytes=max(1, min(self.averaged.memory_bytes, whole // 4))),
-            lifted=replace(self.lifted, memory_bytes=histogram),
-        )
-
-    def decisive(self) -> BuildConfig:
-        """What fingerprints hold: these settings, with those at their defaults that decide nothing about the result.
-
-        How much is kept in memory, the ways to the language that are not taken, the crops of the other mode.
-        """
-        kept = {
-            "trained": {"memory_bytes": TrainedConfig.memory_bytes},
-            "averaged": {"memory_bytes": AveragedConfig.memory_bytes},
-            "lifted": {"memory_bytes": LiftedConfig.memory_bytes},
+        used = METHODS[self.method].settings
+        unused = {part for method in METHODS.values() for part in method.settings} - set(used)
+        usual = BuildConfig()
+        idle: dict[str, Any] = {
+            name: getattr(usual, name) for name in unused | {"memory", "checkpoint_seconds"}
         }
-        parts = {name: replace(getattr(self, name), **fields) for name, fields in kept.items()}
-        unused: dict[str, dict[str, Any]] = {
-            "averaged": {
-                "trained": TrainedConfig(),
-                "lifted": LiftedConfig(),
-                "tuning": TuningConfig(),
-            },
-            "lifted": {
-                "averaged": AveragedConfig(),
-                "trained": TrainedConfig(),
-                "tuning": TuningConfig(),
-            },
-            "trained": {"averaged": AveragedConfig(), "lifted": LiftedConfig(), "tuning": TuningConfig()},
-            "lifted+tuned": {"averaged": AveragedConfig()},
-        }
-        parts |= unused[self.method]
-        return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **parts)
+        return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **idle)
 
     @property
     def uses_dino(self) -> bool:
-        """Whether the language is made of dense features too: averaged features are quantized without."""
-        return self.dino != "none" and self.method != "averaged"
+        """Whether DINO features take part."""
+        return self.dino != "none" and METHODS[self.method].uses_dino
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
-        """The same settings with nothing left open.
+        """The same settings with every open one chosen.
 
         Args:
             device: "cpu" or "cuda".

@@ -1,7 +1,7 @@
-"""The photos and cameras of a scene: for a build, with structure from motion where needed, and found again later.
+"""The capture of a build, with structure from motion where needed, and the same capture reloaded later.
 
-A capture is a folder with cameras, a folder of photos alone, or a video. What structure from motion makes of the
-latter two lies in ``poses/`` of the scene folder: ``sparse/0``, upright copies or frames in ``images/``, masks.
+A capture is a folder with cameras, a folder of photos alone, or a video. For the latter two structure from motion
+writes ``poses/`` in the scene folder: ``sparse/0``, upright copies or frames in ``images/``, and masks.
 """
 
 from __future__ import annotations
@@ -21,91 +21,106 @@ from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
 
+log = logging.getLogger("lexsplat")
+
 
 def prepare_capture(
-    capture: Path,
+    source: Path,
     folder: SceneFolder,
     config: BuildConfig,
     test_names: list[str] | None,
     listener: Listener,
 ) -> Capture:
-    """The capture; photos without cameras, or a video, get them by structure from motion, kept in ``poses/``."""
-    if not is_photo_folder(capture):
+    """Load the capture of a build; photos without cameras and videos get cameras from structure from motion.
+
+    Args:
+        source: Folder or video that the user gave.
+        folder: The scene folder, where cameras from structure from motion are kept in ``poses/``.
+        config: Settings of the build.
+        test_names: Names of the held-out views; None takes those of the capture, or else every n-th view.
+        listener: Receives progress events.
+
+    Raises:
+        CaptureError: If there is no usable capture.
+    """
+    if not is_photo_folder(source):
         folder.record.pop("images", None)
-        return load_capture(capture, test_every=config.test_every, test_names=test_names)
+        return load_capture(source, test_every=config.test_every, test_names=test_names)
     poses = folder.root / "poses"
-    photos = poses / "images" if is_video(capture) else photo_folder(capture)
-    if folder.root.resolve() in (photos.resolve(), capture.resolve()):
+    photos = poses / "images" if is_video(source) else photo_folder(source)
+    if folder.root.resolve() in (photos.resolve(), source.resolve()):
         raise CaptureError(
             folder.root,
             expected="an output folder of its own",
             found="the folder of the photos",
             remedy="give another --output",
         )
-    made_from = _photos_fingerprint(capture, photos, folder.root, config)
-    images = folder.record["stages"].get("poses", {}).get("images")
-    kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()
-    if not (kept and folder.is_finished("poses", made_from)):
-        start = time.perf_counter()
-        folder.reopen("poses")
-        if is_video(capture):
-            sample_video(capture, photos, config.frames, memory=parse_bytes(config.memory), listener=listener)
-        found = poses_from_photos(
-            photos,
-            poses,
-            config.poses,
-            seed=config.seed,
-            memory=parse_bytes(config.memory),
-            listener=listener,
-        )
-        log = logging.getLogger("lexsplat")
-        for note in found.notes:
-            log.warning(note)
-        log.log(logging.INFO if found.is_complete else logging.WARNING, found.note)
-        inside = found.images.resolve().is_relative_to(folder.root.resolve())
-        images = "poses/images" if inside else str(found.images.resolve())
-        facts = {
-            "registered": len(found.registered),
-            "unregistered": list(found.unregistered),
-            "images": images,
-        }
-        folder.finish("poses", made_from, time.perf_counter() - start, **facts)
+    images = _registered_images(source, photos, folder, config, listener)
     folder.record["images"] = images
-    folder.record["capture"] = str(capture.resolve())
+    folder.record["capture"] = str(source.resolve())
     return load_capture(
         poses,
         images=folder.root / images,
-        beside=capture if capture.is_dir() else poses,
+        beside=source if source.is_dir() else poses,
         test_every=config.test_every,
         test_names=test_names,
     )
 
 
-def _photos_fingerprint(capture: Path, photos: Path, output: Path, config: BuildConfig) -> str:
-    """What estimated cameras depend on: photos by name and size, masks also by time, and the settings."""
-    about: list[Any] = [config.poses, config.seed]
-    if is_video(capture):
-        if not capture.is_file():
-            raise CaptureError(capture, expected="a video", found="no such file", remedy="check the path")
-        return fingerprint(about, capture.name, capture.stat().st_size, config.frames)
+def _registered_images(
+    source: Path, photos: Path, folder: SceneFolder, config: BuildConfig, listener: Listener
+) -> str:
+    """Run structure from motion unless its result is up to date; returns the folder of the images that have poses."""
+    poses, memory = folder.root / "poses", parse_bytes(config.memory)
+    made_from = _photos_fingerprint(source, photos, folder.root, config)
+    images = folder.record["stages"].get("poses", {}).get("images")
+    kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()
+    if kept and folder.is_finished("poses", made_from):
+        return str(images)
+    start = time.perf_counter()
+    folder.reopen("poses")
+    if is_video(source):
+        sample_video(source, photos, config.frames, memory=memory, listener=listener)
+    found = poses_from_photos(photos, poses, config.poses, seed=config.seed, memory=memory, listener=listener)
+    for note in found.notes:
+        log.warning(note)
+    log.log(logging.INFO if found.is_complete else logging.WARNING, found.note)
+    inside = found.images.resolve().is_relative_to(folder.root.resolve())
+    images = "poses/images" if inside else str(found.images.resolve())
+    facts = {
+        "registered": len(found.registered),
+        "unregistered": list(found.unregistered),
+        "images": images,
+    }
+    folder.finish("poses", made_from, time.perf_counter() - start, **facts)
+    return images
+
+
+def _photos_fingerprint(source: Path, photos: Path, output: Path, config: BuildConfig) -> str:
+    """Fingerprint of the inputs of structure from motion: photos by name and size, masks also by time, settings."""
+    settings: list[Any] = [config.poses, config.seed]
+    if is_video(source):
+        if not source.is_file():
+            raise CaptureError(source, expected="a video", found="no such file", remedy="check the path")
+        return fingerprint(settings, source.name, source.stat().st_size, config.frames)
     masks = [path for folder in mask_places(photos) for path in sorted(folder.rglob("*")) if path.is_file()]
     names = find_photos(photos, output)
     return fingerprint(
-        about,
+        settings,
         [[name, (photos / name).stat().st_size] for name in names],
         [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in masks],
     )
 
 
-def reload_capture(folder: SceneFolder, capture: Path | None = None) -> Capture:
-    """The capture of a scene that was built, with the views, sizes and split of the build.
+def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
+    """Load the capture of a built scene, with the views, sizes and split of the build.
 
     Args:
-        folder: The scene.
-        capture: Where the photos are now, if they have moved.
+        folder: The scene folder.
+        source: Folder of the capture if it has been moved since the build.
 
     Raises:
-        SceneFolderError: If they are not where the build found them.
+        SceneFolderError: If the photos are not where the build found them.
         CaptureError: If they cannot be used.
     """
     record = folder.record
@@ -113,23 +128,21 @@ def reload_capture(folder: SceneFolder, capture: Path | None = None) -> Capture:
     downscale = record.get("config", {}).get("downscale") or 1.0
     images = record.get("images")
     recorded = record.get("capture")
-    place = capture or (Path(recorded) if recorded else None)
-    owned = (
-        images is not None and not Path(images).is_absolute()
-    )  # copies or frames in the scene folder itself
+    place = source or (Path(recorded) if recorded else None)
+    owned = images is not None and not Path(images).is_absolute()  # images inside the scene folder
     if not owned and (place is None or not place.exists()):
         raise SceneFolderError(
             place or "capture",
             expected="the photos the scene was made from",
             found="no such folder",
-            remedy="say where they are with --capture",
+            remedy="give their folder with --capture",
         )
     if images is None or place is None:
         return load_capture(place or folder.root / "poses", downscale=downscale, test_names=held_out)
     poses = folder.root / "poses"
     return load_capture(
         poses,
-        images=photo_folder(capture) if capture is not None and not owned else folder.root / images,
+        images=photo_folder(source) if source is not None and not owned else folder.root / images,
         beside=place if place.is_dir() else poses,
         downscale=downscale,
         test_names=held_out,

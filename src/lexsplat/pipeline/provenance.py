@@ -1,4 +1,4 @@
-"""Where a scene comes from: what is recorded of it, and the fingerprints that tell when it has changed."""
+"""Where a scene comes from: the record of its inputs, and fingerprints that detect changes."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from lexsplat.scenes.previous import keep_previous
 log = logging.getLogger("lexsplat")
 
 
-def write_provenance(folder: SceneFolder, scene: Capture, config: BuildConfig) -> str:
-    """Record where the scene comes from; returns a fingerprint of photos, cameras and split."""
+def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig) -> str:
+    """Record the capture and the settings of a build; returns a fingerprint of photos, masks, cameras and split."""
     views = {
-        name: (view.camera, "test" if name in scene.test_names else "train")
-        for name, view in scene.views.items()
+        name: (view.camera, "test" if name in capture.test_names else "train")
+        for name, view in capture.views.items()
     }
-    sources = {name: file_hash(view.image_path) for name, view in scene.views.items()}
-    masks = {n: file_hash(v.ignore_path) for n, v in scene.views.items() if v.ignore_path is not None}
+    sources = {name: file_hash(view.image_path) for name, view in capture.views.items()}
+    masks = {n: file_hash(v.ignore_path) for n, v in capture.views.items() if v.ignore_path is not None}
     keep_previous(folder)
     folder.save()
     folder.write_cameras(views)
     _write_world(folder, config.up, {name: camera for name, (camera, _) in views.items()})
     if "images" not in folder.record:
-        folder.record["capture"] = str(Path(scene.root).resolve())
+        folder.record["capture"] = str(Path(capture.root).resolve())
     folder.record["config"] = {
         **to_json(config),
-        "clip": model_place(config.clip),  # a scene is asked from other folders than it was built in
+        "clip": model_place(config.clip),  # the scene may be opened from another working folder
         "dino": model_place(config.dino),
     }
     folder.record["provenance"] = {
@@ -46,14 +46,14 @@ def write_provenance(folder: SceneFolder, scene: Capture, config: BuildConfig) -
         "seed": config.seed,
         "sources": sources,
     }
-    folder.record["warnings"] = list(scene.warnings)
+    folder.record["warnings"] = list(capture.warnings)
     folder.save()
     cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
     return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
 
 
 def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
-    """Up from the cameras or the user; what was said of other cameras no longer holds."""
+    """Store the up direction, of the user or of the cameras. A scale stored for other cameras is dropped."""
     record = folder.record
     world = world_of(record, cameras)
     if up is not None:
@@ -65,14 +65,14 @@ def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]
 
 
 def model_place(name: str) -> str:
-    """The name of a model; of a folder its full path."""
+    """The name of a model, or the full path of a model folder."""
     folder = Path(name).expanduser()
     return name if name in ("bundled", "none") or not folder.is_dir() else str(folder.resolve())
 
 
 def model_identity(name: str, kind: str) -> list[str]:
-    """The name of a model; for a folder also the size and time of its files, for ours the content."""
-    if name == "bundled":  # another version of lexsplat may come with others, with any time of writing
+    """What identifies a model: its name; for a folder also sizes and times of its files; a hash if it is bundled."""
+    if name == "bundled":  # its files differ between versions of lexsplat, and their times mean nothing
         return [name, content_hash(model_folder(name, kind))]
     folder = Path(name).expanduser()
     if not folder.is_dir():

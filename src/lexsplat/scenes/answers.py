@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from lexsplat.geometry.world import world_of
+from lexsplat.language.methods import METHODS
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.phrases import parse
 from lexsplat.queries.relevancy import check_prompts
@@ -160,8 +161,9 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
     config = record.get("config", {})
     stages = record["stages"]
-    averaged = stages.get("language", {}).get("method") == "averaged"
-    codes = stages.get("language" if averaged else "codebook", {})  # where they were found
+    language = stages.get("language", {})
+    codes = language if "codes" in language else stages.get("codebook", {})  # the stage that found them
+    method = METHODS.get(language.get("method"))  # None for methods of earlier versions
     facts: dict[str, Any] = {
         "scene": str(folder.root),
         "capture": record.get("capture"),
@@ -173,10 +175,9 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussians": stages.get("reconstruct", {}).get("gaussians"),
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
-        "method": stages.get("language", {}).get("method"),
-        **({} if averaged else {"weight_dropped": stages.get("language", {}).get("dropped")}),
+        "method": language.get("method"),
         "clip": config.get("clip"),
-        "dino": "not used" if averaged else config.get("dino"),
+        "dino": config.get("dino") if method is None or method.uses_dino else "not used",
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         "language_bytes": folder.bytes_on_disk(folder.language_path),
         "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),

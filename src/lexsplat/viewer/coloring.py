@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
-from lexsplat.language.fields import LanguageField, LiftedField
+from lexsplat.language.fields import CodeField, LanguageField
 from lexsplat.queries.heatmaps import PEAK_FLOOR, colorize
 from lexsplat.queries.picking import field_scores
 from lexsplat.queries.thresholds import automatic_threshold
@@ -218,7 +218,7 @@ def _faded(colors: NDArray[np.uint8], fade: float) -> NDArray[np.uint8]:
 
 def likeliest_codes(language: LanguageField) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The likeliest code of every Gaussian ``[N]``, and whether anything is known about it ``[N]``."""
-    if isinstance(language, LiftedField):
+    if isinstance(language, CodeField):
         weights, place = language.weights.max(1)
         codes = language.codes.gather(1, place[:, None])[:, 0].long()
         return codes.cpu().numpy(), (weights > 0).cpu().numpy()

@@ -14,7 +14,7 @@ def small_field(trained: bool) -> Any:
     import torch
 
     from lexsplat.codebook import Codebook
-    from lexsplat.language.fields import LiftedField, TrainedField
+    from lexsplat.language.fields import CodeField, TrainedField
 
     generator = torch.Generator().manual_seed(0)
     clip, dino = torch.randn(3, 6, generator=generator), torch.randn(3, 4, generator=generator)
@@ -24,7 +24,7 @@ def small_field(trained: bool) -> Any:
     if trained:
         return TrainedField.initial(small_gaussians(), codebook, generator=generator)
     codes = torch.tensor([[0, 1], [1, 2], [2, 0], [0, 2]], dtype=torch.uint8)
-    return LiftedField(codebook, codes, torch.full((4, 2), 0.5), torch.linspace(0, 1, 4))
+    return CodeField(codebook, codes, torch.full((4, 2), 0.5), torch.linspace(0, 1, 4))
 
 
 @reader

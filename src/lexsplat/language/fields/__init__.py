@@ -1,12 +1,9 @@
-"""What a scene says: language on the Gaussians, trained as in the paper (section 3.4) or lifted from the
-index maps.
+"""The two forms of language on the Gaussians (section 3.4), behind the protocol `LanguageField`.
 
-`TrainedField` carries s_G in R^8 and an uncertainty on every Gaussian and decodes what is rendered (Eq. 8).
-`LiftedField` carries a sparse distribution over codes on every Gaussian and renders it. Both answer the same
-questions, `LanguageField`.
+`CodeField` carries a sparse distribution over codes on every Gaussian and renders it.
+`TrainedField` carries s_G in R^8 and an uncertainty on every Gaussian, and decodes what is rendered (Eq. 8).
 
-Geometry is deaf to language: features are rendered with geometry detached, so training a field moves no
-Gaussian.
+Features are rendered with geometry detached, so no field ever moves a Gaussian.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from lexsplat.language.fields.lifted import LiftedField
+from lexsplat.language.fields.codes import CodeField
 from lexsplat.language.fields.protocol import LanguageField
 from lexsplat.language.fields.smoothing import (
     SEMANTIC_CHANNELS,
@@ -29,8 +26,8 @@ from lexsplat.language.fields.trained import INITIAL_UNCERTAINTY, TrainedField
 __all__ = [
     "INITIAL_UNCERTAINTY",
     "SEMANTIC_CHANNELS",
+    "CodeField",
     "LanguageField",
-    "LiftedField",
     "SmoothingMLP",
     "TrainedField",
     "field_from_tensors",
@@ -41,11 +38,11 @@ __all__ = [
 
 def field_from_tensors(
     tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
-) -> TrainedField | LiftedField:
-    """The field that was stored, whichever kind it is.
+) -> TrainedField | CodeField:
+    """A stored field; the names of its tensors say which form it has.
 
     Raises:
-        ValueError: If the tensors are of neither kind, do not fit each other, or hold a number that is not finite.
+        ValueError: If the tensors are of neither form, do not fit each other, or hold NaN or infinity.
     """
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
@@ -54,7 +51,7 @@ def field_from_tensors(
         if "semantics" in tensors:
             return TrainedField.from_tensors(tensors, metadata)
         if "codes" in tensors:
-            return LiftedField.from_tensors(tensors, metadata)
-    except (IndexError, TypeError, RuntimeError) as error:  # a tensor with fewer axes than it must have
+            return CodeField.from_tensors(tensors, metadata)
+    except (IndexError, TypeError, RuntimeError) as error:  # a tensor with too few axes
         raise ValueError(f"language field does not fit: {error}") from error
-    raise ValueError("neither semantics (trained) nor codes (lifted) among the tensors of the language field")
+    raise ValueError("neither semantics (TrainedField) nor codes (CodeField) among the tensors")

@@ -1,4 +1,4 @@
-"""Rendering and storing what both kinds of field have: columns of codes, tables of scores, the codebook."""
+"""Shared by both forms of field: rendering many channels, checking score tables, storing the codebook."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import prepare, render
 
 RENDER_CHANNELS = 32
-"""Feature channels rendered in one pass when there are many."""
+"""Channels rendered in one pass."""
 
 BLOCK_ROWS = 16_384
 """Pixels or Gaussians decoded at a time."""
@@ -38,22 +38,22 @@ def check_table(table: Tensor, codebook: Codebook) -> None:
     """Refuse a table of scores that is not ``[K, P]``.
 
     Raises:
-        ValueError: With the shape that it has.
+        ValueError: If it has another shape.
     """
     if table.ndim != 2 or len(table) != codebook.num_codes:
         raise ValueError(f"table must be [{codebook.num_codes}, P], got {list(table.shape)}")
 
 
 def codebook_tensors(codebook: Codebook) -> dict[str, Tensor]:
-    """The codebook of a field among its tensors."""
+    """Tensors of a codebook under the names they have in a stored field."""
     return {f"codebook.{name}": value.contiguous() for name, value in codebook.tensors().items()}
 
 
 def stored_codebook(tensors: Mapping[str, Tensor]) -> Codebook:
-    """The codebook that `codebook_tensors` stored.
+    """The inverse of `codebook_tensors`.
 
     Raises:
-        ValueError: If a tensor is missing or does not fit.
+        ValueError: If a tensor is missing or has the wrong shape.
     """
     prefix = "codebook."
     return Codebook.from_tensors(
@@ -62,10 +62,10 @@ def stored_codebook(tensors: Mapping[str, Tensor]) -> Codebook:
 
 
 def require(tensors: Mapping[str, Tensor], names: tuple[str, ...]) -> None:
-    """Refuse tensors of a field that are not complete.
+    """Refuse a stored field without the tensors ``names``.
 
     Raises:
-        ValueError: With the names of those that are missing.
+        ValueError: If any is missing.
     """
     missing = [name for name in names if name not in tensors]
     if missing:

@@ -1,4 +1,4 @@
-"""The smoothing MLP (Eq. 13): language as a smooth function of the place."""
+"""The smoothing MLP (Eq. 13): language as a smooth function of position."""
 
 from __future__ import annotations
 
@@ -9,25 +9,24 @@ import torch
 from torch import Tensor, nn
 
 SEMANTIC_CHANNELS = 8
-"""S, the paper's d_s."""
+"""S: channels of s_G, the paper's d_s."""
 
 SMOOTHING_WIDTHS = (128, 128, 128)
-"""Hidden layers of the smoothing MLP (supplement, table of PE and MLP)."""
+"""Widths of the hidden layers of the smoothing MLP (supplement, table of PE and MLP)."""
 
 
 class SmoothingMLP(nn.Module):
     """Eq. 13: s_MLP = MLP(PE(p)), three hidden layers of 128 with ReLU, then a linear layer to 8.
 
-    A coordinate MLP learns low frequencies first, which is what smooths. Positions are mapped to -1..1 over
-    the scene's box, which the paper leaves open (its code feeds raw coordinates); what lies outside is
-    clamped to -2..2.
+    A coordinate MLP learns low frequencies first, hence the smoothing. Positions are mapped to -1..1 over the box of
+    the scene and clamped to -2..2. The paper does not specify a normalization; its code feeds raw coordinates.
 
     Args:
-        center: Middle of the box ``[3]``, world units.
-        extent: Half of its longest side, world units.
-        num_frequencies: L of NeRF's encoding (x, sin(2^l pi x), cos(2^l pi x) for l < L). The paper's table
-            has 0: x alone.
-        generator: Of the initial weights.
+        center: Center of the box ``[3]``, world units.
+        extent: Half the longest side of the box, world units.
+        num_frequencies: L of NeRF's encoding (x, sin(2^l pi x), cos(2^l pi x) for l < L). 0 is x alone, as in the
+            paper's table.
+        generator: Generator of the initial weights.
     """
 
     center: Tensor
@@ -50,7 +49,7 @@ class SmoothingMLP(nn.Module):
         self.layers = mlp((3 + 6 * num_frequencies, *SMOOTHING_WIDTHS, SEMANTIC_CHANNELS), generator)
 
     def forward(self, means: Tensor) -> Tensor:
-        """s_MLP ``[N, 8]`` at positions ``[N, 3]``; the positions get no gradient."""
+        """s_MLP ``[N, 8]`` at positions ``[N, 3]``; no gradient reaches the positions."""
         unit = ((means.detach() - self.center) / self.extent).clamp(-2, 2)
         return self.layers(positional_encoding(unit, self.num_frequencies))
 
@@ -65,13 +64,12 @@ def positional_encoding(positions: Tensor, num_frequencies: int) -> Tensor:
 
 
 def scene_box(means: Tensor) -> tuple[Tensor, Tensor]:
-    """Middle ``[3]`` and half the longest side ``[]`` of the box that holds all but the outermost 2 % on
-    every axis.
+    """Center ``[3]`` and half the longest side ``[]`` of the box between the 2nd and 98th percentile on each axis.
 
-    A few far floaters would otherwise squeeze the scene into a corner of the encoding.
+    The percentiles keep far floaters from shrinking the scene to a corner of the box.
     """
     points = means.detach().float()
-    if len(points) > 1_000_000:  # torch.quantile has an upper limit, and a sample says as much
+    if len(points) > 1_000_000:  # torch.quantile has a size limit; a sample is enough
         points = points[:: len(points) // 1_000_000 + 1]
     ends = torch.quantile(points, torch.tensor([0.02, 0.98], device=points.device), dim=0)
     extent = ((ends[1] - ends[0]).max() / 2).clamp_min(1e-6)
@@ -79,7 +77,7 @@ def scene_box(means: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Sequential:
-    """Linear layers with ReLU between them, initialized like nn.Linear but from the given generator only."""
+    """Linear layers with ReLU between them, initialized as nn.Linear is, but by the given generator."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     layers: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(widths):

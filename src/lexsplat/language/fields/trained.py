@@ -1,4 +1,4 @@
-"""The paper's language field (section 3.4): s_G and an uncertainty on every Gaussian, and their decoder (Eq. 8)."""
+"""The paper's language field (section 3.4): s_G and an uncertainty on every Gaussian, and the decoder of Eq. 8."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from lexsplat.language.fields.smoothing import SEMANTIC_CHANNELS, SmoothingMLP, 
 from lexsplat.rendering import PreparedView, render
 
 DECODER_WIDTHS = (128, 256)
-"""Hidden layers of D_MLP (supplement, table of the decoder)."""
+"""Widths of the hidden layers of D_MLP (supplement, table of the decoder)."""
 
 INITIAL_UNCERTAINTY = 0.01
-"""The paper starts at u = 0, which a sigmoid never is; the authors' code starts here."""
+"""Start of u in the authors' code. The paper starts at 0, which a sigmoid never reaches."""
 
 
 class TrainedField(nn.Module):
@@ -38,8 +38,8 @@ class TrainedField(nn.Module):
         uncertainty_logits: Inverse sigmoid of u ``[N]``.
         smoother: The MLP of Eq. 13.
         normalize_rendering: Scale the rendered s to unit length before decoding, as the authors' code does.
-        method: Name under which results are reported, "trained" or "lifted+tuned".
-        generator: Of the decoder's initial weights.
+        method: Name of the method that made the field.
+        generator: Generator of the decoder's initial weights.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class TrainedField(nn.Module):
         num_frequencies: int = 0,
         normalize_rendering: bool = False,
     ) -> TrainedField:
-        """The start of training: s_G from N(0, 1), u almost zero (`INITIAL_UNCERTAINTY`)."""
+        """The field before training: s_G from N(0, 1), u = `INITIAL_UNCERTAINTY`."""
         count = len(gaussians)
         center, extent = scene_box(gaussians.means)
         field = cls(
@@ -99,7 +99,7 @@ class TrainedField(nn.Module):
     def render_semantics(
         self, gaussians: Gaussians, camera: Camera, *, prepared: PreparedView | None = None
     ) -> tuple[Tensor, Tensor]:
-        """R_s and R_u: ``[H, W, 8]`` and ``[H, W]``, in one pass, with gradients to s_G and u only."""
+        """R_s ``[H, W, 8]`` and R_u ``[H, W]`` in one pass; gradients reach s_G and u only."""
         carried = torch.cat([self.semantics, self.uncertainty_logits.sigmoid()[:, None]], dim=1)
         rendered = render(
             gaussians.detach(), camera, features=carried, color=False, prepared=prepared
@@ -115,14 +115,24 @@ class TrainedField(nn.Module):
     @torch.no_grad()
     def code_probabilities(self) -> Tensor:
         """softmax(D_MLP(s_G)): what each Gaussian would show alone ``[N, K]``."""
-        return torch.cat([self.decode(rows).softmax(-1) for rows in self.semantics.split(BLOCK_ROWS)])
+        return self._probabilities(self.semantics)
+
+    @torch.no_grad()
+    def scores(self, table: Tensor) -> Tensor:
+        """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``, in blocks of Gaussians."""
+        check_table(table, self.codebook)
+        table = table.to(self.semantics)
+        return torch.cat([self._probabilities(rows) @ table for rows in self.semantics.split(4 * BLOCK_ROWS)])
+
+    def _probabilities(self, semantics: Tensor) -> Tensor:
+        """Decoded distributions ``[M, K]`` of rows ``[M, 8]``."""
+        return torch.cat([self.decode(rows).softmax(-1) for rows in semantics.split(BLOCK_ROWS)])
 
     @torch.no_grad()
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """Eq. 8 ``[H, W, K]``; sums to 1 at every pixel, also where nothing is drawn (there s is 0)."""
+        """Eq. 8 ``[H, W, K]``. Every pixel sums to 1, also where no Gaussian is drawn (there s is 0)."""
         semantics, _ = self.render_semantics(gaussians, camera)
-        blocks = [self.decode(rows).softmax(-1) for rows in semantics.flatten(0, 1).split(BLOCK_ROWS)]
-        return torch.cat(blocks).unflatten(0, semantics.shape[:2])
+        return self._probabilities(semantics.flatten(0, 1)).unflatten(0, semantics.shape[:2])
 
     @torch.no_grad()
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
@@ -134,18 +144,18 @@ class TrainedField(nn.Module):
         return torch.cat(blocks).unflatten(0, semantics.shape[:2])
 
     def select(self, index: Tensor) -> TrainedField:
-        """The rows of some Gaussians; decoder, smoother and codebook are the same."""
+        """The field of some Gaussians, with the same decoder, smoother and codebook."""
         tensors = self.tensors()
         rows = {name: tensors[name][index] for name in ("semantics", "uncertainty_logits")}
         return TrainedField.from_tensors(tensors | rows, self.metadata())
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything by name, for safetensors; the codebook under ``codebook.``."""
+        """All tensors by name, for safetensors; those of the codebook under ``codebook.``."""
         stored = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         return stored | codebook_tensors(self.codebook)
 
     def metadata(self) -> dict[str, str]:
-        """What is not a tensor."""
+        """Everything that is not a tensor."""
         return {
             "kind": "trained",
             "method": self.method,
@@ -159,7 +169,7 @@ class TrainedField(nn.Module):
         """The inverse of `tensors` and `metadata`.
 
         Raises:
-            ValueError: If a tensor is missing or of the wrong shape.
+            ValueError: If a tensor is missing or has the wrong shape.
         """
         metadata = metadata or {}
         require(tensors, ("semantics", "uncertainty_logits", "smoother.center", "smoother.layers.0.weight"))

@@ -1,1 +1,27 @@
-"""Methods: ways to a language field."""
+"""Methods: ways to a language field, each an object behind the protocol `LanguageMethod`.
+
+A new method is a file with a class like those below, an entry in `METHODS` and `MethodName`, and a field for its
+settings in `lexsplat.pipeline.config.BuildConfig`. Commands, builds, tables and fingerprints read the rest from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from lexsplat.language.methods.averaged import Averaged
+from lexsplat.language.methods.method import FitRun, LanguageMethod, TrainingViews
+from lexsplat.language.methods.trained import Trained
+
+__all__ = ["METHODS", "FitRun", "LanguageMethod", "MethodName", "TrainingViews", "names"]
+
+MethodName = Literal["averaged", "trained"]
+"""Names of the methods, for the types of settings and options."""
+
+METHODS: Mapping[str, LanguageMethod] = {method.name: method for method in (Averaged(), Trained())}
+"""The methods by name."""
+
+
+def names() -> tuple[str, ...]:
+    """Names of all methods."""
+    return tuple(METHODS)

@@ -1,15 +1,15 @@
-"""Averaging: the features of all views on each Gaussian first, codes afterwards.
+"""Method "averaged", the default: the features of all views on each Gaussian first, codes afterwards.
 
-The paper quantizes the features of every view and then puts the codes on the Gaussians. What is small or seen by few
-pixels, such as the handle of a mug, gets no code of its own there and is lost before the views have met. Here the
-order is turned around. As in lifting, the weight alpha T with which Gaussian n enters a pixel is its share in that
-pixel's feature, so its feature is the weighted mean over all pixels of all training views,
+The paper quantizes the features of every view and then puts the codes on the Gaussians. Small parts such as a mug's
+handle cover too few cells to receive one of the codewords and are lost before the views are combined. This method
+reverses the order. The weight alpha T with which Gaussian n is blended into a pixel is its share of that pixel's
+feature, so its own feature is the weighted mean over all pixels of all training views,
 
     F_n = sum alpha T F(p) / sum alpha T,
 
-the transpose of rendering (as in LUDVIG and Occam's LGS). What is wrong in one view is averaged out by the others.
-The codes are then found among the Gaussians (Eq. 2 to 4 without the DINO half), and each Gaussian is a softmax over
-its nearest ones. The length of the mean of unit vectors tells how far the views agree, which gives u_G.
+the transpose of rendering (as in LUDVIG and Occam's LGS). Averaging cancels what is wrong in single views. The
+codebook is then fitted to the Gaussians (Eq. 2 to 4 without the DINO half), and each Gaussian carries a softmax over
+its nearest codes. The length of the mean of unit vectors measures how far the views agree, which gives u_G.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +32,8 @@ from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views, codes_at_pixels
-from lexsplat.language.fields import LiftedField
+from lexsplat.language.fields import CodeField
+from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
 from lexsplat.rendering import BACK_PROJECTED_CHANNELS, back_project, prepare
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
@@ -40,20 +42,21 @@ from lexsplat.runtime.progress import Event, Listener, silent
 ROWS = 16_384
 """Gaussians handled at a time outside rendering."""
 
+MAX_STORE = 1 << 30
+"""Bytes that the sums may take at most, however much memory there is."""
+
 
 @dataclass(frozen=True)
 class AveragedConfig:
-    """Settings of the averaging.
+    """Settings of method "averaged".
 
     Args:
         top: Codes kept for each Gaussian.
-        temperature: Of the softmax over the cosines with them; towards 0 only the nearest counts.
-        min_visibility: A Gaussian with less weight than this over all training views, in cells of the feature maps,
-            counts as never seen.
-        prior_visibility: Weight in cells at which a Gaussian's mean is half believed; below it u tends to 1.
-        shortest_side: Views are taken at the size of their feature maps, but not below this many pixels.
-        memory_bytes: Bound for the sums; beyond it the views are passed over several times, for a range of the
-            features' dimensions each, and the means lie in a file.
+        temperature: Temperature of the softmax over their cosines; towards 0 only the nearest code counts.
+        min_visibility: Gaussians with less weight than this over all training views, in cells of the feature maps,
+            count as never seen.
+        prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
+        shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels.
     """
 
     top: int = 4
@@ -61,11 +64,10 @@ class AveragedConfig:
     min_visibility: float = 0.01
     prior_visibility: float = 0.25
     shortest_side: int = 120
-    memory_bytes: int = 1 << 30
 
     def __post_init__(self) -> None:
-        if self.top < 1 or self.shortest_side < 1 or self.memory_bytes < 1:
-            raise ValueError("top, shortest_side and memory_bytes must be positive")
+        if self.top < 1 or self.shortest_side < 1:
+            raise ValueError("top and shortest_side must be positive")
         if not self.temperature > 0:
             raise ValueError(f"temperature must be positive, got {self.temperature:g}")
         if self.min_visibility < 0 or self.prior_visibility < 0:
@@ -77,31 +79,61 @@ class MeanFeatures:
     """The mean feature of each Gaussian over the training views.
 
     Args:
-        means: ``[N, D]`` float16, at most of unit length; 0 where the Gaussian was not seen. In memory or in a file.
-        totals: Weight of all pixels ``[N]``, in cells of the feature maps.
+        means: ``[N, D]`` float16, length at most 1; 0 for Gaussians that were not seen. In memory or in a file.
+        totals: Sum of the weights of all pixels ``[N]``, in cells of the feature maps.
     """
 
     means: NDArray[np.float16]
     totals: Tensor
 
     def rows(self, index: slice | Tensor) -> Tensor:
-        """Means of some Gaussians ``[n, D]`` float32, on the device of the totals."""
+        """Means of some Gaussians ``[n, D]`` float32, on the device of `totals`."""
         chosen = index if isinstance(index, slice) else index.cpu().numpy()
         return torch.from_numpy(np.asarray(self.means[chosen], np.float32)).to(self.totals.device)
 
     def visible(self, config: AveragedConfig) -> Tensor:
-        """Which Gaussians the training views have seen ``[N]`` bool."""
+        """Which Gaussians the training views show ``[N]`` bool."""
         return (self.totals >= config.min_visibility) & (self.totals > 0)
 
 
 Valid = Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]
-"""Which pixels ``[H, W]`` of a view count, by its name and (width, height); None for all."""
+"""Valid pixels ``[H, W]`` of a view by its name and (width, height); None if all are valid."""
 
 
 def all_valid(name: str, size: tuple[int, int]) -> None:
-    """Views without masks."""
+    """The `Valid` of views without masks."""
 
 
+class Averaged:
+    """The method as an object (`lexsplat.language.methods.LanguageMethod`)."""
+
+    name = "averaged"
+    settings = ("codebook", "averaged")
+    needs = ("features",)
+    uses_dino = False
+    trains_jointly = False
+    variants: Mapping[str, Variant] = {"one code": {"averaged": {"top": 1}}, "full": {}}
+
+    def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> CodeField:
+        """The features of all views on each Gaussian, then codes for them."""
+
+        def valid(name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+            return views.views[name].load_valid(size)
+
+        found = average_features(
+            gaussians,
+            views.cameras,
+            views.require_features(),
+            config.averaged,
+            valid=valid,
+            memory=run.memory,
+            scratch=run.scratch,
+            listener=run.listener,
+        )
+        return field_from_means(found, config.codebook, config.averaged, seed=run.seed, memory=run.memory)
+
+
+# Beside its inputs: masks, and three options of the run that tests leave out.
 def average_features(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
@@ -109,19 +141,23 @@ def average_features(
     config: AveragedConfig,
     *,
     valid: Valid = all_valid,
+    memory: int = budget.DEFAULT_MEMORY,
     scratch: Path | None = None,
     listener: Listener = silent,
 ) -> MeanFeatures:
-    """The weighted mean of the CLIP features in which each Gaussian has a share.
+    """The mean CLIP feature of each Gaussian, weighted by its share of the pixels.
 
     Args:
         gaussians: The geometry.
-        cameras: The training views by name, and only these.
-        feature_maps: Dense features by view name; cells whose feature is zero count for nothing.
+        cameras: Cameras of the training views by name.
+        feature_maps: Dense features by view name; cells whose feature is zero are ignored.
         config: Settings.
-        valid: Which pixels of a view ``[H, W]`` count, by its name and (width, height); None for all.
-        scratch: Folder for the file that the means lie in where memory does not do; the system's if None.
-        listener: Hears of stage "average".
+        valid: Valid pixels of a view.
+        memory: Host memory in bytes, a quarter of which the sums may take (at most `MAX_STORE`). If they need more,
+            the views are traversed several times, for a range of feature dimensions each, and the means are kept in
+            a file. The result does not depend on it.
+        scratch: Folder for that file; None takes the system's.
+        listener: Receives events of stage "average".
 
     Raises:
         ValueError: If there is no view, a view has no features, or their dimensions differ.
@@ -130,8 +166,9 @@ def average_features(
     check_views(names, feature_maps)
     gaussians, count = gaussians.detach(), len(gaussians)
     dimensions = feature_maps[names[0]].clip.shape[-1]
-    ranges = list(_ranges(dimensions, count, config.memory_bytes))
-    means = _store(count, dimensions, config.memory_bytes, scratch)
+    share = max(1, min(MAX_STORE, memory // 4))
+    ranges = list(_ranges(dimensions, count, share))
+    means = _store(count, dimensions, share, scratch)
     totals = torch.zeros(count, device=gaussians.device)
     for part, columns in enumerate(ranges):
         sums = torch.zeros(count, len(columns), device=gaussians.device)
@@ -154,10 +191,10 @@ def average_features(
 
 
 def features_of_codes(code_maps: Mapping[str, NDArray[np.integer]], codebook: Codebook) -> FeatureMaps:
-    """Feature maps that say what index maps say: the CLIP half of each cell's code, zero where there is none.
+    """Index maps as feature maps: the CLIP half of each cell's code.
 
     Args:
-        code_maps: Index maps ``[h, w]`` by view name; what is no code of the codebook is nothing.
+        code_maps: Index maps ``[h, w]`` by view name; an index outside the codebook gives a zero feature.
         codebook: The discrete feature space S.
     """
     codewords = functional.pad(codebook.clip.cpu(), (0, 0, 0, 1))
@@ -177,15 +214,15 @@ def field_from_means(
     *,
     seed: int = 0,
     memory: int = budget.DEFAULT_MEMORY,
-) -> LiftedField:
-    """Codes among the Gaussians, and the distribution of each over its nearest ones.
+) -> CodeField:
+    """Fit a codebook to the Gaussians and give each a distribution over its nearest codes.
 
     Args:
         found: Means of all Gaussians.
-        codebook_config: K, k-means iterations and sample size; what is about DINO or gradient steps has no part.
+        codebook_config: K, k-means iterations and sample size; settings of DINO and of gradient steps are not used.
         config: Settings.
-        seed: Of the sample and the start of k-means.
-        memory: Bytes half of which the sample and k-means may take; the rest is for means and maps.
+        seed: Seed of the sample and of the start of k-means.
+        memory: Host memory in bytes, half of which the sample and k-means may take; the rest is for means and maps.
 
     Raises:
         MemoryBudgetError: If the sample does not fit.
@@ -195,7 +232,7 @@ def field_from_means(
     what, number = f"a sample of {looked_at:,} Gaussians", codebook_config.num_codes
     budget.require_sample("language", what, looked_at, dimensions, number, 0, memory, share=0.5)
     visible = found.visible(config)
-    with one_thread():  # the last bit of a similarity may decide between two codes
+    with one_thread():  # the order of a sum decides its last bit, which can decide between two codes
         codewords = _fit(found, visible, codebook_config, seed)
         kept = min(config.top, len(codewords))
         codes = torch.zeros(count, kept, dtype=torch.uint8, device=device)
@@ -208,13 +245,13 @@ def field_from_means(
             codes[rows] = nearest.to(torch.uint8)
             weights[rows] = torch.softmax(cosines / config.temperature, 1) * visible[rows, None]
             agreement[rows] = means.norm(dim=-1).clamp(0, 1)
-    believed = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
-    uncertainties = torch.where(visible, 1 - agreement * believed, torch.ones_like(believed))
-    return LiftedField(Codebook(codewords), codes, weights, uncertainties, method="averaged")
+    trusted = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
+    uncertainties = torch.where(visible, 1 - agreement * trusted, torch.ones_like(trusted))
+    return CodeField(Codebook(codewords), codes, weights, uncertainties, method="averaged")
 
 
 def _fit(found: MeanFeatures, visible: Tensor, config: CodebookConfig, seed: int) -> Tensor:
-    """Codes ``[K, D]`` of unit length by spherical k-means over the Gaussians that were seen; fewer if those are."""
+    """Unit codewords ``[K, D]`` by spherical k-means over the visible Gaussians; at most one code a Gaussian."""
     generator = torch.Generator().manual_seed(seed)
     seen = visible.nonzero()[:, 0].cpu()
     if len(seen) == 0:
@@ -241,7 +278,7 @@ def _weighted_sum(
     cells = torch.arange(features.shape[0] * features.shape[1]).view(features.shape[:2])
     at = codes_at_pixels(cells, camera.height, camera.width, pixels)
     flat = features.flatten(0, 1)
-    # A pixel of the view is so much of a cell of the map: weights do not depend on the size that views are taken at.
+    # Cells a pixel covers, so that weights do not depend on the size at which views are rendered.
     share = features.shape[0] * features.shape[1] / (camera.height * camera.width)
     counts = torch.full((len(pixels),), share)
     if counting is not None:
@@ -260,9 +297,9 @@ def _weighted_sum(
 
 
 def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragedConfig) -> Camera:
-    """The camera with about as many pixels as the map has cells: more would say nothing more.
+    """The camera with about as many pixels as the map has cells; more pixels add no information.
 
-    Gaussians without the mip filter look larger in smaller pictures than they are; they are taken at full size.
+    Without the mip filter Gaussians look too large at low resolution, so such scenes are rendered at full size.
     """
     if not antialiased:
         return camera
@@ -271,14 +308,14 @@ def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: Av
 
 
 def _ranges(dimensions: int, count: int, memory_bytes: int) -> Iterator[range]:
-    """Dimensions in ranges so small that their sums, with one copy in work, keep to the bound."""
+    """Ranges of feature dimensions whose sums, with one working copy, fit into the bound."""
     width = max(1, min(dimensions, memory_bytes // (4 * max(count, 1)) - BACK_PROJECTED_CHANNELS))
     for start in range(0, dimensions, width):
         yield range(start, min(start + width, dimensions))
 
 
 def _store(count: int, dimensions: int, memory_bytes: int, scratch: Path | None) -> NDArray[np.float16]:
-    """Room for the means ``[count, dimensions]``: in memory, or in a file that is gone with the array."""
+    """Zeros for the means ``[count, dimensions]``: in memory, or in a file that is deleted with the array."""
     if 2 * count * dimensions <= memory_bytes:
         return np.zeros((count, dimensions), np.float16)
     if scratch is not None:

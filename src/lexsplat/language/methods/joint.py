@@ -1,8 +1,8 @@
-"""Language trained together with geometry, from the first step on, as the authors' released code does it.
+"""Language trained together with geometry from the first step, as in the authors' released code.
 
-The paper trains language on finished geometry, which is the default here. Trained together, every step on a
-view is followed by a language step on the same view; language never reaches geometry either way, and when
-density control copies, splits or removes a Gaussian, its language goes with it.
+The paper trains language on finished geometry, which is the default here. In joint training every geometry step on a
+view is followed by a language step on the same view. The geometry is detached in both. When density control copies,
+splits or removes a Gaussian, its language is copied or removed with it.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from lexsplat.runtime.training import Checkpoint, run_training
 
 
 class JointTrainer:
-    """A reconstruction with its language beside it, step by step.
+    """A reconstruction and the training of its language, step by step.
 
     Args:
-        reconstructor: At its start.
-        cameras: The training views by name.
+        reconstructor: The reconstruction, before its first step.
+        cameras: Cameras of the training views by name.
         code_maps: Index maps by view name.
         codebook: The discrete feature space S.
-        config: Settings of the language training; its number of steps is that of the reconstruction.
-        seed: Of the initial field and of all samples.
+        config: Settings of the language; the number of steps is that of the reconstruction.
+        seed: Seed of the initial field and of all samples.
 
     Raises:
         ValueError: If there is no view, or a view has no index map.
@@ -52,7 +52,7 @@ class JointTrainer:
         self,
         reconstructor: Reconstructor,
         cameras: Mapping[str, Camera],
-        code_maps: Mapping[str, NDArray[np.uint8]],
+        code_maps: Mapping[str, NDArray[np.integer]],
         codebook: Codebook,
         config: TrainedConfig,
         *,
@@ -141,11 +141,11 @@ class JointTrainer:
         )
 
     def result(self) -> tuple[Gaussians, TrainedField]:
-        """The present Gaussians and their language."""
+        """The current Gaussians and their language."""
         return self.reconstructor.gaussians(), self.language.field
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything needed to go on bit for bit."""
+        """Everything that an exact continuation needs."""
         geometry = with_prefix("geometry/", self.reconstructor.state_dict())
         return {**geometry, **with_prefix("language/", self.language.state_dict())}
 

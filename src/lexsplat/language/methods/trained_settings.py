@@ -1,4 +1,4 @@
-"""Settings of the language training, with those of the paper and of the authors' code."""
+"""Settings of method "trained", with those of the paper and of the authors' code."""
 
 from __future__ import annotations
 
@@ -9,38 +9,33 @@ from lexsplat.language.losses import SmoothingWeight, UncertaintyForm
 
 @dataclass(frozen=True)
 class TrainedConfig:
-    """Settings of the language training. Defaults suit a CPU; `as_in_paper` and `as_released` give the
-    others.
+    """Settings of method "trained". The defaults suit a CPU; see also `as_in_paper` and `as_released`.
 
     Args:
         iterations: Steps, one view each (paper: 30,000).
-        pixel_sample: Pixels of a step that enter the cross-entropy, drawn at random; 0 takes the full map
-            (paper).
+        pixel_sample: Random pixels of a step that enter the cross-entropy; 0 takes the full map (paper).
         render_downscale: Views are rendered this many times smaller than their cameras.
         semantics_lr: Learning rate of s_G (paper: 0.001).
-        uncertainty_lr: Of the logits of u (paper: 0.001; authors' code: 0.05).
-        decoder_lr: Of D_MLP (paper: 0.001).
-        smoothing_lr: Of the smoothing MLP (paper: 0.001).
-        decoder_weight_decay: Of D_MLP (paper: 0; authors' code: 1e-5).
-        final_lr_factor: Learning rates fall exponentially to this share of themselves (paper: 1, constant).
-        lambda_ce: Of Eq. 12.
-        lambda_u: Of Eq. 12.
-        lambda_s: Of Eq. 15.
-        lambda_smo: Of Eq. 15.
-        min_smoothing_weight: w_s of Eq. 14.
+        uncertainty_lr: Learning rate of the logits of u (paper: 0.001; authors' code: 0.05).
+        decoder_lr: Learning rate of D_MLP (paper: 0.001).
+        smoothing_lr: Learning rate of the smoothing MLP (paper: 0.001).
+        decoder_weight_decay: Weight decay of D_MLP (paper: 0; authors' code: 1e-5).
+        final_lr_factor: Learning rates decay exponentially to this share (paper: 1, constant).
+        lambda_ce: Weight of the cross-entropy in Eq. 12.
+        lambda_u: Weight of the uncertainty loss in Eq. 12.
+        lambda_s: Weight of the semantic loss in Eq. 15.
+        lambda_smo: Weight of the smoothing loss in Eq. 15.
+        min_smoothing_weight: w_s in Eq. 14.
         use_uncertainty: Off is the paper's ablation "w/o u_G": Eq. 9 in place of Eq. 10 to 12.
         use_smoothing: Off is the paper's ablation "w/o MLP".
-        uncertainty_form: "linear" is Eq. 11, "log" the authors' code.
-        smoothing_weight: "max" is Eq. 14, "linear" the authors' code.
+        uncertainty_form: "linear" is Eq. 11, "log" the form of the authors' code.
+        smoothing_weight: "max" is Eq. 14, "linear" the form of the authors' code.
         smoothing_squared: Squared norms in Eq. 14, as in the authors' code.
-        smoothing_every: Steps from one smoothing to the next (paper: 1; authors' code: 10).
-        smoothing_sample: Gaussians of a step that enter Eq. 14, drawn at random; 0 takes all (paper).
-        num_frequencies: Of the positional encoding in Eq. 13 (paper's table: 0).
+        smoothing_every: Steps between two smoothing steps (paper: 1; authors' code: 10).
+        smoothing_sample: Random Gaussians of a step that enter Eq. 14; 0 takes all (paper).
+        num_frequencies: Frequencies of the positional encoding in Eq. 13 (paper's table: 0).
         normalize_rendering: Scale the rendered s to unit length before decoding (authors' code).
-        clip_decoder_grad: Largest norm of the decoder's gradient, which keeps a bad batch from ruining it;
-            None is off (paper).
-        memory_bytes: Bound for projections of views kept between steps; further views are projected anew each
-            time.
+        clip_decoder_grad: Largest norm of the gradient of D_MLP; None does not clip (paper).
     """
 
     iterations: int = 1000
@@ -67,7 +62,6 @@ class TrainedConfig:
     num_frequencies: int = 0
     normalize_rendering: bool = False
     clip_decoder_grad: float | None = 1.0
-    memory_bytes: int = 1 << 30
 
     def __post_init__(self) -> None:
         if (
@@ -99,7 +93,7 @@ class TrainedConfig:
         )
 
     def as_released(self) -> TrainedConfig:
-        """What the authors' released code does where it differs from the paper."""
+        """The paper's settings with what the authors' released code does differently."""
         return replace(
             self.as_in_paper(),
             uncertainty_lr=0.05,

@@ -1,4 +1,4 @@
-"""The language training as single steps, with all that is needed to go on after a stop."""
+"""Training of the paper's field in single steps, with everything that an exact continuation needs."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from lexsplat.runtime.errors import TrainingError
 
 
 class FieldTrainer:
-    """The language training as single steps, so that it can also run beside a reconstruction.
+    """Training of the language field in single steps, alone or beside a reconstruction.
 
     Args:
-        gaussians: The geometry, which is read and never changed.
+        gaussians: The geometry, which is not changed.
         codebook: The discrete feature space S.
         config: Settings.
-        seed: Of the initial field and of all samples.
-        field: A field to go on from; default is `TrainedField.initial`.
+        seed: Seed of the initial field and of all samples.
+        field: A field to continue from; None takes `TrainedField.initial`.
     """
 
     parameter_prefixes = ("field.",)
@@ -86,15 +86,15 @@ class FieldTrainer:
         return torch.optim.AdamW(groups, betas=(0.9, 0.999))
 
     def step(
-        self, camera: Camera, code_map: NDArray[np.uint8] | Tensor, *, prepared: PreparedView | None = None
+        self, camera: Camera, code_map: NDArray[np.integer] | Tensor, *, prepared: PreparedView | None = None
     ) -> dict[str, Tensor]:
         """One step on one view.
 
         Args:
             camera: The view, at the resolution to render.
-            code_map: Its index map ``[h, w]``; cells with an index of K or above teach no code, and those with
-                `MASKED_CODE` nothing at all.
-            prepared: Its projection, when the geometry has not changed since.
+            code_map: Its index map ``[h, w]``. Cells with an index of K or above are ignored by the cross-entropy,
+                those with `MASKED_CODE` by all losses.
+            prepared: The projection of the view, if the geometry has not changed since.
 
         Returns:
             Losses by name, without gradient history.
@@ -121,9 +121,9 @@ class FieldTrainer:
         """Eq. 8 to 12 for rendered maps ``[H, W, 8]`` and ``[H, W]``."""
         config = self.config
         pixels, codes = self._sample_pixels(semantics.shape[0], semantics.shape[1], code_map)
-        # Not [pixels]: its gradient adds what repeats in the order in which threads run (index_select: in its own).
+        # Not [pixels], whose gradient sums repeated rows in an order that depends on the threads.
         logits = self.field.decode(semantics.flatten(0, 1).index_select(0, pixels))
-        if len(pixels) == 0:  # a view whose cells are all ignored teaches nothing
+        if len(pixels) == 0:  # all cells of the view are ignored
             nothing = semantics.sum() * 0
             return {"cross_entropy": nothing, "semantic": nothing}
         if not config.use_uncertainty:
@@ -135,7 +135,7 @@ class FieldTrainer:
         return {"cross_entropy": cross_entropy, "uncertainty": regularizer, "semantic": semantic}
 
     def _not_masked(self, uncertainty: Tensor, code_map: Any) -> Tensor:
-        """Those of rendered values ``[H, W]`` whose pixels are not masked; all as they are where none is."""
+        """Rendered values ``[H, W]`` of the pixels that are not masked ``[M]``; unchanged if no pixel is masked."""
         codes = torch.as_tensor(code_map).cpu()
         if int(codes.max()) < MASKED_CODE:
             return uncertainty
@@ -144,7 +144,7 @@ class FieldTrainer:
         return uncertainty.flatten()[(codes != MASKED_CODE).to(uncertainty.device)]
 
     def _sample_pixels(self, height: int, width: int, code_map: Any) -> tuple[Tensor, Tensor]:
-        """Flat pixel indices and their codes, without ignored cells."""
+        """Indices of pixels and their codes, both ``[M]``, without pixels of ignored cells."""
         count = height * width
         if self.config.pixel_sample and self.config.pixel_sample < count:
             pixels = torch.randint(count, (self.config.pixel_sample,), generator=self.generator)
@@ -156,7 +156,7 @@ class FieldTrainer:
         return _sent(pixels[known], device), _sent(codes[known], device)
 
     def _smoothing_term(self) -> Tensor:
-        """Eq. 13 and 14 for all Gaussians or a sample of them."""
+        """Eq. 13 and 14 for all Gaussians or a random sample."""
         config, field = self.config, self.field
         count = len(field.semantics)
         means: Tensor = self.gaussians.means
@@ -178,11 +178,11 @@ class FieldTrainer:
         )
 
     def replace_gaussians(self, gaussians: Gaussians, parents: Tensor) -> None:
-        """Follow density control: Gaussian n of the new geometry goes on with the language of ``parents[n]``.
+        """Follow density control: Gaussian n of the new geometry takes over the language of ``parents[n]``.
 
         Args:
-            gaussians: The new geometry, M Gaussians.
-            parents: Integers ``[M]`` into the old ones.
+            gaussians: The new geometry with M Gaussians.
+            parents: Indices ``[M]`` of the old Gaussians.
         """
         if len(parents) != len(gaussians):
             raise ValueError(f"{len(gaussians)} Gaussians, but {len(parents)} parents")
@@ -198,13 +198,13 @@ class FieldTrainer:
             setattr(self.field, name, new)
 
     def view_of_step(self, names: list[str]) -> str:
-        """The view whose turn it is: every view once in a random order, then again in another."""
+        """The view of the next step: random permutations of all views, one after the other."""
         epoch, place = divmod(self.iteration, len(names))
         order = torch.Generator().manual_seed(self.seed * 1_000_003 + epoch)
         return names[int(torch.randperm(len(names), generator=order)[place])]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All that is needed to go on as if never stopped, as named tensors."""
+        """Everything that an exact continuation needs, as named tensors."""
         state = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         for name, parameter in self.field.named_parameters():
             for key, value in self.optimizer.state.get(parameter, {}).items():
@@ -224,7 +224,7 @@ class FieldTrainer:
         """Compare a loss with the first one.
 
         Raises:
-            TrainingError: If it is not finite or ten times as large.
+            TrainingError: If it is NaN, or about ten times as large as the first.
         """
         if math.isnan(self._first_loss):
             self._first_loss = loss
@@ -237,10 +237,10 @@ class FieldTrainer:
             )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """The inverse of `state_dict`, for a trainer made with the same geometry and settings.
+        """The inverse of `state_dict`, for a trainer with the same geometry and settings.
 
         Raises:
-            ValueError: If the state is of another scene or lacks something.
+            ValueError: If the state belongs to another scene or is incomplete.
         """
         prefix = "field."
         own = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
@@ -267,7 +267,7 @@ class FieldTrainer:
 
 
 def _sent(sample: Tensor, device: torch.device) -> Tensor:
-    """A sample on the device; a GPU takes it from pinned memory, so that nobody waits for the step before."""
+    """A sample on the device. For a GPU it is copied from pinned memory, without waiting for earlier steps."""
     if device.type != "cuda":
         return sample.to(device)
     return sample.pin_memory().to(device, non_blocking=True)

@@ -1,4 +1,4 @@
-"""A lifted field: a sparse distribution over codes on every Gaussian, rendered as it is."""
+"""A field of codes: each Gaussian carries a sparse distribution over the codebook, which is rendered directly."""
 
 from __future__ import annotations
 
@@ -19,20 +19,17 @@ from lexsplat.language.fields.rendering import (
 )
 
 
-class LiftedField:
-    """A sparse distribution over codes on every Gaussian; rendering it is linear and needs no decoder.
+class CodeField:
+    """A sparse distribution over codes on every Gaussian. Rendering it is linear and needs no decoder.
 
-    Where a view is not covered, the probabilities of its pixels sum to the coverage: the rest is nothing.
+    The probabilities of a pixel sum to its coverage: uncovered parts of a view have no language.
 
     Args:
         codebook: The discrete feature space S.
-        codes: Code indices ``[N, T]`` uint8, the likeliest first (T = 4 by default).
-        weights: Their probabilities ``[N, T]``; rows sum to 1, or to 0 for a Gaussian about which nothing is
-            known.
+        codes: Code indices ``[N, T]`` uint8, most likely first (T = 4 by default).
+        weights: Their probabilities ``[N, T]``; rows sum to 1, or to 0 for a Gaussian that no training view shows.
         uncertainties: u_G ``[N]`` in 0..1.
-        method: Name under which results are reported.
-        dropped: Share of the weight of all codes that lay outside the T codes kept, 0 to 1: what their sparsity
-            costs.
+        method: Name of the method that made the field.
     """
 
     def __init__(
@@ -42,8 +39,7 @@ class LiftedField:
         weights: Tensor,
         uncertainties: Tensor,
         *,
-        method: str = "lifted",
-        dropped: float = 0.0,
+        method: str = "averaged",
     ) -> None:
         if codes.ndim != 2 or codes.dtype != torch.uint8 or weights.shape != codes.shape:
             raise ValueError(
@@ -63,7 +59,6 @@ class LiftedField:
         self.weights = weights.float()
         self._uncertainties = uncertainties.float()
         self.method = method
-        self.dropped = dropped
 
     @property
     def uncertainties(self) -> Tensor:
@@ -71,7 +66,7 @@ class LiftedField:
         return self._uncertainties
 
     def code_probabilities(self) -> Tensor:
-        """The distributions without their sparsity ``[N, K]``."""
+        """The distributions as a dense array ``[N, K]``."""
         return self._dense(slice(0, self.codebook.num_codes))
 
     @torch.no_grad()
@@ -106,42 +101,41 @@ class LiftedField:
             dense.scatter_add_(1, index[:, None], self.weights[:, column, None])
         return dense[:, :width].contiguous()
 
-    def select(self, index: Tensor) -> LiftedField:
-        """The rows of some Gaussians; the codebook is the same."""
-        return LiftedField(
+    def select(self, index: Tensor) -> CodeField:
+        """The field of some Gaussians, with the same codebook."""
+        return CodeField(
             self.codebook,
             self.codes[index],
             self.weights[index],
             self._uncertainties[index],
             method=self.method,
-            dropped=self.dropped,
         )
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything by name, for safetensors; the codebook under ``codebook.``."""
+        """All tensors by name, for safetensors; those of the codebook under ``codebook.``."""
         own = {"codes": self.codes, "weights": self.weights, "uncertainties": self._uncertainties}
         return {name: value.contiguous() for name, value in own.items()} | codebook_tensors(self.codebook)
 
     def metadata(self) -> dict[str, str]:
-        """What is not a tensor."""
-        return {"kind": "lifted", "method": self.method, "dropped": f"{self.dropped:.6g}"}
+        """Everything that is not a tensor."""
+        return {"kind": "codes", "method": self.method}
 
     @classmethod
     def from_tensors(
         cls, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
-    ) -> LiftedField:
+    ) -> CodeField:
         """The inverse of `tensors` and `metadata`.
 
+        Files of earlier versions have the kind "lifted" and may name the method "lifted"; they open as well.
+
         Raises:
-            ValueError: If a tensor is missing or of the wrong shape.
+            ValueError: If a tensor is missing or has the wrong shape.
         """
         require(tensors, ("codes", "weights", "uncertainties"))
-        metadata = metadata or {}
         return cls(
             stored_codebook(tensors),
             tensors["codes"],
             tensors["weights"],
             tensors["uncertainties"],
-            method=metadata.get("method", "lifted"),
-            dropped=float(metadata.get("dropped", "0")),
+            method=(metadata or {}).get("method", "averaged"),
         )

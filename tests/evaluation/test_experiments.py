@@ -1,0 +1,102 @@
+"""The bench of ablate and compare: shared stages, kept runs, damaged files, and the files of the results."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from support import color_encoder
+from support.experiments import CONFIG
+
+from lexsplat.evaluation.ablate import language_settings, make_language, paper_evaluation
+from lexsplat.evaluation.experiments import Bench, Results
+from lexsplat.runtime.errors import CaptureError
+
+AVERAGED = replace(CONFIG, method="averaged", iterations=4)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def colors():
+    """The color encoders in place of CLIP and DINO."""
+    with pytest.MonkeyPatch.context() as patch:
+        color_encoder.install(patch)
+        yield
+
+
+@pytest.fixture
+def open_bench(tiny_capture, tmp_path_factory):
+    """Opens a bench on the same output folder each time."""
+    output = tmp_path_factory.getbasetemp() / "shared bench"
+    return lambda: Bench(tiny_capture, output, AVERAGED, paper_evaluation())
+
+
+def make(bench, calls):
+    """What `Bench.run` is given to make the language of the settings, counted."""
+    return lambda: calls.append(1) or make_language(bench, bench.config)
+
+
+def test_features_have_dino_whatever_the_method_of_the_settings(open_bench):
+    bench = open_bench()
+    assert bench.config.method == "averaged"
+    assert next(iter(bench.maps.values())).dino is not None
+    assert list(bench.folder.record["stages"]) == ["reconstruct", "features"]
+
+
+def test_a_codebook_is_made_once_and_again_if_its_file_is_damaged(open_bench):
+    bench = open_bench()
+    first, maps, _ = bench.codebook(CONFIG.codebook, 0)
+    (path,) = (bench.output / "codebooks").iterdir()
+    time = path.stat().st_mtime_ns
+    again, same, _ = open_bench().codebook(CONFIG.codebook, 0)
+    assert path.stat().st_mtime_ns == time
+    assert torch.equal(first.clip, again.clip)
+    assert all(np.array_equal(maps[name], same[name]) for name in maps)
+    assert set(maps) == set(bench.capture.train_names)
+    path.write_bytes(b"damaged")
+    repaired, _, _ = open_bench().codebook(CONFIG.codebook, 0)
+    assert torch.equal(first.clip, repaired.clip)
+    assert path.stat().st_size > 100
+
+
+def test_a_run_is_kept_until_its_settings_change_or_its_file_is_damaged(open_bench):
+    bench, calls = open_bench(), []
+    settings = language_settings(bench.config)
+    first = bench.run("mine", 0, settings, make(bench, calls))
+    assert not first.kept
+    bench = open_bench()
+    kept = bench.run("mine", 0, settings, make(bench, calls))
+    assert kept.kept
+    assert kept.result == json.loads(json.dumps(first.result))
+    assert len(calls) == 1
+    other = bench.run("mine", 0, [*settings, "another"], make(bench, calls))
+    assert not other.kept
+    path = bench.output / "runs" / "mine" / "seed-0.json"
+    path.write_text("{")
+    assert not bench.run("mine", 0, [*settings, "another"], make(bench, calls)).kept
+
+
+def test_results_write_every_file_after_every_run(open_bench):
+    bench = open_bench()
+    results = Results(bench, "comparison", ["one", "two"], [0], ("mIoU", "mAP"))
+    settings = language_settings(bench.config)
+    results.add(bench.run("one", 0, settings, make(bench, []), pictures=True))
+    names = {f"comparison.{ending}" for ending in ("json", "csv", "tex", "html")}
+    assert names <= {path.name for path in bench.output.iterdir()}
+    record = json.loads((bench.output / "comparison.json").read_text())
+    assert [row["name"] for row in record["rows"]] == ["one"]
+    assert record["ground_truth"]["layout"] == "segmentations"
+    ablation = Results(bench, "ablation", ["one"], [0])
+    before = (bench.output / "comparison.html").read_bytes()
+    ablation.add(bench.run("one", 0, settings, make(bench, [])))
+    assert (bench.output / "comparison.html").read_bytes() == before, "both keep their own report"
+    assert (bench.output / "ablation.html").is_file()
+
+
+def test_crop_sizes_of_features_of_another_program_are_refused(open_bench, tmp_path):
+    bench = open_bench()
+    bench.config = replace(bench.config, features_from=tmp_path)
+    with pytest.raises(CaptureError, match="several crop sizes"):
+        bench.level_maps("view_01.png")

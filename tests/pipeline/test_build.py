@@ -1,0 +1,168 @@
+"""The builder: order of the stages, what is kept, what is redone for a changed setting, what each stage receives."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import pytest
+from support import color_encoder
+from support.experiments import CONFIG
+
+from lexsplat.language.methods import METHODS, MethodName
+from lexsplat.language.methods.averaged import Averaged, AveragedConfig
+from lexsplat.language.methods.trained import Trained, TrainedConfig
+from lexsplat.pipeline import build as pipeline
+from lexsplat.pipeline.build import STAGES, build
+from lexsplat.runtime.memory import parse_bytes
+from lexsplat.scenes.folder import SceneFolder
+
+AVERAGED = replace(CONFIG, method="averaged", iterations=4)
+TRAINED = replace(CONFIG, iterations=4)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def colors():
+    """The color encoders in place of CLIP and DINO."""
+    with pytest.MonkeyPatch.context() as patch:
+        color_encoder.install(patch)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scenes(tiny_capture, tmp_path_factory):
+    """A scene by each method; its files must not be changed."""
+    folder = tmp_path_factory.mktemp("scenes")
+    for config in (AVERAGED, TRAINED):
+        build(tiny_capture, folder / config.method, config)
+    return folder
+
+
+def stages_run(capture, scene, config, **options) -> dict[str, bool]:
+    """Names of the stages in the order in which they finish, and whether they were kept."""
+    finished: dict[str, bool] = {}
+    finish = SceneFolder.finish
+
+    def listen(event):
+        if "kept" in event.metrics:
+            finished[event.stage] = True
+
+    def record(folder, name, *arguments, **facts):
+        finished[name] = False
+        return finish(folder, name, *arguments, **facts)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SceneFolder, "finish", record)
+        build(capture, scene, config, listener=listen, **options)
+    return finished
+
+
+def test_every_method_has_a_name_that_settings_accept_and_stages_that_exist():
+    from typing import get_args
+
+    assert set(get_args(MethodName)) == set(METHODS)
+    for name, method in METHODS.items():
+        assert method.name == name
+        assert set(method.needs) <= set(STAGES)
+        assert method.variants["full"] == {}
+        for part in (*method.settings, *(part for changes in method.variants.values() for part in changes)):
+            assert hasattr(CONFIG, part), part
+
+
+@pytest.mark.parametrize("config", [AVERAGED, TRAINED], ids=lambda config: config.method)
+def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(scenes, tiny_capture, tmp_path, config):
+    expected = ["reconstruct", *METHODS[config.method].needs, "language"]
+    record = SceneFolder.open(scenes / config.method).record
+    assert list(record["stages"]) == expected
+    assert record["stages"]["language"]["method"] == config.method
+    copy = shutil.copytree(scenes / config.method, tmp_path / "copy")
+    assert stages_run(tiny_capture, copy, config) == dict.fromkeys(expected, True)
+
+
+@pytest.mark.parametrize(
+    ("base", "change", "redone"),
+    [
+        (AVERAGED, {"averaged": AveragedConfig(top=3)}, {"language"}),
+        (AVERAGED, {"codebook": replace(CONFIG.codebook, num_codes=5)}, {"language"}),
+        (AVERAGED, {"trained": TrainedConfig(iterations=3)}, set()),
+        (AVERAGED, {"memory": "1GB", "checkpoint_seconds": 0.0, "dino": "none"}, set()),
+        (AVERAGED, {"iterations": 5}, {"reconstruct", "language"}),
+        (TRAINED, {"averaged": AveragedConfig(top=3)}, set()),
+        (TRAINED, {"trained": replace(CONFIG.trained, iterations=3)}, {"language"}),
+        (TRAINED, {"codebook": replace(CONFIG.codebook, num_codes=5)}, {"codebook", "language"}),
+        (TRAINED, {"features": replace(CONFIG.features, map_cells=16)}, {"features", "codebook", "language"}),
+        (TRAINED, {"seed": 1}, {"reconstruct", "codebook", "language"}),
+    ],
+)
+def test_a_changed_setting_redoes_what_depends_on_it(scenes, tiny_capture, tmp_path, base, change, redone):
+    copy = shutil.copytree(scenes / base.method, tmp_path / "copy")
+    finished = stages_run(tiny_capture, copy, replace(base, **change))
+    assert {name for name, kept in finished.items() if not kept} == redone
+
+
+def test_a_missing_result_is_made_again(scenes, tiny_capture, tmp_path):
+    copy = shutil.copytree(scenes / "averaged", tmp_path / "copy")
+    (copy / "language.safetensors").unlink()
+    finished = stages_run(tiny_capture, copy, AVERAGED)
+    assert finished == {"reconstruct": True, "features": True, "language": False}
+    for name in ("gaussians.ply", "language.safetensors"):
+        assert (copy / name).read_bytes()[-500:] == (scenes / "averaged" / name).read_bytes()[-500:]
+
+
+def test_a_build_stops_after_the_stage_asked_for(tiny_capture, tmp_path):
+    folder = build(tiny_capture, tmp_path / "scene", AVERAGED, until="codebook")
+    assert list(folder.record["stages"]) == ["reconstruct", "features"], "this method has no codebook stage"
+    with pytest.raises(ValueError, match="until must be one of reconstruct"):
+        build(tiny_capture, tmp_path / "other", AVERAGED, until="embed")
+    assert not (tmp_path / "other").exists()
+
+
+def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_capture, tmp_path):
+    joint = replace(TRAINED, joint=True)
+    finished = stages_run(tiny_capture, tmp_path / "scene", joint)
+    assert list(finished) == ["features", "codebook", "reconstruct", "language"]
+    record = SceneFolder.open(tmp_path / "scene").record["stages"]["language"]
+    assert (record["method"], record["joint"]) == ("trained", True)
+    with pytest.raises(ValueError, match="leave --splats out"):
+        build(tiny_capture, tmp_path / "other", joint, splats=tmp_path / "any.ply")
+
+
+def test_encoders_are_loaded_once_a_build(tiny_capture, tmp_path, monkeypatch):
+    loaded = []
+    for kind, encoder in (("clip", color_encoder.ColorClip), ("dino", color_encoder.ColorDino)):
+        monkeypatch.setattr(
+            f"lexsplat.features.encoders.load_{kind}",
+            lambda *_, kind=kind, encoder=encoder: loaded.append(kind) or encoder(),
+        )
+    build(tiny_capture, tmp_path / "trained", TRAINED)
+    assert sorted(loaded) == ["clip", "dino"]
+    loaded.clear()
+    build(tiny_capture, tmp_path / "averaged", AVERAGED)
+    assert loaded == ["clip"], "averaged features need no DINO"
+    loaded.clear()
+    build(tiny_capture, tmp_path / "trained", replace(TRAINED, trained=TrainedConfig(iterations=2)))
+    assert loaded == [], "the codes are there"
+
+
+def test_every_stage_receives_the_memory_budget(tiny_capture, tmp_path, monkeypatch):
+    granted = {}
+    for name in ("reconstruct", "fit_codebook"):
+        original = getattr(pipeline, name)
+
+        def receive(*args, name=name, original=original, **options):
+            granted[name] = options["memory"]
+            return original(*args, **options)
+
+        monkeypatch.setattr(pipeline, name, receive)
+    for method in (Averaged, Trained):
+
+        def fit(self, gaussians, views, config, run, *, original=method.fit):
+            granted[self.name] = run.memory
+            return original(self, gaussians, views, config, run)
+
+        monkeypatch.setattr(method, "fit", fit)
+    for config in (AVERAGED, TRAINED):
+        build(tiny_capture, tmp_path / config.method, replace(config, memory="900MB"))
+    assert granted == dict.fromkeys(
+        ("reconstruct", "fit_codebook", "averaged", "trained"), parse_bytes("900MB")
+    )
