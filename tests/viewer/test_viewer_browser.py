@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.rendering import render
-from lexsplat.viewer import panels
+from lexsplat.viewer import side_panels
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -29,7 +29,7 @@ def viewer():
 
     scene, ground_truth = ball_scene()
     running = ViewerServer(scene, ViewerConfig(port=0))
-    running.session.memory.set_vocabulary(WORDS)
+    running.session.history.set_vocabulary(WORDS)
     running.ground_truth = ground_truth
     yield running
     running.stop()
@@ -165,7 +165,7 @@ def test_what_is_typed_is_completed_and_asked_by_a_click(page, viewer):
     page.keyboard.type("ba", delay=120)
     page.get_by_role("button", name="ball 1", exact=True).first.click()
     until(lambda: viewer.session.current and viewer.session.current.text == "ball 1")
-    until(lambda: "ball 1" in viewer.session.memory.history)
+    until(lambda: "ball 1" in viewer.session.history.prompts)
 
 
 def test_a_click_says_what_is_there_and_selects_it(page, viewer):
@@ -177,7 +177,7 @@ def test_a_click_says_what_is_there_and_selects_it(page, viewer):
     click(page, viewer, box["x"] + columns[place] + 0.5, box["y"] + rows[place] + 0.5)
     assert np.array_equal(viewer.session.selection.mask.numpy(), viewer.ground_truth.labels == 2)
     page.get_by_role("tab", name="What is this?").click()
-    page.get_by_text("splats belong to it").wait_for()
+    page.get_by_text("splats selected").wait_for()
     after = settled(page, viewer)
     assert_changed(picture, after, where_is(viewer, 2, picture.shape))
 
@@ -197,7 +197,7 @@ def test_the_selection_is_downloaded(page, viewer, tmp_path):
 
 
 def test_the_mode_changes_the_colors(page, viewer):
-    from lexsplat.viewer.panels import MODE_LABELS
+    from lexsplat.viewer.search_panel import MODE_LABELS
 
     clear(page, viewer)
     colored = settled(page, viewer)
@@ -262,8 +262,8 @@ def test_a_click_on_a_camera_in_the_scene_goes_there(page, viewer):
 
 def test_an_orbit_video_is_downloaded_and_shows_every_frame(page, viewer, tmp_path, monkeypatch):
     av = pytest.importorskip("av")
-    monkeypatch.setitem(panels._ORBIT, "frames", 8)
-    monkeypatch.setitem(panels._ORBIT, "height", 120)
+    monkeypatch.setitem(side_panels._ORBIT, "frames", 8)
+    monkeypatch.setitem(side_panels._ORBIT, "height", 120)
     clear(page, viewer)
     page.get_by_role("tab", name="Save").click()
     with page.expect_download(timeout=120_000) as started:
