@@ -216,7 +216,7 @@ def test_an_exported_selection_is_read_by_plyfile(session, balls):
     assert np.array_equal(np.stack([vertices["x"], vertices["y"], vertices["z"]], 1), expected)
 
 
-def test_an_exported_glb_holds_the_selection(session):
+def test_an_exported_glb_contains_the_selection(session):
     question = session.ask("ball 2")
     session.refine(question)
     name, content = session.export(question.selection, ".glb")
@@ -226,7 +226,7 @@ def test_an_exported_glb_holds_the_selection(session):
         session.export(question.selection, ".exe")
 
 
-def test_nothing_is_not_exported(session):
+def test_an_empty_selection_is_not_exported(session):
     question = session.ask("ball 2")
     session.set_threshold(question, 1.0)
     session.refine(question)
@@ -234,7 +234,7 @@ def test_nothing_is_not_exported(session):
         session.export(question.selection)
 
 
-def test_an_orbit_keeps_height_and_distance_and_looks_at_its_middle():
+def test_an_orbit_keeps_height_and_distance_and_looks_at_its_target():
     target, up = np.array([1.0, 2, 3]), np.array([0.0, 0, 2])
     poses = orbit(np.array([4.0, 2, 5]), target, up, 12)
     assert np.allclose(poses[0][0], [4, 2, 5])
@@ -245,15 +245,15 @@ def test_an_orbit_keeps_height_and_distance_and_looks_at_its_middle():
         assert np.linalg.det(rotation) == pytest.approx(1)
         along = (target - place) / np.linalg.norm(target - place)
         assert np.allclose(rotation[:, 2], along)
-        assert rotation[2, 1] < 0  # y points down in the picture, so its world z falls
+        assert rotation[2, 1] < 0  # y points down in the image, so its world z is negative
     angles = np.unwrap([np.arctan2(p[1] - 2, p[0] - 1) for p, _ in poses])
     assert np.allclose(np.diff(angles), 2 * np.pi / 12)
 
 
 @given(st.floats(0.1, 3.9), st.floats(-1.9, 1.9))
 @settings(deadline=None)
-def test_an_orbit_stays_where_photos_were_taken(width, start):
-    """Photos on an arc of ``width`` radians around 0: the cameras swing over it, and reach both ends."""
+def test_an_orbit_stays_within_the_arc_of_the_photos(width, start):
+    """With photos on an arc of ``width`` radians around 0, the cameras swing over it and reach both ends."""
     seen = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.0]) for a in np.linspace(-width / 2, width / 2, 30)]
     start = float(np.clip(start, -width / 2, width / 2))
     begin = np.array([2 * np.cos(start), 2 * np.sin(start), 0.5])
@@ -274,12 +274,12 @@ def test_photos_from_all_around_give_a_full_turn():
         assert np.allclose(place, expected)
 
 
-def test_an_orbit_from_above_is_refused():
+def test_an_orbit_from_vertically_above_is_refused():
     with pytest.raises(ValueError, match="above"):
         orbit(np.array([0.0, 0, 5]), np.zeros(3), np.array([0.0, 0, 1]), 4)
 
 
-def test_looking_at_is_the_camera_of_cameras():
+def test_looking_at_agrees_with_look_at():
     from lexsplat.geometry.cameras import look_at
 
     place, target, up = np.array([1.0, -2, 0.5]), np.array([0.3, 0.2, 0]), np.array([0.1, 0, 1])
@@ -287,7 +287,7 @@ def test_looking_at_is_the_camera_of_cameras():
     assert np.allclose(looking_at(place, target, up), camera.viewmat[:3, :3].T)
 
 
-def test_a_video_without_an_encoder_is_a_gif_with_all_frames(monkeypatch):
+def test_without_pyav_a_video_is_a_gif_with_all_frames(monkeypatch):
     monkeypatch.setattr("lexsplat.viewer.recording.importlib.util.find_spec", lambda name: None)
     frames = [np.full((31, 41, 3), 20 * k, np.uint8) for k in range(6)]
     suffix, content = encode_video(frames, fps=10)
@@ -303,7 +303,7 @@ def test_a_video_without_an_encoder_is_a_gif_with_all_frames(monkeypatch):
 
 
 @pytest.mark.parametrize("shape", [(64, 80), (63, 81)])
-def test_a_video_is_an_mp4_whose_frames_come_back_in_order(shape):
+def test_a_video_is_an_mp4_with_its_frames_in_order(shape):
     av = pytest.importorskip("av")
     frames = [np.full((*shape, 3), 20 * k, np.uint8) for k in range(12)]
     suffix, content = encode_video(frames, fps=10)
@@ -423,7 +423,7 @@ class Reader(HTMLParser):
 HOSTILE = '<script>alert(1)</script><img src=x onerror="alert(2)">&quot;\'"x"'
 
 
-def test_text_of_users_and_scenes_never_becomes_a_tag(session, balls):
+def test_text_of_users_never_becomes_a_tag(session, balls):
     session.history.vocabulary = [HOSTILE, *WORDS]
     question = session.ask(HOSTILE[:100])
     session.refine(question)
