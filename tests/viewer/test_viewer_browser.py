@@ -29,6 +29,7 @@ def viewer():
 
     scene, ground_truth = ball_scene()
     running = ViewerServer(scene, ViewerConfig(port=0))
+    running.example = running.session.history.vocabulary[0]
     running.session.history.set_vocabulary(WORDS)
     running.ground_truth = ground_truth
     yield running
@@ -145,6 +146,24 @@ def clear(page, viewer) -> None:
 def test_the_page_loads_completely_under_its_content_security_policy(page):
     assert page.refused == []
     assert page.locator("canvas").count() >= 1
+
+
+def test_the_page_has_a_title_and_its_controls_have_names_and_an_example(page, viewer):
+    until(lambda: page.title() == "lexsplat")
+    for name in ("Recent", "Show", "Opacity", "Fade rest"):
+        assert page.get_by_label(name, exact=True).count() >= 1, name
+    box = page.get_by_role("textbox", name="Find", exact=True)
+    assert box.get_attribute("placeholder") == f"{viewer.example}, ..."
+
+
+def test_the_search_box_is_empty_after_an_answer(page, viewer):
+    clear(page, viewer)
+    ask(page, viewer, "ball 4")
+    until(lambda: page.get_by_role("textbox", name="Find", exact=True).input_value() == "")
+    page.keyboard.type("ball 2", delay=70)
+    page.wait_for_timeout(120)
+    page.keyboard.press("Enter")
+    until(lambda: viewer.session.find("ball 2"))
 
 
 def test_a_prompt_changes_the_image_at_the_object_and_nowhere_else(page, viewer):

@@ -446,6 +446,13 @@ def test_text_of_users_never_becomes_a_tag(session, balls):
         assert "alert" not in page or "<script>alert(1)</script>" in reader.text
 
 
+def test_a_hostile_title_stays_a_string_in_the_script_of_the_page():
+    script = pages.page_script(HOSTILE, HOSTILE)
+    assert "<" not in script.split(";")[0]
+    (title,) = [line for line in script.splitlines() if line.startswith("document.title = ")]
+    assert json.loads(title.removeprefix("document.title = ").removesuffix(";")) == HOSTILE
+
+
 def test_the_legend_explains_the_colors_of_each_mode(session):
     assert "Type" in pages.legend([], "relevancy", (0, 1), "Type something")
     question = session.ask("ball 0")

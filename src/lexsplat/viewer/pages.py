@@ -1,4 +1,4 @@
-"""HTML fragments of the panels, rendered from the templates beside this file with autoescaping."""
+"""HTML of the panels and the script of the page, rendered from ``templates/`` with autoescaping."""
 
 from __future__ import annotations
 
@@ -79,6 +79,16 @@ def view_counts(
 ) -> str:
     """The numbers of training and held-out views, with the colors of their frustums."""
     return _render("views.html", train=train, train_color=train_color, test=test, test_color=test_color)
+
+
+def page_script(title: str, example: str) -> str:
+    """JavaScript that sets the page title, accessible names of the controls, and an example in the search box.
+
+    Args:
+        title: The title.
+        example: A prompt.
+    """
+    return _render("page.js", title=title, placeholder=f"{example}, ...")
 
 
 def _scale(low: float, label: str, high: float, start: float = 0.0) -> dict[str, str]:

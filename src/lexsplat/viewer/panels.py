@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lexsplat.geometry.cameras import Camera
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
+from lexsplat.viewer import pages
 from lexsplat.viewer.controls import EventRunner
 from lexsplat.viewer.display import Display, page_camera
 from lexsplat.viewer.prompt_panel import PromptPanel
@@ -49,7 +50,9 @@ class Panels:
         gui.configure_theme(
             show_logo=False, show_share_button=False, brand_color=(29, 78, 137), dark_mode=False
         )
-        gui.set_panel_label(title_of(session.scene))
+        title = title_of(session.scene)
+        gui.set_panel_label(title)
+        _run_script(gui, pages.page_script(title, session.history.vocabulary[0]))
         gui.main_panel.dock_left()
         gui.main_panel.set_width(320)
         self.search = SearchPanel(gui, self)
@@ -190,6 +193,13 @@ class Panels:
             return page_camera(client)
         except (ValueError, ZeroDivisionError):
             return self._viewpoint
+
+
+def _run_script(gui: viser.GuiApi, script: str) -> None:
+    """Run a script in every page. viser uses this message for its plots only, so it is not part of its public API."""
+    from viser._messages import RunJavascriptMessage
+
+    gui._websock_interface.queue_message(RunJavascriptMessage(script))
 
 
 def title_of(scene: Scene) -> str:
