@@ -97,7 +97,7 @@ def browser_seconds(viewer: ViewerServer) -> dict[str, float]:
             time.sleep(0.1)
         (client,) = viewer.viser.get_clients().values()
         while True:  # an empty page answers too: wait for a picture that is not one color
-            picture = viewer.display.picture(client, 240)
+            picture = viewer.display.image(client, 240)
             if np.ptp(picture.reshape(-1, picture.shape[-1]), axis=0).max() > 30:
                 break
             if time.perf_counter() - started > 500:

@@ -1,8 +1,8 @@
-"""Make the pictures of docs/viewer.md: the viewer in headless Chromium, with three prompts and after a click.
+"""Make the images of docs/viewer.md: the viewer in headless Chromium, with three prompts and after a click.
 
 python tools/viewer_pictures.py demo docs/images
 
-Needs Chromium on the path and playwright. Drawing is software WebGL, so it takes a minute or two.
+Needs Chromium on the path and playwright. It draws with software WebGL and takes a minute or two.
 """
 
 import io
@@ -50,14 +50,14 @@ def main() -> None:
         page.get_by_role("tab", name="What is this?").click()
         camera = page_camera(client)
         place = camera.K @ (camera.viewmat @ np.append(scene.select(CLICKED).center, 1))[:3]
-        viewer.panels._what_is(camera, float(place[0] / place[2]), float(place[1] / place[2]))
+        viewer.panels.click.what_is(camera, float(place[0] / place[2]), float(place[1] / place[2]))
         save(page, viewer, folder / "viewer_click.jpg")
         browser.close()
     viewer.stop()
 
 
 def save(page: Page, viewer: ViewerServer, path: Path) -> None:
-    """A screenshot once the page does not change any more."""
+    """Save a screenshot once the page has stopped changing."""
     viewer.panels.wait()
     page.wait_for_timeout(3000)
     before = page.screenshot()
@@ -67,9 +67,9 @@ def save(page: Page, viewer: ViewerServer, path: Path) -> None:
         if before == after:
             break
         before = after
-    picture = Image.open(io.BytesIO(after)).convert("RGB")
-    size = WIDTH, WIDTH * picture.height // picture.width
-    picture.resize(size, Image.Resampling.LANCZOS).save(path, quality=80, optimize=True)
+    image = Image.open(io.BytesIO(after)).convert("RGB")
+    size = WIDTH, WIDTH * image.height // image.width
+    image.resize(size, Image.Resampling.LANCZOS).save(path, quality=80, optimize=True)
     print(f"{path}: {path.stat().st_size:,} bytes")
 
 

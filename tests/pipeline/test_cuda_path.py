@@ -266,11 +266,11 @@ def test_a_scene_is_edited_on_the_gpu(on_gpu):
 
 def test_the_viewer_answers_on_the_gpu(on_gpu):
     from lexsplat.viewer.coloring import MODES
-    from lexsplat.viewer.history import Memory
+    from lexsplat.viewer.history import History
     from lexsplat.viewer.session import Session
 
     scene, ground_truth = on_gpu
-    session = Session(scene, Memory(vocabulary=[*WORDS, "spoon"]))
+    session = Session(scene, History(vocabulary=[*WORDS, "spoon"]))
     session.warm_up()
     question = session.ask("ball 2")
     session.refine(question)

@@ -1,4 +1,4 @@
-"""A scene whose answers are known, for tests of the viewer: colored balls, "ball 0" to "ball 4", one code each."""
+"""A scene with known answers for tests of the viewer: colored balls, "ball 0" to "ball 4", one code each."""
 
 import colorsys
 
@@ -16,7 +16,7 @@ WORDS = [f"ball {number}" for number in range(5)]
 
 
 class BallScene(Scene):
-    """Embeds words without an encoder: "ball k" is code k; canonical phrases come next, then the rest."""
+    """Embeds text without an encoder: "ball k" is axis k, canonical phrases are axis 31, other text is in between."""
 
     def encode_text(self, texts: list[str]) -> torch.Tensor:
         rows = torch.zeros(len(texts), 32)
@@ -32,7 +32,7 @@ class BallScene(Scene):
 
 
 def ball_scene(per_ball: int = 300) -> tuple[BallScene, LanguageScene]:
-    """The scene and its truth."""
+    """The scene and its ground truth."""
     ground_truth = make_scene(per_ball=per_ball, views=6, width=96, height=72)
     gaussians = ground_truth.gaussians
     colors = np.array([colorsys.hsv_to_rgb(k / 5, 0.5, 0.75) for k in range(5)])[ground_truth.labels]

@@ -1,4 +1,4 @@
-"""The viewer in a real browser: headless Chromium with software WebGL, on balls whose places are known."""
+"""The viewer in a real browser: headless Chromium with software WebGL, on balls with known positions."""
 
 import io
 import itertools
@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.rendering import render
-from lexsplat.viewer import panels
+from lexsplat.viewer import side_panels
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -29,7 +29,8 @@ def viewer():
 
     scene, ground_truth = ball_scene()
     running = ViewerServer(scene, ViewerConfig(port=0))
-    running.session.memory.set_vocabulary(WORDS)
+    running.example = running.session.history.vocabulary[0]
+    running.session.history.set_vocabulary(WORDS)
     running.ground_truth = ground_truth
     yield running
     running.stop()
@@ -57,10 +58,10 @@ def page(viewer):
 
 
 def until(condition, seconds: float = 120.0):
-    """Waits for a condition; returns what it gave."""
+    """Waits until a condition holds; returns its value."""
     end = time.monotonic() + seconds
     while not (value := condition()):
-        assert time.monotonic() < end, "waited in vain"
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.1)
     return value
 
@@ -76,12 +77,12 @@ def canvas(page) -> dict[str, float]:
 
 
 def look(page, viewer) -> np.ndarray:
-    """The canvas ``[H, W, 3]`` as it is shown."""
+    """The canvas ``[H, W, 3]``."""
     return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=canvas(page)))).convert("RGB")).astype(int)
 
 
 def settled(page, viewer) -> np.ndarray:
-    """The canvas once it does not change any more."""
+    """The canvas once it has stopped changing."""
     viewer.panels.wait()
     before = look(page, viewer)
     while True:
@@ -93,7 +94,7 @@ def settled(page, viewer) -> np.ndarray:
 
 
 def where_is(viewer, ball: int, shape) -> np.ndarray:
-    """How much each pixel of the page ``[H, W]`` shows of a ball, drawn by our own renderer."""
+    """The coverage of a ball at each pixel of the page ``[H, W]``, by our own renderer."""
     from lexsplat.viewer.display import page_camera
 
     camera = page_camera(client(viewer)).resized(shape[1], shape[0])
@@ -103,7 +104,7 @@ def where_is(viewer, ball: int, shape) -> np.ndarray:
 
 
 def assert_changed(before, after, share) -> None:
-    """That the picture differs where ``share`` says the object is, and not where nothing of it is."""
+    """Asserts that the image differs where the object is, by its coverage ``share``, and nowhere else."""
     changed = np.abs(after - before).max(-1) > 12
     assert (share > 0.9).sum() > 200
     assert changed[binary_erosion(share > 0.9, iterations=2)].mean() > 0.97
@@ -123,8 +124,8 @@ def ask(page, viewer, text: str) -> None:
 
 
 def click(page, viewer, x: float, y: float) -> None:
-    """Clicks on the scene as a hand does: move, press, release."""
-    for _ in range(3):  # a page that is busy drawing in software misses one now and then
+    """Clicks on the scene like a user: move, press, release."""
+    for _ in range(3):  # a page that is busy with software WebGL may miss a click
         page.mouse.move(x - 3, y)
         page.mouse.move(x, y)
         page.mouse.click(x, y, delay=80)
@@ -142,12 +143,30 @@ def clear(page, viewer) -> None:
         until(lambda: not viewer.session.all_questions())
 
 
-def test_the_page_loads_everything_it_needs_under_its_own_policy(page):
+def test_the_page_loads_completely_under_its_content_security_policy(page):
     assert page.refused == []
     assert page.locator("canvas").count() >= 1
 
 
-def test_typing_changes_the_picture_where_the_object_is_and_not_elsewhere(page, viewer):
+def test_the_page_has_a_title_and_its_controls_have_names_and_an_example(page, viewer):
+    until(lambda: page.title() == "lexsplat")
+    for name in ("Recent", "Show", "Opacity", "Fade rest"):
+        assert page.get_by_label(name, exact=True).count() >= 1, name
+    box = page.get_by_role("textbox", name="Find", exact=True)
+    assert box.get_attribute("placeholder") == f"{viewer.example}, ..."
+
+
+def test_the_search_box_is_empty_after_an_answer(page, viewer):
+    clear(page, viewer)
+    ask(page, viewer, "ball 4")
+    until(lambda: page.get_by_role("textbox", name="Find", exact=True).input_value() == "")
+    page.keyboard.type("ball 2", delay=70)
+    page.wait_for_timeout(120)
+    page.keyboard.press("Enter")
+    until(lambda: viewer.session.find("ball 2"))
+
+
+def test_a_prompt_changes_the_image_at_the_object_and_nowhere_else(page, viewer):
     clear(page, viewer)
     before = settled(page, viewer)
     ask(page, viewer, "ball 4")
@@ -156,7 +175,7 @@ def test_typing_changes_the_picture_where_the_object_is_and_not_elsewhere(page, 
     assert page.get_by_text("ball 4").count() >= 1
 
 
-def test_what_is_typed_is_completed_and_asked_by_a_click(page, viewer):
+def test_a_click_on_a_completion_asks_it(page, viewer):
     clear(page, viewer)
     box = page.locator("form input").first
     box.fill("")
@@ -165,10 +184,10 @@ def test_what_is_typed_is_completed_and_asked_by_a_click(page, viewer):
     page.keyboard.type("ba", delay=120)
     page.get_by_role("button", name="ball 1", exact=True).first.click()
     until(lambda: viewer.session.current and viewer.session.current.text == "ball 1")
-    until(lambda: "ball 1" in viewer.session.memory.history)
+    until(lambda: "ball 1" in viewer.session.history.prompts)
 
 
-def test_a_click_says_what_is_there_and_selects_it(page, viewer):
+def test_a_click_on_the_scene_names_and_selects_the_object(page, viewer):
     clear(page, viewer)
     picture = settled(page, viewer)
     box = canvas(page)
@@ -177,12 +196,12 @@ def test_a_click_says_what_is_there_and_selects_it(page, viewer):
     click(page, viewer, box["x"] + columns[place] + 0.5, box["y"] + rows[place] + 0.5)
     assert np.array_equal(viewer.session.selection.mask.numpy(), viewer.ground_truth.labels == 2)
     page.get_by_role("tab", name="What is this?").click()
-    page.get_by_text("splats belong to it").wait_for()
+    page.get_by_text("splats selected").wait_for()
     after = settled(page, viewer)
     assert_changed(picture, after, where_is(viewer, 2, picture.shape))
 
 
-def test_the_selection_is_downloaded(page, viewer, tmp_path):
+def test_the_selection_can_be_downloaded(page, viewer, tmp_path):
     from plyfile import PlyData
 
     clear(page, viewer)
@@ -197,7 +216,7 @@ def test_the_selection_is_downloaded(page, viewer, tmp_path):
 
 
 def test_the_mode_changes_the_colors(page, viewer):
-    from lexsplat.viewer.panels import MODE_LABELS
+    from lexsplat.viewer.search_panel import MODE_LABELS
 
     clear(page, viewer)
     colored = settled(page, viewer)
@@ -229,17 +248,17 @@ def test_a_screenshot_is_downloaded_and_shows_the_scene(page, viewer, tmp_path):
     picture = np.asarray(Image.open(tmp_path / "shot.png").convert("RGB")).astype(int)
     assert started.value.suggested_filename == "lexsplat.png"
     shown = sum(where_is(viewer, ball, picture.shape) for ball in range(5))
-    assert np.ptp(picture[shown < 0.01].reshape(-1, 3), axis=0).max() < 10  # the ground, without cameras
+    assert np.ptp(picture[shown < 0.01].reshape(-1, 3), axis=0).max() < 10  # the background, without frustums
     assert np.abs(picture[shown > 0.95] - picture[shown < 0.01][0]).max(-1).min() > 25
 
 
-def test_a_click_on_a_camera_in_the_scene_goes_there(page, viewer):
+def test_a_click_on_a_frustum_jumps_to_its_view(page, viewer):
     from lexsplat.geometry.cameras import Camera
 
     clear(page, viewer)
     view = viewer.session.scene.views["view1"].camera
     viewmat = view.viewmat.copy()
-    viewmat[2, 3] += 0.8  # a step back: the camera then stands in the middle of the picture
+    viewmat[2, 3] += 0.8  # a step back puts the frustum in the center of the image
     behind = Camera(view.width, view.height, view.K, viewmat)
     viewer.display.jump(client(viewer), behind)
     until(lambda: np.allclose(client(viewer).camera.position, behind.position, atol=1e-3))
@@ -255,15 +274,15 @@ def test_a_click_on_a_camera_in_the_scene_goes_there(page, viewer):
     page.wait_for_timeout(300)
     page.mouse.click(*middle, delay=80)
     until(lambda: np.allclose(client(viewer).camera.position, view.position, atol=1e-3), seconds=30)
-    assert viewer.session.clicked is asked, "what stands behind the camera was not asked about"
+    assert viewer.session.clicked is asked, "the object behind the frustum was not asked about"
     page.get_by_label("Show cameras").uncheck()
     until(lambda: not viewer.display._frustums[0].visible)
 
 
-def test_an_orbit_video_is_downloaded_and_shows_every_frame(page, viewer, tmp_path, monkeypatch):
+def test_an_orbit_video_is_downloaded_with_every_frame(page, viewer, tmp_path, monkeypatch):
     av = pytest.importorskip("av")
-    monkeypatch.setitem(panels._ORBIT, "frames", 8)
-    monkeypatch.setitem(panels._ORBIT, "height", 120)
+    monkeypatch.setitem(side_panels._ORBIT, "frames", 8)
+    monkeypatch.setitem(side_panels._ORBIT, "height", 120)
     clear(page, viewer)
     page.get_by_role("tab", name="Save").click()
     with page.expect_download(timeout=120_000) as started:

@@ -1,4 +1,4 @@
-"""Colors of Gaussians: scikit-learn's PCA, matplotlib-free scales worked out by hand, and laws that must hold."""
+"""Colors of Gaussians, compared with scikit-learn's PCA, hand-computed scales, and invariants."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def field(scene):
-    """Each Gaussian says its ball's code with 0.7 to 1, the next code with the rest; the last one says nothing."""
+    """Each Gaussian has its ball's code with weight 0.7 to 1, the next code with the rest; the last has none."""
     count = len(scene.labels)
     main = torch.from_numpy(0.7 + 0.3 * np.random.default_rng(0).random(count)).float()
     codes = torch.from_numpy(np.stack([scene.labels, (scene.labels + 1) % 5], 1)).to(torch.uint8)
@@ -44,14 +44,14 @@ def layer(scene, ball: int, **options) -> Layer:
     return Layer(f"ball {ball}", scores, 0.5, PROMPT_COLORS[ball], **options)
 
 
-def test_photo_colors_are_those_of_the_constant_harmonic(scene):
+def test_photo_colors_come_from_the_constant_spherical_harmonic(scene):
     gaussians = scene.gaussians.select(torch.arange(3))
     gaussians.sh0 = torch.tensor([[[0.0, 1.0, -1.0]], [[9.0, -9.0, 0.0]], [[0.0, 0.0, 0.0]]])
     expected = [[128, 200, 56], [255, 0, 128], [128, 128, 128]]  # 255 (0.5 + 0.2820948 c), cut to 0..255
     assert np.abs(photo_colors(gaussians).astype(int) - expected).max() <= 1
 
 
-def test_relevancy_changes_what_is_marked_and_nothing_else(scene, field):
+def test_relevancy_changes_only_marked_gaussians(scene, field):
     coloring = Coloring(scene.gaussians, field)
     before = coloring.colors("photo")
     after = coloring.colors("relevancy", [layer(scene, 2)])
@@ -59,14 +59,14 @@ def test_relevancy_changes_what_is_marked_and_nothing_else(scene, field):
     assert np.array_equal(changed, scene.labels == 2)
 
 
-def test_one_prompt_glows_in_the_colors_of_the_scale(scene, field):
+def test_a_single_prompt_is_drawn_with_the_color_scale(scene, field):
     coloring = Coloring(scene.gaussians, field)
     marked = coloring.colors("relevancy", [layer(scene, 2)], opacity=1.0)[scene.labels == 2]
     full = colorize(np.array([1.0]))[0]  # 0.8 is the peak
     assert np.abs(marked.astype(int) - full).max() <= 1
 
 
-def test_several_prompts_show_their_own_colors(scene, field):
+def test_several_prompts_are_drawn_in_their_own_colors(scene, field):
     layers = [layer(scene, 1), layer(scene, 3)]
     colors = Coloring(scene.gaussians, field).colors("relevancy", layers, opacity=1.0)
     for ball in (1, 3):
@@ -76,7 +76,7 @@ def test_several_prompts_show_their_own_colors(scene, field):
     assert (colors[scene.labels == 3] == colors[scene.labels == 0][0]).all()
 
 
-def test_where_prompts_overlap_the_surer_one_is_drawn(scene, field):
+def test_where_prompts_overlap_the_more_relevant_one_is_drawn(scene, field):
     sure = Layer("sure", np.full(len(scene.labels), 0.9, np.float32), 0.5, (255, 0, 0))
     unsure = Layer("unsure", np.full(len(scene.labels), 0.6, np.float32), 0.5, (0, 255, 0))
     unsure.peak = 1.0
@@ -85,7 +85,7 @@ def test_where_prompts_overlap_the_surer_one_is_drawn(scene, field):
         assert (colors[:, 0] > colors[:, 1]).all()
 
 
-def test_a_mask_decides_over_the_threshold(scene, field):
+def test_a_mask_overrides_the_threshold(scene, field):
     mask = scene.labels == 4
     colors = Coloring(scene.gaussians, field).colors("relevancy", [layer(scene, 2, mask=mask)])
     assert np.array_equal((colors != photo_colors(scene.gaussians)).any(1), mask)
@@ -103,7 +103,7 @@ def test_opacity_and_fade_mix_linearly(scene, field):
     assert np.array_equal(faded[scene.labels == 2], again[scene.labels == 2])  # marks do not fade
 
 
-def test_colors_are_fresh_arrays(scene, field):
+def test_colors_are_new_arrays(scene, field):
     coloring = Coloring(scene.gaussians, field)
     for mode in MODES:
         coloring.colors(mode)[:] = 7
@@ -123,30 +123,30 @@ def test_language_colors_are_the_principal_components_of_the_features(scene, fie
     assert min(np.abs(colors[:, 0] - unit).max(), np.abs(colors[:, 0] - (255 - unit)).max()) < 3
 
 
-def test_what_says_nothing_is_gray(scene, field):
+def test_gaussians_without_language_are_gray(scene, field):
     coloring = Coloring(scene.gaussians, field)
     for mode in ("language", "codes"):
         assert np.ptp(coloring.colors(mode)[-1].astype(int)) < 12
 
 
-def test_a_field_of_one_meaning_has_a_language_picture(scene):
+def test_a_field_with_a_single_code_has_language_colors(scene):
     same = CodeField(scene.codebook, torch.zeros(9, 1, dtype=torch.uint8), torch.ones(9, 1), torch.zeros(9))
     assert language_colors(same).shape == (9, 3)
 
 
-def test_codes_are_those_with_the_largest_probability(scene, field):
+def test_likeliest_codes_have_the_largest_probability(scene, field):
     codes, known = likeliest_codes(field)
     probabilities = field.code_probabilities().numpy()
     assert np.array_equal(known, probabilities.sum(1) > 0)
     assert np.array_equal(codes[known], probabilities.argmax(1)[known])
 
 
-def test_the_palette_tells_all_codes_apart():
+def test_the_palette_has_distinct_colors():
     palette = code_palette(128)
     assert len(np.unique(palette, axis=0)) == 128
 
 
-def test_depth_is_bright_near_the_eye(scene, field):
+def test_depth_is_bright_near_the_camera(scene, field):
     coloring = Coloring(scene.gaussians, field)
     eye = np.array([10.0, 0, 0])
     colors = coloring.colors("depth", eye=eye).astype(float).sum(1)
@@ -173,7 +173,7 @@ def test_marked_and_amount_agree_with_a_loop(values, threshold):
     assert peak_of(scores) == sorted(scores)[min(len(scores) - 1, int(0.999 * len(scores)))]
 
 
-def test_a_trained_field_has_all_pictures(scene):
+def test_a_trained_field_has_language_and_code_colors(scene):
     from lexsplat.language.fields import TrainedField
 
     field = TrainedField.initial(

@@ -1,4 +1,4 @@
-"""The viewer without a browser: questions, clicks, memory, suggestions, pages, files; on balls with known names."""
+"""The viewer without a browser: prompts, clicks, history, suggestions, pages, files; on balls with known names."""
 
 import io
 import json
@@ -14,7 +14,7 @@ from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.runtime.errors import QueryError
 from lexsplat.viewer import pages
-from lexsplat.viewer.history import MAX_HISTORY, Memory
+from lexsplat.viewer.history import MAX_PROMPTS, History
 from lexsplat.viewer.recording import encode_png, encode_video, looking_at, orbit
 from lexsplat.viewer.session import MAX_QUESTIONS, Session, is_plain
 from lexsplat.viewer.vocabulary import MAX_PHRASES, clean_phrases, default_vocabulary, suggestions
@@ -27,7 +27,7 @@ def balls():
 
 @pytest.fixture
 def session(balls):
-    return Session(balls[0], Memory(vocabulary=[*WORDS, "spoon", "fork"]))
+    return Session(balls[0], History(vocabulary=[*WORDS, "spoon", "fork"]))
 
 
 def changed(session, before) -> np.ndarray:
@@ -37,7 +37,7 @@ def changed(session, before) -> np.ndarray:
 # -- questions
 
 
-def test_a_question_colors_its_ball_at_once_and_selects_it_when_refined(session, balls):
+def test_a_prompt_colors_its_ball_at_once_and_selects_it_when_refined(session, balls):
     _, ground_truth = balls
     before = session.colors()
     question = session.ask("  ball   2 ")
@@ -51,10 +51,10 @@ def test_a_question_colors_its_ball_at_once_and_selects_it_when_refined(session,
     assert session.selection is question.selection
 
 
-def test_what_is_judged_absent_is_drawn_at_half_from_the_first_moment(balls, monkeypatch):
-    fresh = Session(balls[0], Memory(vocabulary=WORDS))
+def test_an_absent_object_has_the_threshold_one_half_before_and_after_refinement(balls, monkeypatch):
+    fresh = Session(balls[0], History(vocabulary=WORDS))
     fresh.warm_up()
-    monkeypatch.setattr(type(fresh._judge), "judge", lambda self, scores: "no")
+    monkeypatch.setattr(type(fresh._presence), "judge", lambda self, scores: "no")
     question = fresh.ask("ball 3")
     assert question.layer.threshold == 0.5
     fresh.refine(question)
@@ -62,7 +62,7 @@ def test_what_is_judged_absent_is_drawn_at_half_from_the_first_moment(balls, mon
     assert question.selection.present == "no"
 
 
-def test_several_questions_are_shown_and_can_be_hidden_and_removed(session, balls):
+def test_several_prompts_are_shown_hidden_and_removed(session, balls):
     _, ground_truth = balls
     before = session.colors()
     first, second = session.ask("ball 0"), session.ask("ball 4")
@@ -77,7 +77,7 @@ def test_several_questions_are_shown_and_can_be_hidden_and_removed(session, ball
     assert not changed(session, before).any()
 
 
-def test_a_phrase_with_several_parts_is_answered_as_by_find(session, balls):
+def test_a_phrase_with_relations_is_answered_by_find(session, balls):
     scene, ground_truth = balls
     question = session.ask("ball 4 and ball 0")
     session.refine(question)
@@ -90,15 +90,20 @@ def test_a_phrase_with_several_parts_is_answered_as_by_find(session, balls):
     ]  # fmt: skip
     none = session.ask("ball 0 inside ball 4")
     session.refine(none)
-    assert none.selection.count == 0
+    assert len(none.selection) == 0
 
 
-def test_asking_again_does_not_show_it_twice(session):
-    assert session.ask("ball 1") is session.ask("ball 1")
+def test_a_repeated_prompt_is_shown_once_and_answered_once(session, monkeypatch):
+    question = session.ask("ball 1")
+    assert session.ask("ball 1") is question
     assert len(session.questions) == 1
+    session.refine(question)
+    monkeypatch.setattr(session.scene, "select", None)  # not asked again
+    session.refine(question)
+    assert len(question.selection) == 300
 
 
-def test_the_oldest_question_makes_room_and_colors_stay_different(session):
+def test_the_oldest_prompt_is_dropped_and_colors_stay_distinct(session):
     for number in range(MAX_QUESTIONS + 3):
         session.ask(f"thing number {number}")
     texts = [question.text for question in session.questions]
@@ -107,20 +112,20 @@ def test_the_oldest_question_makes_room_and_colors_stay_different(session):
 
 
 @pytest.mark.parametrize("text", ["", "   ", "x" * 500])
-def test_empty_and_endless_questions_are_refused(session, text):
+def test_empty_and_very_long_prompts_are_refused(session, text):
     with pytest.raises(QueryError):
         session.ask(text)
     assert session.questions == []
 
 
-def test_a_threshold_by_hand_holds_until_automatic_is_chosen_again(session, balls):
+def test_a_manual_threshold_holds_until_automatic_is_chosen_again(session, balls):
     question = session.ask("ball 3")
     session.refine(question)
     automatic = question.layer.threshold
     session.set_threshold(question, 0.0)
     assert len(question.layer.marked()) == len(balls[1].labels)
     session.refine(question)
-    assert question.selection.count == len(balls[1].labels)
+    assert len(question.selection) == len(balls[1].labels)
     session.set_threshold(question, 1.0)
     assert len(question.layer.marked()) == 0
     session.set_threshold(question, None)
@@ -134,7 +139,7 @@ def test_a_threshold_by_hand_holds_until_automatic_is_chosen_again(session, ball
 
 def test_a_click_names_and_selects_what_is_there(session, balls):
     _, ground_truth = balls
-    right = asked = 0
+    correct = asked = 0
     for name, camera in ground_truth.cameras.items():
         codes = ground_truth.code_maps[name]
         for ball in range(5):
@@ -144,17 +149,17 @@ def test_a_click_names_and_selects_what_is_there(session, balls):
             middle = np.argmin((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2)
             found = session.what_is(camera, columns[middle] + 0.5, rows[middle] + 0.5)
             asked += 1
-            right += found.phrases[0][0] == f"ball {ball}"
+            correct += found.phrases[0][0] == f"ball {ball}"
             assert np.array_equal(found.selection.mask.numpy(), ground_truth.labels == ball)
             assert session.selection is found.selection
             scores = [score for _, score in found.phrases]
             assert scores == sorted(scores, reverse=True)
             assert all(0 <= score <= 1 for score in scores)
     assert asked > 10
-    assert right == asked
+    assert correct == asked
 
 
-def test_a_click_on_nothing_is_told(session, balls):
+def test_a_click_on_the_background_is_refused(session, balls):
     camera = balls[1].cameras["view0"]
     with pytest.raises(QueryError, match="something to be seen"):
         session.what_is(camera, 0.5, 0.5)
@@ -185,14 +190,14 @@ def test_the_best_views_are_those_that_show_most(session, balls):
         assert share == pytest.approx(shares[name], abs=0.03)
 
 
-def test_a_thumbnail_tints_the_selection_alone(session, balls):
+def test_a_thumbnail_tints_only_the_selection(session, balls):
     _, ground_truth = balls
     question = session.ask("ball 0")
     session.refine(question)
-    picture = session.thumbnail("view1", question.selection).astype(int)
+    image = session.thumbnail("view1", question.selection).astype(int)
     truth_mask = ground_truth.code_maps["view1"] == 0
-    assert picture.shape == (72, 96, 3)
-    tinted = picture.sum(-1) > 300  # the ground is white, dimmed to 345
+    assert image.shape == (72, 96, 3)
+    tinted = image.sum(-1) > 300  # the white background is dimmed to 345
     tinted &= ground_truth.code_maps["view1"] != 255
     assert (tinted & truth_mask).sum() / (tinted | truth_mask).sum() > 0.75
 
@@ -211,7 +216,7 @@ def test_an_exported_selection_is_read_by_plyfile(session, balls):
     assert np.array_equal(np.stack([vertices["x"], vertices["y"], vertices["z"]], 1), expected)
 
 
-def test_an_exported_glb_holds_the_selection(session):
+def test_an_exported_glb_contains_the_selection(session):
     question = session.ask("ball 2")
     session.refine(question)
     name, content = session.export(question.selection, ".glb")
@@ -221,7 +226,7 @@ def test_an_exported_glb_holds_the_selection(session):
         session.export(question.selection, ".exe")
 
 
-def test_nothing_is_not_exported(session):
+def test_an_empty_selection_is_not_exported(session):
     question = session.ask("ball 2")
     session.set_threshold(question, 1.0)
     session.refine(question)
@@ -229,7 +234,7 @@ def test_nothing_is_not_exported(session):
         session.export(question.selection)
 
 
-def test_an_orbit_keeps_height_and_distance_and_looks_at_its_middle():
+def test_an_orbit_keeps_height_and_distance_and_looks_at_its_target():
     target, up = np.array([1.0, 2, 3]), np.array([0.0, 0, 2])
     poses = orbit(np.array([4.0, 2, 5]), target, up, 12)
     assert np.allclose(poses[0][0], [4, 2, 5])
@@ -240,15 +245,15 @@ def test_an_orbit_keeps_height_and_distance_and_looks_at_its_middle():
         assert np.linalg.det(rotation) == pytest.approx(1)
         along = (target - place) / np.linalg.norm(target - place)
         assert np.allclose(rotation[:, 2], along)
-        assert rotation[2, 1] < 0  # y points down in the picture, so its world z falls
+        assert rotation[2, 1] < 0  # y points down in the image, so its world z is negative
     angles = np.unwrap([np.arctan2(p[1] - 2, p[0] - 1) for p, _ in poses])
     assert np.allclose(np.diff(angles), 2 * np.pi / 12)
 
 
 @given(st.floats(0.1, 3.9), st.floats(-1.9, 1.9))
 @settings(deadline=None)
-def test_an_orbit_stays_where_photos_were_taken(width, start):
-    """Photos on an arc of ``width`` radians around 0: the cameras swing over it, and reach both ends."""
+def test_an_orbit_stays_within_the_arc_of_the_photos(width, start):
+    """With photos on an arc of ``width`` radians around 0, the cameras swing over it and reach both ends."""
     seen = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.0]) for a in np.linspace(-width / 2, width / 2, 30)]
     start = float(np.clip(start, -width / 2, width / 2))
     begin = np.array([2 * np.cos(start), 2 * np.sin(start), 0.5])
@@ -269,12 +274,12 @@ def test_photos_from_all_around_give_a_full_turn():
         assert np.allclose(place, expected)
 
 
-def test_an_orbit_from_above_is_refused():
+def test_an_orbit_from_vertically_above_is_refused():
     with pytest.raises(ValueError, match="above"):
         orbit(np.array([0.0, 0, 5]), np.zeros(3), np.array([0.0, 0, 1]), 4)
 
 
-def test_looking_at_is_the_camera_of_cameras():
+def test_looking_at_agrees_with_look_at():
     from lexsplat.geometry.cameras import look_at
 
     place, target, up = np.array([1.0, -2, 0.5]), np.array([0.3, 0.2, 0]), np.array([0.1, 0, 1])
@@ -282,7 +287,7 @@ def test_looking_at_is_the_camera_of_cameras():
     assert np.allclose(looking_at(place, target, up), camera.viewmat[:3, :3].T)
 
 
-def test_a_video_without_an_encoder_is_a_gif_with_all_frames(monkeypatch):
+def test_without_pyav_a_video_is_a_gif_with_all_frames(monkeypatch):
     monkeypatch.setattr("lexsplat.viewer.recording.importlib.util.find_spec", lambda name: None)
     frames = [np.full((31, 41, 3), 20 * k, np.uint8) for k in range(6)]
     suffix, content = encode_video(frames, fps=10)
@@ -298,7 +303,7 @@ def test_a_video_without_an_encoder_is_a_gif_with_all_frames(monkeypatch):
 
 
 @pytest.mark.parametrize("shape", [(64, 80), (63, 81)])
-def test_a_video_is_an_mp4_whose_frames_come_back_in_order(shape):
+def test_a_video_is_an_mp4_with_its_frames_in_order(shape):
     av = pytest.importorskip("av")
     frames = [np.full((*shape, 3), 20 * k, np.uint8) for k in range(12)]
     suffix, content = encode_video(frames, fps=10)
@@ -317,56 +322,66 @@ def test_a_screenshot_is_a_png_of_the_same_pixels():
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(encode_png(picture)))), picture)
 
 
-# -- memory and suggestions
+# -- history and suggestions
 
 
-def test_memory_comes_back_and_keeps_the_latest_first(tmp_path):
-    memory = Memory.load(tmp_path)
-    assert memory.vocabulary == default_vocabulary()
+def test_the_history_is_stored_with_the_latest_prompt_first(tmp_path):
+    history = History.load(tmp_path)
+    assert history.vocabulary == default_vocabulary()
     for phrase in ("mug", "red apple", "mug"):
-        memory.remember(phrase)
-    memory.set_vocabulary([" pear ", "", "Pear", "plum"])
-    again = Memory.load(tmp_path)
-    assert again.history == ["mug", "red apple"]
+        history.add(phrase)
+    history.set_vocabulary([" pear ", "", "Pear", "plum"])
+    again = History.load(tmp_path)
+    assert again.prompts == ["mug", "red apple"]
     assert again.vocabulary == ["pear", "plum"]
     again.set_vocabulary([])
-    assert Memory.load(tmp_path).vocabulary == default_vocabulary()
-    again.history = [f"thing {number}" for number in range(2 * MAX_HISTORY)]
-    again.remember("the last")
-    assert Memory.load(tmp_path).history == ["the last", *(f"thing {n}" for n in range(MAX_HISTORY - 1))]
+    assert History.load(tmp_path).vocabulary == default_vocabulary()
+    again.prompts = [f"thing {number}" for number in range(2 * MAX_PROMPTS)]
+    again.add("the last")
+    assert History.load(tmp_path).prompts == ["the last", *(f"thing {n}" for n in range(MAX_PROMPTS - 1))]
+
+
+def test_files_written_by_earlier_versions_are_read_and_written_again_alike(tmp_path):
+    content = {"history": ["mug", "red apple"], "vocabulary": ["pear", "plum"]}
+    (tmp_path / "viewer.json").write_text(json.dumps(content))
+    history = History.load(tmp_path)
+    assert history.prompts == content["history"]
+    assert history.vocabulary == content["vocabulary"]
+    history.add("mug")
+    assert json.loads((tmp_path / "viewer.json").read_text()) == content
 
 
 @pytest.mark.parametrize(
     "content", ["", "{", "[]", '{"history": 3}', '{"history": [1]}', '{"vocabulary": null}']
 )
-def test_a_damaged_memory_is_told_and_not_used(tmp_path, content, caplog):
+def test_a_damaged_history_is_reported_and_ignored(tmp_path, content, caplog):
     (tmp_path / "viewer.json").write_text(content)
-    memory = Memory.load(tmp_path)
-    assert memory.history == []
-    assert memory.vocabulary == default_vocabulary()
+    history = History.load(tmp_path)
+    assert history.prompts == []
+    assert history.vocabulary == default_vocabulary()
     assert "viewer.json" in caplog.text
-    memory.remember("mug")
+    history.add("mug")
     assert json.loads((tmp_path / "viewer.json").read_text())["history"] == ["mug"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
-def test_a_folder_that_cannot_be_written_is_left_alone(tmp_path, monkeypatch):
+def test_nothing_is_written_to_a_read_only_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
-    memory = Memory.load(tmp_path)
-    memory.remember("mug")
-    assert memory.history == ["mug"]
+    history = History.load(tmp_path)
+    history.add("mug")
+    assert history.prompts == ["mug"]
     assert list(tmp_path.iterdir()) == []
 
 
-def test_scenes_of_the_embedded_encoder_start_with_what_it_knows(tmp_path):
-    known = Memory.load(tmp_path, "bundled").vocabulary
+def test_scenes_of_the_bundled_encoder_start_with_its_own_vocabulary(tmp_path):
+    known = History.load(tmp_path, "bundled").vocabulary
     assert {"teddy bear", "rubber duck", "traffic cone"} <= set(known)
     assert len(known) == 22
-    Memory.load(tmp_path, "bundled").remember("duck")  # does not fix the words
-    assert Memory.load(tmp_path, "openai/clip-vit-base-patch16").vocabulary == default_vocabulary()
+    History.load(tmp_path, "bundled").add("duck")  # does not store the default vocabulary
+    assert History.load(tmp_path, "openai/clip-vit-base-patch16").vocabulary == default_vocabulary()
 
 
-def test_suggestions_take_beginnings_before_words_and_history_before_vocabulary():
+def test_suggestions_rank_beginnings_before_words_and_history_before_vocabulary():
     history, vocabulary = ["red mug", "apple"], ["apron", "toy apple", "mug", "red mug"]
     assert suggestions("ap", history, vocabulary) == ["apple", "apron", "toy apple"]
     assert suggestions("MUG", history, vocabulary) == ["red mug"]
@@ -376,7 +391,7 @@ def test_suggestions_take_beginnings_before_words_and_history_before_vocabulary(
 
 
 @given(st.lists(st.text(max_size=12) | st.just("long " * 60), max_size=8))
-def test_cleaned_phrases_are_short_single_and_stable(phrases):
+def test_cleaning_phrases_is_idempotent_and_removes_duplicates(phrases):
     cleaned = clean_phrases(phrases)
     assert len(cleaned) <= MAX_PHRASES
     assert all(phrase and phrase == " ".join(phrase.split()) and len(phrase) <= 120 for phrase in cleaned)
@@ -388,7 +403,7 @@ def test_cleaned_phrases_are_short_single_and_stable(phrases):
 
 
 class Reader(HTMLParser):
-    """Collects the tags and the text of a page."""
+    """Collects the tags, attributes and text of a page."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -408,8 +423,8 @@ class Reader(HTMLParser):
 HOSTILE = '<script>alert(1)</script><img src=x onerror="alert(2)">&quot;\'"x"'
 
 
-def test_text_of_users_and_scenes_never_becomes_a_tag(session, balls):
-    session.memory.vocabulary = [HOSTILE, *WORDS]
+def test_text_of_users_never_becomes_a_tag(session, balls):
+    session.history.vocabulary = [HOSTILE, *WORDS]
     question = session.ask(HOSTILE[:100])
     session.refine(question)
     camera = balls[1].cameras["view0"]
@@ -418,7 +433,7 @@ def test_text_of_users_and_scenes_never_becomes_a_tag(session, balls):
     everything = [
         pages.note(HOSTILE),
         pages.warning(HOSTILE),
-        pages.answer(found),
+        pages.click_answer(found),
         pages.selection_facts(question),
         pages.legend([question], "relevancy", (0, 1), HOSTILE),
         pages.legend([question, *session.all_questions()], "relevancy", (0, 1), HOSTILE),
@@ -426,12 +441,19 @@ def test_text_of_users_and_scenes_never_becomes_a_tag(session, balls):
     ]
     for page in everything:
         reader = Reader(page)
-        assert not set(reader.tags) - {"div", "span", "b", "br", "img"}
-        assert not reader.attributes - {"style", "src", "alt"}
+        assert not set(reader.tags) - {"div", "span", "b", "br", "img", "style"}
+        assert not reader.attributes - {"class", "style", "src", "alt"}
         assert "alert" not in page or "<script>alert(1)</script>" in reader.text
 
 
-def test_the_legend_says_what_the_colors_mean(session):
+def test_a_hostile_title_stays_a_string_in_the_script_of_the_page():
+    script = pages.page_script(HOSTILE, HOSTILE)
+    assert "<" not in script.split(";")[0]
+    (title,) = [line for line in script.splitlines() if line.startswith("document.title = ")]
+    assert json.loads(title.removeprefix("document.title = ").removesuffix(";")) == HOSTILE
+
+
+def test_the_legend_explains_the_colors_of_each_mode(session):
     assert "Type" in pages.legend([], "relevancy", (0, 1), "Type something")
     question = session.ask("ball 0")
     text = Reader(pages.legend([question], "relevancy", (0, 1), "")).text

@@ -1,4 +1,4 @@
-"""What is sent to the browser: covariances from scipy's rotations, orders and budgets from their definitions."""
+"""What is sent to the browser: covariances against scipy's rotations, orders and budgets against definitions."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def cloud(count: int, seed: int = 0) -> Gaussians:
     )
 
 
-def test_covariances_are_rotated_squares_of_the_scales():
+def test_covariances_are_rotated_squared_scales():
     gaussians = cloud(50)
     found = covariances(gaussians.quats, gaussians.scales).numpy()
     rotations = Rotation.from_quat(gaussians.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
@@ -35,7 +35,7 @@ def test_covariances_are_rotated_squares_of_the_scales():
         assert np.allclose(found[number], expected, rtol=1e-4, atol=1e-5 * expected.max())
 
 
-def test_everything_is_drawn_once_within_the_budget():
+def test_every_gaussian_is_drawn_once_within_the_budget():
     gaussians = cloud(1000)
     splats = SplatBlocks(gaussians, budget=1000, block_size=300)
     index = np.concatenate([block.index for block in splats.blocks])
@@ -50,7 +50,7 @@ def test_everything_is_drawn_once_within_the_budget():
 
 
 def test_half_floats_keep_the_shape_of_small_and_large_gaussians():
-    """The browser's half floats reach from 6e-8 to 65504: sizes of a room in kilometers or in millimeters fit."""
+    """The browser's half floats range from 6e-8 to 65504; a room in kilometers or in millimeters must fit."""
     for size in (1e-4, 1.0, 1e3):
         gaussians = cloud(2000)
         gaussians.log_scales += float(np.log(size))
@@ -62,7 +62,7 @@ def test_half_floats_keep_the_shape_of_small_and_large_gaussians():
         assert np.quantile(np.abs(kept / own - 1), 0.99) < 0.01
 
 
-def test_level_of_detail_keeps_what_covers_most_and_grows_it():
+def test_level_of_detail_keeps_and_enlarges_what_covers_most():
     gaussians = cloud(5000)
     kept, growth = level_of_detail(gaussians, 1000)
     assert len(set(kept)) == 1000
@@ -75,7 +75,7 @@ def test_level_of_detail_keeps_what_covers_most_and_grows_it():
     assert (splats.drawn, splats.total, splats.growth) == (1000, 5000, growth)
 
 
-def test_only_blocks_that_change_are_sent_again():
+def test_only_changed_blocks_are_sent_again():
     gaussians = cloud(1000)
     splats = SplatBlocks(gaussians, block_size=100)
     colors = np.zeros((1000, 3), np.uint8)
@@ -88,7 +88,7 @@ def test_only_blocks_that_change_are_sent_again():
     assert np.array_equal(sent, colors[splats.blocks[3].index])
 
 
-def test_neighbors_in_space_share_blocks():
+def test_spatial_neighbors_share_blocks():
     points = np.random.default_rng(0).random((20_000, 3)).astype(np.float32)
     blocks = np.array_split(morton_order(points), 64)
     spread = np.mean([np.ptp(points[block], axis=0).max() for block in blocks])
@@ -113,7 +113,7 @@ def test_the_order_of_a_grid_is_the_z_curve():
 
 
 @pytest.mark.parametrize("options", [{"budget": 0}, {"block_size": 0}])
-def test_nonsense_budgets_are_refused(options):
+def test_invalid_budgets_are_refused(options):
     with pytest.raises(ValueError, match="positive"):
         SplatBlocks(cloud(3), **options)
 

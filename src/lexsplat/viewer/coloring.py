@@ -1,6 +1,6 @@
-"""A color for every Gaussian: photo colors, relevancy of prompts, language, codes, uncertainty, depth.
+"""A color for every Gaussian in each mode: photo, relevancy, language, codes, uncertainty, depth.
 
-Everything here is arithmetic on arrays, done in milliseconds, and knows no browser. N Gaussians, K codes.
+Pure array arithmetic that takes milliseconds. N Gaussians, K codes.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ PROMPT_COLORS: tuple[tuple[int, int, int], ...] = (
     (214, 51, 132),
     (120, 90, 40),
 )
-"""Colors of prompts when several are shown, told apart on light ground."""
+"""Colors of prompts when several are shown; distinct on a light background."""
 
 _FADED = 236.0
 _SAMPLE = 65_536
 _ROWS = 16_384
 _PLAIN = (150, 150, 158)
-"""Color of Gaussians about which nothing is known."""
+"""Color of Gaussians without language."""
 
 
 @dataclass
 class Layer:
-    """One prompt as it is drawn.
+    """A prompt as it is drawn.
 
     Args:
         text: The prompt.
         scores: Relevancy of every Gaussian ``[N]`` float32 in 0..1.
-        threshold: Relevancy from which a Gaussian is marked.
+        threshold: Minimum relevancy of a marked Gaussian.
         color: RGB bytes, used when several prompts are shown.
-        mask: Which Gaussians are marked ``[N]`` bool; none takes those with at least the threshold.
-        shown: Whether it is drawn at all.
+        mask: The marked Gaussians ``[N]`` bool; None marks those at or above the threshold.
+        shown: Whether the prompt is drawn.
     """
 
     text: str
@@ -66,27 +66,27 @@ class Layer:
         self.peak = peak_of(self.scores)
 
     def set_scores(self, scores: NDArray[np.float32]) -> None:
-        """Replace the relevancies, as when a phrase turns out to have several parts."""
+        """Replace the relevancies, for example by those of a parsed phrase."""
         self.scores, self.peak = scores, peak_of(scores)
 
     @property
     def high(self) -> float:
-        """Relevancy that is drawn in full color."""
+        """The relevancy drawn in full color."""
         return max(self.peak, self.threshold + PEAK_FLOOR)
 
     def marked(self) -> NDArray[np.int64]:
-        """Indices of the Gaussians that are marked."""
+        """Indices of the marked Gaussians ``[M]``."""
         mask = self.scores >= self.threshold if self.mask is None else self.mask
         return np.flatnonzero(mask)
 
     def amount(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
-        """How relevant the Gaussians ``index`` are, 0 at the threshold and 1 at `high`."""
+        """Relevancy of the Gaussians ``index``, scaled to 0 at the threshold and 1 at `high`."""
         span = self.high - self.threshold
         return np.clip((self.scores[index] - self.threshold) / span, 0, 1).astype(np.float32)
 
 
 def peak_of(scores: NDArray[np.float32]) -> float:
-    """The relevancy that all but a few stray Gaussians stay under: the 99.9th percentile."""
+    """The 99.9th percentile of the relevancies, a maximum without stray Gaussians."""
     if len(scores) == 0:
         return 0.0
     position = min(len(scores) - 1, int(0.999 * len(scores)))
@@ -94,9 +94,13 @@ def peak_of(scores: NDArray[np.float32]) -> float:
 
 
 def quick_threshold(scores: NDArray[np.float32], opacities: NDArray[np.float32]) -> float:
-    """A threshold from the scores of the Gaussians alone, in milliseconds.
+    """A provisional threshold from the scores of the Gaussians alone, in milliseconds.
 
-    It is drawn for the moment it takes to compute the scene's own, which looks at rendered views.
+    It is shown until the automatic threshold, which needs rendered views, is known.
+
+    Args:
+        scores: Relevancy of every Gaussian ``[N]``.
+        opacities: Opacity of every Gaussian ``[N]``, used as its weight.
     """
     step = max(1, len(scores) // _SAMPLE)
     values, weights = torch.from_numpy(scores[::step].copy()), torch.from_numpy(opacities[::step].copy())
@@ -114,7 +118,7 @@ class Coloring:
 
     Args:
         gaussians: The scene.
-        language: What its Gaussians say.
+        language: The language field of the scene.
     """
 
     def __init__(self, gaussians: Gaussians, language: LanguageField) -> None:
@@ -133,14 +137,17 @@ class Coloring:
         fade: float = 0.0,
         eye: NDArray | None = None,
     ) -> NDArray[np.uint8]:
-        """RGB bytes ``[N, 3]``; a new array.
+        """The color of every Gaussian.
 
         Args:
             mode: What the colors mean.
             layers: The prompts, for ``"relevancy"``.
-            opacity: Of the marks over the photo colors, 0..1.
-            fade: How far what is not marked recedes to light gray, 0..1.
-            eye: Position of the camera ``[3]``, for ``"depth"``.
+            opacity: Opacity of the marks over the photo colors, 0..1.
+            fade: Blend of unmarked Gaussians towards light gray, 0..1.
+            eye: Camera position ``[3]``, for ``"depth"``; None takes the mean of the Gaussians.
+
+        Returns:
+            A new array ``[N, 3]`` of RGB bytes.
 
         Raises:
             ValueError: If the mode is unknown.
@@ -160,7 +167,7 @@ class Coloring:
 
     @property
     def scale(self) -> tuple[float, float]:
-        """What the darkest and the brightest color stood for when depth or uncertainty was last drawn."""
+        """The values of the darkest and the brightest color of the last depth or uncertainty image."""
         return self._scale
 
     def _relevancy(self, layers: Sequence[Layer], opacity: float, fade: float) -> NDArray[np.uint8]:
@@ -173,7 +180,7 @@ class Coloring:
             if best is None:
                 marks = colorize(0.3 + 0.7 * amount)
             else:
-                # Where two prompts mark the same Gaussian, the one that is surer of it is drawn.
+                # If two prompts mark the same Gaussian, the one with the larger amount is drawn.
                 wins = amount + 1e-3 > best[index]
                 index, amount = index[wins], amount[wins]
                 best[index] = amount + 1e-3
@@ -213,11 +220,11 @@ def _faded(colors: NDArray[np.uint8], fade: float) -> NDArray[np.uint8]:
     return np.round((1 - fade) * colors + fade * target[:, None]).astype(np.uint8)
 
 
-# Language
+# -- language
 
 
 def likeliest_codes(language: LanguageField) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The likeliest code of every Gaussian ``[N]``, and whether anything is known about it ``[N]``."""
+    """The most probable code of every Gaussian ``[N]``, and whether the Gaussian has language ``[N]``."""
     if isinstance(language, CodeField):
         weights, place = language.weights.max(1)
         codes = language.codes.gather(1, place[:, None])[:, 0].long()
@@ -230,7 +237,7 @@ def likeliest_codes(language: LanguageField) -> tuple[NDArray[np.int64], NDArray
 
 
 def code_palette(count: int) -> NDArray[np.uint8]:
-    """Colors ``[count, 3]`` for codes: hues a golden angle apart, in three lightnesses."""
+    """Colors ``[count, 3]`` for codes: hues in steps of the golden angle, in three lightnesses."""
     import colorsys
 
     colors = [
@@ -240,11 +247,11 @@ def code_palette(count: int) -> NDArray[np.uint8]:
 
 
 def language_colors(language: LanguageField) -> NDArray[np.uint8]:
-    """The three main directions of the Gaussians' language features as red, green and blue ``[N, 3]``.
+    """The first three principal components of the Gaussians' language features as RGB bytes ``[N, 3]``.
 
-    The feature of a Gaussian is linear in its codes, F = p S, so its coordinates along the main directions V are
-    p (S V): the directions come from a sample of the Gaussians, the projection of all of them is sparse.
-    Gaussians about which nothing is known are gray.
+    The feature of a Gaussian is linear in its code probabilities, F = p S with the codewords S. Its coordinates
+    along the principal directions V are therefore p (S V). The directions come from a sample of the Gaussians; the
+    projection covers all of them. Gaussians without language are gray.
     """
     codewords = language.codebook.clip.double().cpu()
     count = len(language.uncertainties)
@@ -257,7 +264,7 @@ def language_colors(language: LanguageField) -> NDArray[np.uint8]:
     sample = torch.from_numpy(places[:: max(1, len(places) // _SAMPLE)])
     shares = language.select(sample.to(ones.device)).code_probabilities().double().cpu()
     centered = shares - shares.mean(0)
-    # The covariance of F is S^T cov(p) S; cov(p) is only K x K.
+    # The covariance of F is S^T cov(p) S, and cov(p) is only K x K.
     covariance = codewords.T @ (centered.T @ centered) @ codewords
     directions = torch.linalg.eigh(covariance).eigenvectors[:, -3:].flip(-1)
     signs = directions.gather(0, directions.abs().argmax(0, keepdim=True)).sign()

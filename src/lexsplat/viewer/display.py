@@ -1,10 +1,11 @@
-"""The scene on the page: splats, camera frustums, jumps, pictures of what the page shows."""
+"""The scene on the page: splats, camera frustums, camera jumps, and images rendered by the page."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.rotations import quaternion_from_matrix
+from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.recording import looking_at, orbit
-from lexsplat.viewer.splats import SplatBlocks
+from lexsplat.viewer.splats import BYTES_PER_SPLAT, SplatBlocks
 
 if TYPE_CHECKING:
     import viser
@@ -31,7 +33,7 @@ class Display:
     Args:
         server: viser's server.
         scene: The scene.
-        budget: How many Gaussians are drawn at most.
+        budget: Maximum number of Gaussians that are drawn.
     """
 
     def __init__(self, server: viser.ViserServer, scene: Scene, budget: int) -> None:
@@ -48,9 +50,11 @@ class Display:
     # -- splats
 
     def draw(self, colors: NDArray[np.uint8]) -> int:
-        """Show the Gaussians in these colors ``[N, 3]``; returns how many bytes were queued for each page."""
-        from lexsplat.viewer.splats import BYTES_PER_SPLAT
+        """Draw the Gaussians in these colors ``[N, 3]``.
 
+        Returns:
+            Bytes queued for each page.
+        """
         sent = 0
         with self.server.atomic():
             for number, own in self.splats.changes(colors):
@@ -75,9 +79,13 @@ class Display:
     # -- cameras
 
     def add_frustums(self, jump: Callable[[StoredView, Any], None], *, visible: bool) -> None:
-        """A frustum for each view (evenly chosen when there are very many); a click on one calls ``jump``."""
-        views = list(self.scene.views.values())
-        views = views[:: max(1, -(-len(views) // MAX_FRUSTUMS))]
+        """Draw a frustum for each view, or for an even choice of at most `MAX_FRUSTUMS`.
+
+        Args:
+            jump: Called with the view and the page when a frustum is clicked.
+            visible: Whether the frustums are shown at first.
+        """
+        views = evenly(list(self.scene.views.values()), MAX_FRUSTUMS)
         size = 0.25 * _spacing([view.camera for view in views])
         for number, view in enumerate(views):
             camera = view.camera
@@ -103,16 +111,11 @@ class Display:
                 handle.visible = visible
 
     def jump(self, client: viser.ClientHandle, camera: Camera) -> None:
-        """Put a page's camera where a view was taken; it orbits what the view looks at."""
+        """Move a page's camera to the pose of a view; the page then orbits what the view looks at."""
         with client.atomic():
             client.camera.position = camera.position
             client.camera.look_at = camera.position + camera.forward * self._distance(camera)
             client.camera.fov = 2 * math.atan(camera.height / (2 * camera.K[1, 1]))
-        client.flush()
-
-    def look_at(self, client: viser.ClientHandle, point: NDArray) -> None:
-        """Turn a page's camera to a point, which it then orbits."""
-        client.camera.look_at = np.asarray(point, dtype=np.float64)
         client.flush()
 
     def _start_at(self, cameras: list[Camera]) -> None:
@@ -126,19 +129,19 @@ class Display:
         start.fov = 2 * math.atan(first.height / (2 * first.K[1, 1]))
 
     def _distance(self, camera: Camera) -> float:
-        """How far what a camera looks at is away: the point of its axis that is nearest to the scene's middle."""
+        """Distance to the look-at point: the point on the optical axis that is closest to the scene's center."""
         along = float((self.center - camera.position) @ camera.forward)
         return along if along > 1e-3 else max(float(np.linalg.norm(self.center - camera.position)), 1e-3)
 
-    # -- pictures
+    # -- images
 
-    def picture(self, client: viser.ClientHandle, height: int, pose: Any = None) -> NDArray[np.uint8]:
-        """What a page shows, without the frustums: ``[height, W, 3]``, rendered by the page.
+    def image(self, client: viser.ClientHandle, height: int, pose: Any = None) -> NDArray[np.uint8]:
+        """What a page shows ``[height, W, 3]``, rendered by the page itself.
 
         Args:
             client: The page.
-            height: Rows; the shape is the page's.
-            pose: ``(position, camera-to-world rotation)``; none takes the page's camera.
+            height: Rows; the aspect ratio is that of the page.
+            pose: ``(position, camera-to-world rotation)``; None takes the page's camera.
         """
         extra: dict[str, Any] = {}
         if pose is not None:
@@ -158,44 +161,38 @@ class Display:
         )[..., :3]
 
     def orbit_frames(
-        self, client: viser.ClientHandle, frames: int, height: int, told: Callable[[int], None]
+        self, client: viser.ClientHandle, frames: int, height: int, listener: Callable[[int], None]
     ) -> list[NDArray[np.uint8]]:
-        """Pictures of one turn around what a page looks at, as seen from the height it looks from.
+        """Images of one orbit around the look-at point of a page, at the height of its camera.
 
-        ``told`` hears how many are done.
+        Args:
+            client: The page, which renders them.
+            frames: Number of images.
+            height: Rows of each image.
+            listener: Receives the number of finished images.
         """
         camera = client.camera
-        pictures = []
+        images = []
         seen_from = [view.camera.position for view in self.scene.views.values()]
         poses = orbit(camera.position, camera.look_at, self.up, frames, seen_from)
         for number, pose in enumerate(poses):
-            pictures.append(self.picture(client, height, pose))
-            told(number + 1)
-        return pictures
+            images.append(self.image(client, height, pose))
+            listener(number + 1)
+        return images
 
-    def without_frustums(self) -> _Hidden:
-        """A context in which no frustum is shown."""
-        return _Hidden(self)
-
-
-class _Hidden:
-    """Hides the frustums that are visible, and shows them again at the end."""
-
-    def __init__(self, display: Display) -> None:
-        self._display = display
-        self._visible = False
-
-    def __enter__(self) -> None:
-        frustums = self._display._frustums
-        self._visible = bool(frustums) and bool(frustums[0].visible)
-        if self._visible:
-            self._display.show_frustums(False)
-            self._display.server.flush()
-            time.sleep(0.2)  # until the page has drawn without them
-
-    def __exit__(self, *_: object) -> None:
-        if self._visible:
-            self._display.show_frustums(True)
+    @contextlib.contextmanager
+    def without_frustums(self) -> Iterator[None]:
+        """A context in which the frustums are hidden."""
+        visible = bool(self._frustums) and bool(self._frustums[0].visible)
+        if visible:
+            self.show_frustums(False)
+            self.server.flush()
+            time.sleep(0.2)  # until the page has drawn a frame without them
+        try:
+            yield
+        finally:
+            if visible:
+                self.show_frustums(True)
 
 
 def _jumps_to(view: StoredView, jump: Callable[[StoredView, Any], None]) -> Callable[[Any], None]:
@@ -203,7 +200,7 @@ def _jumps_to(view: StoredView, jump: Callable[[StoredView, Any], None]) -> Call
 
 
 def page_camera(client: viser.ClientHandle) -> Camera:
-    """The camera of a page, with the size of its canvas in pixels."""
+    """The camera of a page; its size is that of the page's canvas in pixels."""
     camera = client.camera
     height, width = int(camera.image_height), int(camera.image_width)
     focal = 0.5 * height / math.tan(0.5 * camera.fov)
@@ -216,7 +213,7 @@ def page_camera(client: viser.ClientHandle) -> Camera:
 
 
 def _spacing(cameras: list[Camera]) -> float:
-    """Usual distance from a camera to the nearest other one; 1 where there is none."""
+    """Median distance from a camera to its nearest neighbor; 1 for a single camera."""
     if len(cameras) < 2:
         return 1.0
     from scipy.spatial import cKDTree

@@ -1,4 +1,4 @@
-"""What the viewer remembers of a scene between visits: questions asked, and the vocabulary."""
+"""What the viewer keeps of a scene between visits: the prompts that were asked, and the vocabulary."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from lexsplat.runtime.errors import LexsplatError
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.viewer.vocabulary import clean_phrases, default_vocabulary
 
-MAX_HISTORY = 50
+MAX_PROMPTS = 50
 
 logger = logging.getLogger("lexsplat")
 
 
 @dataclass
-class Memory:
-    """History and vocabulary of a scene, kept in ``viewer.json`` of its folder where that can be written.
+class History:
+    """Prompts and vocabulary of a scene, stored in ``viewer.json`` of its folder if the folder is writable.
 
     Args:
-        path: The file; none keeps nothing.
-        history: Questions, the latest first.
-        vocabulary: Phrases of "what is this?"; none takes ``default``.
-        default: What the vocabulary starts with, and comes back to.
+        path: The file; None stores nothing.
+        prompts: Prompts that were asked, latest first.
+        vocabulary: Phrases for "What is this?"; an empty list becomes ``default``.
+        default: The initial vocabulary, restored when the user empties the list.
     """
 
     path: Path | None = None
-    history: list[str] = field(default_factory=list)
+    prompts: list[str] = field(default_factory=list)
     vocabulary: list[str] = field(default_factory=list)
     default: list[str] = field(default_factory=default_vocabulary)
 
@@ -36,36 +36,43 @@ class Memory:
         self.vocabulary = self.vocabulary or list(self.default)
 
     @classmethod
-    def load(cls, folder: Path | None, clip: str = "") -> Memory:
-        """The memory of a scene folder; a damaged file is told in the log and replaced at the next question."""
+    def load(cls, folder: Path | None, clip: str = "") -> History:
+        """Read the history of a scene folder.
+
+        A damaged file is reported in the log, ignored, and overwritten by the next prompt.
+
+        Args:
+            folder: The scene folder; None stores nothing.
+            clip: Name of the text encoder, which decides the default vocabulary.
+        """
         default = default_vocabulary(clip)
         if folder is None:
             return cls(default=default)
-        memory = cls(folder / "viewer.json" if os.access(folder, os.W_OK) else None, default=default)
         path = folder / "viewer.json"
+        history = cls(path if os.access(folder, os.W_OK) else None, default=default)
         if not path.is_file():
-            return memory
+            return history
         try:
             content = read_json(path)
             if not isinstance(content, dict):
                 raise ValueError("not an object")
-            history, vocabulary = content.get("history", []), content.get("vocabulary", [])
-            if not all(isinstance(phrase, str) for phrase in [*history, *vocabulary]):
+            prompts, vocabulary = content.get("history", []), content.get("vocabulary", [])
+            if not all(isinstance(phrase, str) for phrase in [*prompts, *vocabulary]):
                 raise ValueError("phrases must be strings")
         except (LexsplatError, ValueError, TypeError) as error:
-            logger.warning("%s: not used: %s", path, error)
-            return memory
-        memory.history = clean_phrases(history)[:MAX_HISTORY]
-        memory.vocabulary = clean_phrases(vocabulary) or default
-        return memory
+            logger.warning("%s: ignored: %s", path, error)
+            return history
+        history.prompts = clean_phrases(prompts)[:MAX_PROMPTS]
+        history.vocabulary = clean_phrases(vocabulary) or default
+        return history
 
-    def remember(self, phrase: str) -> None:
-        """Put a question first in the history."""
-        self.history = clean_phrases([phrase, *self.history])[:MAX_HISTORY]
+    def add(self, prompt: str) -> None:
+        """Put a prompt first, and save."""
+        self.prompts = clean_phrases([prompt, *self.prompts])[:MAX_PROMPTS]
         self._save()
 
     def set_vocabulary(self, phrases: list[str]) -> None:
-        """Replace the vocabulary; nothing in it brings the default back."""
+        """Replace the vocabulary, and save; an empty list restores the default."""
         self.vocabulary = clean_phrases(phrases) or list(self.default)
         self._save()
 
@@ -74,7 +81,7 @@ class Memory:
             return
         try:
             own = {} if self.vocabulary == self.default else {"vocabulary": self.vocabulary}
-            write_json(self.path, {"history": self.history, **own})
-        except OSError as error:  # a full disk must not stop the viewing
+            write_json(self.path, {"history": self.prompts, **own})
+        except OSError as error:  # a full disk must not stop the viewer
             logger.warning("%s: not saved: %s", self.path, error.strerror or error)
             self.path = None

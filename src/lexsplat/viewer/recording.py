@@ -1,4 +1,4 @@
-"""Pictures and orbit videos as bytes to download."""
+"""Orbit camera paths, and screenshots and videos as bytes to download."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ _FULL_TURN_GAP = 2 * np.pi / 3
 def orbit(
     position: NDArray, target: NDArray, up: NDArray, frames: int, seen_from: Sequence[NDArray] = ()
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Cameras on a circle around ``target``, starting at ``position``, at its height.
+    """Camera poses on a horizontal circle around ``target``, starting at ``position``.
 
-    Where the photos leave a third of the circle or more unseen, the cameras swing to and fro over the rest of it: a
-    scene looks like nothing from where it was never photographed.
+    If the photos leave a gap of a third of the circle or more, the cameras swing back and forth over the rest of it,
+    because a reconstruction is poor where no photo was taken.
 
     Args:
-        position: Start ``[3]``.
-        target: What stays in the middle ``[3]``.
+        position: First camera position ``[3]``.
+        target: Look-at point ``[3]``.
         up: Axis of the circle ``[3]``.
-        frames: How many; after the last comes the first again.
-        seen_from: Where the photos were taken, ``[3]`` each; none means from everywhere.
+        frames: Number of poses; the sequence loops.
+        seen_from: Camera positions of the photos, ``[3]`` each; empty means no gap.
 
     Returns:
-        ``(position, rotation)``: rotation is camera to world ``[3, 3]`` with OpenCV axes.
+        ``(position, rotation)`` of each pose; the rotation is camera to world ``[3, 3]`` with OpenCV axes.
 
     Raises:
-        ValueError: If there is no frame, or the camera stands above or in the target.
+        ValueError: If ``frames`` is not positive, or if the camera is in or vertically above the target.
     """
     if frames < 1:
         raise ValueError(f"frames must be positive, got {frames}")
@@ -45,7 +45,9 @@ def orbit(
     height = offset @ axis
     flat = offset - height * axis
     if np.linalg.norm(flat) < 1e-9:
-        raise ValueError("the camera stands above what it looks at: there is no circle around it")
+        raise ValueError(
+            "the camera is vertically above its look-at point: an orbit needs a horizontal distance"
+        )
     side = np.cross(axis, flat)
     places = np.reshape([np.asarray(place) - target for place in seen_from], (-1, 3))
     turns = _turns(np.arctan2(places @ side, places @ flat), frames)
@@ -57,7 +59,7 @@ def orbit(
 
 
 def _turns(seen: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
-    """Angles of the cameras; ``seen`` are those of the photos. The start is at 0."""
+    """Angles of the cameras in radians, starting at 0; ``seen`` are the angles of the photos."""
     times = 2 * np.pi * np.arange(frames) / frames
     if len(seen) == 0:
         return times
@@ -76,22 +78,24 @@ def _turns(seen: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
 
 
 def looking_at(position: NDArray, target: NDArray, up: NDArray) -> NDArray[np.float64]:
-    """Camera to world rotation ``[3, 3]``, OpenCV axes, of a camera that looks at ``target``."""
+    """Camera-to-world rotation ``[3, 3]`` with OpenCV axes of a camera that looks at ``target``."""
     return looking_along(target - position, up).T
 
 
-def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """A picture ``[H, W, 3 or 4]`` as PNG."""
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """Encode an image ``[H, W, 3 or 4]`` as PNG."""
     stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, format="PNG", optimize=True)
+    Image.fromarray(image).save(stream, format="PNG", optimize=True)
     return stream.getvalue()
 
 
 def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = 20) -> tuple[str, bytes]:
-    """Frames ``[H, W, 3]`` as a file: its suffix and content.
+    """Encode frames ``[H, W, 3]`` as MP4 if PyAV is installed (``lexsplat[video]``), else as GIF.
 
-    It is an MP4 where PyAV is installed (``lexsplat[video]``), else a GIF. An MP4 has even sizes: a last odd row or
-    column is left out.
+    MP4 needs even sizes, so an odd last row or column is dropped.
+
+    Returns:
+        The suffix and the content of the file.
 
     Raises:
         ValueError: If there is no frame.
@@ -100,16 +104,16 @@ def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = 20) -> tuple[st
         raise ValueError("a video needs at least one frame")
     if importlib.util.find_spec("av") is not None:
         return ".mp4", _mp4(frames, fps)
-    pictures = [Image.fromarray(frame[..., :3]).quantize(128) for frame in frames]
+    images = [Image.fromarray(frame[..., :3]).quantize(128) for frame in frames]
     stream = io.BytesIO()
-    pictures[0].save(
-        stream, format="GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0
+    images[0].save(
+        stream, format="GIF", save_all=True, append_images=images[1:], duration=1000 // fps, loop=0
     )
     return ".gif", stream.getvalue()
 
 
 def _mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
-    """H.264, or MPEG-4 where FFmpeg was built without it; the index comes first, so that browsers play it at once."""
+    """H.264, or MPEG-4 if FFmpeg lacks it. The index comes first, so browsers can play while loading."""
     import av
 
     h264 = "libx264" in av.codecs_available
@@ -120,7 +124,7 @@ def _mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
             stream = container.add_stream("libx264", fps) if h264 else container.add_stream("mpeg4", fps)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             for frame in frames:
-                picture = np.ascontiguousarray(frame[:height, :width, :3])
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+                image = np.ascontiguousarray(frame[:height, :width, :3])
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             container.mux(stream.encode(None))
         return path.read_bytes()

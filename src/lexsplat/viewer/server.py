@@ -1,31 +1,28 @@
-"""Starts the viewer: binds viser behind the guard, and puts scene and panels on the page."""
+"""Starts the viewer: viser behind the request guard, with the scene and the panels on its page."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import socket
 from dataclasses import dataclass
 
 from lexsplat.runtime.errors import BackendError
 from lexsplat.scenes.scene import Scene
-from lexsplat.viewer.guard import Guard, Limits
-from lexsplat.viewer.history import Memory
+from lexsplat.viewer.guard import RequestGuard, restrict_messages
+from lexsplat.viewer.history import History
 from lexsplat.viewer.session import Session
-
-logger = logging.getLogger("lexsplat")
 
 
 @dataclass(frozen=True)
 class ViewerConfig:
-    """How the viewer is served.
+    """Where and how the viewer is served.
 
     Args:
-        host: Address to listen on; 127.0.0.1 is this machine alone.
-        port: Port to listen on; the next free one is taken if it is in use, 0 takes any.
-        names: Host names under which pages may reach it, besides addresses and ``localhost``.
-        splats: How many Gaussians the browser draws at most.
+        host: Address to listen on; 127.0.0.1 is reachable from this machine only.
+        port: Port to listen on; the next free one if it is in use, any free one for 0.
+        names: Host names under which pages may open the viewer, besides addresses and ``localhost``.
+        splats: Maximum number of Gaussians that the browser draws.
     """
 
     host: str = "127.0.0.1"
@@ -45,16 +42,13 @@ class ViewerServer:
 
     Args:
         scene: The scene to show.
-        config: How it is served.
-        limits: Bounds on what pages may send.
+        config: Where and how it is served; None takes the defaults.
 
     Raises:
-        BackendError: If viser is missing or cannot be guarded, or the address cannot be used.
+        BackendError: If viser is missing or cannot be guarded, or if the address cannot be used.
     """
 
-    def __init__(
-        self, scene: Scene, config: ViewerConfig | None = None, limits: Limits | None = None
-    ) -> None:
+    def __init__(self, scene: Scene, config: ViewerConfig | None = None) -> None:
         self.config = config or ViewerConfig()
         _check_address(self.config.host)
         try:
@@ -66,21 +60,19 @@ class ViewerServer:
         from lexsplat.viewer.display import Display
         from lexsplat.viewer.panels import Panels
 
-        guard = Guard(self.config.names, limits)
-        # viser greets on standard output; the command line has its own words.
-        with guard.before_viser(), contextlib.redirect_stdout(io.StringIO()):
+        guard = RequestGuard(self.config.names)
+        # viser prints a banner; the command line prints its own line.
+        with guard.wrap_server(), contextlib.redirect_stdout(io.StringIO()):
             self.viser = viser.ViserServer(self.config.host, self.config.port, verbose=False)
-        if not guard.in_place:
-            self.viser.stop()
-            raise BackendError(
-                f"viser {viser.__version__}",
-                expected="a server that starts through websockets, as version 1.1 does",
-                found="another way",
-                remedy="install the version of viser that constraints.txt names",
-            )
         try:
+            if not guard.in_place:
+                raise _unguarded(viser.__version__)
+            try:
+                restrict_messages(self.viser)
+            except (ImportError, AttributeError, AssertionError, KeyError) as error:
+                raise _unguarded(viser.__version__) from error
             folder = scene.folder.root if scene.folder and not scene.folder.is_bundled else None
-            self.session = Session(scene, Memory.load(folder, scene.clip))
+            self.session = Session(scene, History.load(folder, scene.clip))
             self.display = Display(self.viser, scene, self.config.splats)
             self.panels = Panels(self.viser, self.session, self.display)
         except BaseException:
@@ -89,35 +81,24 @@ class ViewerServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port it listens on."""
         return int(self.viser.get_port())
 
     @property
     def url(self) -> str:
-        """What to open in a browser on this machine."""
-        host = self.config.host
-        shown = "127.0.0.1" if host in ("0.0.0.0", "") else "[::1]" if host == "::" else host
-        return f"http://{f'[{shown}]' if ':' in shown and shown[0] != '[' else shown}:{self.port}"
+        """The address to open in a browser on this machine."""
+        host = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.config.host, self.config.host)
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     def stop(self) -> None:
         """Close all pages and free the port."""
         self.panels.stop()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser says farewell, too
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints here, too
             self.viser.stop()
 
 
-def is_loopback(host: str) -> bool:
-    """Whether an address to listen on can be reached from this machine alone."""
-    import ipaddress
-
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def _check_address(host: str) -> None:
-    """viser waits forever for an address that is not ours, so it is tried first."""
+    """Fail at once for a foreign address, for which viser would wait forever."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as probe:
@@ -127,3 +108,12 @@ def _check_address(host: str) -> None:
             f"--host {host}", expected="an address of this machine", found=str(error),
             remedy="use 127.0.0.1, or 0.0.0.0 for all networks of this machine",
         ) from error  # fmt: skip
+
+
+def _unguarded(version: str) -> BackendError:
+    return BackendError(
+        f"viser {version}",
+        expected="a server that can be guarded, as in version 1.1",
+        found="a different way to start or to handle messages",
+        remedy="install the version of viser that constraints.txt names",
+    )

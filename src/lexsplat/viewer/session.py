@@ -1,7 +1,7 @@
-"""What is asked, shown and selected: the state of the viewer, without a browser.
+"""State of the viewer without a browser: prompts, clicks, selections.
 
-Quick answers (`ask`, `colors`) take milliseconds; `refine` looks at rendered views and takes longer, so the page
-shows the quick answer first.
+`Session.ask` and `Session.colors` take milliseconds. `Session.refine` renders views to find the automatic threshold
+and takes longer, so the page shows provisional colors first.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
+from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.exporting import export_gaussians
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.coloring import PROMPT_COLORS, Coloring, Layer, Mode, quick_threshold
-from lexsplat.viewer.history import Memory
+from lexsplat.viewer.history import History
 from lexsplat.viewer.vocabulary import MAX_LENGTH
 
 MAX_QUESTIONS = len(PROMPT_COLORS)
@@ -37,18 +38,18 @@ CLICKED_COLOR = (0, 168, 150)
 EXPORT_ENDINGS = (".ply", ".glb", ".splat", ".spz", ".points.ply")
 _CANDIDATE_VIEWS = 16
 _MANY_GAUSSIANS = 500_000
-"""From here on fewer views are tried: rendering one takes long."""
+"""From this size on, `Session.best_views` tries fewer views, because each render is slow."""
 
 
-@dataclass
+@dataclass(eq=False)  # compared by identity: the same prompt can be removed and asked again
 class Question:
-    """A prompt that is shown, and what it found.
+    """A prompt on the page, and its answer.
 
     Args:
         layer: How it is drawn.
-        automatic: The scene's threshold for it; none until `Session.refine`.
-        manual: The threshold that was chosen by hand, if one was.
-        selection: The Gaussians it found; none until `Session.refine`.
+        automatic: The automatic threshold; None until `Session.refine`.
+        manual: The threshold set by the user, if any.
+        selection: The Gaussians that answer it; None until `Session.refine`.
     """
 
     layer: Layer
@@ -63,12 +64,12 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What a click found.
+class ClickAnswer:
+    """The answer to a click.
 
     Args:
-        phrases: The likeliest phrases of the vocabulary with their relevancy in 0..1, best first.
-        selection: The surface that was clicked and what belongs to it.
+        phrases: The most relevant phrases of the vocabulary with their relevancy in 0..1, best first.
+        selection: The clicked surface and the Gaussians that belong to it.
         point: Where the click hit ``[3]``, world units.
     """
 
@@ -78,15 +79,15 @@ class Answer:
 
 
 class Session:
-    """The state of one viewer.
+    """State of one viewer, shared by all open pages.
 
     Args:
         scene: The scene.
-        memory: History and vocabulary.
+        history: Earlier prompts and the vocabulary; None starts empty and stores nothing.
     """
 
-    def __init__(self, scene: Scene, memory: Memory | None = None) -> None:
-        self.scene, self.memory = scene, memory or Memory()
+    def __init__(self, scene: Scene, history: History | None = None) -> None:
+        self.scene, self.history = scene, history or History()
         self.coloring = Coloring(scene.gaussians, scene.field)
         self.mode: Mode = "photo"
         self.opacity, self.fade = 0.9, 0.0
@@ -94,32 +95,31 @@ class Session:
         self.clicked: Question | None = None
         self.current: Question | None = None
         self._encoding = threading.Lock()
-        self._judge: PresenceClassifier | None = None
+        self._presence: PresenceClassifier | None = None
         self._opacities = scene.gaussians.opacities.detach().cpu().numpy()
 
     def warm_up(self) -> None:
-        """Load the text encoder and read the vocabulary, so that the first answers are quick.
+        """Load the text encoder and embed the vocabulary, so that the first answers are fast.
 
         Raises:
             ModelError: If the encoder cannot be loaded.
         """
         with self._encoding:
             self.scene.preload()
-        for phrase in [*self.scene.query.negatives, *self.memory.vocabulary]:
-            with self._encoding:  # phrase by phrase: a question that comes meanwhile need not wait for all
+        for phrase in [*self.scene.query.negatives, *self.history.vocabulary, *REFERENCE_PHRASES]:
+            with self._encoding:  # one phrase at a time, so that a prompt waits for one phrase at most
                 self.scene.embed([phrase])
-        for phrase in REFERENCE_PHRASES:
-            with self._encoding:
-                self.scene.embed([phrase])
-        self._judge = self.scene.presence_classifier
+        self._presence = self.scene.presence_classifier
 
-    # -- questions
+    # -- prompts
 
     def ask(self, text: str) -> Question:
-        """Show a prompt; an old one makes room when there are too many. Its threshold is provisional.
+        """Show a prompt with a provisional threshold; it becomes the current one.
+
+        The oldest prompt is dropped when `MAX_QUESTIONS` are shown.
 
         Raises:
-            QueryError: If it is empty or very long.
+            QueryError: If the prompt is empty or longer than `MAX_LENGTH`.
             ModelError: If the text encoder cannot be loaded.
         """
         (text,) = check_prompts([text])
@@ -130,7 +130,7 @@ class Session:
             with self._encoding:
                 self.scene.embed([text])
             scores = self.scene.scores([text])[0].cpu().numpy()
-            layer = Layer(text, scores, self._quick_threshold(scores), self._free_color())
+            layer = Layer(text, scores, self._provisional_threshold(scores), self._free_color())
             question = Question(layer)
             self.questions = [*self.questions[-(MAX_QUESTIONS - 1) :], question]
         self.current, self.mode = question, "relevancy"
@@ -138,46 +138,38 @@ class Session:
 
     def find(self, text: str) -> Question | None:
         """The question with this text, if it is shown."""
-        return next((q for q in self.all_questions() if q.text == text), None)
+        return next((question for question in self.all_questions() if question.text == text), None)
 
     def all_questions(self) -> list[Question]:
-        """Everything that is drawn: the prompts, then what was clicked."""
+        """Everything that is drawn: the prompts, then the clicked object."""
         return [*self.questions, *([self.clicked] if self.clicked else [])]
 
     def refine(self, question: Question, viewpoint: Camera | None = None) -> None:
-        """Find the scene's own threshold for a prompt, and the Gaussians it selects.
-
-        A phrase with relations ("mug on the cloth", see `lexsplat.queries.phrases`) is answered as by ``scene.find``.
+        """Compute the final answer to a prompt: its automatic threshold and the Gaussians it selects.
 
         Args:
             question: The prompt.
-            viewpoint: Whose left and right a phrase means; none takes the view that shows it best.
+            viewpoint: The camera that defines left and right in phrases with relations; None takes the view that
+                shows the reference object best.
         """
-        if question is self.clicked:
+        # The selection of a plain prompt stays valid until `set_threshold` clears it.
+        if question is self.clicked or (question.selection is not None and is_plain(question.text)):
             return
         manual = question.manual
-        if is_plain(question.text):
-            if question.automatic is None:
-                question.automatic = float(self.scene.thresholds([question.text])[0])
-            limit = question.automatic if manual is None else manual
-            selection = self.scene.select(question.text, limit)
-            selection = selection.convincing() if manual is None else selection
-        else:
-            selection = self.scene.find(question.text, viewpoint, threshold=manual)
-            if manual is None:
-                question.automatic = float(selection.threshold)
-            selection = replace(selection, phrase=question.text)
-            question.layer.set_scores(selection.scores.float().cpu().numpy())
-        if manual == question.manual:  # otherwise the slider has moved on meanwhile
+        selection = answer_prompt(self.scene, question.text, manual, viewpoint)
+        if manual is None:
+            question.automatic = float(selection.threshold)
+        if manual == question.manual:  # otherwise the user has moved the slider in the meantime
             question.selection = selection
+            question.layer.set_scores(selection.scores.float().cpu().numpy())
             question.layer.threshold = float(selection.threshold)
             question.layer.mask = selection.mask.cpu().numpy()
 
     def set_threshold(self, question: Question, value: float | None) -> None:
-        """Choose a threshold by hand, or none for the automatic one; drawn at once, selected by `refine`.
+        """Set a threshold by hand, or None for the automatic one. Colors follow at once, the selection on `refine`.
 
         Raises:
-            ValueError: If it is not in 0..1.
+            ValueError: If the threshold is not in 0..1.
         """
         if value is not None and not 0 <= value <= 1:
             raise ValueError(f"threshold must be in 0..1, got {value}")
@@ -187,21 +179,21 @@ class Session:
         elif question.automatic is not None:
             question.layer.threshold = question.automatic
         else:
-            question.layer.threshold = self._quick_threshold(question.layer.scores)
+            question.layer.threshold = self._provisional_threshold(question.layer.scores)
 
     def remove(self, question: Question) -> None:
-        """Show a prompt no longer."""
-        self.questions = [q for q in self.questions if q is not question]
+        """Remove a prompt; the latest remaining one becomes the current one."""
+        self.questions = [other for other in self.questions if other is not question]
         if question is self.clicked:
             self.clicked = None
         if question is self.current:
             shown = self.all_questions()
             self.current = shown[-1] if shown else None
 
-    def _quick_threshold(self, scores: NDArray[np.float32]) -> float:
-        """A provisional threshold in milliseconds: 0.5 for what is not there, as the scene's own will be."""
-        judge = self._judge  # none until `warm_up` has read its reference phrases
-        if judge is not None and judge.judge(torch.from_numpy(scores)) == "no":
+    def _provisional_threshold(self, scores: NDArray[np.float32]) -> float:
+        """A threshold in milliseconds. It is 0.5 for an absent object, as the automatic one will be."""
+        presence = self._presence  # None until `warm_up` has embedded the reference phrases
+        if presence is not None and presence.judge(torch.from_numpy(scores)) == "no":
             return BORDER
         return quick_threshold(scores, self._opacities)
 
@@ -211,56 +203,61 @@ class Session:
 
     # -- clicks
 
-    def what_is(self, camera: Camera, x: float, y: float, count: int = 6) -> Answer:
-        """What a pixel of a picture shows: phrases of the vocabulary, and a selection that becomes the current one.
+    def what_is(self, camera: Camera, x: float, y: float, count: int = 6) -> ClickAnswer:
+        """Name and select the surface at a pixel; the selection becomes the current one.
+
+        Args:
+            camera: The camera of the page.
+            x: Column in pixels.
+            y: Row in pixels.
+            count: Maximum number of phrases.
 
         Raises:
-            QueryError: If nothing is there.
+            QueryError: If there is no surface at the pixel.
         """
         scene = self.scene
         hit = surface_at(scene.gaussians, camera, x, y)
         selection = select_hit(hit, scene.gaussians, scene.field, scene.cameras, world=scene.world)
         shares = hit.weights.float() / hit.weights.sum().clamp_min(1e-12)
-        blended = shares @ scene.field.select(hit.indices).code_probabilities()
-        vocabulary = self.memory.vocabulary
+        probabilities = shares @ scene.field.select(hit.indices).code_probabilities()
+        vocabulary = self.history.vocabulary
         with self._encoding:
-            words, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
+            positives, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
         relevancy = probability_relevancy(
-            blended[None], scene.field.codebook.clip, words, negatives, scene.query
+            probabilities[None], scene.field.codebook.clip, positives, negatives, scene.query
         )[0]
         order = relevancy.argsort(descending=True)[:count].tolist()
         phrases = [(vocabulary[i], float(relevancy[i])) for i in order]
-        scores = selection.scores.float().cpu().numpy()
+        threshold = float(selection.threshold)
         layer = Layer(
-            "what was clicked",
-            scores,
-            float(selection.threshold),
+            "clicked object",
+            selection.scores.float().cpu().numpy(),
+            threshold,
             CLICKED_COLOR,
             selection.mask.cpu().numpy(),
         )
-        self.clicked = Question(layer, automatic=float(selection.threshold), selection=selection)
+        self.clicked = Question(layer, automatic=threshold, selection=selection)
         self.current, self.mode = self.clicked, "relevancy"
-        return Answer(phrases, selection, hit.point)
+        return ClickAnswer(phrases, selection, hit.point)
 
-    # -- pictures
+    # -- images
 
     def colors(self, eye: NDArray | None = None) -> NDArray[np.uint8]:
-        """A color for every Gaussian ``[N, 3]`` as things stand; ``eye`` is the camera, for depth."""
+        """The color of every Gaussian ``[N, 3]`` in the current state; ``eye`` is the camera position, for depth."""
         layers = [question.layer for question in self.all_questions()]
         return self.coloring.colors(self.mode, layers, opacity=self.opacity, fade=self.fade, eye=eye)
 
     @property
     def selection(self) -> Selection | None:
-        """The Gaussians of the current question, once they are known."""
+        """The selection of the current question; None until `refine`."""
         return self.current.selection if self.current else None
 
     def best_views(self, selection: Selection, count: int = 3) -> list[tuple[str, float]]:
-        """The views that show most of a selection, with the share of the picture it takes; best first."""
+        """The views that show most of a selection, with the share of the image it covers; best first."""
         if not selection:
             return []
-        names = list(self.scene.views)
         tried = _CANDIDATE_VIEWS if len(self.scene.gaussians) < _MANY_GAUSSIANS else _CANDIDATE_VIEWS // 4
-        names = names[:: max(1, -(-len(names) // tried))]
+        names = evenly(list(self.scene.views), tried)
         if selection.best_view and selection.best_view not in names:
             names.append(selection.best_view)
         mask = selection.mask.float()[:, None]
@@ -275,42 +272,60 @@ class Session:
         return [entry for entry in shares[:count] if entry[1] > 0]
 
     def thumbnail(self, name: str, selection: Selection, long_side: int = 280) -> NDArray[np.uint8]:
-        """A view with the selection tinted, the rest dimmed ``[h, w, 3]``."""
+        """A view ``[h, w, 3]`` with the selection tinted and the rest dimmed."""
         camera = self.scene.view(name).camera
         small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
         with torch.no_grad():
             drawn = render(self.scene.gaussians, small, features=selection.mask.float()[:, None])
-        picture = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        return overlay_mask(picture, drawn.features[..., 0].cpu().numpy() > 0.5)
+        image = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        return overlay_mask(image, drawn.features[..., 0].cpu().numpy() > 0.5)
 
     # -- files
 
     def export(self, selection: Selection, ending: str = ".ply") -> tuple[str, bytes]:
-        """A name and the content of a file with the selection alone.
+        """File name and content of an export of the selected Gaussians.
 
         Args:
-            selection: What to write.
+            selection: The Gaussians to export.
             ending: One of `EXPORT_ENDINGS`.
 
         Raises:
-            ValueError: If the ending is another one.
-            QueryError: If nothing is selected.
+            ValueError: If the ending is not one of them.
+            QueryError: If the selection is empty.
             BackendError: If the format needs a library that is not installed.
         """
         if ending not in EXPORT_ENDINGS:
             raise ValueError(f"ending must be one of {', '.join(EXPORT_ENDINGS)}, got {ending!r}")
         if not selection:
-            raise QueryError("selection", expected="something selected", found="nothing")
+            raise QueryError("selection", expected="at least one Gaussian", found="none")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"selection{ending}"
             export_gaussians(selection.selected, path, world=self.scene.world)
             return f"{file_name(selection.phrase)}{ending}", path.read_bytes()
 
 
-def is_plain(phrase: str) -> bool:
-    """Whether a phrase is a thing by itself; "something to sit on" is one, whatever it ends in.
+def answer_prompt(
+    scene: Scene, prompt: str, threshold: float | None = None, viewpoint: Camera | None = None
+) -> Selection:
+    """The scene's answer to a prompt: scores, threshold, presence and selection.
 
-    Phrases with parts, articles or counts ("how many mugs") are for `lexsplat.queries.phrases`.
+    All final answers of the viewer come from here. Phrases with relations are answered by `Scene.find`.
+
+    Args:
+        scene: The scene.
+        prompt: A thing or a phrase with relations.
+        threshold: See `Scene.select`.
+        viewpoint: See `Session.refine`.
+    """
+    if is_plain(prompt):
+        return scene.select(prompt, threshold)
+    return replace(scene.find(prompt, viewpoint, threshold=threshold), phrase=prompt)
+
+
+def is_plain(phrase: str) -> bool:
+    """Whether a phrase names one thing, such as "mug" or "something to sit on".
+
+    Phrases with relations, articles or counts ("how many mugs") are parsed by `lexsplat.queries.phrases`.
     """
     try:
         return parse(phrase) == Thing(phrase)

@@ -1,4 +1,4 @@
-"""What the browser is sent: Gaussians within a budget, in blocks of neighbors, and only the blocks that change."""
+"""What the browser receives: Gaussians within a budget, in blocks of spatial neighbors, only changed blocks again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import covariances
 
 BYTES_PER_SPLAT = 32
-"""What one Gaussian costs on the wire, whatever changed of it (position, covariance, color and opacity)."""
+"""Wire size of a Gaussian. Any change of it sends position, covariance, color and opacity."""
 
 _LARGEST_VARIANCE = 1e4
 _HALF_MAX = 6e4
@@ -21,10 +21,10 @@ _MAX_GROWTH = 1.5
 
 @dataclass(frozen=True)
 class Block:
-    """Neighboring Gaussians that are sent together.
+    """Spatially neighboring Gaussians that are sent together.
 
     Args:
-        index: Which Gaussians of the scene they are ``[M]``.
+        index: Their indices in the scene ``[M]``.
         centers: Their centers ``[M, 3]``, in drawing units (world units times `SplatBlocks.unit`).
         covariances: ``[M, 3, 3]``, in drawing units squared.
         opacities: ``[M, 1]`` in 0..1.
@@ -37,15 +37,14 @@ class Block:
 
 
 class SplatBlocks:
-    """A scene cut into blocks for the browser.
+    """The Gaussians of a scene, divided into blocks for the browser.
 
-    Level of detail: where there are more Gaussians than the budget, those that cover most (opacity times area) are
-    kept and grown a little, so that surfaces stay closed. Answers are always computed on all Gaussians.
+    A scene larger than the budget is reduced by `level_of_detail`. Answers are always computed on all Gaussians.
 
     Args:
         gaussians: The scene.
-        budget: How many Gaussians are drawn at most.
-        block_size: How many Gaussians a block holds at most.
+        budget: Maximum number of Gaussians that are drawn.
+        block_size: Maximum number of Gaussians in a block.
 
     Raises:
         ValueError: If the budget or the block size is not positive.
@@ -59,7 +58,7 @@ class SplatBlocks:
         chosen = gaussians.select(torch.from_numpy(drawn).to(gaussians.device)).to("cpu")
         means = chosen.means.numpy()
         order = morton_order(means)
-        # The browser keeps covariances as half floats; scaled like this, small ones keep their digits.
+        # The browser stores covariances as half floats; this unit keeps small ones within their range.
         largest = float(np.quantile(chosen.scales.amax(1).numpy(), 0.999)) if len(drawn) else 1.0
         self.unit = float(np.sqrt(_LARGEST_VARIANCE) / max(largest * growth, 1e-12))
         self.blocks = [
@@ -70,11 +69,18 @@ class SplatBlocks:
 
     @property
     def drawn(self) -> int:
-        """How many Gaussians are drawn."""
+        """Number of Gaussians that are drawn."""
         return sum(len(block.index) for block in self.blocks)
 
     def changes(self, colors: NDArray[np.uint8]) -> list[tuple[int, NDArray[np.uint8]]]:
-        """The blocks whose colors differ from what this returned last: ``(block, colors [M, 3])``."""
+        """The blocks whose colors changed since the last call.
+
+        Args:
+            colors: Color of every Gaussian of the scene ``[N, 3]``.
+
+        Returns:
+            ``(block number, colors [M, 3])`` of each changed block.
+        """
         changed = []
         for number, block in enumerate(self.blocks):
             own = colors[block.index]
@@ -96,24 +102,29 @@ class SplatBlocks:
 
 
 def level_of_detail(gaussians: Gaussians, budget: int) -> tuple[NDArray[np.int64], float]:
-    """The ``budget`` Gaussians that cover most, in ascending order, and how much longer they are drawn.
+    """Keep the Gaussians that cover most (opacity times area), and enlarge them to keep surfaces closed.
 
-    The growth makes up for the covered area of those that were left out, at most 1.5 times.
+    Args:
+        gaussians: The scene.
+        budget: Maximum number of Gaussians to keep.
+
+    Returns:
+        Their indices in ascending order, and the factor for their scales. The factor compensates for the area of
+        the dropped Gaussians and is at most 1.5.
     """
     if len(gaussians) <= budget:
         return np.arange(len(gaussians)), 1.0
     scales = gaussians.scales.sort(1).values
     coverage = (gaussians.opacities * scales[:, 1] * scales[:, 2]).cpu().numpy()
-    coverage = np.minimum(
-        coverage, np.quantile(coverage, 0.99)
-    )  # one sky does not make up for a thousand leaves
+    # Clipped, so that a few huge background Gaussians do not dominate the total coverage.
+    coverage = np.minimum(coverage, np.quantile(coverage, 0.99))
     kept = np.sort(np.argpartition(-coverage, budget - 1)[:budget])
     growth = float(np.sqrt(coverage.sum() / max(coverage[kept].sum(), 1e-30)))
     return kept, min(max(growth, 1.0), _MAX_GROWTH)
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """An order of points ``[N, 3]`` in which neighbors in space are near each other (the Z curve, 2^10 cells)."""
+    """Sort points ``[N, 3]`` along the Z curve (2^10 cells per axis), which keeps spatial neighbors close."""
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     low, high = np.percentile(points, [0.5, 99.5], axis=0)

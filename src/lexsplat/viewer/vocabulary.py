@@ -1,4 +1,4 @@
-"""The phrases that "what is this?" chooses from, and suggestions while typing."""
+"""The phrases that "What is this?" chooses from, and suggestions while the user types."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 MAX_PHRASES = 500
 MAX_LENGTH = 120
-"""Characters of one phrase."""
+"""Characters in one phrase."""
 
 _EVERYDAY = """
     apple, banana, orange, lemon, pear, bread, cake, cookie, cheese, egg, cup, mug, glass, bottle, bowl,
@@ -20,7 +20,6 @@ _EVERYDAY = """
     guitar, piano
 """
 
-
 _BUNDLED = """
     apple, rubber duck, mug, stack of books, vase, ring, traffic cone, potted plant, table lamp, banana, teddy bear,
     striped ball, bowl, candle, bottle, pumpkin, toy car, wooden crate, table, tablecloth, wall, floor
@@ -28,12 +27,12 @@ _BUNDLED = """
 
 
 def default_vocabulary(clip: str = "") -> list[str]:
-    """The phrases a scene starts with: everyday things, or those that the bundled encoder knows."""
+    """The initial vocabulary: everyday things, or what the bundled encoder was trained on."""
     return clean_phrases((_BUNDLED if clip == "bundled" else _EVERYDAY).split(","))
 
 
 def clean_phrases(phrases: Iterable[str]) -> list[str]:
-    """Phrases without surrounding space, empty ones and repetitions, at most `MAX_PHRASES`."""
+    """Normalize white space; drop empty phrases and duplicates (ignoring case); keep at most `MAX_PHRASES`."""
     cleaned: dict[str, str] = {}
     for phrase in phrases:
         short = " ".join(phrase.split())[:MAX_LENGTH].strip()
@@ -45,10 +44,16 @@ def clean_phrases(phrases: Iterable[str]) -> list[str]:
 
 
 def suggestions(typed: str, history: Sequence[str], vocabulary: Sequence[str], count: int = 6) -> list[str]:
-    """What may be meant by the beginning of a phrase: from the history first, then from the vocabulary.
+    """Complete what the user typed, from the history first and then from the vocabulary.
 
-    Phrases that begin with it come before phrases with a later word that begins with it. Nothing typed suggests
-    what was asked last.
+    Phrases that start with the typed text come before phrases with a later word that starts with it. Empty text
+    returns the latest prompts.
+
+    Args:
+        typed: The text so far.
+        history: Earlier prompts, latest first.
+        vocabulary: Further phrases.
+        count: Maximum number of suggestions.
     """
     start = " ".join(typed.lower().split())
     if not start:

@@ -12,19 +12,19 @@ from support.hostile.registry import Reader, reader
 
 @reader
 def viewer_memory() -> Reader:
-    from lexsplat.viewer.history import Memory
+    from lexsplat.viewer.history import History
 
     def make(folder: Path) -> None:
         (folder / "viewer.json").write_text(
             json.dumps({"history": ["red apple", "床"], "vocabulary": ["mug"]})
         )
 
-    def check(memory: Any) -> None:
-        phrases = [*memory.history, *memory.vocabulary]
+    def check(history: Any) -> None:
+        phrases = [*history.prompts, *history.vocabulary]
         assert all(isinstance(phrase, str) and phrase.strip() for phrase in phrases)
         json.dumps(phrases, ensure_ascii=False).encode("utf-8")
 
-    return Reader(make, lambda folder: Memory.load(folder), check,
+    return Reader(make, lambda folder: History.load(folder), check,
                   {"viewer.json": lambda c, r: mutate.json_file(c, r, 40, 200)})  # fmt: skip
 
 
