@@ -30,18 +30,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that replaces it when the block ends without an error.
 
     Readers see the old file or the new one, never a part. The data reach the disk before the name changes. Missing
-    folders are created. The file gets the permissions of the user's umask, whatever library wrote it. Threads and
-    processes may write the same file at once; the last one wins.
+    folders are created. Threads and processes may write the same file at once; the last one wins.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
     try:
-        temporary.touch()
-        permissions = stat.S_IMODE(
-            temporary.stat().st_mode
-        )  # the umask itself cannot be read without setting it
         yield temporary
-        os.chmod(temporary, permissions)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -150,9 +144,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path, metadata: Mapping[str, str]) -> None:
-    """``safetensors.torch.save_file`` with a reproducible header, and with ``OSError`` for failed writes.
+    """``safetensors.torch.save_file`` with equal bytes for equal arguments, and with ``OSError`` for failed writes.
 
-    Equal arguments give equal bytes: safetensors writes the metadata in random order, here they are sorted.
+    safetensors writes the metadata in random order; here they are sorted. It also creates files that only their owner
+    can read; here the permissions follow the umask.
 
     Raises:
         OSError: If the file cannot be written.
@@ -160,12 +155,15 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, metadata: Mapping[st
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
+    path.touch()
+    permissions = stat.S_IMODE(path.stat().st_mode)  # reading the umask itself would mean setting it
     try:
         save_file(dict(tensors), path, metadata=dict(metadata))
     except SafetensorError as error:
         found = re.search(r"os error (\d+)", str(error))
         code = int(found[1]) if found else errno.EIO
         raise OSError(code, os.strerror(code), str(path)) from error
+    path.chmod(permissions)
     _sort_metadata(path)
 
 
