@@ -73,7 +73,7 @@ def test_an_array_has_the_photos_aspect_up_to_one_cell(capture, tmp_path, shape,
     if fits:
         assert maps["left/0.png"].clip.shape == (*shape, 3)
     else:
-        with pytest.raises(FileFormatError, match="photo's shape, 48x32, found"):
+        with pytest.raises(FileFormatError, match="photo's aspect, 48x32, found"):
             maps["left/0.png"]
 
 

@@ -13,6 +13,7 @@ from support.hostile import (  # noqa: F401  (importing a module registers its r
     reconstruction,
     scenes,
     splats,
+    viewer,
 )
 from support.hostile.registry import READERS, Reader
 
