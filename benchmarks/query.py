@@ -30,15 +30,15 @@ def published(probabilities, codewords, positives, negatives, temperature=10.0):
     """The full feature map, a softmax against each negative, prompt by prompt: ``[H, W, P]``."""
     features = probabilities @ codewords
     features = features / features.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    answers = []
+    maps = []
     for positive in positives:
         cosine = features @ positive
         pairs = [
             torch.softmax(temperature * torch.stack([cosine, features @ negative], dim=-1), dim=-1)[..., 0]
             for negative in negatives
         ]
-        answers.append(torch.stack(pairs).amin(0))
-    return torch.stack(answers, dim=-1)
+        maps.append(torch.stack(pairs).amin(0))
+    return torch.stack(maps, dim=-1)
 
 
 def make_inputs(width, height, codes, prompts):
