@@ -1,37 +1,32 @@
-"""Speed on a GPU at the paper's resolution: frames per second with and without language, and training.
+"""Rendering and training speed on a GPU at the paper's resolution.
 
     python benchmarks/gpu.py                                       # 0.3, 1 and 3 million Gaussians, 1297x840
-    python benchmarks/gpu.py --scene OUTPUT_OF_A_BUILD             # and a scene of your own, at its size
-    python benchmarks/gpu.py --device cpu --counts 20000 --size 320x240    # the same on a CPU
+    python benchmarks/gpu.py --scene SCENE                         # also a scene of your own, at its size
+    python benchmarks/gpu.py --device cpu --counts 20000 --size 320x240    # on a CPU
 
 Synthetic scenes are three shells of Gaussians (`render.three_shells`) with four random codes each. Printed for each:
 
-    rgb         frames per second of color alone
-    prompt      of color and the relevancy of one prompt in the same pass: each Gaussian's score is blended
-                (`code` form), scored anew for every frame as if every frame asked another prompt
-    paper       of color, s and u in one pass, then the paper's decoder and relevancy at every pixel
+    rgb         frames per second of color
+    prompt      frames per second of color and the relevancy of one prompt in one pass: the scores of the Gaussians
+                are blended (`code` form) and computed for each frame, as if each frame had another prompt
+    paper       frames per second of color, s and u in one pass, then the paper's decoder and relevancy per pixel
     training    iterations per second: render, L1 + D-SSIM, gradients, Adam on all parameters; no density control
-    memory      largest amount allocated, MiB (of the device; of the process on a CPU)
+    memory      peak memory in MiB (of the device; of the process on a CPU)
 
-Every frame has another camera on a circle, so nothing is prepared. Results go to benchmarks/results/, named after
-the hardware.
+Each frame has another camera on a circle, so no projection is reused.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import platform
-import re
 import resource
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from records import argument_parser, write_record
 from render import three_shells
 
 from lexsplat.codebook import Codebook
@@ -43,12 +38,11 @@ from lexsplat.reconstruction.adam import Adam
 from lexsplat.reconstruction.image_losses import photometric_loss, ssim_target
 from lexsplat.rendering import render
 
-RESULTS = Path(__file__).parent / "results"
 CODES, DIMENSION = 128, 512
 
 
 def cameras_around(count: int, width: int, height: int) -> list[Camera]:
-    """On a circle of radius 3.2 around the origin."""
+    """Cameras on a circle of radius 3.2 around the origin."""
     angles = np.arange(count) * 2 * math.pi / count
     eyes = [np.array([3.2 * math.sin(a), -0.4, -3.2 * math.cos(a)]) for a in angles]
     up = np.array([0.0, -1.0, 0.0])
@@ -56,7 +50,7 @@ def cameras_around(count: int, width: int, height: int) -> list[Camera]:
 
 
 def random_fields(gaussians: Gaussians) -> tuple[CodeField, TrainedField]:
-    """Language of no meaning but of full size."""
+    """Random language fields of realistic size."""
     generator = torch.Generator().manual_seed(0)
     unit = torch.nn.functional.normalize(torch.randn(CODES, DIMENSION, generator=generator), dim=-1)
     codebook = Codebook(unit.to(gaussians.device))
@@ -69,7 +63,7 @@ def random_fields(gaussians: Gaussians) -> tuple[CodeField, TrainedField]:
 
 
 def frames_per_second(draw: Callable[[Camera], object], cameras: Sequence[Camera], seconds: float) -> float:
-    """After a warm-up round; the device is waited for at the end."""
+    """Frame rate after a warm-up, with the device synchronized at the end."""
 
     def wait() -> None:
         if torch.cuda.is_available():
@@ -97,7 +91,7 @@ def draw_prompt(gaussians: Gaussians, field: LanguageField, camera: Camera, text
 def draw_as_the_paper(
     gaussians: Gaussians, field: TrainedField, camera: Camera, texts: Sequence[torch.Tensor]
 ):
-    """Color, s and u in one pass, then decoder and relevancy of the blended feature at every pixel."""
+    """Color, s and u in one pass, then decoder and relevancy at every pixel."""
     carried = torch.cat([field.semantics, field.uncertainties[:, None]], 1)
     rendering = render(gaussians, camera, features=carried)
     probabilities = field.decoder(rendering.features[..., :8]).softmax(-1)
@@ -105,7 +99,7 @@ def draw_as_the_paper(
 
 
 def iterations_per_second(gaussians: Gaussians, cameras: Sequence[Camera], seconds: float) -> float:
-    """Photometric training on the renders of the Gaussians themselves, darkened so that there is something to do."""
+    """Photometric training on darkened renderings of the Gaussians themselves."""
     with torch.no_grad():
         targets = [ssim_target(0.8 * render(gaussians, camera).image) for camera in cameras]
     leaves = gaussians.map(lambda tensor: torch.nn.Parameter(tensor.detach().clone()))
@@ -149,37 +143,16 @@ def measure(gaussians: Gaussians, cameras: Sequence[Camera], seconds: float) -> 
     return {name: round(value, 1) for name, value in rates.items()}
 
 
-def hardware(device: str) -> str:
-    """Name of the GPU, or of the processor and how many cores of it."""
-    if device == "cuda":
-        return torch.cuda.get_device_name()
-    models = (
-        re.findall(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
-        if Path("/proc/cpuinfo").exists()
-        else []
-    )
-    return f"{models[0] if models else platform.machine()}, {torch.get_num_threads()} threads"
-
-
-def commit() -> str:
-    found = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True
-    )
-    return found.stdout.strip() or "unknown"
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(__doc__)
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--counts", type=int, nargs="*", default=[300_000, 1_000_000, 3_000_000])
     parser.add_argument("--size", default="1297x840", help="of the synthetic scenes")
     parser.add_argument("--scene", type=Path, nargs="*", default=[], help="scene folders to measure as well")
-    parser.add_argument("--seconds", type=float, default=3.0, help="time for each rate")
+    parser.add_argument("--seconds", type=float, default=3.0, help="duration of each measurement")
     options = parser.parse_args()
     if options.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("no CUDA device: expected one, or --device cpu")
+        raise SystemExit("no CUDA device; use --device cpu")
     width, height = map(int, options.size.split("x"))
     cases = [(f"synthetic {n:,}", three_shells(n), cameras_around(24, width, height)) for n in options.counts]
     for folder in options.scene:
@@ -187,33 +160,21 @@ def main() -> None:
 
         scene = open_scene(folder, device="cpu")
         cases.append((folder.name, scene.gaussians, list(scene.cameras.values())[:24]))
-    name = hardware(options.device)
-    print(f"{name}, torch {torch.__version__}, commit {commit()}")
-    heads = (
-        ("Gaussians", 10),
-        ("size", 10),
-        ("rgb", 8),
-        ("prompt", 8),
-        ("paper", 8),
-        ("training", 9),
-        ("MiB", 8),
+    device = (
+        torch.cuda.get_device_name()
+        if options.device == "cuda"
+        else f"CPU, {torch.get_num_threads()} threads"
     )
-    print(f"{'scene':>22}", *(f"{head:>{room}}" for head, room in heads))
+    print(f"{device}, torch {torch.__version__}")
+    heads = {"gaussians": 10, "size": 10, "rgb": 8, "prompt": 8, "paper": 8, "training": 9, "memory": 8}
+    print(f"{'scene':>22}", *(f"{head:>{room}}" for head, room in heads.items()))
     rows = []
     for title, gaussians, cameras in cases:
         rates = measure(gaussians.to(options.device), cameras, options.seconds)
         size = f"{cameras[0].width}x{cameras[0].height}"
         rows.append({"scene": title, "gaussians": len(gaussians), "size": size, **rates})
-        print(
-            f"{title:>22} {len(gaussians):>10,} {size:>10} {rates['rgb']:>8} {rates['prompt']:>8} {rates['paper']:>8}"
-            f" {rates['training']:>9} {rates['memory']:>8}",
-            flush=True,
-        )
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"gpu_{re.sub(r'[^a-z0-9]+', '_', name.lower()).strip('_')}.json"
-    record = {"hardware": name, "torch": torch.__version__, "commit": commit(), "rows": rows}
-    path.write_text(json.dumps(record, indent=1) + "\n")
-    print(f"written to {path}")
+        print(f"{title:>22}", *(f"{rows[-1][head]:>{room}}" for head, room in heads.items()), flush=True)
+    write_record(options.json, rows, device=device)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Peak memory and time of the feature stage on many large views, each memory setting in a process of its own.
+"""Peak memory and time of the feature stage on many large views, with one process per memory setting.
 
     python benchmarks/memory.py [--views 300] [--size 1297x840] [--memory 1GB 4GB] [--json FILE]
 
-The views are photographs of noise (the count and size of crops do not depend on what is seen) with cameras around
-nothing; the encoders are the bundled ones, whose maps are as large as any of their width. `photos` is what all
-photos would take together, `maps` what all maps take on disk: neither may be held. `peak` counts everything, Python,
-torch and weights included, of which `bare` is what a process takes that has only loaded the encoders.
+The views are images of noise (number and size of crops do not depend on the content) with cameras on a line; the
+encoders are the bundled ones. `photos` is the size of all photos as float32 and `maps` that of all maps on disk:
+neither may be held in memory. `peak` is the peak of the process, including Python, torch and weights; `bare` is that
+of a process that has only loaded the encoders.
 """
 
 from __future__ import annotations
@@ -21,18 +21,16 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from records import argument_parser, write_record
 
 GIB = 1 << 30
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(__doc__)
     parser.add_argument("--views", type=int, default=300)
     parser.add_argument("--size", default="1297x840")
     parser.add_argument("--memory", nargs="+", default=["1GB", "4GB"])
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--child", nargs=2, metavar=("CAPTURE", "MEMORY"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
@@ -51,14 +49,11 @@ def main() -> None:
                 "memory {memory}: peak {peak:.2f} GiB (bare {bare:.2f}), maps {maps:.2f} GiB, "
                 "{seconds:.0f} s".format(**rows[-1])
             )
-    if options.json:
-        options.json.write_text(
-            json.dumps({"views": options.views, "size": options.size, "rows": rows}) + "\n"
-        )
+    write_record(options.json, rows, views=options.views, size=options.size)
 
 
 def make_capture(folder: Path, views: int, width: int, height: int) -> None:
-    """JPEGs of blurred noise, a few different ones linked under many names would be encoded once: all differ."""
+    """JPEGs of blurred noise. All differ: equal photos would be encoded once."""
     (folder / "images").mkdir()
     rng = np.random.default_rng(0)
     frames = []
@@ -74,7 +69,7 @@ def make_capture(folder: Path, views: int, width: int, height: int) -> None:
 
 
 def extract(capture: Path, memory: str) -> dict[str, float]:
-    """The feature stage at full size; GiB and seconds."""
+    """Run the feature stage at full size; memory in GiB, time in seconds."""
     from lexsplat.captures import load_capture
     from lexsplat.features.encoders import load_clip, load_dino
     from lexsplat.pipeline.config import BuildConfig

@@ -1,10 +1,10 @@
-"""What a prompt costs in a view once the language is rendered: ours against the published algorithm.
+"""Cost of a prompt in a view after the language is rendered, compared with the published algorithm.
 
-The published algorithm (LERF's relevancy on the paper's feature map) builds F = p S for every pixel,
-normalizes it, compares it with the prompt and each canonical phrase, takes a softmax for each of the pairs and
-keeps the least. Ours answers the same without F (``feature``: equal to 1e-5) or blends the answers of the codes
-(``code``); ``gaussians`` scores 200,000 Gaussians with four codes each. All get the same code probabilities p,
-codebook and texts. Memory is the largest growth of the process beyond p.
+The published algorithm (LERF's relevancy on the paper's feature map) computes F = p S for each pixel, normalizes it,
+compares it with the prompt and each canonical phrase, takes a softmax of each pair and keeps the minimum. ``feature``
+computes the same without F (difference below 1e-5), ``code`` blends the relevancies of the codes, and ``gaussians``
+scores 200,000 Gaussians with four codes each. All receive the same code probabilities p, codebook and texts. Memory
+is the growth of the process's peak beyond p.
 
     python benchmarks/query.py                       # 480x360, K = 32, 128, 256
     python benchmarks/query.py --sizes 480x360 1297x840 --prompts 1 14
@@ -12,14 +12,13 @@ codebook and texts. Memory is the largest growth of the process beyond p.
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import resource
 import statistics
 import time
 
 import torch
+from records import argument_parser, write_record
 
 from lexsplat.queries.relevancy import QueryConfig, code_relevancy, probability_relevancy
 
@@ -31,21 +30,21 @@ def published(probabilities, codewords, positives, negatives, temperature=10.0):
     """The full feature map, a softmax against each negative, prompt by prompt: ``[H, W, P]``."""
     features = probabilities @ codewords
     features = features / features.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    answers = []
+    maps = []
     for positive in positives:
         cosine = features @ positive
         pairs = [
             torch.softmax(temperature * torch.stack([cosine, features @ negative], dim=-1), dim=-1)[..., 0]
             for negative in negatives
         ]
-        answers.append(torch.stack(pairs).amin(0))
-    return torch.stack(answers, dim=-1)
+        maps.append(torch.stack(pairs).amin(0))
+    return torch.stack(maps, dim=-1)
 
 
 def make_inputs(width, height, codes, prompts):
     generator = torch.Generator().manual_seed(0)
     probabilities = torch.empty(height, width, codes)
-    for row in probabilities:  # in place: no second copy, or the peak would hide what is measured
+    for row in probabilities:  # in place: a second copy would raise the peak and hide the measured growth
         torch.softmax(3 * torch.randn(width, codes, generator=generator), dim=-1, out=row)
     codewords, positives, negatives = (
         torch.nn.functional.normalize(torch.randn(count, DIMENSION, generator=generator), dim=-1)
@@ -94,7 +93,7 @@ def measure(connection, method, width, height, codes, prompts, repeats, threads)
 
 
 def run(*arguments):
-    """One measurement in a process of its own, since a process never forgets its peak."""
+    """One measurement in a new process: the peak memory of a process cannot be reset."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=measure, args=(sender, *arguments))
@@ -103,28 +102,24 @@ def run(*arguments):
     try:
         return receiver.recv()
     except EOFError:
-        return None  # killed, most likely for want of memory
+        return None  # killed, most likely out of memory
     finally:
         process.join()
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(__doc__)
     parser.add_argument("--sizes", nargs="+", default=["480x360"])
     parser.add_argument("--codes", nargs="+", type=int, default=[32, 128, 256])
     parser.add_argument("--prompts", nargs="+", type=int, default=[1])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     rows = []
-    if not options.json:
-        print(f"torch {torch.__version__}, {options.threads} threads, D = {DIMENSION}")
-        print(
-            f"{'size':>10}{'K':>5}{'prompts':>9}{'method':>11}{'ms/prompt':>11}{'faster':>8}{'MB':>8}{'less':>7}"
-        )
+    print(f"torch {torch.__version__}, {options.threads} threads, D = {DIMENSION}")
+    print(
+        f"{'size':>10}{'K':>5}{'prompts':>9}{'method':>11}{'ms/prompt':>11}{'faster':>8}{'MB':>8}{'less':>7}"
+    )
     for size in options.sizes:
         width, height = map(int, size.split("x"))
         for codes in options.codes:
@@ -137,10 +132,8 @@ def main():
                     if found is not None:
                         row |= {"ms": found[0], "megabytes": found[1], "error": found[2]}
                     rows.append(row)
-                    if not options.json:
-                        print(describe(row, base), flush=True)
-    if options.json:
-        print(json.dumps(rows, indent=2))
+                    print(describe(row, base), flush=True)
+    write_record(options.json, rows, threads=options.threads)
 
 
 def describe(row, base):

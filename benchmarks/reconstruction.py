@@ -1,20 +1,17 @@
-"""Quality of reconstruction: PSNR, SSIM, Gaussians and seconds of settings side by side, over captures and seeds.
+"""Reconstruction quality (PSNR, SSIM, Gaussians, seconds) of settings, over captures and seeds.
 
     python benchmarks/reconstruction.py second demo ../data/bonsai=4 --variants default mcmc --seeds 0 1 --json FILE
 
-A capture is a folder, or ``demo`` or ``second``, with a downscale behind ``=`` where the default is not meant.
-Settings are measured on **validation views**: every sixth *training* view is held out and the capture's own test
-views are not looked at, so a default may be chosen by this table. ``--on test`` measures on the test views
-instead, for a default that has been chosen. All variants start from the same points, which are computed once.
+A capture is a folder, ``demo`` or ``second``, optionally with ``=DOWNSCALE``. Settings are measured on **validation
+views**: every sixth *training* view is held out and the test views are not used, so a default may be chosen by this
+table. ``--on test`` measures a chosen default on the test views. All variants start from the same points, which are
+computed once.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
-import platform
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from records import argument_parser, write_record
 
 from lexsplat.captures import Capture, InitialPoints, View, initial_points, load_capture
 from lexsplat.cli.progress import ProgressBars
@@ -42,20 +40,17 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01},
     "exposure": {"exposure": True},
 }
-"""Names of settings and what they change of `ReconstructionConfig`."""
+"""Variants by name, and the fields of `ReconstructionConfig` that they change."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(__doc__)
     parser.add_argument("captures", nargs="+", metavar="CAPTURE[=DOWNSCALE]")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["default", "mcmc"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--iterations", type=int, help="of the optimization; none: 3,000, on CUDA 30,000")
+    parser.add_argument("--iterations", type=int, help="optimization steps; default: 3,000, on CUDA 30,000")
     parser.add_argument("--on", choices=("validation", "test"), default="validation")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     rows = []
     print(f"{'capture':12} {'variant':12} seed   PSNR   SSIM  Gaussians  seconds")
@@ -75,16 +70,13 @@ def main() -> None:
                     f" {row['gaussians']:10,} {row['seconds']:8.1f}",
                     flush=True,
                 )
-    if options.json:
-        facts = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-        facts |= {"torch": torch.__version__, "on": options.on, "device": options.device}
-        options.json.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
+    write_record(options.json, rows, on=options.on, device=options.device)
 
 
 def prepared(
     name: str, downscale: float | None, options: argparse.Namespace
 ) -> tuple[Capture, ReconstructionConfig]:
-    """A capture at its working size, split as asked, and the settings that `lexsplat build` would take."""
+    """A capture at its working size with the chosen split, and the settings that `lexsplat build` would use."""
     capture = demo_capture("tabletop" if name == "demo" else "second") if name in ("demo", "second") else name
     scene = load_capture(capture)
     largest = max((view.capture_size for view in scene.views.values()), key=lambda size: size[0] * size[1])
@@ -101,7 +93,7 @@ def prepared(
 def measured(
     scene: Capture, config: ReconstructionConfig, points: InitialPoints, seed: int, device: str
 ) -> dict[str, Any]:
-    """Train once; numbers of the held-out views at the working size."""
+    """Train once and measure the held-out views at the working size."""
     trainer = Reconstructor(scene, config, points, device=device, seed=seed)
     start = time.perf_counter()
     trainer.run()

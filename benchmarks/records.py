@@ -45,7 +45,7 @@ def write_record(path: Path | None, rows: Sequence[Mapping[str, Any]], **facts: 
 
 
 def command() -> str:
-    """The command line of this process, relative to the repository."""
+    """The command line of this process, without the folder of the interpreter and of the script."""
     script = Path(sys.argv[0]).name
     return shlex.join(["python", f"benchmarks/{script}", *sys.argv[1:]])
 

@@ -1,34 +1,32 @@
-"""Time of the CPU rasterizer: forward and backward, against a naive port of the CUDA kernel in the same run.
+"""Time of the CPU rasterizer, forward and backward, compared with a naive port of the CUDA kernel.
 
     python benchmarks/render.py [--threads 2] [--repeats 15] [--json FILE]
 
-For each size, number of Gaussians and number of channels it prints, in milliseconds (best and median):
+For each size, number of Gaussians and number of channels, in milliseconds (best and median):
 
-    forward     projection, shading, sorting into tiles, blending; nothing kept for gradients
-    backward    gradients of every tensor, given those of image and alpha
-    blend       blending alone, of that
-    naive       the same blending, pixel by pixel over the list of its tile, with libm's exp (`per_pixel`)
+    forward     projection, shading, sorting into tiles, blending, without gradients
+    backward    gradients of all tensors from those of image and alpha
+    blend       the blending part of forward
+    naive       the same blending pixel by pixel over the list of its tile, with libm's exp (`per_pixel`)
 
-and the pairs of Gaussian and tile per second of forward time. Two floors, in milliseconds:
+and the pairs of Gaussian and tile per second of forward time. Two lower bounds, in milliseconds:
 
-    exps        what blending would take if its exps were all there was: rows of 16 pixels that the boxes
-                cover, at the rate measured for a loop of only `alpha_of`
-    bytes       what forward would take if it only moved what it must (`bytes_moved`), at the rate of a copy
+    exps        time of the exponentials of blending: the rows of 16 pixels covered by the boxes, at the measured
+                rate of a loop of only `alpha_of`
+    bytes       time to move the necessary bytes of forward (`bytes_moved`) at the rate of a copy
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import platform
 import time
-from pathlib import Path
 
 import numba
 import numpy as np
 import torch
+from records import argument_parser, write_record
 
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
@@ -43,7 +41,7 @@ CHANNELS = (3, 12)
 
 
 def three_shells(count: int, seed: int = 0) -> Gaussians:
-    """Gaussians on three spheres; their size shrinks with their number so that they cover the same area."""
+    """Gaussians on three spheres; their size depends on their number so that they cover the same area."""
     g = torch.Generator().manual_seed(seed)
     means = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=-1)
     means *= torch.tensor([0.6, 1.0, 1.4])[torch.randint(0, 3, (count,), generator=g)][:, None]
@@ -93,7 +91,7 @@ def per_pixel(start, stop, ellipses, tile_offsets, members, values, tiles_x, ima
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
 def only_alphas(start, stop, rows, out):
-    """As many rows of `alpha_of` as blending computes, and nothing else."""
+    """Only the rows of `alpha_of` that blending computes."""
     step = lanes.splat(np.float32(-1e-3))
     for part in range(start, stop):
         sums = lanes.splat(np.float32(0))
@@ -103,7 +101,7 @@ def only_alphas(start, stop, rows, out):
 
 
 def measure(function, repeats: int) -> tuple[float, float]:
-    """Best and median wall time in milliseconds, after one call that does not count."""
+    """Best and median wall time in milliseconds after one warm-up call."""
     function()
     times = []
     for _ in range(repeats):
@@ -114,16 +112,16 @@ def measure(function, repeats: int) -> tuple[float, float]:
 
 
 def rows_of(pairs: TilePairs) -> int:
-    """Rows of 16 pixels that all boxes cover, as if no tile were ever finished early."""
+    """Number of rows of 16 pixels covered by all boxes, without early termination of tiles."""
     boxes = pairs.boxes.astype(np.int64)
     return int(((boxes[:, 3] - boxes[:, 2]) * (boxes[:, 1] - boxes[:, 0])).sum())
 
 
 def bytes_moved(gaussians: Gaussians, channels: int, pairs: TilePairs) -> int:
-    """What a forward pass reads and writes at least, each thing once: parameters, projections, pairs, pictures.
+    """Minimum number of bytes that a forward pass reads and writes: parameters, projections, pairs, image.
 
-    A visible Gaussian has 12 projected numbers, written and read again, as are the values it is blended with; a
-    pair has a number, written and read.
+    A visible Gaussian has 12 projected numbers and its channels, each written and read once; a pair has one number,
+    written and read once.
     """
     parameters = sum(tensor.numel() for tensor in gaussians.tensors().values())
     parameters += len(gaussians) * (channels - 3)
@@ -133,7 +131,7 @@ def bytes_moved(gaussians: Gaussians, channels: int, pairs: TilePairs) -> int:
 
 
 def copy_rate(repeats: int) -> float:
-    """Bytes read and written a millisecond by a copy of 64 MiB on all threads."""
+    """Bytes read and written per millisecond by a copy of 64 MiB on all threads."""
     source = torch.ones(1 << 24)
     target = torch.empty_like(source)
     return 2 * 4 * source.numel() / measure(lambda: target.copy_(source), repeats)[0]
@@ -170,7 +168,7 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
     lists = (pairs.ellipses, pairs.tile_offsets, pairs.members, gathered, pairs.tiles_x, image, alpha)
     naive = measure(lambda: parallel(per_pixel, pairs.tiles, 8, *lists), max(3, repeats // 4))
     if np.abs(ours.numpy() - image).mean() > 1e-5:
-        raise SystemExit("the naive port renders something else")
+        raise SystemExit("the naive port renders another image")
     floor = measure(lambda: parallel(only_alphas, 64, 4, rows_of(pairs), np.empty(64, np.float32)), repeats)
     return {
         "width": width, "height": height, "gaussians": count, "channels": channels, "pairs": len(pairs.members),
@@ -183,10 +181,9 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argument_parser(__doc__)
     parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--json", type=Path, help="also write the numbers there")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     print(
@@ -210,8 +207,7 @@ def main() -> None:
                     f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f}",
                     flush=True,
                 )
-    if options.json:
-        options.json.write_text(json.dumps({"threads": options.threads, "cases": cases}, indent=1) + "\n")
+    write_record(options.json, cases, threads=options.threads)
 
 
 if __name__ == "__main__":

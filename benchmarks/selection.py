@@ -1,19 +1,18 @@
-"""3D selections against exact ground truth, and the calibration of "not in this scene".
+"""3D selections against exact ground truth, and the calibration of presence.
 
-Truth comes from index maps and depth of every view (``TRUTH/truth/VIEW.npz``, ``TRUTH/cameras.json``, as
-tools/demo_scene writes them), lifted to Gaussians and to boxes (`lexsplat.truth`). Which indices a prompt means is
-read off the masks of the capture.
+Ground truth is index maps and depth of each view (``FOLDER/truth/VIEW.npz`` and ``FOLDER/cameras.json``, written by
+tools/demo_scene), lifted to Gaussians and boxes (`selection_ground_truth`). The indices of a prompt are derived from
+the masks of the capture.
 
-    python benchmarks/selection.py --calibrate SECOND_SCENE --ground truth-of SECOND_SCENE=RENDERS/second \\
-        --scene output/demo --ground truth-of output/demo=RENDERS/tabletop
+    python benchmarks/selection.py --calibrate SECOND_SCENE --ground-truth-of SECOND_SCENE=RENDERS/second \\
+        --scene output/demo --ground-truth-of output/demo=RENDERS/tabletop
 
 Presence is calibrated on ``--calibrate`` only and reported on the scenes of ``--scene``. Prints JSON; ``calibration``
-is what goes into ``CALIBRATION`` in src/lexsplat/presence.py.
+holds the values of ``CALIBRATION`` in src/lexsplat/queries/presence.py.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from records import argument_parser, write_record
 from selection_ground_truth import (
     GroundTruthView,
     lift_labels,
@@ -38,7 +38,7 @@ KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant", "table lamp",
     "banana", "teddy bear", "striped ball", "bowl", "candle", "green bottle", "pumpkin", "toy car", "wooden crate",
 )  # fmt: skip
-ALIASES = {  # words of things.json: words of the lists here
+ALIASES = {  # kinds in things.json: prompts in the lists here
     "duck": "rubber duck", "books": "stack of books", "cone": "traffic cone", "plant": "potted plant",
     "lamp": "table lamp", "teddy": "teddy bear", "ball": "striped ball", "bottle": "green bottle", "car": "toy car",
     "crate": "wooden crate",
@@ -51,16 +51,15 @@ COLORS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(__doc__)
     parser.add_argument("--calibrate", type=Path)
     parser.add_argument("--scene", type=Path, action="append", default=[])
-    parser.add_argument("--ground truth-of", action="append", default=[], metavar="SCENE=FOLDER")
-    parser.add_argument("--stride", type=int, default=1, help="take every n-th view of the truth")
-    parser.add_argument("--only", choices=("presence", "accuracy"), help="measure only one of the two")
+    parser.add_argument("--ground-truth-of", action="append", default=[], metavar="SCENE=FOLDER")
+    parser.add_argument("--stride", type=int, default=1, help="use every n-th view of the ground truth")
+    parser.add_argument("--only", choices=("presence", "accuracy"), help="measure only this")
     options = parser.parse_args()
-    truths = {Path(key): Path(value) for key, value in (item.split("=", 1) for item in options.truth_of)}
+    pairs = (item.split("=", 1) for item in options.ground_truth_of)
+    truths = {Path(key): Path(value) for key, value in pairs}
     result: dict = {"scenes": {}}
     calibration = CALIBRATION
     if options.calibrate and options.only != "accuracy":
@@ -74,15 +73,28 @@ def main() -> None:
         if options.only != "presence":
             measured["accuracy"] = accuracy(folder, truths[folder], options.stride)
     print(json.dumps(result, indent=1))
+    write_record(options.json, table_rows(result), **result)
+
+
+def table_rows(result: dict) -> list[dict]:
+    """The means of each scene, for benchmarks/tables.py."""
+    rows = []
+    for scene, measured in result["scenes"].items():
+        row: dict = {"scene": Path(scene).name, **measured.get("accuracy", {}).get("mean", {})}
+        for group, found in measured.get("presence", {}).items():
+            if isinstance(found, dict):
+                row[f"{group}: yes / unsure / no"] = f"{found['yes']} / {found['unsure']} / {found['no']}"
+        rows.append(row)
+    return rows
 
 
 def capture_folder(scene: lexsplat.Scene) -> Path:
-    """Where the photos, prompts and masks of a scene are."""
+    """Folder of the photos, prompts and masks of a scene."""
     return Path(scene.folder.record["capture"])
 
 
 def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
-    """Evidence of prompts that are there, that are not, and that are but for their color."""
+    """Evidence of prompts that are present, absent, and present in another color."""
     scene = lexsplat.open_scene(folder)
     prompts = list(json.loads((capture_folder(scene) / "prompts.json").read_text()))
     things = list(json.loads((ground_truth / "things.json").read_text()).values())
@@ -129,7 +141,7 @@ def evidence_values(group: dict):
 
 
 def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:
-    """F1 of Gaussians and IoU of boxes for every prompt that masks of the capture tell the meaning of."""
+    """F1 of Gaussians and IoU of boxes for every prompt whose indices follow from the masks of the capture."""
     scene = lexsplat.open_scene(folder)
     views = load_ground_truth(ground_truth, stride)
     meanings = meaning_of_prompts(capture_folder(scene) / "segmentations", ground_truth)
@@ -159,7 +171,7 @@ def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:
 
 
 def best_box_iou(scene, lifted, views, meanings, up) -> float:
-    """What boxes around the right Gaussians reach: the limit that reconstruction sets."""
+    """IoU of boxes around the correct Gaussians: the upper bound set by the reconstruction."""
     from lexsplat.queries.selection import Selection
 
     found = []
@@ -175,7 +187,7 @@ def best_box_iou(scene, lifted, views, meanings, up) -> float:
 
 
 def things_of(indices: list[int]) -> list[list[int]]:
-    """Indices by thing: 10 times the thing plus the part."""
+    """Indices grouped by thing; an index is 10 times the thing plus the part."""
     return [[i for i in indices if i // 10 == thing] for thing in sorted({i // 10 for i in indices})]
 
 
@@ -185,19 +197,17 @@ def load_ground_truth(folder: Path, stride: int) -> list[GroundTruthView]:
     for name in sorted(record["camera_to_world"])[::stride]:
         pose = np.array(record["camera_to_world"][name], float)
         camera = camera_from_opengl(record["width"], record["height"], np.array(record["K"], float), pose)
-        with np.load(folder / "ground_truth" / f"{name}.npz", allow_pickle=False) as content:
+        with np.load(folder / "truth" / f"{name}.npz", allow_pickle=False) as content:
             views.append(GroundTruthView(camera, content["index"], content["depth"].astype(np.float64)))
     return views
 
 
 def meaning_of_prompts(masks: Path, ground_truth: Path) -> dict[str, list[int]]:
-    """Which indices lie in a prompt's masks for the most part, over all views that have masks."""
+    """Indices that lie mostly inside the masks of a prompt, over all views with masks."""
     inside: dict[str, np.ndarray] = {}
     total: dict[str, np.ndarray] = {}
     for path in sorted(masks.glob("*/*.png")):
-        with np.load(
-            ground_truth / "ground_truth" / f"{path.parent.name}.npz", allow_pickle=False
-        ) as content:
+        with np.load(ground_truth / "truth" / f"{path.parent.name}.npz", allow_pickle=False) as content:
             index = content["index"]
         size = (index.shape[1], index.shape[0])
         mask = np.array(Image.open(path).convert("L").resize(size, Image.Resampling.NEAREST)) > 127

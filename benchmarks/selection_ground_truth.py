@@ -1,8 +1,8 @@
-"""Exact ground truth in 3D: labels of pixels, known for every view, lifted to labels of Gaussians and to boxes.
+"""Exact ground truth in 3D: pixel labels of each view, lifted to labels of Gaussians and to boxes.
 
-A Gaussian belongs to the thing that most of its visible weight (alpha T over all pixels of all views) falls on,
-where the exact depth agrees with its own: weight that a Gaussian gets through a hole in something nearer, or
-from beyond a surface, says nothing about what it is.
+A Gaussian receives the label with the largest share of its visible weight (alpha T over all pixels of all views),
+counted only where the exact depth agrees with its own: weight through a hole of a nearer object or from behind a
+surface does not identify the Gaussian.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from lexsplat.rendering import accumulate_codes, prepare
 
 @dataclass(frozen=True)
 class GroundTruthView:
-    """What a view shows, exactly.
+    """Exact labels and depth of a view.
 
     Args:
-        camera: The view, of the size of the maps.
-        labels: Number of the thing at each pixel ``[H, W]``, 0 for nothing.
-        depth: Distance along the view axis ``[H, W]``, world units; not positive where nothing is.
+        camera: Camera with the size of the maps.
+        labels: Label of each pixel ``[H, W]``, 0 for background.
+        depth: Depth along the viewing axis ``[H, W]`` in world units; not positive for background.
     """
 
     camera: Camera
@@ -38,12 +38,12 @@ class GroundTruthView:
 
 @dataclass(frozen=True)
 class GaussianLabels:
-    """The ground truth about Gaussians.
+    """Labels of Gaussians.
 
     Args:
-        labels: The thing each belongs to ``[N]`` int64, 0 for none.
-        weights: How much of the views it makes up ``[N]``, in pixels: Gaussians that show count by this.
-        purity: Share of its weight that falls on its thing ``[N]`` in 0..1.
+        labels: Label of each Gaussian ``[N]`` int64, 0 for none.
+        weights: Visible weight over all views ``[N]``, in pixels.
+        purity: Share of the weight on the label ``[N]`` in 0..1.
     """
 
     labels: Tensor
@@ -59,10 +59,10 @@ def lift_labels(
 
     Args:
         gaussians: The scene.
-        views: Exact views, enough to see every thing from all sides.
-        num_labels: Labels are 0 to this, exclusive.
-        tolerance: How far a Gaussian may lie before or behind the exact surface, as a share of its depth, beyond
-            three standard deviations of its own.
+        views: Exact views that show every object from all sides.
+        num_labels: Number of labels, including 0.
+        tolerance: Permitted distance behind the exact surface as a share of the depth, in addition to three standard
+            deviations of the Gaussian.
     """
     totals = torch.zeros(len(gaussians), num_labels)
     for view in views:
@@ -81,7 +81,7 @@ def lift_labels(
 
 
 def surface_points(views: Iterable[GroundTruthView], label: int, *, stride: int = 2) -> NDArray[np.float64]:
-    """Exact points of a thing in the world ``[M, 3]``, from the depth of every ``stride``-th pixel."""
+    """Exact world points of a label ``[M, 3]``, from the depth of every ``stride``-th pixel."""
     found = []
     for view in views:
         rows, columns = np.nonzero((view.labels == label) & (view.depth > 0))
@@ -94,17 +94,17 @@ def surface_points(views: Iterable[GroundTruthView], label: int, *, stride: int 
 
 
 def true_box(points: NDArray[np.float64], up: NDArray[np.float64]) -> Box:
-    """The upright box of exact points, without trimming but for a thousandth at each end (edges of masks)."""
+    """The upright box of exact points, trimmed by a thousandth at each end (edges of masks)."""
     return fit_box(points, up, trim=0.001)
 
 
 def selection_f1(mask: Tensor, ground_truth: Tensor, weights: Tensor) -> tuple[float, float, float]:
-    """F1, precision and recall of a selection, every Gaussian counted by how much of the views it makes up.
+    """F1, precision and recall of a selection; Gaussians are weighted by their visible weight.
 
     Args:
-        mask: What was selected ``[N]`` bool.
-        ground truth: What belongs to the thing ``[N]`` bool.
-        weights: ``[N]``, not negative.
+        mask: Selected Gaussians ``[N]`` bool.
+        ground_truth: Gaussians of the object ``[N]`` bool.
+        weights: Visible weights ``[N]``, not negative.
     """
     mask, ground_truth, weights = mask.cpu(), ground_truth.cpu(), weights.cpu().double()
     hit = float(weights[mask & ground_truth].sum())
@@ -114,7 +114,7 @@ def selection_f1(mask: Tensor, ground_truth: Tensor, weights: Tensor) -> tuple[f
 
 
 def _near_surface(gaussians: Gaussians, view: GroundTruthView, tolerance: float) -> Tensor:
-    """Which Gaussians lie at the exact surface where their center is seen ``[N]`` as 0 or 1."""
+    """Whether a Gaussian lies at the exact surface at the pixel of its center: ``[N]`` of 0 or 1."""
     means = gaussians.means.detach().cpu().double().numpy()
     local = means @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
     depth = np.maximum(local[:, 2], 1e-9)
@@ -124,6 +124,6 @@ def _near_surface(gaussians: Gaussians, view: GroundTruthView, tolerance: float)
     inside = (local[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
     exact = view.depth[row.clip(0, height - 1), column.clip(0, width - 1)]
     reach = tolerance * depth + 3 * gaussians.scales.detach().cpu().double().numpy().min(1)
-    # Just outside a silhouette the center's own pixel shows something far behind: that is no contradiction
-    # to the front, so only what lies clearly behind the exact surface is left out.
+    # Just outside a silhouette the pixel of the center shows a surface far behind, which does not contradict a
+    # Gaussian in front of it. Only Gaussians clearly behind the exact surface are excluded.
     return torch.from_numpy(inside & (exact > 0) & (depth <= exact + reach)).float()

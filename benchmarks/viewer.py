@@ -1,15 +1,14 @@
-"""How long the viewer takes from a question to the last byte for the page, and what a page is sent.
+"""Response time of the viewer, from a prompt to the last byte sent to the page, and bytes sent.
 
-python benchmarks/viewer.py output/demo                 # a scene folder
-python benchmarks/viewer.py --synthetic 3000000 --quick             # random Gaussians with language
-python benchmarks/viewer.py --synthetic 3000000 --quick --browser   # until Chromium (software WebGL) drew them
+    python benchmarks/viewer.py output/demo                             # a scene folder
+    python benchmarks/viewer.py --synthetic 3000000 --quick             # random Gaussians with language
+    python benchmarks/viewer.py --synthetic 3000000 --quick --browser   # until Chromium (software WebGL) drew them
 
-"cpu" times are processor time of all threads of the process, which other programs on the machine change little.
+"cpu" is processor time of all threads of the process, which hardly depends on other programs on the machine.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -18,6 +17,7 @@ import time
 
 import numpy as np
 import torch
+from records import argument_parser, write_record
 
 import lexsplat
 from lexsplat.codebook import Codebook
@@ -42,7 +42,7 @@ PROMPTS = (
 
 
 class Synthetic(Scene):
-    """Random Gaussians on the walls of a room; every word is a fixed random direction."""
+    """Random Gaussians on the walls of a room; each text is a fixed random direction."""
 
     def encode_text(self, texts: list[str]) -> torch.Tensor:
         rows = [torch.randn(512, generator=torch.Generator().manual_seed(sum(t.encode()))) for t in texts]
@@ -80,7 +80,7 @@ def synthetic(count: int) -> Scene:
 
 
 def browser_seconds(viewer: ViewerServer) -> dict[str, float]:
-    """Until a page shows its controls, and until its picture of the scene is in our hands."""
+    """Seconds until a page shows its controls, and until it has drawn the scene."""
     import shutil
 
     from playwright.sync_api import sync_playwright
@@ -96,7 +96,7 @@ def browser_seconds(viewer: ViewerServer) -> dict[str, float]:
         while not viewer.viser.get_clients():
             time.sleep(0.1)
         (client,) = viewer.viser.get_clients().values()
-        while True:  # an empty page answers too: wait for a picture that is not one color
+        while True:  # an empty page responds, too: wait until the image is not uniform
             picture = viewer.display.image(client, 240)
             if np.ptp(picture.reshape(-1, picture.shape[-1]), axis=0).max() > 30:
                 break
@@ -108,13 +108,11 @@ def browser_seconds(viewer: ViewerServer) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(__doc__)
     parser.add_argument("scene", nargs="?")
     parser.add_argument("--synthetic", type=int)
     parser.add_argument("--splats", type=int, default=1_000_000)
-    parser.add_argument("--quick", action="store_true", help="do not wait for thresholds and selections")
+    parser.add_argument("--quick", action="store_true", help="skip thresholds and selections")
     parser.add_argument("--browser", action="store_true")
     options = parser.parse_args()
     scene = synthetic(options.synthetic) if options.synthetic else lexsplat.open_scene(options.scene)
@@ -126,8 +124,8 @@ def main() -> None:
         "start_s": round(time.perf_counter() - started, 2),
         "first_page_bytes": viewer.display.splats.drawn * BYTES_PER_SPLAT,
     }
-    viewer.panels.wait()  # the text encoder and the vocabulary are read
-    scene.embed(PROMPTS)  # not timed: words the encoder has not met take as long as the encoder takes
+    viewer.panels.wait()  # until the text encoder and the vocabulary are loaded
+    scene.embed(PROMPTS)  # not timed: the cost of new words is that of the encoder
     if options.browser:
         result |= browser_seconds(viewer)
         print(json.dumps(result, indent=2), flush=True)
@@ -154,7 +152,8 @@ def main() -> None:
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
     print(json.dumps(result, indent=2), flush=True)
-    os._exit(0)  # what the worker still does for the last question is of no interest
+    write_record(options.json, [result])
+    os._exit(0)  # do not wait for the worker, which still refines the last prompt
 
 
 if __name__ == "__main__":

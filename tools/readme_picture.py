@@ -1,4 +1,4 @@
-"""Make the picture at the top of the README: a rendering and the relevancy of a few queries, side by side.
+"""Make the image at the top of the README: a rendering and the relevancy of a few prompts, side by side.
 
 python tools/readme_picture.py output/demo view_033 docs/images/queries.jpg \\
     "red apple" "blue mug" "something made of metal" "bear nose" "checkered cloth"
@@ -20,12 +20,12 @@ def main() -> None:
     folder, view, output, prompts = sys.argv[1], sys.argv[2], Path(sys.argv[3]), sys.argv[4:]
     scene = lexsplat.open_scene(folder)
     camera = scene.view(view).camera.resized(480, 360)
-    picture = scene.render(camera).image.clamp(0, 1).cpu().numpy()
-    tiles = [("rendering of a held-out view", (picture * 255).astype(np.uint8))]
+    image = scene.render(camera).image.clamp(0, 1).cpu().numpy()
+    tiles = [("rendering of a held-out view", (image * 255).astype(np.uint8))]
     for prompt, relevancy in zip(prompts, scene.relevancy(prompts, camera).cpu().numpy()):
-        tiles.append((f"\u201c{prompt}\u201d", overlay_heatmap(picture, relevancy)))
+        tiles.append((f"\u201c{prompt}\u201d", overlay_heatmap(image, relevancy)))
     font = ImageFont.load_default(size=16)
-    height = WIDTH * picture.shape[0] // picture.shape[1]
+    height = WIDTH * image.shape[0] // image.shape[1]
     columns = 3
     rows = -(-len(tiles) // columns)
     sheet = Image.new("RGB", (columns * (WIDTH + 8) - 8, rows * (height + 34) - 4), "white")
@@ -37,4 +37,5 @@ def main() -> None:
     sheet.save(output, quality=88, optimize=True)
 
 
-main()
+if __name__ == "__main__":
+    main()

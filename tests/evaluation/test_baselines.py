@@ -234,13 +234,13 @@ def test_the_divergence_is_scipys_and_bounded(first, second):
 def test_alignment_pulls_similar_pixels_together_and_pushes_others_apart():
     config = Ovs3dConfig(similar_weight=1.0, dissimilar_weight=1.0)
     same, other = torch.tensor([4.0, 0]).log_softmax(-1), torch.tensor([0.0, 4]).log_softmax(-1)
-    alike, unlike = torch.tensor([[1.0, 0], [1, 0]]), torch.tensor([[1.0, 0], [0, 1]])
-    assert float(alignment_loss(torch.stack([same, same]), alike, config)) == pytest.approx(0, abs=1e-6)
+    similar, different = torch.tensor([[1.0, 0], [1, 0]]), torch.tensor([[1.0, 0], [0, 1]])
+    assert float(alignment_loss(torch.stack([same, same]), similar, config)) == pytest.approx(0, abs=1e-6)
     gap = float(js_divergence(same, other))
-    assert float(alignment_loss(torch.stack([same, other]), alike, config)) == pytest.approx(
+    assert float(alignment_loss(torch.stack([same, other]), similar, config)) == pytest.approx(
         0.3 * gap, rel=1e-4
     )
-    assert float(alignment_loss(torch.stack([same, other]), unlike, config)) == pytest.approx(
+    assert float(alignment_loss(torch.stack([same, other]), different, config)) == pytest.approx(
         -0.7 * gap, rel=1e-4
     )
 

@@ -22,7 +22,7 @@ def random_image(seed, size=(37, 41, 3)):
     return np.random.default_rng(seed).random(size).astype(np.float32)
 
 
-# Pictures
+# Image quality
 
 
 def test_psnr_of_a_constant_difference_of_a_tenth_is_20_db():

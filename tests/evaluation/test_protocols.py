@@ -24,10 +24,10 @@ SCORES = arrays(np.float32, (5, 7), elements=st.sampled_from([i / 16 for i in ra
 def official_reference(relevancy, mask, threshold):
     """The description in torch, float32, threshold by threshold and recall by recall."""
     height, width = relevancy.shape
-    picture = Image.fromarray(mask.astype(np.uint8) * 255)
-    if picture.size != (width, height):
-        picture = picture.resize((width, height), Image.Resampling.BICUBIC)
-    ground_truth = torch.from_numpy(np.array(picture)).float() / 255
+    image = Image.fromarray(mask.astype(np.uint8) * 255)
+    if image.size != (width, height):
+        image = image.resize((width, height), Image.Resampling.BICUBIC)
+    ground_truth = torch.from_numpy(np.array(image)).float() / 255
     render = torch.from_numpy(relevancy)
 
     def ratios(found):

@@ -5,7 +5,7 @@ import shutil
 import pytest
 from support.report_pages import evaluated
 
-from lexsplat.evaluation.report import write_report
+from lexsplat.evaluation.report import Comparison, MeasuredMethod, write_comparison, write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(12)}
@@ -13,21 +13,33 @@ VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")
 
 
-@pytest.fixture(scope="module", params=[1280, 400])
-def opened(request, tmp_path_factory):
-    """The report in a window of some width; failed requests and console messages are in ``refused``."""
-    playwright = pytest.importorskip("playwright.sync_api")
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The report of a scene and that of a comparison."""
+    folder = tmp_path_factory.mktemp("reports")
     metrics, gallery = evaluated()
     metrics.machine["versions"] = VERSIONS
-    path = tmp_path_factory.mktemp("report") / "report.html"
-    write_report(path, metrics, gallery)
+    write_report(folder / "report.html", metrics, gallery)
+    curves = {prompt: list(curve) for prompt, curve in metrics.curves.items()}
+    methods = [
+        MeasuredMethod(name, [metrics.to_json()] * 2, curves, gallery=gallery)
+        for name in ("averaged", "trained-feature", "dff", "lerf", "3dovs", "nearest")
+    ]
+    write_comparison(folder / "comparison.html", Comparison(methods, "compare", machine=metrics.machine))
+    return folder
+
+
+@pytest.fixture(scope="module", params=[1280, 400])
+def opened(request, folder):
+    """The report in a window of some width; failed requests and console messages are in ``refused``."""
+    playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": request.param, "height": 800})
         page.refused = []
         page.on("console", lambda message: page.refused.append(message.text))
         page.on("requestfailed", lambda request: page.refused.append(request.url))
-        page.goto(path.as_uri())
+        page.goto((folder / "report.html").as_uri())
         yield page
         browser.close()
 
@@ -51,3 +63,10 @@ def test_images_of_a_case_are_large_enough(opened):
     )
     assert widths
     assert min(widths) >= 120
+
+
+def test_a_comparison_is_no_wider_than_its_window_and_requests_nothing(opened, folder):
+    opened.goto((folder / "comparison.html").as_uri())
+    assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert opened.evaluate("document.querySelectorAll('.versus .answer').length") == 6 * 6
+    assert opened.refused == []

@@ -1,4 +1,4 @@
-"""The ground truth tool: on balls whose labels, places and sizes are known."""
+"""Exact ground truth in 3D, on balls with known labels, positions and sizes."""
 
 import numpy as np
 import pytest
@@ -46,11 +46,11 @@ def test_lifted_labels_are_those_of_the_balls(scene, views):
     seen = lifted.weights > 1
     assert seen.float().mean() > 0.8
     right = lifted.labels[seen].numpy() == scene.labels[seen.numpy()] + 1
-    assert right.mean() > 0.95  # Gaussians at a silhouette may stick out more than they lie on the ball
+    assert right.mean() > 0.95  # Gaussians at a silhouette may lie mostly outside the ball
     assert (lifted.purity[seen] > 0.5).float().mean() > 0.9
 
 
-def test_what_lies_behind_the_exact_surface_gets_no_label(scene, views):
+def test_gaussians_behind_the_exact_surface_receive_no_label(scene, views):
     inner = scene.gaussians.select(torch.arange(len(scene.labels)))
     ball = scene.labels == 0
     inner.means[ball] = torch.from_numpy(CENTERS[0]).float()  # hidden in the middle of the ball

@@ -1,6 +1,6 @@
 """Several methods on one page: the report of ``compare`` and ``ablate``.
 
-The answers of all methods to the same prompt in the same view are shown side by side, the cases with the worst mean
+The maps of all methods for the same prompt and view are shown side by side, the cases with the worst mean
 over the methods first.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lexsplat.evaluation.report.gallery import Gallery
-from lexsplat.evaluation.report.numbers import mean_and_spread, number
+from lexsplat.evaluation.report.numbers import mean_and_std, number
 from lexsplat.evaluation.report.tables import (
     OTHER_PROTOCOLS,
     REFERENCE_ROWS,
@@ -64,7 +64,7 @@ class MeasuredMethod:
         """Mean and standard deviation over the seeds of one number of each prompt."""
         rows = [result["language"]["per_prompt"] for result in self.results if result.get("language")]
         prompts = sorted({prompt for row in rows for prompt in row})
-        return {p: mean_and_spread([row[p].get(key) for row in rows if p in row]) for p in prompts}
+        return {p: mean_and_std([row[p].get(key) for row in rows if p in row]) for p in prompts}
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[dict[
         best = sorted(best_rows(rows, key))
         if best:
             row = rows[best[0]]
-            facts.append((name, number(mean_and_spread(row.get(key))[0]), str(row["name"])))
+            facts.append((name, number(mean_and_std(row.get(key))[0]), str(row["name"])))
     prompts = {prompt for method in methods for views in method.cases.values() for prompt in views}
     views = {view for method in methods for view in method.cases}
     if prompts:
@@ -164,10 +164,10 @@ def _table(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
 def _prompt_table(
     methods: Sequence[MeasuredMethod], key: str
 ) -> list[tuple[str, float | None, list[tuple[float | None, float | None]]]]:
-    """Prompt, mean over the methods, and mean and spread of each method; sorted by the mean."""
+    """Prompt, mean over the methods, and mean and standard deviation of each method; sorted by the mean."""
     numbers = [method.of_prompts(key) for method in methods]
     prompts = sorted({prompt for found in numbers for prompt in found})
-    means = {p: mean_and_spread([found[p][0] for found in numbers if p in found])[0] for p in prompts}
+    means = {p: mean_and_std([found[p][0] for found in numbers if p in found])[0] for p in prompts}
     return [
         (prompt, means[prompt], [found.get(prompt, (None, None)) for found in numbers])
         for prompt in sorted(prompts, key=lambda p: (means[p] or 0.0, p))
@@ -226,5 +226,5 @@ def _seconds(
     for method in methods:
         seconds = [result["speed"]["stage_seconds"] for result in method.results]
         seeds = ", ".join(str(result["config"].get("seed", "-")) for result in method.results)
-        rows.append((method.name, seeds, [mean_and_spread([s.get(t) for s in seconds])[0] for t in stages]))
+        rows.append((method.name, seeds, [mean_and_std([s.get(t) for s in seconds])[0] for t in stages]))
     return stages, rows

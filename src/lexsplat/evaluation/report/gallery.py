@@ -30,21 +30,19 @@ class Gallery:
     views: dict[str, dict[str, bytes]] = field(default_factory=dict)
     cases: dict[tuple[str, str], dict[str, bytes]] = field(default_factory=dict)
 
-    def add(self, pictures: ViewPictures) -> None:
+    def add(self, view: ViewPictures) -> None:
         """Store thumbnails of a view and of all its prompts."""
-        self.views[pictures.name] = {
-            "photo": self._jpeg(_to_bytes(pictures.photo)),
-            "render": self._jpeg(_to_bytes(pictures.image)),
+        self.views[view.name] = {
+            "photo": self._jpeg(_to_bytes(view.photo)),
+            "render": self._jpeg(_to_bytes(view.image)),
         }
-        for prompt, relevancy in pictures.relevancy.items():
-            image, photo = (
-                _fit(_to_bytes(side), relevancy.shape) for side in (pictures.image, pictures.photo)
-            )
-            self.cases[pictures.name, prompt] = {
+        for prompt, relevancy in view.relevancy.items():
+            image, photo = (_fit(_to_bytes(side), relevancy.shape) for side in (view.image, view.photo))
+            self.cases[view.name, prompt] = {
                 "heatmap": self._jpeg(overlay_heatmap(image, relevancy)),
-                "mask": self._jpeg(overlay_mask(image, relevancy >= pictures.thresholds[prompt])),
+                "mask": self._jpeg(overlay_mask(image, relevancy >= view.thresholds[prompt])),
                 "ground_truth": self._jpeg(
-                    overlay_mask(photo, pictures.ground_truth[prompt], color=(64, 200, 140))
+                    overlay_mask(photo, view.ground_truth[prompt], color=(64, 200, 140))
                 ),
             }
 

@@ -31,7 +31,7 @@ def known_values(values: Any) -> list[float]:
     return [float(value) for value in listed if value is not None and math.isfinite(value)]
 
 
-def mean_and_spread(values: Any) -> tuple[float | None, float | None]:
+def mean_and_std(values: Any) -> tuple[float | None, float | None]:
     """Mean and sample standard deviation of the finite values; None where there are too few."""
     known = known_values(values)
     if not known:

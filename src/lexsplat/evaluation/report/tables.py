@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lexsplat.evaluation.report.numbers import known_values, mean_and_spread, number, size_text
+from lexsplat.evaluation.report.numbers import known_values, mean_and_std, number, size_text
 from lexsplat.evaluation.report.templating import latex_table, write_text
 
 COLUMNS = ("mIoU", "mPA", "mP", "mAP")
@@ -184,7 +184,7 @@ def heading(key: str) -> str:
 def best_rows(rows: Sequence[Row], key: str) -> set[int]:
     """Indices of the rows with the best mean of a score; empty if all are equal, and for times and sizes."""
     methods = {i: row.get(key) for i, row in enumerate(rows) if row.get("name") not in REFERENCE_ROWS}
-    means = {i: mean for i, values in methods.items() if (mean := mean_and_spread(values)[0]) is not None}
+    means = {i: mean for i, values in methods.items() if (mean := mean_and_std(values)[0]) is not None}
     if len(set(means.values())) < 2 or key in _MEASURED_ONCE:
         return set()
     best = (min if key == "lpips" else max)(means.values())
@@ -224,8 +224,8 @@ def csv_text(rows: Sequence[Row]) -> str:
     for row in rows:
         values: list[Any] = [row["name"], row.get("runs", 1)]
         for key in keys:
-            mean, spread = mean_and_spread(row.get(key))
-            values += ["" if v is None else f"{v:.6g}" for v in ((mean, spread) if several else (mean,))]
+            mean, std = mean_and_std(row.get(key))
+            values += ["" if v is None else f"{v:.6g}" for v in ((mean, std) if several else (mean,))]
         writer.writerow(values)
     return stream.getvalue()
 
@@ -238,10 +238,10 @@ def latex_text(rows: Sequence[Row], keys: Sequence[str] = ()) -> str:
 
 
 def _cell(values: Any, digits: int) -> str:
-    mean, spread = mean_and_spread(values)
+    mean, std = mean_and_std(values)
     if digits == -1:
         return size_text(None if mean is None else int(mean))
     if digits == -2:
         return "-" if mean is None else f"{mean:.0f} s"
     text = number(mean, digits)
-    return text if spread is None else f"{text} ± {number(spread, digits)}"
+    return text if std is None else f"{text} ± {number(std, digits)}"

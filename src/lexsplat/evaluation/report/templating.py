@@ -30,7 +30,7 @@ def write_page(path: Path, template: str, content: Mapping[str, Any], views: Map
         path: The file.
         template: File name in ``templates/``.
         content: Variables of the template, with "title", "subtitle", "cards" (dictionaries of "name", "value" and
-            "note"), "shown_views" (names of ``views`` whose images are embedded), "config" and "machine".
+            "note"), "shown_views" (names of ``views`` whose images the page contains), "config" and "machine".
         views: ``{view: {"photo" | "render": JPEG}}``.
     """
     rendered = (
