@@ -1,14 +1,14 @@
 """3D selections against exact ground truth, and the calibration of "not in this scene".
 
-Truth comes from index maps and depth of every view (``TRUTH/truth/VIEW.npz``, ``TRUTH/cameras.json``, as
-tools/demo_scene writes them), lifted to Gaussians and to boxes (`lexsplat.truth`). Which indices a prompt means is
-read off the masks of the capture.
+Ground truth comes from index maps and depth of every view (``FOLDER/ground_truth/VIEW.npz``, ``FOLDER/cameras.json``,
+as tools/demo_scene writes them), lifted to Gaussians and to boxes (`selection_ground_truth`). The indices that a
+prompt means come from the masks of the capture.
 
-    python benchmarks/selection.py --calibrate SECOND_SCENE --ground truth-of SECOND_SCENE=RENDERS/second \\
-        --scene output/demo --ground truth-of output/demo=RENDERS/tabletop
+    python benchmarks/selection.py --calibrate SECOND_SCENE --ground-truth-of SECOND_SCENE=RENDERS/second \\
+        --scene output/demo --ground-truth-of output/demo=RENDERS/tabletop
 
 Presence is calibrated on ``--calibrate`` only and reported on the scenes of ``--scene``. Prints JSON; ``calibration``
-is what goes into ``CALIBRATION`` in src/lexsplat/presence.py.
+is the value of ``CALIBRATION`` in src/lexsplat/queries/presence.py.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ import torch
 from PIL import Image
 from selection_ground_truth import (
     GroundTruthView,
+    box_iou,
     lift_labels,
     selection_f1,
     surface_points,
     true_box,
 )
+from sklearn.linear_model import LogisticRegression
 
 import lexsplat
-from lexsplat.geometry.boxes import box_iou, gravity_up
+from lexsplat.geometry.boxes import gravity_up
 from lexsplat.geometry.cameras import camera_from_opengl
-from lexsplat.queries.presence import CALIBRATION, fit_calibration
+from lexsplat.queries.presence import CALIBRATION, Calibration, Evidence
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant", "table lamp",
@@ -56,11 +58,13 @@ def main() -> None:
     )
     parser.add_argument("--calibrate", type=Path)
     parser.add_argument("--scene", type=Path, action="append", default=[])
-    parser.add_argument("--ground truth-of", action="append", default=[], metavar="SCENE=FOLDER")
+    parser.add_argument("--ground-truth-of", action="append", default=[], metavar="SCENE=FOLDER")
     parser.add_argument("--stride", type=int, default=1, help="take every n-th view of the truth")
     parser.add_argument("--only", choices=("presence", "accuracy"), help="measure only one of the two")
     options = parser.parse_args()
-    truths = {Path(key): Path(value) for key, value in (item.split("=", 1) for item in options.truth_of)}
+    truths = {
+        Path(key): Path(value) for key, value in (item.split("=", 1) for item in options.ground_truth_of)
+    }
     result: dict = {"scenes": {}}
     calibration = CALIBRATION
     if options.calibrate and options.only != "accuracy":
@@ -74,6 +78,38 @@ def main() -> None:
         if options.only != "presence":
             measured["accuracy"] = accuracy(folder, truths[folder], options.stride)
     print(json.dumps(result, indent=1))
+
+
+def fit_calibration(
+    present: list[Evidence], absent: list[Evidence], *, recall: float = 0.9, false_positives: float = 0.1
+) -> Calibration:
+    """Logistic regression with balanced classes and slight shrinkage, and limits from the phrases themselves.
+
+    "no" ends where ``recall`` of the present phrases lies above; "yes" begins where at most ``false_positives`` of
+    the absent ones lie above. If these cross, both are their mean, and nothing is "unsure". A negative weight is
+    fitted to chance, as more evidence never counts against a phrase: its term is dropped and the others fitted again.
+    """
+    if not present or not absent:
+        raise ValueError("a calibration needs phrases that are present and phrases that are absent")
+    x = np.array([evidence.values()[1:] for evidence in (*present, *absent)])
+    y = np.array([1] * len(present) + [0] * len(absent))
+    used, weights = [0, 1, 2], np.zeros(3)
+    while True:
+        model = LogisticRegression(C=10, class_weight="balanced", tol=1e-10, max_iter=10_000)
+        found = model.fit(x[:, used], y).coef_[0]
+        if (found >= 0).all() or len(used) == 1:
+            break
+        used = [place for place, weight in zip(used, found) if weight >= 0]
+    weights[used] = found.clip(min=0)
+    p = 1 / (1 + np.exp(-(x @ weights + model.intercept_[0])))
+    low = float(np.quantile(p[y == 1], 1 - recall))
+    high = float(np.quantile(p[y == 0], 1 - false_positives))
+    if high <= low:
+        low = high = (low + high) / 2
+    height, rank, peak = (round(float(w), 3) for w in weights)
+    return Calibration(
+        round(float(model.intercept_[0]), 3), height, rank, yes=round(high, 3), no=round(low, 3), peak=peak
+    )
 
 
 def capture_folder(scene: lexsplat.Scene) -> Path:
@@ -94,10 +130,10 @@ def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
         taken = {thing["color"] for thing in things if thing["kind"] == kind}
         free = [color for color in COLORS if color not in taken]
         recolored.append(f"{free[number % len(free)]} {kind}")
-    judge = scene.presence_classifier
+    classifier = scene.presence_classifier
 
     def of(phrases: list[str]) -> dict:
-        return {phrase: judge.evidence(scores) for phrase, scores in zip(phrases, scene.scores(phrases))}
+        return {phrase: classifier.evidence(scores) for phrase, scores in zip(phrases, scene.scores(phrases))}
 
     return of(prompts), of(absent), of(recolored)
 
@@ -106,7 +142,7 @@ def presence(folder: Path, ground_truth: Path, calibration) -> dict:
     groups = zip(("present", "absent", "wrong color"), evidence(folder, ground_truth))
     answer = {}
     for name, found in groups:
-        judged = {phrase: calibration.judge(e) for phrase, e in found.items()}
+        judged = {phrase: calibration.classify(e) for phrase, e in found.items()}
         answer[name] = {
             "phrases": len(judged),
             **{word: sum(v == word for v in judged.values()) for word in ("yes", "unsure", "no")},
@@ -123,13 +159,11 @@ def presence(folder: Path, ground_truth: Path, calibration) -> dict:
 
 
 def evidence_values(group: dict):
-    from lexsplat.queries.presence import Evidence
-
     return [Evidence(*numbers) for _, *numbers in group["each"].values()]
 
 
 def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:
-    """F1 of Gaussians and IoU of boxes for every prompt that masks of the capture tell the meaning of."""
+    """F1 of Gaussians and IoU of boxes for every prompt whose meaning follows from masks of the capture."""
     scene = lexsplat.open_scene(folder)
     views = load_ground_truth(ground_truth, stride)
     meanings = meaning_of_prompts(capture_folder(scene) / "segmentations", ground_truth)

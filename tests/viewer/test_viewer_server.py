@@ -108,7 +108,7 @@ def test_asking_reaches_session_and_panels(viewer):
     viewer.panels.ask(WORDS[1])
     viewer.panels.wait()
     assert viewer.session.selection is not None
-    assert viewer.session.selection.count == 60
+    assert len(viewer.session.selection) == 60
     assert viewer.panels.seconds["ask"] > 0
     viewer.panels._remove("Remove all")
     assert viewer.session.all_questions() == []

@@ -31,7 +31,7 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.transforms import moved
+from lexsplat.scenes.transforms import transformed
 
 Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -118,7 +118,7 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     else:
         numbers = {name: step.values.get(name) for name in ("rotation", "translation", "center")}
         arrays = {name: np.array(value, float) for name, value in numbers.items() if value is not None}
-        changed = moved(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
+        changed = transformed(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
         if changed.damage():
             raise ValueError(f"the move leads to {changed.damage()}")
     tensors: dict[str, Any] = {}
@@ -185,7 +185,7 @@ class Motion:
             middle = chosen.center
         turn = np.eye(3) if self.rotation is None else np.asarray(self.rotation, float)
         shift = np.asarray(self.translation, float)
-        moved(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
+        transformed(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
         return {
             "rotation": turn.tolist(),
             "scale": float(self.scale),
@@ -246,7 +246,7 @@ class Editor:
         """Shift, turn and scale a selection.
 
         Raises:
-            ValueError: If the motion is none (see `lexsplat.scenes.transforms.moved`).
+            ValueError: If the motion is none (see `lexsplat.scenes.transforms.transformed`).
         """
         self._do("move", chosen, **motion.values(chosen))
 
@@ -254,7 +254,7 @@ class Editor:
         """Add a copy of a selection, moved as `move` does.
 
         Raises:
-            ValueError: If the motion is none (see `lexsplat.scenes.transforms.moved`).
+            ValueError: If the motion is none (see `lexsplat.scenes.transforms.transformed`).
         """
         self._do("duplicate", chosen, **motion.values(chosen))
 

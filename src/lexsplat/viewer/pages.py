@@ -68,7 +68,7 @@ def _question_row(question: Question, alone: bool) -> str:
         state = f'<span style="{_MUTED}">…</span>'
     else:
         word, tint = _PRESENT[question.selection.present]
-        state = f'<span style="{_MUTED}">{question.selection.count:,} splats</span>'
+        state = f'<span style="{_MUTED}">{len(question.selection):,} splats</span>'
         if layer.text == question.selection.phrase:
             state = f'<span style="color:{tint}">{word}</span> ' + state
     text = f'<b style="flex:1;overflow-wrap:anywhere">{escape(layer.text)}</b>'
@@ -102,7 +102,7 @@ def answer(found: Answer) -> str:
             f'<span style="{_MUTED}">{score:.2f}</span></div>'
         )
     place = ", ".join(f"{value:.2f}" for value in found.point)
-    count = f"{found.selection.count:,}"
+    count = f"{len(found.selection):,}"
     return box(f'{rows}<div style="{_MUTED}">{count} splats belong to it; at ({place})</div>')
 
 
@@ -117,7 +117,7 @@ def selection_facts(question: Question | None) -> str:
     center = ", ".join(f"{value:.2f}" for value in selection.center)
     parts = len(selection.instances)
     return box(
-        f"<b>{escape(question.text)}</b><br>{selection.count:,} splats in {parts} "
+        f"<b>{escape(question.text)}</b><br>{len(selection):,} splats in {parts} "
         f"{'piece' if parts == 1 else 'pieces'}<br>"
         f'<span style="{_MUTED}">size {size}, center ({center}), world units</span>'
     )

@@ -20,6 +20,7 @@ from lexsplat.queries.heatmaps import overlay_mask
 from lexsplat.queries.phrases import Thing, parse
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
+from lexsplat.queries.relevancy import Question as TextQuestion
 from lexsplat.queries.relevancy import check_prompts, probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
@@ -157,11 +158,9 @@ class Session:
             return
         manual = question.manual
         if is_plain(question.text):
-            if question.automatic is None:
-                question.automatic = float(self.scene.thresholds([question.text])[0])
-            limit = question.automatic if manual is None else manual
-            selection = self.scene.select(question.text, limit)
-            selection = selection.convincing() if manual is None else selection
+            selection = self.scene.select(question.text, manual)
+            if manual is None:
+                question.automatic = float(selection.threshold)
         else:
             selection = self.scene.find(question.text, viewpoint, threshold=manual)
             if manual is None:
@@ -201,7 +200,7 @@ class Session:
     def _quick_threshold(self, scores: NDArray[np.float32]) -> float:
         """A provisional threshold in milliseconds: 0.5 for what is not there, as the scene's own will be."""
         judge = self._judge  # none until `warm_up` has read its reference phrases
-        if judge is not None and judge.judge(torch.from_numpy(scores)) == "no":
+        if judge is not None and judge.classify(torch.from_numpy(scores)) == "no":
             return BORDER
         return quick_threshold(scores, self._opacities)
 
@@ -225,9 +224,8 @@ class Session:
         vocabulary = self.memory.vocabulary
         with self._encoding:
             words, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
-        relevancy = probability_relevancy(
-            blended[None], scene.field.codebook.clip, words, negatives, scene.query
-        )[0]
+        asked = TextQuestion(words, negatives, scene.query)
+        relevancy = probability_relevancy(blended[None], scene.field.codebook.clip, asked)[0]
         order = relevancy.argsort(descending=True)[:count].tolist()
         phrases = [(vocabulary[i], float(relevancy[i])) for i in order]
         scores = selection.scores.float().cpu().numpy()

@@ -1,4 +1,4 @@
-"""What queries, evaluation and export need of a language field, whatever made it."""
+"""The interface of every language field, whichever method made it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from lexsplat.geometry.gaussians import Gaussians
 
 @runtime_checkable
 class LanguageField(Protocol):
-    """What queries, evaluation and export need of a field, whatever made it."""
+    """The language of N Gaussians: a distribution over the K codes of a codebook for each of them.
+
+    Queries, evaluation and export use nothing else of a field.
+    """
 
     method: str
     codebook: Codebook
@@ -24,7 +27,14 @@ class LanguageField(Protocol):
         ...
 
     def code_probabilities(self) -> Tensor:
-        """Distribution over codes of every Gaussian ``[N, K]``: rows sum to 1, or 0 if nothing is known."""
+        """Distribution over codes of every Gaussian ``[N, K]``; rows sum to 1, or to 0 where nothing is known."""
+        ...
+
+    def scores(self, table: Tensor) -> Tensor:
+        """Expected table entry of every Gaussian, the sum over codes of p_k table[k]: ``[K, P]`` to ``[N, P]``.
+
+        ``[N, K]`` is never held.
+        """
         ...
 
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
@@ -32,17 +42,17 @@ class LanguageField(Protocol):
         ...
 
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
-        """Per pixel sum over codes of p_k table[k]: ``[K, P]`` to ``[H, W, P]``."""
+        """Expected table entry at every pixel, the sum over codes of p_k table[k]: ``[K, P]`` to ``[H, W, P]``."""
         ...
 
     def select(self, index: Tensor) -> LanguageField:
-        """The language of the Gaussians named by a mask or an index ``[M]``, as `Gaussians.select` orders them."""
+        """The language of the Gaussians given by a mask ``[N]`` or an index ``[M]``, as `Gaussians.select`."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything by name, for safetensors."""
+        """All tensors by name, for safetensors."""
         ...
 
     def metadata(self) -> dict[str, str]:
-        """What is not a tensor, for the header of the safetensors file."""
+        """Everything that is not a tensor, for the header of the safetensors file."""
         ...

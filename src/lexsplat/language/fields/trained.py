@@ -115,7 +115,18 @@ class TrainedField(nn.Module):
     @torch.no_grad()
     def code_probabilities(self) -> Tensor:
         """softmax(D_MLP(s_G)): what each Gaussian would show alone ``[N, K]``."""
-        return torch.cat([self.decode(rows).softmax(-1) for rows in self.semantics.split(BLOCK_ROWS)])
+        return self._probabilities(self.semantics)
+
+    @torch.no_grad()
+    def scores(self, table: Tensor) -> Tensor:
+        """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``, in blocks of Gaussians."""
+        check_table(table, self.codebook)
+        table = table.to(self.semantics)
+        return torch.cat([self._probabilities(rows) @ table for rows in self.semantics.split(4 * BLOCK_ROWS)])
+
+    def _probabilities(self, semantics: Tensor) -> Tensor:
+        """Decoded distributions ``[M, K]`` of rows ``[M, 8]``."""
+        return torch.cat([self.decode(rows).softmax(-1) for rows in semantics.split(BLOCK_ROWS)])
 
     @torch.no_grad()
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
@@ -169,7 +180,8 @@ class TrainedField(nn.Module):
             tensors["semantics"],
             tensors["uncertainty_logits"],
             SmoothingMLP(tensors["smoother.center"], tensors["smoother.extent"], num_frequencies),
-            normalize_rendering=metadata.get("normalize_rendering") == "true",
+            normalize_rendering="true"
+            in (metadata.get("normalize_rendering"), metadata.get("normalise_rendering")),
             method=metadata.get("method", "trained"),
         )
         own = {name: value for name, value in tensors.items() if not name.startswith("codebook.")}
