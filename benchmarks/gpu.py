@@ -33,7 +33,7 @@ from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField, LanguageField, TrainedField
-from lexsplat.queries.relevancy import code_relevancy, probability_relevancy
+from lexsplat.queries.relevancy import Question, code_relevancy, probability_relevancy
 from lexsplat.reconstruction.adam import Adam
 from lexsplat.reconstruction.image_losses import photometric_loss, ssim_target
 from lexsplat.rendering import render
@@ -84,7 +84,7 @@ def frames_per_second(draw: Callable[[Camera], object], cameras: Sequence[Camera
 
 def draw_prompt(gaussians: Gaussians, field: LanguageField, camera: Camera, texts: Sequence[torch.Tensor]):
     """Color and relevancy of one prompt, in one pass ``[H, W, 4]``."""
-    table = code_relevancy(field.codebook.clip, *texts)
+    table = code_relevancy(field.codebook.clip, Question(*texts))
     return render(gaussians, camera, features=field.scores(table)).channels
 
 
@@ -95,7 +95,7 @@ def draw_as_the_paper(
     carried = torch.cat([field.semantics, field.uncertainties[:, None]], 1)
     rendering = render(gaussians, camera, features=carried)
     probabilities = field.decoder(rendering.features[..., :8]).softmax(-1)
-    return probability_relevancy(probabilities, field.codebook.clip, *texts)
+    return probability_relevancy(probabilities, field.codebook.clip, Question(*texts))
 
 
 def iterations_per_second(gaussians: Gaussians, cameras: Sequence[Camera], seconds: float) -> float:

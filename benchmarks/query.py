@@ -20,7 +20,7 @@ import time
 import torch
 from records import argument_parser, write_record
 
-from lexsplat.queries.relevancy import QueryConfig, code_relevancy, probability_relevancy
+from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy, probability_relevancy
 
 DIMENSION = 512
 METHODS = ("published", "feature", "code", "gaussians")
@@ -64,18 +64,21 @@ def sparse_scores(codes, weights, table):
 def measure(connection, method, width, height, codes, prompts, repeats, threads):
     torch.set_num_threads(threads)
     probabilities, codewords, positives, negatives = make_inputs(width, height, codes, prompts)
+    question = Question(positives, negatives, QueryConfig(form="feature" if method == "feature" else "code"))
     if method == "published":
         work = lambda: published(probabilities, codewords, positives, negatives)  # noqa: E731
     elif method == "gaussians":
         count = 200_000
         index = torch.randint(0, codes, (count, 4))
         weights = torch.rand(count, 4)
-        work = lambda: sparse_scores(index, weights, code_relevancy(codewords, positives, negatives))  # noqa: E731
+        work = lambda: sparse_scores(index, weights, code_relevancy(codewords, question))  # noqa: E731
     else:
-        config = QueryConfig(form=method)
-        work = lambda: probability_relevancy(probabilities, codewords, positives, negatives, config)  # noqa: E731
+        work = lambda: probability_relevancy(probabilities, codewords, question)  # noqa: E731
     small = make_inputs(16, 16, codes, prompts)
-    published(*small), probability_relevancy(*small)  # libraries allocate at their first call
+    (
+        published(*small),
+        probability_relevancy(*small[:2], Question(*small[2:])),
+    )  # libraries allocate at their first call
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result = work()
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before

@@ -23,16 +23,18 @@ from PIL import Image
 from records import argument_parser, write_record
 from selection_ground_truth import (
     GroundTruthView,
+    box_iou,
     lift_labels,
     selection_f1,
     surface_points,
     true_box,
 )
+from sklearn.linear_model import LogisticRegression
 
 import lexsplat
-from lexsplat.geometry.boxes import box_iou, gravity_up
+from lexsplat.geometry.boxes import gravity_up
 from lexsplat.geometry.cameras import camera_from_opengl
-from lexsplat.queries.presence import CALIBRATION, fit_calibration
+from lexsplat.queries.presence import CALIBRATION, Calibration, Evidence
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant", "table lamp",
@@ -88,6 +90,38 @@ def table_rows(result: dict) -> list[dict]:
     return rows
 
 
+def fit_calibration(
+    present: list[Evidence], absent: list[Evidence], *, recall: float = 0.9, false_positives: float = 0.1
+) -> Calibration:
+    """Logistic regression with balanced classes and slight shrinkage, and limits from the phrases themselves.
+
+    "no" ends where ``recall`` of the present phrases lies above; "yes" begins where at most ``false_positives`` of
+    the absent ones lie above. If these cross, both are their mean, and nothing is "unsure". A negative weight is
+    fitted to chance, as more evidence never counts against a phrase: its term is dropped and the others fitted again.
+    """
+    if not present or not absent:
+        raise ValueError("a calibration needs phrases that are present and phrases that are absent")
+    x = np.array([evidence.values()[1:] for evidence in (*present, *absent)])
+    y = np.array([1] * len(present) + [0] * len(absent))
+    used, weights = [0, 1, 2], np.zeros(3)
+    while True:
+        model = LogisticRegression(C=10, class_weight="balanced", tol=1e-10, max_iter=10_000)
+        found = model.fit(x[:, used], y).coef_[0]
+        if (found >= 0).all() or len(used) == 1:
+            break
+        used = [place for place, weight in zip(used, found) if weight >= 0]
+    weights[used] = found.clip(min=0)
+    p = 1 / (1 + np.exp(-(x @ weights + model.intercept_[0])))
+    low = float(np.quantile(p[y == 1], 1 - recall))
+    high = float(np.quantile(p[y == 0], 1 - false_positives))
+    if high <= low:
+        low = high = (low + high) / 2
+    height, rank, peak = (round(float(w), 3) for w in weights)
+    return Calibration(
+        round(float(model.intercept_[0]), 3), height, rank, yes=round(high, 3), no=round(low, 3), peak=peak
+    )
+
+
 def capture_folder(scene: lexsplat.Scene) -> Path:
     """Folder of the photos, prompts and masks of a scene."""
     return Path(scene.folder.record["capture"])
@@ -106,10 +140,10 @@ def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
         taken = {thing["color"] for thing in things if thing["kind"] == kind}
         free = [color for color in COLORS if color not in taken]
         recolored.append(f"{free[number % len(free)]} {kind}")
-    judge = scene.presence_classifier
+    classifier = scene.presence_classifier
 
     def of(phrases: list[str]) -> dict:
-        return {phrase: judge.evidence(scores) for phrase, scores in zip(phrases, scene.scores(phrases))}
+        return {phrase: classifier.evidence(scores) for phrase, scores in zip(phrases, scene.scores(phrases))}
 
     return of(prompts), of(absent), of(recolored)
 
@@ -118,7 +152,7 @@ def presence(folder: Path, ground_truth: Path, calibration) -> dict:
     groups = zip(("present", "absent", "wrong color"), evidence(folder, ground_truth))
     answer = {}
     for name, found in groups:
-        judged = {phrase: calibration.judge(e) for phrase, e in found.items()}
+        judged = {phrase: calibration.classify(e) for phrase, e in found.items()}
         answer[name] = {
             "phrases": len(judged),
             **{word: sum(v == word for v in judged.values()) for word in ("yes", "unsure", "no")},
@@ -135,8 +169,6 @@ def presence(folder: Path, ground_truth: Path, calibration) -> dict:
 
 
 def evidence_values(group: dict):
-    from lexsplat.queries.presence import Evidence
-
     return [Evidence(*numbers) for _, *numbers in group["each"].values()]
 
 

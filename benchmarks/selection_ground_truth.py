@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from torch import Tensor
 
 from lexsplat.geometry.boxes import Box, fit_box
@@ -127,3 +129,31 @@ def _near_surface(gaussians: Gaussians, view: GroundTruthView, tolerance: float)
     # Just outside a silhouette the pixel of the center shows a surface far behind, which does not contradict a
     # Gaussian in front of it. Only Gaussians clearly behind the exact surface are excluded.
     return torch.from_numpy(inside & (exact > 0) & (depth <= exact + reach)).float()
+
+
+def box_iou(first: Box, second: Box) -> float:
+    """Intersection over union of two oriented boxes by volume, in 0..1; exact."""
+    if min(first.volume, second.volume) <= 0:
+        return 0.0
+    faces = []
+    for box in (first, second):
+        for axis, half in zip(box.axes, box.half_sizes):
+            middle = float(axis @ box.center)
+            faces += [[*axis, -middle - half], [*(-axis), middle - half]]
+    halfspaces = np.array(faces)
+    # The middle of the largest ball inside all faces: a point that is surely inside, if any is.
+    scale = float(max(first.half_sizes.max(), second.half_sizes.max()))
+    found = linprog(
+        [0, 0, 0, -1],
+        A_ub=np.hstack([halfspaces[:, :3], np.ones((len(faces), 1))]),
+        b_ub=-halfspaces[:, 3],
+        bounds=[(None, None)] * 3 + [(0, None)],
+    )
+    if not found.success or found.x[3] <= 1e-9 * scale:
+        return 0.0
+    try:
+        inside = HalfspaceIntersection(halfspaces, found.x[:3])
+        shared = float(ConvexHull(inside.intersections).volume)
+    except QhullError:  # thinner than Qhull can tell from a plane
+        return 0.0
+    return min(1.0, shared / (first.volume + second.volume - shared))

@@ -28,14 +28,13 @@ from lexsplat.evaluation.baselines.feature_rendering import TrainingViews, back_
 from lexsplat.evaluation.baselines.lerf import level_weights, smooth_by_similarity
 from lexsplat.evaluation.baselines.ovs3d import alignment_loss, js_divergence
 from lexsplat.features import FeatureMap
-from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
+from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.rendering import back_project, render
 
 BALLS = len(CENTERS)
 DIM = BALLS + 1  # one direction for each ball, one for everything else
 WORDS = torch.eye(DIM)[:BALLS]
 OTHER = torch.eye(DIM)[BALLS:]
-CONFIG = QueryConfig()
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +59,7 @@ def maps(scene):
 
 def ball_scores(method, scene):
     """Share of the Gaussians whose highest score is that of their own ball."""
-    scores = method.gaussian_scores(WORDS, OTHER, CONFIG)
+    scores = method.gaussian_scores(Question(WORDS, OTHER))
     assert scores.shape == (BALLS, len(scene.gaussians))
     assert float(scores.min()) >= 0
     assert float(scores.max()) <= 1
@@ -70,7 +69,7 @@ def ball_scores(method, scene):
 def pixel_accuracy(method, scene, maps_shape=(24, 32)):
     right = total = 0
     for name, camera in scene.cameras.items():
-        found = method.relevancy(scene.gaussians, camera, WORDS, OTHER, CONFIG)
+        found = method.relevancy(scene.gaussians, camera, Question(WORDS, OTHER))
         assert found.shape == (BALLS, *maps_shape)
         ground_truth = scene.code_maps[name]
         on = ground_truth != IGNORED
@@ -185,11 +184,11 @@ def test_each_prompt_takes_the_scale_with_the_highest_relevancy(scene):
     second[labels == 1] = WORDS[1]
     both = ScaledFeatures(torch.stack([first, second]), torch.tensor([0.1, 0.2]))
     camera = scene.cameras["view0"]
-    found = both.relevancy(scene.gaussians, camera, WORDS[:2], OTHER, CONFIG)
+    found = both.relevancy(scene.gaussians, camera, Question(WORDS[:2], OTHER))
     for index, features in enumerate((first, second)):
-        alone = DistilledFeatures(features).relevancy(scene.gaussians, camera, WORDS[:2], OTHER, CONFIG)
+        alone = DistilledFeatures(features).relevancy(scene.gaussians, camera, Question(WORDS[:2], OTHER))
         torch.testing.assert_close(found[index], alone[index])
-    scores = both.gaussian_scores(WORDS[:2], OTHER, CONFIG)
+    scores = both.gaussian_scores(Question(WORDS[:2], OTHER))
     assert ((scores[0] > 0.9).numpy() == (scene.labels == 0)).all()
     assert ((scores[1] > 0.9).numpy() == (scene.labels == 1)).all()
 
@@ -254,7 +253,7 @@ def test_3dovs_separates_the_classes_and_one_half_selects_the_best_class(scene, 
     found = fit_3dovs(data, classes, Ovs3dConfig(steps=15, pairs=32))
     assert isinstance(found, Method)
     assert ball_scores(found, scene) > 0.85
-    scores = found.gaussian_scores(classes, OTHER, CONFIG)
+    scores = found.gaussian_scores(Question(classes, OTHER))
     known = found.features.norm(dim=1) > 0
     assert ((scores >= 0.5).sum(0)[known] == 1).all(), "one class is the best of all"
     with pytest.raises(ValueError, match="two classes"):
@@ -269,12 +268,12 @@ def test_nearest_is_the_relevancy_of_the_views_own_features(scene, maps):
     assert isinstance(found, Method)
     camera = scene.cameras["view2"]
     expected = pairwise_relevancy(maps["view2"].clip @ WORDS.T, maps["view2"].clip @ OTHER.T, 10.0)
-    same = found.relevancy(scene.gaussians, camera, WORDS, OTHER, CONFIG)
+    same = found.relevancy(scene.gaussians, camera, Question(WORDS, OTHER))
     torch.testing.assert_close(same, expected.permute(2, 0, 1))
-    larger = found.relevancy(scene.gaussians, camera.resized(64, 48), WORDS, OTHER, CONFIG)
+    larger = found.relevancy(scene.gaussians, camera.resized(64, 48), Question(WORDS, OTHER))
     assert larger.shape == (BALLS, 48, 64)
     assert float((F.avg_pool2d(larger[None], 2)[0] - same).abs().mean()) < 0.02
-    assert found.gaussian_scores(WORDS, OTHER, CONFIG) is None
+    assert found.gaussian_scores(Question(WORDS, OTHER)) is None
     stranger = make_scene(per_ball=2, views=7).cameras["view3"]
     with pytest.raises(ValueError, match="poses"):
-        found.relevancy(scene.gaussians, stranger, WORDS, OTHER, CONFIG)
+        found.relevancy(scene.gaussians, stranger, Question(WORDS, OTHER))

@@ -19,6 +19,7 @@ from lexsplat.evaluation import (
     PairResult,
     ViewPictures,
     evaluate,
+    measuring,
     peak_memory,
     precision_curves,
     summarize_language,
@@ -27,6 +28,7 @@ from lexsplat.evaluation.metrics import average_precision, threshold_counts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.queries.thresholds import scene_thresholds
 
 WORDS = {"red apple": 1, "blue ball": 2}
 
@@ -47,9 +49,7 @@ def things_seen(camera):
     return things_at(camera.viewmat.tobytes(), camera.K[0, 0], camera.width, camera.height)
 
 
-QUICK = EvaluationConfig(
-    threshold_views=3, timing_views=1, lpips=False, protocols=("strict", "official", "lerf-2d")
-)
+QUICK = EvaluationConfig(timing_views=1, lpips=False, protocols=("strict", "official", "lerf-2d"))
 
 
 class PerfectField:
@@ -65,6 +65,9 @@ class PerfectField:
 
     def code_probabilities(self):
         return torch.eye(3)[torch.arange(9999) % 3]  # everything is somewhere
+
+    def scores(self, table):
+        return self.code_probabilities() @ table
 
     def select(self, index):
         return SimpleNamespace(code_probabilities=lambda: self.code_probabilities()[index])
@@ -154,19 +157,16 @@ def test_automatic_thresholds_never_see_the_truth(scene, gaussians, perfect):
 
 
 def test_automatic_thresholds_look_at_training_views_only(scene, gaussians, monkeypatch):
-    from lexsplat.queries import presence
-
     cameras = []
-    original = presence.scene_threshold
     monkeypatch.setattr(
-        presence,
-        "scene_threshold",
-        lambda f, g, views, *rest: cameras.extend(views) or original(f, g, views, *rest),
+        measuring,
+        "scene_thresholds",
+        lambda relevancy, views, *rest: cameras.extend(views) or scene_thresholds(relevancy, views, *rest),
     )
     evaluate(scene, gaussians, PerfectField(), encode_text, QUICK)
-    training = [scene.views[name].camera for name in scene.train_names]
-    assert len(cameras) == 3
-    assert all(any(camera is other for other in training) for camera in cameras)
+    training = [view.camera for view in scene.train_views]
+    assert len(cameras) == len(training)
+    assert all(camera is other for camera, other in zip(cameras, training))
 
 
 def test_masks_of_training_views_do_not_count(scene, gaussians):
@@ -349,12 +349,12 @@ class PaintedScene:
             near = (gaussians.means - torch.tensor(center)).norm(dim=1) < 1.2 * radius
             self.owner[near] = index
 
-    def gaussian_scores(self, positives, negatives, config):
-        return torch.stack([(self.owner == int(p.argmax())).float() for p in positives])
+    def gaussian_scores(self, question):
+        return torch.stack([(self.owner == int(p.argmax())).float() for p in question.positives])
 
-    def relevancy(self, gaussians, camera, positives, negatives, config):
+    def relevancy(self, gaussians, camera, question):
         things = torch.from_numpy(things_seen(camera)).long()
-        return torch.stack([(things == int(p.argmax())).float() for p in positives])
+        return torch.stack([(things == int(p.argmax())).float() for p in question.positives])
 
     def tensors(self):
         return {"owner": self.owner}

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.tilted_cameras import UP, cameras
 
-from lexsplat.geometry.boxes import Box, box_iou, fit_box, gravity_up
+from lexsplat.geometry.boxes import Box, fit_box, gravity_up
 from lexsplat.geometry.cameras import look_at
 
 
@@ -39,26 +39,6 @@ def test_points_without_weight_do_not_count():
     points = np.vstack([np.random.default_rng(0).uniform(-1, 1, (500, 3)), np.full((200, 3), 9.0)])
     weights = np.r_[np.ones(500), np.zeros(200)]
     assert fit_box(points, UP, weights).half_sizes.max() < 1.5
-
-
-@given(st.integers(0, 50))
-@settings(max_examples=25, deadline=None)
-def test_the_overlap_of_boxes_is_the_share_of_random_points_in_both(seed):
-    rng = np.random.default_rng(seed)
-    first = turned(rng.uniform(0, 3), rng.uniform(-0.3, 0.3, 3), rng.uniform(0.4, 1.0, 3))
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    second = Box(rng.uniform(-0.3, 0.3, 3), rotation, rng.uniform(0.4, 1.0, 3))
-    points = rng.uniform(-2.5, 2.5, (200_000, 3))
-    a, b = first.contains(points), second.contains(points)
-    assert box_iou(first, second) == pytest.approx((a & b).sum() / (a | b).sum(), abs=0.02)
-
-
-def test_the_overlap_of_boxes_by_hand():
-    box = turned(0.0)
-    assert box_iou(box, box) == pytest.approx(1.0)
-    assert box_iou(box, turned(0.0, center=(1.0, 0, 0))) == pytest.approx(1 / 3)
-    assert box_iou(box, turned(0.0, center=(5.0, 0, 0))) == 0.0
-    assert box_iou(box, turned(0.0, halves=(1.0, 0.5, 0.0))) == 0.0
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 2, -0.5)])

@@ -241,7 +241,7 @@ def test_things_are_found_on_the_gpu(on_gpu):
         assert other.mask.is_cuda
     assert found.box.contains(found.center[None]).all()
     assert found.best_view in scene.views
-    json.dumps(found.to_json())
+    json.dumps(found.to_dict())
     assert scene.find("ball 1 nearest to ball 2") is not None
     name = next(iter(scene.views))
     assert scene.relevancy(["ball 2"], name).shape[:2] == scene.relevancy(["ball 1"], name).shape[:2]

@@ -7,7 +7,7 @@ from support.language_scene import CENTERS, RADIUS, make_scene
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.language.fields import CodeField
-from lexsplat.queries.picking import Hit, field_scores, likeness_to, select_hit, surface_at
+from lexsplat.queries.picking import Hit, select_hit, similarity_to, surface_at
 from lexsplat.runtime.errors import QueryError
 
 
@@ -50,34 +50,15 @@ def test_two_things_of_one_meaning_are_told_apart_by_where_the_click_was(scene):
     assert np.array_equal(chosen.mask.numpy(), scene.labels == 1)
 
 
-def test_likeness_is_the_cosine_of_features(scene, field):
+def test_similarity_is_the_cosine_of_features(scene, field):
     features = torch.nn.functional.normalize(scene.codebook.clip, dim=-1)[scene.labels]
     expected = (features @ features[scene.labels == 2][0]).clamp(0, 1)
-    assert torch.allclose(likeness_to(click(scene, 2)[0], field), expected, atol=1e-5)
+    assert torch.allclose(similarity_to(click(scene, 2)[0], field), expected, atol=1e-5)
 
 
-def test_scores_in_blocks_are_the_dense_product(field):
-    class Plain:
-        """A field without scores of its own."""
-
-        def __init__(self, inner):
-            self.inner, self.uncertainties = inner, inner.uncertainties
-
-        def select(self, index):
-            return Plain(self.inner.select(index))
-
-        def code_probabilities(self):
-            return self.inner.code_probabilities()
-
-    table = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
-    dense = field.code_probabilities() @ table
-    assert torch.allclose(field_scores(Plain(field), table, rows=64), dense, atol=1e-6)
-    assert torch.allclose(field_scores(field, table), dense, atol=1e-6)
-
-
-def test_a_click_beside_everything_is_told(scene):
+def test_a_click_that_hits_nothing_is_refused(scene):
     camera = look_at([0.0, -6.0, 6.0], [0.0, 0.0, 8.0], np.array([0.0, 0, 1]), 40, 30, 0.5)
-    with pytest.raises(QueryError, match="found nothing"):
+    with pytest.raises(QueryError, match="expected a surface, found nothing"):
         surface_at(scene.gaussians, camera, 20.0, 15.0)
     with pytest.raises(QueryError, match="outside"):
         surface_at(scene.gaussians, camera, 41.0, 15.0)

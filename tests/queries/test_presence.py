@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from selection import fit_calibration
 from support.language_scene import make_scene
 
 from lexsplat.language.fields import CodeField
@@ -13,10 +14,8 @@ from lexsplat.queries.presence import (
     Calibration,
     Evidence,
     PresenceClassifier,
-    fit_calibration,
-    found_thresholds,
 )
-from lexsplat.queries.relevancy import gaussian_relevancy
+from lexsplat.queries.relevancy import Question, gaussian_relevancy
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +37,8 @@ def parts():
 
 def evidence_of(parts, text: torch.Tensor) -> Evidence:
     gaussians, field, references, negatives = parts
-    judge = PresenceClassifier(gaussians, field, references, negatives, 10.0)
-    return judge.evidence(gaussian_relevancy(field, text[None], negatives)[0])
+    classifier = PresenceClassifier(gaussians, field, Question(references, negatives))
+    return classifier.evidence(gaussian_relevancy(field, Question(text[None], negatives))[0])
 
 
 def test_what_is_there_has_more_evidence_than_what_is_not(parts):
@@ -56,15 +55,15 @@ def test_what_is_there_has_more_evidence_than_what_is_not(parts):
 
 def test_evidence_by_hand(parts):
     gaussians, field, references, negatives = parts
-    judge = PresenceClassifier(gaussians, field, references, negatives, 10.0)
-    all_scores = gaussian_relevancy(field, references, negatives)
+    classifier = PresenceClassifier(gaussians, field, Question(references, negatives))
+    all_scores = gaussian_relevancy(field, Question(references, negatives))
     shown = gaussians.opacities >= 0.1
     peaks = all_scores[:, shown].topk(20, dim=1).values.mean(1)
     spread = (peaks - peaks.median()).abs().median() * 1.4826
     text = torch.nn.functional.normalize(field.codebook.clip[2] + 0.5, dim=0)
-    scores = gaussian_relevancy(field, text[None], negatives)[0]
+    scores = gaussian_relevancy(field, Question(text[None], negatives))[0]
     best = scores.topk(20)
-    found = judge.evidence(scores)
+    found = classifier.evidence(scores)
     assert found.height == pytest.approx(float((best.values.mean() - peaks.median()) / spread), rel=1e-3)
     lower = all_scores[:, best.indices].mean(1) < best.values.mean()
     assert found.rank == pytest.approx(float(lower.float().mean()))
@@ -77,7 +76,7 @@ def test_a_probability_is_the_logistic_function_and_grows_with_evidence(height, 
     logit = -2 + 0.7 * min(10, max(-5, height)) + 3 * rank
     p = calibration.probability(Evidence(height, rank))
     assert p == pytest.approx(1 / (1 + math.exp(-logit)))
-    assert calibration.judge(Evidence(height, rank)) == (
+    assert calibration.classify(Evidence(height, rank)) == (
         "yes" if p >= 0.6 else "no" if p <= 0.3 else "unsure"
     )
     assert calibration.probability(Evidence(height + 1, rank)) >= p
@@ -94,8 +93,8 @@ def test_a_fit_separates_what_is_separable_and_keeps_its_promises():
     present, absent = draw(4.0, 60), draw(0.0, 60)
     fitted = fit_calibration(present, absent)
     assert fitted.height > 0
-    assert sum(fitted.judge(e) != "no" for e in present) >= 0.88 * 60
-    assert sum(fitted.judge(e) == "yes" for e in absent) <= 0.12 * 60
+    assert sum(fitted.classify(e) != "no" for e in present) >= 0.88 * 60
+    assert sum(fitted.classify(e) == "yes" for e in absent) <= 0.12 * 60
     assert fitted.yes >= fitted.no
     with pytest.raises(ValueError, match="present and"):
         fit_calibration(present, [])
@@ -104,17 +103,6 @@ def test_a_fit_separates_what_is_separable_and_keeps_its_promises():
 def test_an_empty_scene_holds_nothing(parts):
     gaussians, field, references, negatives = parts
     nothing = torch.zeros(500, dtype=torch.bool)
-    judge = PresenceClassifier(gaussians.select(nothing), field.select(nothing), references, negatives, 10.0)
-    assert judge.judge(torch.zeros(0)) == "no"
-
-
-@pytest.mark.parametrize(("verdict", "expected"), [("no", 0.5), ("unsure", 0.3), ("yes", 0.3)])
-def test_only_what_is_judged_absent_falls_back_to_half(parts, monkeypatch, verdict, expected):
-    gaussians, field, references, negatives = parts
-    texts = torch.nn.functional.normalize(field.codebook.clip[:2], dim=1)
-    second = gaussian_relevancy(field, texts, negatives)[1]
-    judge = PresenceClassifier(gaussians, field, references, negatives, 10.0)
-    monkeypatch.setattr(judge, "judge", lambda row: verdict if torch.equal(row, second) else "yes")
-    monkeypatch.setattr("lexsplat.queries.presence.scene_threshold", lambda *_: torch.tensor([0.4, 0.3]))
-    found = found_thresholds(judge, gaussians, [], texts, negatives)
-    assert found.tolist() == pytest.approx([0.4, expected])
+    question = Question(references, negatives)
+    classifier = PresenceClassifier(gaussians.select(nothing), field.select(nothing), question)
+    assert classifier.classify(torch.zeros(0)) == "no"

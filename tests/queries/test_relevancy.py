@@ -6,10 +6,20 @@ from hypothesis import strategies as st
 from support.question_scene import lifted_cloud, texts
 
 from lexsplat.queries import relevancy as queries
-from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.queries.relevancy import QueryConfig, Question
 from lexsplat.runtime.errors import QueryError
 
 FORMS = ("feature", "code")
+
+
+def asked(form="code", prompts=3, dim=16) -> Question:
+    return Question(texts(prompts, dim, 5), texts(4, dim, 6), QueryConfig(form=form))
+
+
+def cosines_of_built_features(probabilities, codewords, prompts):
+    """The reference of `feature_cosines`: it builds the feature map F = p S ``[..., D]``."""
+    features = torch.nn.functional.normalize(probabilities @ codewords, dim=-1)
+    return features @ torch.nn.functional.normalize(prompts, dim=-1).T
 
 
 def distributions(shape, seed, sharpness=3.0):
@@ -77,7 +87,7 @@ def test_cosines_without_the_feature_map_equal_those_with_it(codes, dim, sharpne
     codewords = texts(codes, dim, 0) * torch.linspace(0.5, 2, codes)[:, None]
     probabilities = distributions((9, 11, codes), 1, sharpness)
     prompts = texts(6, dim, 2)
-    expected = queries.feature_cosines_naive(probabilities.double(), codewords.double(), prompts.double())
+    expected = cosines_of_built_features(probabilities.double(), codewords.double(), prompts.double())
     found = queries.feature_cosines(probabilities, codewords, prompts)
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5)
 
@@ -98,62 +108,49 @@ def test_blocks_do_not_show(monkeypatch):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_both_forms_agree_on_hard_codes(form):
-    codewords, positives, negatives = texts(6, 16, 0), texts(2, 16, 1), texts(4, 16, 2)
-    found = queries.probability_relevancy(
-        torch.eye(6), codewords, positives, negatives, QueryConfig(form=form)
-    )
-    torch.testing.assert_close(found, queries.code_relevancy(codewords, positives, negatives))
+    codewords, question = texts(6, 16, 0), asked(form)
+    found = queries.probability_relevancy(torch.eye(6), codewords, question)
+    torch.testing.assert_close(found, queries.code_relevancy(codewords, question))
 
 
 def test_the_code_form_is_linear_and_the_feature_form_is_not():
-    codewords, positives, negatives = texts(6, 16, 0), texts(2, 16, 1), texts(4, 16, 2)
+    codewords = texts(6, 16, 0)
     mixed = torch.tensor([[0.25, 0.75, 0, 0, 0, 0]])
-    table = queries.code_relevancy(codewords, positives, negatives)
+    table = queries.code_relevancy(codewords, asked())
     expected = 0.25 * table[:1] + 0.75 * table[1:2]
-    by_code = queries.probability_relevancy(mixed, codewords, positives, negatives, QueryConfig(form="code"))
+    by_code = queries.probability_relevancy(mixed, codewords, asked("code"))
     torch.testing.assert_close(by_code, expected)
-    by_feature = queries.probability_relevancy(
-        mixed, codewords, positives, negatives, QueryConfig(form="feature")
-    )
+    by_feature = queries.probability_relevancy(mixed, codewords, asked("feature"))
     assert (by_feature - expected).abs().max() > 1e-2
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_what_is_not_covered_is_not_relevant(form):
-    codewords, positives, negatives = texts(6, 16, 0), texts(2, 16, 1), texts(4, 16, 2)
     full = distributions((1, 6), 3)
     rows = torch.cat([full, 0.4 * full, 0 * full])
-    composite = queries.probability_relevancy(rows, codewords, positives, negatives, QueryConfig(form=form))
-    torch.testing.assert_close(composite[1], 0.4 * composite[0])
-    assert not composite[2].any()
-    config = QueryConfig(form=form, coverage="divide")
-    divided = queries.probability_relevancy(rows, codewords, positives, negatives, config)
-    torch.testing.assert_close(divided[1], composite[0])
-    assert not divided[2].any()
+    found = queries.probability_relevancy(rows, texts(6, 16, 0), asked(form))
+    torch.testing.assert_close(found[1], 0.4 * found[0])
+    assert not found[2].any()
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("coverage", ["composite", "divide"])
-def test_a_view_is_answered_as_its_distributions_are(lifted, form, coverage):
+def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(lifted, form):
     field, gaussians, camera = lifted
-    config = QueryConfig(form=form, coverage=coverage)
-    positives, negatives = texts(3, 16, 5), texts(4, 16, 6)
-    found = queries.render_relevancy(field, gaussians, camera, positives, negatives, config)
+    found = queries.render_relevancy(field, gaussians, camera, asked(form))
     probabilities = field.render_code_probabilities(gaussians, camera)
-    expected = queries.probability_relevancy(probabilities, field.codebook.clip, positives, negatives, config)
+    expected = queries.probability_relevancy(probabilities, field.codebook.clip, asked(form))
     assert found.shape == (3, 36, 48)
     torch.testing.assert_close(found, expected.permute(2, 0, 1), rtol=0, atol=2e-5)
-    assert not found[:, 0, 0].any(), "nothing is in the corner"
+    assert not found[:, 0, 0].any(), "the corner is empty"
 
 
 def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted):
     from lexsplat.rendering import render
 
     field, gaussians, camera = lifted
-    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form="code")
-    scores = queries.gaussian_relevancy(field, positives, negatives, config)
+    scores = queries.gaussian_relevancy(field, asked())
     rendered = render(gaussians, camera, features=scores.T.contiguous(), color=False).features
-    found = queries.render_relevancy(field, gaussians, camera, positives, negatives, config)
+    found = queries.render_relevancy(field, gaussians, camera, asked())
     torch.testing.assert_close(found, rendered.permute(2, 0, 1), rtol=0, atol=1e-5)
     assert found.max() > 0.1
 
@@ -161,23 +158,17 @@ def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted
 @pytest.mark.parametrize("form", FORMS)
 def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
     field, _, _ = lifted
-    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form=form)
-    found = queries.gaussian_relevancy(field, positives, negatives, config)
-    dense = queries.probability_relevancy(
-        field.code_probabilities(), field.codebook.clip, positives, negatives, config
-    )
+    found = queries.gaussian_relevancy(field, asked(form))
+    dense = queries.probability_relevancy(field.code_probabilities(), field.codebook.clip, asked(form))
     torch.testing.assert_close(found, dense.T, rtol=0, atol=1e-6)
-    assert not found[:, :20].any(), "Gaussians without language answer nothing"
+    assert not found[:, :20].any(), "Gaussians without language score 0"
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("coverage", ["composite", "divide"])
-def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, coverage, monkeypatch):
+def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, monkeypatch):
     """``[N, K]`` of millions of Gaussians would be gigabytes."""
     field, _, _ = lifted
-    positives, negatives = texts(3, 16, 5), texts(4, 16, 6)
-    config = QueryConfig(form=form, coverage=coverage)
-    whole = queries.gaussian_relevancy(field, positives, negatives, config)
+    whole = queries.gaussian_relevancy(field, asked(form))
     most = []
 
     def probabilities(self):
@@ -187,42 +178,40 @@ def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, coverage
     original = type(field).code_probabilities
     monkeypatch.setattr(type(field), "code_probabilities", probabilities)
     monkeypatch.setattr(queries, "_GAUSSIANS", 7)
-    found = queries.gaussian_relevancy(field, positives, negatives, config)
+    found = queries.gaussian_relevancy(field, asked(form))
     torch.testing.assert_close(found, whole, rtol=0, atol=1e-6)
     assert max(most, default=0) <= 7
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_several_prompts_at_once_are_each_alone(lifted, form):
+def test_prompts_do_not_influence_each_other(lifted, form):
     field, gaussians, camera = lifted
-    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form=form)
-    together = queries.render_relevancy(field, gaussians, camera, positives, negatives, config)
+    question = asked(form)
+    together = queries.render_relevancy(field, gaussians, camera, question)
     for index in range(3):
-        alone = queries.render_relevancy(
-            field, gaussians, camera, positives[index : index + 1], negatives, config
-        )
+        one = Question(question.positives[index : index + 1], question.negatives, question.config)
+        alone = queries.render_relevancy(field, gaussians, camera, one)
         torch.testing.assert_close(alone[0], together[index], rtol=0, atol=1e-6)
 
 
 def test_embeddings_of_another_encoder_are_refused():
     with pytest.raises(ValueError, match=r"positives must be \[\*, 16\]"):
-        queries.code_relevancy(texts(6, 16, 0), texts(2, 8, 1), texts(4, 16, 2))
+        queries.code_relevancy(texts(6, 16, 0), Question(texts(2, 8, 1), texts(4, 16, 2)))
+
+
+@pytest.mark.parametrize("prompts", [[1], [None, "apple"], 3, None, [["apple"]]])
+def test_prompts_that_are_not_text_are_refused(prompts):
+    with pytest.raises(QueryError, match="expected a text or a list of texts"):
+        queries.check_prompts(prompts)
+
+
+def test_a_single_text_is_one_prompt():
+    assert queries.check_prompts(" red  apple ") == ["red apple"]
 
 
 @pytest.mark.parametrize(
-    "change", [{"temperature": 0}, {"form": "both"}, {"negatives": ()}, {"threshold": 1.5}, {"coverage": "?"}]
+    "change", [{"temperature": 0}, {"form": "both"}, {"negatives": ()}, {"threshold": 1.5}]
 )
 def test_a_setting_that_cannot_be_is_refused(change):
     with pytest.raises(ValueError):
         QueryConfig(**change)
-
-
-# Ranking
-
-
-def test_ranking_is_best_first_and_ties_keep_their_order():
-    scores = torch.tensor([[0.2, 0.9, 0.9, 0.1]])
-    indices, values = queries.ranking(scores, 3)
-    assert indices.tolist() == [[1, 2, 0]]
-    torch.testing.assert_close(values, torch.tensor([[0.9, 0.9, 0.2]]))
-    assert queries.ranking(scores, 10)[0].shape == (1, 4)

@@ -25,11 +25,11 @@ def ball(scene, *numbers) -> Selection:
 
 def test_each_ball_is_an_instance_where_it_stands(scene):
     chosen = ball(scene, 0, 1, 4)
-    assert len(chosen.instances) == 3
+    assert chosen.count == len(chosen.instances) == 3
     centers = sorted(tuple(instance.center.round(1)) for instance in chosen.instances)
     assert np.allclose(centers, sorted(map(tuple, CENTERS[[0, 1, 4]])), atol=0.1)
     for instance in chosen.instances:
-        assert instance.count == 200
+        assert len(instance) == 200
         assert instance.size == pytest.approx(2 * RADIUS * 0.95, abs=0.12)
 
 
@@ -37,9 +37,9 @@ def test_specks_are_no_instances_and_can_be_left_out(scene):
     mask = scene.labels == 0
     mask[np.flatnonzero(scene.labels == 1)[:4]] = True
     chosen = select(scene, mask)
-    assert chosen.count == 204
+    assert len(chosen) == 204
     assert len(chosen.instances) == 1
-    assert chosen.without_specks().count == 200
+    assert len(chosen.without_specks()) == 200
     assert len(chosen.clusters()) > 1
 
 
@@ -50,9 +50,9 @@ def test_only_instances_that_answer_about_as_well_as_the_best_convince(scene):
     assert len(chosen.instances) == 3
     kept = chosen.convincing()
     assert torch.equal(kept.mask, (labels == 0) | (labels == 2))
-    assert kept.convincing().count == kept.count
+    assert len(kept.convincing()) == len(kept)
     alone = Selection(scene.gaussians, scene.cameras, labels == 1, scores, threshold=0.4)
-    assert alone.convincing().count == 200, "the best one is never left out"
+    assert len(alone.convincing()) == 200, "the best one is never left out"
 
 
 def test_operators_are_those_of_sets(scene):
@@ -63,7 +63,7 @@ def test_operators_are_those_of_sets(scene):
         (first | second, a | b), (first & second, a & b), (first - second, a & ~b), (~first, ~a),
     ]:  # fmt: skip
         assert np.array_equal(combined.mask.numpy(), expected)
-        assert combined.count == expected.sum()
+        assert len(combined) == combined.num_gaussians == expected.sum()
 
 
 def test_presence_of_combinations_is_that_of_the_words(scene):
@@ -104,8 +104,8 @@ def test_the_best_view_shows_the_ball_and_not_what_hides_it(scene):
 def test_an_empty_selection_has_no_box_but_answers_the_rest(scene):
     empty = select(scene, np.zeros(len(scene.labels), bool))
     assert not empty
-    assert (empty.count, empty.instances, empty.best_view, empty.grow().count) == (0, [], "", 0)
-    assert empty.to_json()["instances"] == []
+    assert (len(empty), empty.count, empty.instances, empty.best_view, len(empty.grow())) == (0, 0, [], "", 0)
+    assert empty.to_dict()["instances"] == []
     with pytest.raises(QueryError, match="something selected"):
         _ = empty.box
 
@@ -120,3 +120,16 @@ def test_one_gaussian_is_an_instance(scene):
 def test_masks_of_another_scene_are_refused(scene):
     with pytest.raises(ValueError, match="mask must be bool"):
         Selection(scene.gaussians, {}, torch.zeros(3, dtype=torch.bool), torch.zeros(3))
+
+
+def test_plain_data_counts_instances_and_lists_none_of_what_is_not_there(scene):
+    there = select(scene, np.isin(scene.labels, (0, 1)), phrase="ball").to_dict()
+    assert (there["count"], len(there["instances"]), there["gaussians"]) == (2, 2, 400)
+    absent = select(scene, scene.labels == 0, phrase="giraffe", present="no").to_dict()
+    assert (absent["present"], absent["count"], absent["instances"], absent["best_view"]) == ("no", 0, [], "")
+    assert absent["gaussians"] == 200
+
+
+def test_the_representation_of_a_selection_is_one_line(scene):
+    text = repr(select(scene, scene.labels == 0, phrase="ball"))
+    assert text == "Selection('ball', present='yes', gaussians=200, threshold=0.5)"

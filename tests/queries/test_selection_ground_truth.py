@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from selection_ground_truth import (
     GroundTruthView,
+    box_iou,
     lift_labels,
     selection_f1,
     surface_points,
@@ -12,6 +15,7 @@ from selection_ground_truth import (
 )
 from support.language_scene import CENTERS, RADIUS, make_scene, trace
 
+from lexsplat.geometry.boxes import Box
 from lexsplat.geometry.cameras import Camera
 
 
@@ -74,3 +78,28 @@ def test_f1_by_hand():
     assert (precision, recall) == (pytest.approx(3 / 6), pytest.approx(3 / 7))
     assert f1 == pytest.approx(2 * 3 / (6 + 7))
     assert selection_f1(~ground_truth & False, ground_truth, torch.ones(5))[0] == 0
+
+
+def turned(angle: float, center=(0.0, 0.0, 0.0), halves=(1.0, 0.5, 0.25)) -> Box:
+    axes = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    return Box(np.array(center, float), axes, np.array(halves, float))
+
+
+@given(st.integers(0, 50))
+@settings(max_examples=25, deadline=None)
+def test_the_overlap_of_boxes_is_the_share_of_random_points_in_both(seed):
+    rng = np.random.default_rng(seed)
+    first = turned(rng.uniform(0, 3), rng.uniform(-0.3, 0.3, 3), rng.uniform(0.4, 1.0, 3))
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    second = Box(rng.uniform(-0.3, 0.3, 3), rotation, rng.uniform(0.4, 1.0, 3))
+    points = rng.uniform(-2.5, 2.5, (200_000, 3))
+    a, b = first.contains(points), second.contains(points)
+    assert box_iou(first, second) == pytest.approx((a & b).sum() / (a | b).sum(), abs=0.02)
+
+
+def test_the_overlap_of_boxes_by_hand():
+    box = turned(0.0)
+    assert box_iou(box, box) == pytest.approx(1.0)
+    assert box_iou(box, turned(0.0, center=(1.0, 0, 0))) == pytest.approx(1 / 3)
+    assert box_iou(box, turned(0.0, center=(5.0, 0, 0))) == 0.0
+    assert box_iou(box, turned(0.0, halves=(1.0, 0.5, 0.0))) == 0.0

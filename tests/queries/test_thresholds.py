@@ -1,13 +1,15 @@
-"""Thresholds: the automatic one parts what is meant from the rest without seeing the truth."""
+"""Thresholds: the automatic one separates what is meant from the rest without ground truth."""
 
 import numpy as np
 import pytest
 import torch
 from support.question_scene import lifted_cloud, texts
 
+from lexsplat.geometry.cameras import look_at
 from lexsplat.queries import relevancy as queries
 from lexsplat.queries import thresholds
-from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.queries.relevancy import Question
+from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")
@@ -95,13 +97,43 @@ def test_each_prompt_has_its_own_threshold():
 
 def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(lifted):
     field, gaussians, camera = lifted
-    positives, negatives, config = texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form="code")
+    question = Question(texts(3, 16, 5), texts(4, 16, 6))
+
+    def relevancy(view):
+        return queries.render_relevancy(field, gaussians, view, question)
+
     views = [camera, camera.resized(96, 72)]
-    found = thresholds.scene_threshold(field, gaussians, views, positives, negatives, config, long_side=48)
-    one = queries.render_relevancy(field, gaussians, camera, positives, negatives, config).flatten(1)
+    found = thresholds.scene_thresholds(relevancy, views, long_side=48)
+    one = relevancy(camera).flatten(1)
     torch.testing.assert_close(found, thresholds.automatic_threshold(torch.cat([one, one], dim=1)))
     with pytest.raises(ValueError, match="at least one camera"):
-        thresholds.scene_threshold(field, gaussians, [], positives, negatives, config)
+        thresholds.scene_thresholds(relevancy, [])
+
+
+@pytest.mark.parametrize(("presence", "expected"), [("no", 0.5), ("unsure", 0.25), ("yes", 0.25)])
+def test_only_what_the_scene_does_not_hold_falls_back_to_half(lifted, presence, expected):
+    maps = torch.tensor([[[0.1] * 90 + [0.4] * 10]] * 2)
+    found = thresholds.scene_thresholds(lambda _: maps, [lifted[2]], ["yes", presence])
+    assert found.tolist() == pytest.approx([0.25, expected], abs=2e-3)
+
+
+@pytest.mark.parametrize(("count", "expected"), [(60, [0, 8, 17, 25, 34, 42, 51, 59]), (3, [0, 1, 2])])
+def test_the_views_of_a_threshold_are_spread_evenly(count, expected):
+    cameras = [look_at([0, -4, 0.1 * n], [0, 0, 0], [0, 0, 1], 8, 6, 0.9) for n in range(count)]
+    seen = []
+
+    def relevancy(camera):
+        seen.append(next(n for n in range(count) if np.array_equal(cameras[n].viewmat, camera.viewmat)))
+        return torch.rand(1, 6, 8)
+
+    thresholds.scene_thresholds(relevancy, cameras)
+    assert seen == expected
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.5, float("nan"), "0.5", None, True])
+def test_a_threshold_outside_the_unit_interval_is_refused(wrong):
+    with pytest.raises(QueryError, match=r"expected a number in 0\.\.1"):
+        thresholds.check_threshold(wrong)
 
 
 def test_masks_take_one_threshold_or_one_for_each_prompt():

@@ -41,7 +41,7 @@ def test_a_selection_alone_holds_the_gaussians_that_were_found(built, tmp_path):
     arguments = ["--select", "red apple", "--language", "--threshold", limit]
     assert export(built, tmp_path / "apple.ply", *arguments) == 0
     found = open_scene(built).select("red apple", limit)
-    assert 0 < found.count < len(found.mask)
+    assert 0 < len(found) < len(found.mask)
     assert torch.equal(read_ply(tmp_path / "apple.ply").means, found.selected.means)
     vertex = pytest.importorskip("plyfile").PlyData.read(tmp_path / "apple.ply")["vertex"]
     codes = open_scene(built).field.select(found.mask).code_probabilities().argmax(1)
@@ -56,7 +56,7 @@ def test_selections_are_those_of_find_and_are_told(built, tmp_path, monkeypatch,
 
     def find(scene, phrase, view=None, *, threshold=None):
         asked.append((phrase, view))
-        found = scene.select("red apple", 2.0 if "giraffe" in phrase else limit)
+        found = scene.select("red apple", 1.0 if "giraffe" in phrase else limit)
         return replace(found, phrase="as understood", present="no" if "giraffe" in phrase else "yes")
 
     monkeypatch.setattr("lexsplat.scenes.scene.Scene.find", find)

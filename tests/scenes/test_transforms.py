@@ -12,7 +12,7 @@ from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import multiply_quaternions, quaternion_from_matrix
 from lexsplat.rendering import render
-from lexsplat.scenes.transforms import moved, rotated_harmonics
+from lexsplat.scenes.transforms import rotated_harmonics, transformed
 
 
 def cloud(degree: int = 3, count: int = 80) -> Gaussians:
@@ -29,7 +29,7 @@ def test_a_camera_that_moves_along_sees_the_same_picture(degree):
     scale, shift, center = 1.7, np.array([0.3, -2.0, 1.0]), np.array([0.1, 0.2, -0.3])
     camera = look_at([0.5, -3.0, 1.0], [0.0, 0.0, 0.0], np.array([0, 0, 1.0]), 64, 48, 0.8)
     before = render(g, camera).image
-    after = moved(g, rotation=rotation, scale=scale, translation=shift, center=center)
+    after = transformed(g, rotation=rotation, scale=scale, translation=shift, center=center)
     # The camera makes the same move; its frame has no scale, so its place moves and its axes turn.
     position = scale * rotation @ (camera.position - center) + center + shift
     viewmat = np.eye(4)
@@ -61,8 +61,8 @@ def test_quaternions_multiply_as_scipy_says(seed):
 
 def test_only_proper_motions_are_taken():
     with pytest.raises(ValueError, match="proper rotation"):
-        moved(cloud(0), rotation=np.diag([1.0, 1.0, -1.0]))
+        transformed(cloud(0), rotation=np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match="scale"):
-        moved(cloud(0), scale=0.0)
+        transformed(cloud(0), scale=0.0)
     with pytest.raises(ValueError, match="finite"):
-        moved(cloud(0), translation=np.array([0, 0, np.nan]))
+        transformed(cloud(0), translation=np.array([0, 0, np.nan]))

@@ -45,16 +45,19 @@ class Export:
     def run(self) -> None:
         """Write the file."""
         from lexsplat.geometry.world import world_of
-        from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene, found_by
+        from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene
         from lexsplat.scenes.folder import SceneFolder
 
         ending_of(self.file)
         SceneFolder.open(Path(self.scene)).refuse_own_file(self.file)
         if self.select or self.language:
             scene = open_scene(self.scene, self.device, self.clip)
-            found = found_by(scene, self.select, self.view, self.threshold)
+            found = [
+                dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
+                for phrase in self.select
+            ]
             for selection in found:
-                print(f"{selection.phrase}: {selection.count:,} Gaussians{PRESENCE[selection.present]}")
+                print(f"{selection.phrase}: {len(selection):,} Gaussians{PRESENCE[selection.present]}")
             files = export_scene(scene, self.file, found=found, language=self.language)
         else:
             folder = SceneFolder.open(Path(self.scene))

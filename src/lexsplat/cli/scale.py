@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import tyro
@@ -89,10 +90,10 @@ class Scale:
 
     def _length(self) -> float:
         """The given distance as it is in the scene, in world units."""
-        from lexsplat.scenes.scale import height_of, length_between, length_of_points
+        from lexsplat.scenes.scale import height_of, length_between, positive_length
 
         if self.points is not None:
-            return length_of_points(parse_vector(self.points[0]), parse_vector(self.points[1]))
+            return positive_length(math.dist(*map(parse_vector, self.points)), "the two points")
         scene = open_scene(self.scene, self.device, self.clip)
         if self.between is not None:
             return length_between(scene, *self.between)

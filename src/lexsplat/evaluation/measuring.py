@@ -1,12 +1,12 @@
-"""Measuring a scene on its held-out views: pictures, words, speed and size, as in the paper's Table 1.
+"""Measuring a scene on its held-out views: images, language, speed and size, as in the paper's Table 1.
 
-Nothing is chosen on the views it is reported on. Three thresholds stand side by side: ``fixed`` (0.5, the
-paper), ``auto`` (per prompt, from renderings of training views, `presence.found_thresholds`) and ``oracle``
-(per prompt, the best one for the ground truth: an upper bound, never a result).
+Nothing is chosen on the views it is reported on. Three thresholds are reported side by side: ``fixed`` (0.5, the
+paper), ``auto`` (per prompt, from renderings of training views, `lexsplat.queries.thresholds.scene_thresholds`) and
+``oracle`` (per prompt, the best one for the ground truth: an upper bound, never a result).
 
-Relevancy is rendered at the size of the ground truth, so that neither has to be resized; only masks larger than
-``max_pixels`` are met by a map rendered at the working size and enlarged. The official protocol renders at
-the working size and resizes the ground truth, as the authors do.
+Relevancy is rendered at the size of the ground truth, so that neither is resized. Only for masks larger than
+``max_pixels`` is the map rendered at the working size and enlarged. The official protocol renders at the working
+size and resizes the ground truth, as the authors do.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lexsplat.captures.ground_truth.layouts import load_ground_truth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
-from lexsplat.evaluation.methods import FieldMethod, Method, method_thresholds
+from lexsplat.evaluation.methods import FieldMethod, Method, method_presences
 from lexsplat.evaluation.metrics import (
     THRESHOLDS,
     Perceptual,
@@ -41,8 +41,10 @@ from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kin
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.presence import REFERENCE_PHRASES
-from lexsplat.queries.relevancy import QueryConfig, TextEncoder, embed_prompts
+from lexsplat.queries.relevancy import QueryConfig, Question, TextEncoder, embed_prompts
+from lexsplat.queries.thresholds import scene_thresholds
 from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.sampling import evenly
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
@@ -51,19 +53,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What is measured and how.
+    """Settings of an evaluation.
 
     Args:
         query: How text is compared with the scene; its ``threshold`` is the fixed one.
-        threshold_views: Training views rendered for the automatic thresholds, at most.
         timing_views: Held-out views on which speed is measured, at most.
-        max_pixels: Largest rendering for the truth's sake, in pixels.
-        lpips: Whether to measure LPIPS if it is installed.
+        max_pixels: Largest rendering at the size of the ground truth, in pixels.
+        lpips: Whether to measure LPIPS, if it is installed.
         protocols: Names out of `PROTOCOLS`; "strict" is always measured.
     """
 
     query: QueryConfig = field(default_factory=QueryConfig)
-    threshold_views: int = 8
     timing_views: int = 4
     max_pixels: int = 2_000_000
     lpips: bool = True
@@ -73,12 +73,12 @@ class EvaluationConfig:
         unknown = set(self.protocols) - set(PROTOCOLS)
         if unknown:
             raise ValueError(f"protocols are {', '.join(PROTOCOLS)}, got {', '.join(sorted(unknown))}")
-        if min(self.threshold_views, self.timing_views, self.max_pixels) < 1:
-            raise ValueError("threshold_views, timing_views and max_pixels must be positive")
+        if min(self.timing_views, self.max_pixels) < 1:
+            raise ValueError("timing_views and max_pixels must be positive")
 
 
 def evaluate(
-    scene: Capture,
+    capture: Capture,
     gaussians: Gaussians,
     language: LanguageField | Method | None,
     encode_text: TextEncoder | None,
@@ -94,25 +94,24 @@ def evaluate(
     machine: Mapping[str, Any] | None = None,
     prompt_kinds: Mapping[str, str] | None = None,
 ) -> Metrics:
-    """Measure a scene on its held-out views, one view in memory at a time.
+    """Measure a scene on its held-out views, with one view in memory at a time.
 
     Args:
-        scene: Photos, cameras and the split.
+        capture: Photos, cameras and the split.
         gaussians: The reconstruction.
-        language: Its language, or any other method that answers words; None measures pictures only.
-        encode_text: Texts to embeddings; needed where there are masks.
-        config: What is measured.
-        masks: Truth by view and prompt; None takes what the capture has (`scenes.load_annotations`). Views of the
-            training split are left out.
-        boxes: Boxes by view and prompt for LangSplat's localization; where there are none, those of the masks.
-        observer: Called once for each held-out view, for reports.
-        listener: Told how far it is.
-        stage_seconds: Time of each stage of the build, passed through.
-        stored_bytes: "language_bytes" and "gaussian_bytes" on disk; else the size of the tensors.
-        settings: Settings of the build, passed through.
-        machine: Passed through.
-        prompt_kinds: What kind of question a prompt is ("name", "color", "part", ...); the numbers are then also
-            given for each kind.
+        language: Its language field or another method; None measures images only.
+        encode_text: Texts to embeddings; needed if there are masks.
+        config: Settings.
+        masks: Ground truth by view and prompt; None takes that of the capture
+            (`lexsplat.captures.load_annotations`). Training views are ignored.
+        boxes: Boxes by view and prompt for LangSplat's localization; None takes those of the masks.
+        observer: Receives the images of each held-out view once, for reports.
+        listener: Receives progress events.
+        stage_seconds: Time of each stage of the build; copied into the result.
+        stored_bytes: "language_bytes" and "gaussian_bytes" on disk; None takes the size of the tensors.
+        settings: Settings of the build; copied into the result.
+        machine: Facts about the machine; copied into the result.
+        prompt_kinds: Kind of each prompt ("name", "color", "part", ...); adds the numbers of each kind.
 
     Raises:
         ValueError: If there are masks and a language but no ``encode_text``.
@@ -121,10 +120,10 @@ def evaluate(
     if masks is None:
         from lexsplat.captures import load_annotations
 
-        found = load_annotations(scene)
+        found = load_annotations(capture)
         masks, boxes = found.masks, found.boxes if boxes is None else boxes
     method = language if language is None or isinstance(language, Method) else FieldMethod(language)
-    run = _Evaluation(scene, gaussians, method, config, masks, boxes or {})
+    run = _Evaluation(capture, gaussians, method, config, masks, boxes or {})
     if run.prompts:
         run.embed(encode_text)
     quality = run.run(observer, listener)
@@ -146,47 +145,48 @@ def evaluate(
 
 
 class _Evaluation:
-    """One pass over the held-out views. Keeps numbers, no pictures."""
+    """One pass over the held-out views; keeps numbers, no images."""
 
     def __init__(
         self,
-        scene: Capture,
+        capture: Capture,
         gaussians: Gaussians,
         method: Method | None,
         config: EvaluationConfig,
         masks: Masks,
         boxes: Boxes,
     ) -> None:
-        self.scene, self.gaussians, self.method, self.config = scene, gaussians, method, config
+        self.capture, self.gaussians, self.method, self.config = capture, gaussians, method, config
         self.boxes = boxes
-        self.views: list[View] = [scene.views[name] for name in scene.test_names]
+        self.views: list[View] = [capture.views[name] for name in capture.test_names]
         self.masks = {view.name: masks[view.name] for view in self.views if method and masks.get(view.name)}
         self.prompts = sorted({prompt for prompts in self.masks.values() for prompt in prompts})
         self.texts: dict[str, Tensor] = {}
         self.negatives = torch.empty(0)
         self.selected: dict[str, Gaussians] = {}
         self.thresholds: dict[str, dict[str, float]] = {}
-        self.pictures: dict[str, dict[str, float | None]] = {}
+        self.per_view: dict[str, dict[str, float | None]] = {}
         self.pairs: dict[str, dict[str, PairResult]] = {}
 
     def embed(self, encode_text: TextEncoder | None) -> None:
-        """Embed the prompts and choose what can be chosen without the truth."""
+        """Embed the prompts and choose their automatic thresholds."""
         if encode_text is None or self.method is None:
             raise ValueError("a scene with masks and language needs encode_text")
         query = self.config.query
         embeddings = embed_prompts(self.prompts, encode_text, query.templates)
         self.texts = dict(zip(self.prompts, embeddings))
         self.negatives = embed_prompts(query.negatives, encode_text, query.templates)
-        views = [self.scene.views[name] for name in self.scene.train_names] or self.views
-        cameras = [view.camera for view in _spread(views, self.config.threshold_views)]
         references = embed_prompts(REFERENCE_PHRASES, encode_text, query.templates)
-        found = method_thresholds(
-            self.method, self.gaussians, cameras, embeddings, self.negatives, references, query
+        method, question = self.method, Question(embeddings, self.negatives, query)
+        scores = method.gaussian_scores(question)
+        found = scene_thresholds(
+            lambda camera: method.relevancy(self.gaussians, camera, question),
+            [view.camera for view in self.capture.train_views or self.views],
+            method_presences(method, self.gaussians, scores, Question(references, self.negatives, query)),
         )
         for prompt, value in zip(self.prompts, found.tolist()):
             self.thresholds[prompt] = {"auto": round(value, 3), "fixed": query.threshold}
         if "lerf-3d" in self.config.protocols:
-            scores = self.method.gaussian_scores(embeddings, self.negatives, query)
             for prompt, row in zip(self.prompts, scores if scores is not None else ()):
                 self.selected[prompt] = self.gaussians.select(row >= self.thresholds[prompt]["auto"])
 
@@ -199,7 +199,7 @@ class _Evaluation:
         for done, view in enumerate(self.views, start=1):
             photo, image = view.load_image(), self._render_image(view.camera)
             valid = view.load_valid()
-            if valid is not None:  # masked pixels are those of the photo, and are not counted below
+            if valid is not None:  # masked pixels are copied from the photo and not counted below
                 image = np.where(valid[..., None], image, photo)
             counted = 1.0 if valid is None else max(float(valid.mean()), 1e-6)
             structure = ssim(image, photo) if min(image.shape[:2]) >= 11 else None
@@ -208,7 +208,7 @@ class _Evaluation:
                 "ssim": None if structure is None else 1 - (1 - structure) / counted,
                 "lpips": perceptual(image, photo) if perceptual else None,
             }
-            self.pictures[view.name] = scores
+            self.per_view[view.name] = scores
             relevancy, ground_truth = self._score_language(view)
             if observer is not None:
                 automatic = {prompt: self.thresholds[prompt]["auto"] for prompt in ground_truth}
@@ -218,25 +218,26 @@ class _Evaluation:
             curves = [prompts[prompt].counts.iou for prompts in self.pairs.values() if prompt in prompts]
             self.thresholds[prompt]["oracle"] = float(THRESHOLDS[np.argmax(np.mean(curves, axis=0))])
         quality: dict[str, Any] = {
-            name: mean_of([scores[name] for scores in self.pictures.values()])
+            name: mean_of([scores[name] for scores in self.per_view.values()])
             for name in ("psnr", "ssim", "lpips")
         }
-        return quality | ({} if perceptual else {"lpips_reason": reason}) | {"per_view": self.pictures}
+        return quality | ({} if perceptual else {"lpips_reason": reason}) | {"per_view": self.per_view}
 
     def _render_image(self, camera: Camera) -> NDArray[np.float32]:
         from lexsplat.rendering import render
 
         device = self.gaussians.device
-        background = torch.tensor(self.scene.background, dtype=torch.float32, device=device)
+        background = torch.tensor(self.capture.background, dtype=torch.float32, device=device)
         with torch.no_grad():
             image = render(self.gaussians, camera, background=background).image
         return image.clamp(0, 1).cpu().numpy()
 
     def _relevancy(self, camera: Camera, prompts: Sequence[str]) -> dict[str, NDArray[np.float32]]:
-        positives, query = torch.stack([self.texts[prompt] for prompt in prompts]), self.config.query
+        positives = torch.stack([self.texts[prompt] for prompt in prompts])
         if self.method is None:
             raise ValueError("this scene has no language")
-        maps = self.method.relevancy(self.gaussians, camera, positives, self.negatives, query)
+        question = Question(positives, self.negatives, self.config.query)
+        maps = self.method.relevancy(self.gaussians, camera, question)
         return dict(zip(prompts, maps.cpu().numpy()))
 
     def _score_language(
@@ -304,7 +305,7 @@ class _Evaluation:
 
     def speed(self) -> dict[str, float | None]:
         """Mean times over a few held-out views after one warm-up."""
-        cameras = [view.camera for view in _spread(self.views, self.config.timing_views)]
+        cameras = [view.camera for view in evenly(self.views, self.config.timing_views)]
         if not cameras:
             return {"render_fps": None, "rgb_fps": None, "query_ms": None}
         rgb = self._seconds(self._render_image, cameras)
@@ -316,19 +317,12 @@ class _Evaluation:
         return {"render_fps": 1 / (rgb + one), "rgb_fps": 1 / rgb, "query_ms": query_ms}
 
     def _seconds(self, work: Callable[[Camera], object], cameras: Sequence[Camera]) -> float:
-        # What was rendered comes back to the CPU, so the device is done when the work returns.
+        # Results are copied to the CPU, so the device has finished when the work returns.
         work(cameras[0])
         start = time.perf_counter()
         for camera in cameras:
             work(camera)
         return max(time.perf_counter() - start, 1e-9) / len(cameras)
-
-
-def _spread(items: Sequence[Any], count: int) -> list[Any]:
-    """At most ``count`` items, evenly spread, in order."""
-    if len(items) <= count:
-        return list(items)
-    return [items[round(i * (len(items) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def _sizes(gaussians: Gaussians, method: Method | None, stored: Mapping[str, int]) -> dict[str, int | None]:

@@ -1,7 +1,7 @@
-"""What an evaluation asks of a method that finds words in a scene: maps, and scores of Gaussians if it has them.
+"""The interface that evaluation needs of a method: relevancy maps, and scores of Gaussians if it has any.
 
-Language fields (`language_field.LanguageField`) are one kind; the rebuilt methods of
-`lexsplat.evaluation.baselines` others.
+Language fields (`lexsplat.language.fields.LanguageField`) are one kind of method; the rebuilt methods of
+`lexsplat.evaluation.baselines` are others.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.presence import PresenceClassifier, found_thresholds
-from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
-from lexsplat.queries.thresholds import automatic_threshold
+from lexsplat.queries.presence import PresenceClassifier
+from lexsplat.queries.relevancy import Question, gaussian_relevancy, render_relevancy
+from lexsplat.queries.selection import Presence
 
 if TYPE_CHECKING:
     from lexsplat.language.fields import LanguageField
@@ -24,22 +23,20 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Method(Protocol):
-    """A method that answers words with relevancy maps."""
+    """A method that answers prompts with relevancy maps."""
 
     method: str
 
-    def relevancy(
-        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
-    ) -> Tensor:
-        """Maps ``[P, H, W]`` in 0..1 of prompts ``[P, D]`` against negatives ``[M, D]``."""
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
+        """Maps ``[P, H, W]`` of the prompts in a view, in 0..1."""
         ...
 
-    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
-        """Scores ``[P, N]`` in 0..1 of the Gaussians; None for a method without 3D."""
+    def gaussian_scores(self, question: Question) -> Tensor | None:
+        """Scores ``[P, N]`` of the Gaussians in 0..1; None for a method without 3D."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:
-        """What has to be stored to answer."""
+        """The tensors that have to be stored to answer prompts."""
         ...
 
 
@@ -54,56 +51,31 @@ class FieldMethod:
         self.field = field
         self.method = field.method
 
-    def relevancy(
-        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
-    ) -> Tensor:
-        """See `queries.render_relevancy`."""
-        return render_relevancy(self.field, gaussians, camera, positives, negatives, config)
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
+        """See `lexsplat.queries.relevancy.render_relevancy`."""
+        return render_relevancy(self.field, gaussians, camera, question)
 
-    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
-        """See `queries.gaussian_relevancy`."""
-        return gaussian_relevancy(self.field, positives, negatives, config)
-
-    def thresholds(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        positives: Tensor,
-        negatives: Tensor,
-        references: Tensor,
-        config: QueryConfig,
-    ) -> Tensor:
-        """See `presence.found_thresholds`: what a user of the scene gets."""
-        judge = PresenceClassifier(gaussians, self.field, references, negatives, config.temperature)
-        return found_thresholds(judge, gaussians, cameras, positives, negatives, config)
+    def gaussian_scores(self, question: Question) -> Tensor | None:
+        """See `lexsplat.queries.relevancy.gaussian_relevancy`."""
+        return gaussian_relevancy(self.field, question)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything the field stores."""
+        """The tensors of the field."""
         return self.field.tensors()
 
 
-def method_thresholds(
-    method: Method,
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    positives: Tensor,
-    negatives: Tensor,
-    references: Tensor,
-    config: QueryConfig,
-    *,
-    long_side: int = 320,
-) -> Tensor:
-    """Automatic thresholds ``[P]`` from maps of views that are not evaluated, the same rule for every method.
+def method_presences(
+    method: Method, gaussians: Gaussians, scores: Tensor | None, references: Question
+) -> Sequence[Presence] | None:
+    """Whether the scene holds each prompt, as for its users; None for methods other than language fields.
 
-    Language fields say in addition what is not in the scene (`presence.found_thresholds`), by ``references``
-    ``[V, D]``, the embeddings of `presence.REFERENCE_PHRASES`; its masks are then all but empty.
+    Args:
+        method: The method.
+        gaussians: The reconstruction.
+        scores: Relevancy of the prompts ``[P, N]``.
+        references: The embedded `lexsplat.queries.presence.REFERENCE_PHRASES`.
     """
-    if isinstance(method, FieldMethod):
-        return method.thresholds(gaussians, cameras, positives, negatives, references, config)
-    if not cameras:
-        raise ValueError("an automatic threshold needs at least one camera")
-    maps = []
-    for camera in cameras:
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
-        maps.append(method.relevancy(gaussians, small, positives, negatives, config).flatten(1).cpu())
-    return automatic_threshold(torch.cat(maps, dim=1))
+    if not isinstance(method, FieldMethod) or scores is None:
+        return None
+    classifier = PresenceClassifier(gaussians, method.field, references)
+    return [classifier.classify(row) for row in scores]

@@ -41,17 +41,17 @@ def evaluate_scene(
     Args:
         scene: An opened scene folder.
         capture: Where the photos are, if not where the build found them.
-        masks: Folder with the ground truth in any layout of `scenes.annotations`, if not the capture's own.
-        prompt_list: Ask the words of the paper or of the released code; for captures called like its scenes.
-        protocols: Names out of `evaluation.PROTOCOLS`.
+        masks: Folder of the ground truth in any layout of `lexsplat.captures.ground_truth`, if not the capture's own.
+        prompt_list: Ask the prompts of the paper or of the released code; for captures named after its scenes.
+        protocols: Names out of `lexsplat.evaluation.protocols.PROTOCOLS`.
         title: Heading of the report.
-        listener: Told how far it is.
+        listener: Receives progress events.
 
     Returns:
         The content of ``metrics.json``.
 
     Raises:
-        SceneFolderError: If the photos are not there.
+        SceneFolderError: If the photos are missing, or the scene is the bundled one or being rebuilt.
         CaptureError: If a photo or a mask cannot be used.
     """
     if scene.folder is None:
@@ -62,7 +62,7 @@ def evaluate_scene(
         raise SceneFolderError(
             "demo",
             expected="a scene folder of your own, for the results",
-            found="the scene that ships with lexsplat",
+            found="the bundled scene",
             remedy="make your own copy of it with: lexsplat demo",
         )
     photos = load_photos(scene, capture)
@@ -94,30 +94,34 @@ def evaluate_scene(
     write_json(folder.root / "metrics.json", result)
     write_rows(folder.root, "metrics", table_rows({title: result}))
     write_report(folder.root / "report.html", metrics, gallery, title=title)
-    for (view, prompt), pictures in gallery.cases.items():
+    for (view, prompt), images in gallery.cases.items():
         stem = Path(view).with_suffix("")
         path = folder.root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
         with atomic_path(path) as temporary:
-            temporary.write_bytes(pictures["heatmap"])
+            temporary.write_bytes(images["heatmap"])
     return result
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:
-    """``prompts.json`` of a capture, ``{prompt: kind}``, where there is one."""
+    """``prompts.json`` of a capture, ``{prompt: kind}``; empty if there is none."""
     path = root / "prompts.json"
     if not path.is_file():
         return {}
     content = read_json(path)
     if not isinstance(content, dict) or not all(isinstance(kind, str) for kind in content.values()):
-        raise CaptureError(path, expected="an object of prompt: kind", found=type(content).__name__)
+        raise CaptureError(path, expected="a JSON object {prompt: kind}", found=type(content).__name__)
     return content
 
 
 def load_photos(scene: Scene, capture: Path | None) -> Capture:
     """The capture of a scene, with the views, sizes and split of the build.
 
+    Args:
+        scene: A scene opened from a folder.
+        capture: Where the photos are; None takes the place where the build found them.
+
     Raises:
-        SceneFolderError: If the photos are not where the build found them and no other place is given.
+        SceneFolderError: If a photo is missing there.
     """
     if scene.folder is None:
         raise ValueError("only a scene opened from a folder knows its photos")

@@ -130,37 +130,6 @@ def upright_frame(up: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return first, np.cross(upwards, first), upwards
 
 
-def box_iou(first: Box, second: Box) -> float:
-    """Volume that two boxes share divided by the volume they cover, 0..1; exact for any two orientations."""
-    from scipy.optimize import linprog
-    from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
-
-    if min(first.volume, second.volume) <= 0:
-        return 0.0
-    faces = []
-    for box in (first, second):
-        for axis, half in zip(box.axes, box.half_sizes):
-            middle = float(axis @ box.center)
-            faces += [[*axis, -middle - half], [*(-axis), middle - half]]
-    halfspaces = np.array(faces)
-    # The middle of the largest ball inside all faces: a point that is surely inside, if any is.
-    scale = float(max(first.half_sizes.max(), second.half_sizes.max()))
-    found = linprog(
-        [0, 0, 0, -1],
-        A_ub=np.hstack([halfspaces[:, :3], np.ones((len(faces), 1))]),
-        b_ub=-halfspaces[:, 3],
-        bounds=[(None, None)] * 3 + [(0, None)],
-    )
-    if not found.success or found.x[3] <= 1e-9 * scale:
-        return 0.0
-    try:
-        inside = HalfspaceIntersection(halfspaces, found.x[:3])
-        shared = float(ConvexHull(inside.intersections).volume)
-    except QhullError:  # thinner than Qhull can tell from a plane
-        return 0.0
-    return min(1.0, shared / (first.volume + second.volume - shared))
-
-
 def _turn(angle: float) -> NDArray[np.float64]:
     return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 

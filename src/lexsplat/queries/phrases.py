@@ -143,6 +143,18 @@ def parse(text: str) -> Phrase:
     return _each(_parse(_THERE.sub("", counted), quoted, text), keep=bool(quoted))
 
 
+def things_of(phrase: Phrase) -> list[str]:
+    """The texts of all things in a phrase, each once, in order."""
+    if isinstance(phrase, Thing):
+        return [phrase.text]
+    if isinstance(phrase, Pick):
+        return things_of(phrase.target)
+    parts = (
+        (phrase.target, phrase.reference) if isinstance(phrase, Related) else (phrase.first, phrase.second)
+    )
+    return list(dict.fromkeys(text for part in parts for text in things_of(part)))
+
+
 def _each(phrase: Phrase, keep: bool) -> Phrase:
     """A counted phrase in the singular: an encoder is asked for one of what is counted. Quoted words stay."""
     if keep:

@@ -1,4 +1,4 @@
-"""From a click to a selection: what is seen there, and what is joined to it and means the same."""
+"""From a click to a selection: the surface at the pixel, and what is connected to it and means the same."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import QueryError
 
 _SAME_SURFACE = 0.05
-"""Gaussians this share of the distance before or behind the point belong to the surface that was clicked."""
-_ALIKE = 0.8
-"""What belongs to a click is at least this share as alike to it as the surface itself is. Chosen among 0.7 to 0.9 on
-the second demo scene with earlier encoders (mean IoU of 63 clicks on things in held-out views: 0.81, 0.56 without).
-On the table top that ships, where it was not chosen, 90 clicks give 0.74, 0.49 without."""
+"""A Gaussian belongs to the clicked surface if its depth differs from the surface's by at most this share."""
+_SIMILAR = 0.8
+"""Smallest similarity to the click, as a share of the surface's own. Chosen among 0.7 to 0.9 on the second demo scene
+(mean IoU of 63 clicks on objects in held-out views: 0.81, without it 0.56). On the bundled table top, where it was
+not chosen, 90 clicks give 0.74, without it 0.49."""
 
 
 @dataclass(frozen=True)
 class Hit:
-    """What one pixel shows.
+    """The surface that one pixel shows.
 
     Args:
         point: Where the ray meets the surface ``[3]``, world units.
-        indices: The Gaussians that make up the surface there ``[M]``.
-        weights: Their share in the pixel ``[M]``.
+        indices: Gaussians of the surface there ``[M]``.
+        weights: Their shares of the pixel ``[M]``.
     """
 
     point: NDArray[np.float64]
@@ -44,22 +44,22 @@ class Hit:
 
 @torch.no_grad()
 def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
-    """The surface that a picture shows at a pixel: the one behind which less than half of the light is left.
+    """The surface at a pixel: the depth behind which less than half of the transmittance is left.
 
     Args:
         gaussians: The scene.
         camera: The view.
-        x: Pixels from the left, 0.5 being the middle of the first.
+        x: Pixels from the left; the first pixel's center is 0.5.
         y: Pixels from the top.
 
     Raises:
-        QueryError: If the pixel lies outside the picture or shows nothing.
+        QueryError: If the pixel lies outside the image or shows nothing.
     """
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise QueryError(
             f"pixel ({x:g}, {y:g})",
-            expected=f"a pixel of a picture of {camera.width}x{camera.height}",
-            found="one outside",
+            expected=f"a pixel of a {camera.width}x{camera.height} image",
+            found="one outside it",
         )
     K = camera.K.copy()
     K[:2, 2] += 0.5 - np.array([x, y])
@@ -67,7 +67,7 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
     seen = (weights > 1e-4).nonzero()[:, 0]
     shares = weights[seen].double().cpu()
     if float(shares.sum()) < 0.3:
-        raise QueryError(f"pixel ({x:g}, {y:g})", expected="something to be seen there", found="nothing")
+        raise QueryError(f"pixel ({x:g}, {y:g})", expected="a surface", found="nothing")
     means = gaussians.means[seen].double().cpu()
     depths = means @ torch.from_numpy(camera.viewmat[2, :3].copy()) + camera.viewmat[2, 3]
     order = depths.argsort()
@@ -80,24 +80,16 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
 
 
 @torch.no_grad()
-def likeness_to(hit: Hit, field: LanguageField) -> Tensor:
-    """How alike in language every Gaussian is to what was hit: ``[N]`` in 0..1.
+def similarity_to(hit: Hit, field: LanguageField) -> Tensor:
+    """Similarity in language of every Gaussian to the hit: ``[N]`` in 0..1.
 
     Linear in the codes: the feature of the hit is compared with each code once, and each Gaussian blends the
-    answers.
+    results.
     """
     codewords = torch.nn.functional.normalize(field.codebook.clip.to(hit.weights).float(), dim=-1)
     feature = hit.weights @ field.select(hit.indices).code_probabilities() @ codewords
     table = (codewords @ torch.nn.functional.normalize(feature, dim=0))[:, None]
-    return field_scores(field, table)[:, 0].clamp(0, 1)
-
-
-def field_scores(field: LanguageField, table: Tensor, rows: int = 1 << 16) -> Tensor:
-    """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``, a block of rows at a time."""
-    if hasattr(field, "scores"):
-        return field.scores(table)
-    index = torch.arange(len(field.uncertainties), device=field.uncertainties.device)
-    return torch.cat([field.select(block).code_probabilities() @ table for block in index.split(rows)])
+    return field.scores(table)[:, 0].clamp(0, 1)
 
 
 def select_hit(
@@ -108,21 +100,21 @@ def select_hit(
     similarity: float | None = None,
     world: World | None = None,
 ) -> Selection:
-    """What is joined to a hit and means the same.
+    """The connected Gaussians around a hit that mean the same.
 
     Args:
         hit: From `surface_at`.
         gaussians: The scene.
         field: Its language.
         cameras: Its views by name.
-        likeness: How alike in language a Gaussian must be, in 0..1; none finds a limit in the scene.
-        world: Up and scale of the scene; none takes up from the cameras.
+        similarity: Smallest similarity in language, in 0..1; None derives it from the scene.
+        world: Up and scale of the scene; None takes up from the cameras.
     """
-    scores = likeness_to(hit, field)
+    scores = similarity_to(hit, field)
     if similarity is None:
         own = float((scores[hit.indices] * hit.weights).sum() / hit.weights.sum().clamp_min(1e-12))
         two_classes = float(automatic_threshold(scores[None], gaussians.opacities.detach())[0])
-        similarity = max(two_classes, _ALIKE * own)
+        similarity = max(two_classes, _SIMILAR * own)
     chosen = Selection(
         gaussians, cameras, scores >= similarity, scores, similarity, "yes", "what was clicked", world
     )

@@ -243,7 +243,7 @@ def _same(first: Selection, second: Selection) -> bool:
     """Whether two words mean one thing. A coin that its table's selection takes in is not the table."""
     small, large = sorted((first, second), key=lambda s: s.box.volume)
     shared = int((first.mask & second.mask).sum())
-    return shared > 0.5 * min(first.count, second.count) and small.box.volume > _SAME_SIZE * large.box.volume
+    return shared > 0.5 * min(len(first), len(second)) and small.box.volume > _SAME_SIZE * large.box.volume
 
 
 def _union(whole: Selection, parts: list[Selection]) -> Selection:

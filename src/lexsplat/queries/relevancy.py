@@ -1,43 +1,39 @@
-"""Questions in words: from text embeddings to relevancy of pixels and Gaussians, and masks (supplement B).
+"""Text queries: from text embeddings to the relevancy of pixels and Gaussians (supplement B of the paper).
 
-Nothing here needs an encoder: text comes in as embeddings. Dimension letters: P prompts (positives),
+Nothing here needs an encoder: texts arrive as embeddings. Dimension letters: P prompts (positives),
 M negatives, T texts, K codes, D feature dimensions, N Gaussians, H and W image size.
 
-Relevancy is LERF's: a prompt is compared with each canonical phrase by a softmax of two, and the least
-favorable phrase counts. 0.5 means "as near to the prompt as to a canonical phrase". Two forms, by name:
+Relevancy follows LERF: a prompt is compared with each canonical phrase by a softmax over the two, and the
+smallest result counts. 0.5 means that the prompt and a canonical phrase are equally near. There are two forms:
 
 - ``"feature"`` (the paper): code probabilities p become a feature, F = p S, which is compared with the text.
-- ``"code"``: each code is compared with the text once (a table r of K numbers for a prompt), and the answers
-  are blended, sum over k of p_k r_k. Linear: the map of a view is the rendering of the Gaussians' scores.
+- ``"code"``: each code is compared with the text once (a table r of K numbers per prompt), and the results
+  are blended, sum over k of p_k r_k. This is linear: the map of a view is the rendering of the Gaussians' scores.
 
-Where a view is not opaque, the missing part counts as "nothing here", relevancy 0, in both forms: relevancy
-is an expectation over what a pixel shows. Dividing by the coverage instead would give a faint floater before
-an empty background the full relevancy of the object it resembles, and would break linearity.
-``coverage="divide"`` does it nevertheless, for scenes where opaque surfaces carry Gaussians without language
-because no training view saw them.
+Both forms give relevancy 0 to the transparent part of a pixel: relevancy is an expectation over what the pixel
+shows. Dividing by the coverage instead would give a faint floater in front of an empty background the full
+relevancy of the object it resembles, and would break linearity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields import LanguageField
 from lexsplat.runtime.errors import QueryError
 
-if TYPE_CHECKING:
-    from lexsplat.codebook import Codebook
-
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
-"""What a prompt is compared with (LERF, and the paper after it)."""
+"""The negatives of LERF and of the paper."""
 
 NO_TEMPLATE = ("{}",)
-"""Prompts as they are, the paper's way."""
+"""The prompt as it is, as in the paper."""
 
 PHOTO_TEMPLATES = (
     "a photo of {}",
@@ -45,17 +41,15 @@ PHOTO_TEMPLATES = (
     "a close-up photo of the {}",
     "there is a {} in the scene",
 )
-"""A small ensemble of sentences; their embeddings are averaged."""
+"""A small prompt ensemble; its embeddings are averaged."""
 
-
-_CHUNK = 1 << 13  # pixels at a time; small enough that a block stays in the cache
-_GAUSSIANS = 1 << 16  # whose distributions are held at a time
-_MIN_COVERAGE = 0.05
+_CHUNK = 1 << 13  # pixels per block; small enough for a block to stay in the cache
+_GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
 
 QueryForm = Literal["feature", "code"]
 """Whether the blended feature or each code is compared with the text."""
 TextEncoder = Callable[[list[str]], Tensor]
-"""Texts to embeddings ``[T, D]``; they need not be of unit length."""
+"""Texts to embeddings ``[T, D]``, of any length."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +58,11 @@ class QueryConfig:
 
     Args:
         temperature: Factor on cosines before the pairwise softmax (the paper and LERF: 10).
-        form: ``"code"`` blends the comparisons of codes with the text; ``"feature"`` compares the blended feature
-            (the paper). "code" measured better for every field (docs/results.md).
-        negatives: Phrases that a prompt has to beat.
-        templates: Sentences with ``{}`` for the prompt; several are averaged.
-        threshold: Relevancy from which a pixel belongs to the mask, in 0..1 (paper: 0.5).
-        coverage: ``"composite"`` counts what is not covered as not relevant; ``"divide"`` ignores it.
+        form: ``"code"`` blends the relevancies of codes; ``"feature"`` (the paper) compares the blended feature.
+            "code" measures better for every field (docs/results.md).
+        negatives: Phrases that each prompt is compared with.
+        templates: Sentences with ``{}`` for the prompt; the embeddings of several are averaged.
+        threshold: Fixed relevancy threshold of masks, in 0..1 (paper: 0.5).
     """
 
     temperature: float = 10.0
@@ -77,90 +70,98 @@ class QueryConfig:
     negatives: tuple[str, ...] = CANONICAL_PHRASES
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5
-    coverage: Literal["composite", "divide"] = "composite"
 
     def __post_init__(self) -> None:
         if not 0 < self.temperature < float("inf"):
             raise ValueError(f"temperature must be positive, got {self.temperature}")
         if self.form not in ("feature", "code"):
             raise ValueError(f"form must be 'feature' or 'code', got {self.form!r}")
-        if self.coverage not in ("composite", "divide"):
-            raise ValueError(f"coverage must be 'composite' or 'divide', got {self.coverage!r}")
         if not self.negatives:
             raise ValueError("negatives must hold at least one phrase")
         for template in self.templates:
             if template.count("{}") != 1:
-                raise ValueError(f"a template needs {{}} once, got {template!r}")
+                raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"threshold must be in 0..1, got {self.threshold}")
 
 
-class QueryableField(Protocol):
-    """What a query needs of a language field (``language_field.LanguageField`` has it)."""
+@dataclass(frozen=True, eq=False)
+class Question:
+    """Embedded prompts, the negatives they are compared with, and how.
 
-    codebook: Codebook
+    Args:
+        positives: Text embeddings of the prompts ``[P, D]``, of any length.
+        negatives: Text embeddings of the negatives ``[M, D]``, M > 0, of any length.
+        config: Temperature and form.
+    """
 
-    @property
-    def uncertainties(self) -> Tensor:
-        """``[N]`` in 0..1."""
+    positives: Tensor
+    negatives: Tensor
+    config: QueryConfig = field(default_factory=QueryConfig)
 
-    def select(self, index: Tensor) -> QueryableField:
-        """The rows of some Gaussians."""
+    def __len__(self) -> int:
+        return len(self.positives)
 
-    def code_probabilities(self) -> Tensor:
-        """Distribution over codes of every Gaussian ``[N, K]``; a row of zeros was never seen."""
+    def units(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Positives and negatives of unit length in float32, on the device of ``like [..., D]``.
 
-    def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """Distribution over codes at every pixel ``[H, W, K]``; sums to the coverage."""
-
-    def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
-        """Sum over codes of p_k table[k] at every pixel: ``[K, P]`` to ``[H, W, P]``."""
+        Raises:
+            ValueError: If their dimension D differs from that of ``like``.
+        """
+        return _unit_texts(self.positives, like, "positives"), _unit_texts(self.negatives, like, "negatives")
 
 
 # Text
 
 
-def check_prompts(prompts: Sequence[str]) -> list[str]:
-    """Prompts without surrounding space.
+def check_prompts(prompts: str | Sequence[str]) -> list[str]:
+    """The prompts as a list, with surrounding and repeated spaces removed; a single text is one prompt.
 
     Raises:
-        QueryError: If there is none, or one is empty or no text.
+        QueryError: If there is no prompt, or one of them is empty or not text.
     """
     if isinstance(prompts, str):
         prompts = [prompts]
+    if not isinstance(prompts, Sequence) or not all(isinstance(prompt, str) for prompt in prompts):
+        raise QueryError(
+            "prompts",
+            expected="a text or a list of texts",
+            found=repr(prompts)[:60],
+            remedy='name something, such as "red apple"',
+        )
     cleaned = [" ".join(prompt.split()) for prompt in prompts]
     if not cleaned:
         raise QueryError(
             "query",
             expected="at least one prompt",
             found="none",
-            remedy='ask for something, such as "red apple"',
+            remedy='name something, such as "red apple"',
         )
     for number, prompt in enumerate(cleaned, start=1):
-        # Bytes that are no text come from the command line as halves of characters.
+        # Bytes of the command line that are not UTF-8 arrive as lone surrogates.
         is_text = prompt.encode("utf-8", "ignore").decode("utf-8") == prompt
         if not prompt or not is_text:
             raise QueryError(
                 f"prompt {number} of {len(cleaned)}",
                 expected="a word or phrase",
-                found="bytes that are no text" if prompt else "an empty text",
+                found="bytes that are not UTF-8" if prompt else "an empty text",
                 remedy='name something, such as "red apple"',
             )
     return cleaned
 
 
-def expand_templates(prompts: Sequence[str], templates: Sequence[str] = NO_TEMPLATE) -> list[str]:
+def expand_templates(prompts: str | Sequence[str], templates: Sequence[str] = NO_TEMPLATE) -> list[str]:
     """Every prompt in every template, prompts outermost: ``P * len(templates)`` texts.
 
     Raises:
         QueryError: If a prompt is empty.
-        ValueError: If there is no template, or one does not have exactly one ``{}``.
+        ValueError: If there is no template, or one does not contain ``{}`` exactly once.
     """
     if not templates:
         raise ValueError("templates must hold at least one sentence with {}")
     for template in templates:
         if template.count("{}") != 1:
-            raise ValueError(f"a template needs {{}} once, got {template!r}")
+            raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
     return [template.replace("{}", prompt) for prompt in check_prompts(prompts) for template in templates]
 
 
@@ -173,9 +174,9 @@ def average_templates(embeddings: Tensor, num_templates: int) -> Tensor:
 
 
 def embed_prompts(
-    prompts: Sequence[str], encode_text: TextEncoder, templates: Sequence[str] = NO_TEMPLATE
+    prompts: str | Sequence[str], encode_text: TextEncoder, templates: Sequence[str] = NO_TEMPLATE
 ) -> Tensor:
-    """Unit embeddings ``[P, D]`` of prompts, averaged over templates, by one call of the encoder."""
+    """Unit embeddings ``[P, D]`` of prompts, averaged over templates, in one call of the encoder."""
     return average_templates(encode_text(expand_templates(prompts, templates)), len(templates))
 
 
@@ -185,8 +186,8 @@ def embed_prompts(
 def pairwise_relevancy(positives: Tensor, negatives: Tensor, temperature: float = 10.0) -> Tensor:
     """LERF's relevancy: min over negatives n of exp(t c+) / (exp(t c+) + exp(t c_n)).
 
-    The pairwise softmax of two is a sigmoid of the difference, and it falls as c_n grows, so only the nearest
-    negative matters.
+    The pairwise softmax is a sigmoid of the difference and falls as c_n grows, so only the nearest negative
+    matters.
 
     Args:
         positives: Cosines with the prompts ``[..., P]``.
@@ -201,36 +202,23 @@ def pairwise_relevancy(positives: Tensor, negatives: Tensor, temperature: float 
     return torch.sigmoid(temperature * (positives - negatives.amax(-1, keepdim=True)))
 
 
-def code_relevancy(
-    codewords: Tensor, positives: Tensor, negatives: Tensor, temperature: float = 10.0
-) -> Tensor:
+def code_relevancy(codewords: Tensor, question: Question) -> Tensor:
     """Relevancy of each code by itself: the table r ``[K, P]`` that the ``"code"`` form blends.
 
     Args:
         codewords: CLIP part of the codebook ``[K, D]``, of any length.
-        positives: Text embeddings of the prompts ``[P, D]``.
-        negatives: Text embeddings of the negatives ``[M, D]``.
-        temperature: Factor on the cosines.
+        question: The embedded prompts.
     """
-    codewords, positives, negatives = _matching(codewords, positives, negatives)
-    unit = torch.nn.functional.normalize(codewords, dim=-1)
-    return pairwise_relevancy(unit @ positives.T, unit @ negatives.T, temperature)
-
-
-def feature_cosines_naive(probabilities: Tensor, codewords: Tensor, texts: Tensor) -> Tensor:
-    """Cosine of the blended feature F = p S with texts, by building F: ``[..., K]`` to ``[..., T]``.
-
-    The reference for `feature_cosines`; it holds a feature map ``[..., D]``. A zero feature has cosine 0.
-    """
-    features = torch.nn.functional.normalize(probabilities @ codewords, dim=-1)
-    return features @ torch.nn.functional.normalize(texts, dim=-1).T
+    positives, negatives = question.units(codewords)
+    unit = torch.nn.functional.normalize(codewords.float(), dim=-1)
+    return pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
 
 
 def feature_cosines(probabilities: Tensor, codewords: Tensor, texts: Tensor) -> Tensor:
     """Cosine of the blended feature F = p S with texts, without building F.
 
-    cos(p S, t) = p . (S t) / sqrt(p G p) with G = S S^T: exact, as the length of F is a quadratic form of p.
-    S t is K numbers for a text, the length is shared by all texts, and pixels are done in bounded blocks.
+    cos(p S, t) = p . (S t) / sqrt(p G p) with G = S S^T. This is exact, as the squared length of F is a quadratic
+    form of p. S t is K numbers per text, all texts share the length, and pixels are processed in blocks.
 
     Args:
         probabilities: Code weights p ``[..., K]``; their scale does not matter. A zero row has cosine 0.
@@ -240,10 +228,10 @@ def feature_cosines(probabilities: Tensor, codewords: Tensor, texts: Tensor) -> 
     Returns:
         Cosines ``[..., T]`` in -1..1.
     """
-    codewords, texts, _ = _matching(codewords, texts, texts)
+    texts, codewords = _unit_texts(texts, codewords, "texts"), codewords.float()
     num_codes, num_texts = len(codewords), len(texts)
     products = codewords @ texts.T
-    # The shorter way to the length: through G when there are fewer codes than dimensions, else through S.
+    # The length is cheaper through G when there are fewer codes than dimensions, else through S.
     gram = num_codes <= codewords.shape[1]
     matrix = torch.cat([products, codewords @ codewords.T if gram else codewords], dim=1)
     flat = probabilities.reshape(-1, num_codes)
@@ -258,49 +246,31 @@ def feature_cosines(probabilities: Tensor, codewords: Tensor, texts: Tensor) -> 
     return cosines.view(*probabilities.shape[:-1], num_texts).clamp_(-1.0, 1.0)
 
 
-def probability_relevancy(
-    probabilities: Tensor,
-    codewords: Tensor,
-    positives: Tensor,
-    negatives: Tensor,
-    config: QueryConfig | None = None,
-) -> Tensor:
-    """Relevancy of distributions over codes, in either form.
+def probability_relevancy(probabilities: Tensor, codewords: Tensor, question: Question) -> Tensor:
+    """Relevancy of distributions over codes, in the form that the question asks for.
 
     Args:
-        probabilities: ``[..., K]``, non-negative; a row's sum is its coverage in 0..1.
+        probabilities: ``[..., K]``, non-negative; the sum of a row is its coverage in 0..1.
         codewords: CLIP part of the codebook ``[K, D]``.
-        positives: Text embeddings of the prompts ``[P, D]``.
-        negatives: Text embeddings of the negatives ``[M, D]``.
-        config: Form, temperature, coverage.
+        question: The embedded prompts.
 
     Returns:
         Relevancy ``[..., P]`` in 0..1; 0 where the distribution is empty.
     """
-    config = config or QueryConfig()
-    codewords, positives, negatives = _matching(codewords.to(probabilities.device), positives, negatives)
-    if config.form == "code":
-        scores = probabilities @ code_relevancy(codewords, positives, negatives, config.temperature)
-        if config.coverage == "divide":
-            return _divide(scores, probabilities.sum(-1, keepdim=True))
-        return scores.clamp_(0.0, 1.0)
+    codewords = codewords.to(probabilities.device)
+    if question.config.form == "code":
+        return (probabilities @ code_relevancy(codewords, question)).clamp_(0.0, 1.0)
     coverage = probabilities.sum(-1, keepdim=True).clamp_(0.0, 1.0)
+    positives, negatives = question.units(codewords)
     cosines = feature_cosines(probabilities, codewords, torch.cat([positives, negatives]))
-    split = len(positives)
-    relevancy = pairwise_relevancy(cosines[..., :split], cosines[..., split:], config.temperature)
-    if config.coverage == "divide":
-        return relevancy * (coverage > _MIN_COVERAGE)
+    split = len(question)
+    relevancy = pairwise_relevancy(cosines[..., :split], cosines[..., split:], question.config.temperature)
     return relevancy * coverage
 
 
 @torch.no_grad()
 def render_relevancy(
-    field: QueryableField,
-    gaussians: Gaussians,
-    camera: Camera,
-    positives: Tensor,
-    negatives: Tensor,
-    config: QueryConfig | None = None,
+    field: LanguageField, gaussians: Gaussians, camera: Camera, question: Question
 ) -> Tensor:
     """Relevancy of every prompt at every pixel of a view (supplement B).
 
@@ -308,71 +278,37 @@ def render_relevancy(
         field: The language of the scene.
         gaussians: Its geometry.
         camera: The view.
-        positives: Text embeddings of the prompts ``[P, D]``.
-        negatives: Text embeddings of the negatives ``[M, D]``.
-        config: Form, temperature, coverage.
+        question: The embedded prompts.
 
     Returns:
         ``[P, H, W]`` in 0..1, on the device of the Gaussians.
     """
-    config = config or QueryConfig()
     codewords = field.codebook.clip.to(gaussians.device)
-    if config.form == "feature":
+    if question.config.form == "feature":
         probabilities = field.render_code_probabilities(gaussians, camera)
-        relevancy = probability_relevancy(probabilities, codewords, positives, negatives, config)
-        return relevancy.permute(2, 0, 1).contiguous()
-    table = code_relevancy(codewords, positives, negatives, config.temperature)
-    if config.coverage == "divide":
-        table = torch.cat([table, torch.ones_like(table[:, :1])], dim=1)
-    scores = field.render_scores(gaussians, camera, table)
-    if config.coverage == "divide":
-        scores = _divide(scores[..., :-1], scores[..., -1:])
-    return scores.permute(2, 0, 1).clamp(0.0, 1.0).contiguous()
+        relevancy = probability_relevancy(probabilities, codewords, question)
+    else:
+        relevancy = field.render_scores(gaussians, camera, code_relevancy(codewords, question))
+    return relevancy.permute(2, 0, 1).clamp(0.0, 1.0).contiguous()
 
 
 @torch.no_grad()
-def gaussian_relevancy(
-    field: QueryableField, positives: Tensor, negatives: Tensor, config: QueryConfig | None = None
-) -> Tensor:
-    """Relevancy of every prompt for every Gaussian ``[P, N]`` in 0..1; 0 for those that were never seen."""
-    config = config or QueryConfig()
-    if config.form == "code" and config.coverage == "composite" and hasattr(field, "scores"):
-        table = code_relevancy(field.codebook.clip, positives, negatives, config.temperature)
-        return field.scores(table).T.clamp(0.0, 1.0).contiguous()  # sparse: [N, K] is never held
+def gaussian_relevancy(field: LanguageField, question: Question) -> Tensor:
+    """Relevancy of every prompt for every Gaussian ``[P, N]`` in 0..1; 0 for Gaussians that no view saw."""
+    if question.config.form == "code":
+        scores = field.scores(code_relevancy(field.codebook.clip, question))
+        return scores.T.clamp(0.0, 1.0).contiguous()
     codewords = field.codebook.clip.to(field.uncertainties.device)
     index = torch.arange(len(field.uncertainties), device=codewords.device)
     blocks = [
-        probability_relevancy(rows.code_probabilities(), codewords, positives, negatives, config).T
-        for rows in map(field.select, index.split(_GAUSSIANS))  # [N, K] is never held
+        probability_relevancy(rows.code_probabilities(), codewords, question).T
+        for rows in map(field.select, index.split(_GAUSSIANS))
     ]
     return torch.cat(blocks, dim=1).contiguous()
 
 
-def ranking(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The best of each prompt, best first: indices and scores, both ``[P, min(count, N)]``.
-
-    For Gaussians (`gaussian_relevancy`) and for codes (``code_relevancy(...).T``). Ties keep their order.
-    """
-    if scores.ndim != 2 or count < 1:
-        raise ValueError(
-            f"ranking needs scores [P, N] and a positive count, got {list(scores.shape)}, {count}"
-        )
-    values, indices = scores.sort(dim=1, descending=True, stable=True)
-    return indices[:, :count], values[:, :count]
-
-
-def _divide(scores: Tensor, coverage: Tensor) -> Tensor:
-    ratio = scores / coverage.clamp_min(_MIN_COVERAGE)
-    return (ratio * (coverage > _MIN_COVERAGE)).clamp(0.0, 1.0)
-
-
-def _matching(codewords: Tensor, positives: Tensor, negatives: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The three on one device in float32, texts of unit length, their dimensions checked."""
-    for name, texts in (("positives", positives), ("negatives", negatives)):
-        if texts.ndim != 2 or texts.shape[1] != codewords.shape[-1]:
-            raise ValueError(f"{name} must be [*, {codewords.shape[-1]}], got {list(texts.shape)}")
-    positives, negatives = (
-        torch.nn.functional.normalize(texts.to(codewords.device, torch.float32), dim=-1)
-        for texts in (positives, negatives)
-    )
-    return codewords.float(), positives, negatives
+def _unit_texts(texts: Tensor, like: Tensor, name: str) -> Tensor:
+    """Embeddings ``[*, D]`` of unit length in float32, on the device of ``like [..., D]``."""
+    if texts.ndim != 2 or texts.shape[1] != like.shape[-1]:
+        raise ValueError(f"{name} must be [*, {like.shape[-1]}], got {list(texts.shape)}")
+    return torch.nn.functional.normalize(texts.to(like.device, torch.float32), dim=-1)

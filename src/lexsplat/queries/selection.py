@@ -1,13 +1,13 @@
-"""A set of Gaussians that answers to something: what a search finds in 3D.
+"""A set of Gaussians with the scores that selected it: the result of a search in 3D.
 
-A `Selection` never changes: ``a | b``, ``a - b``, ``a.grow()`` and the like make new ones. Its clusters are its
-*instances*: two mugs found by "mug" are one selection with two instances.
+A `Selection` is immutable: ``a | b``, ``a - b``, ``a.grow()`` and the like make new ones. Its connected clusters are
+its *instances*: two mugs found by "mug" are one selection with two instances.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -28,45 +28,46 @@ from lexsplat.runtime.errors import QueryError
 
 Presence = Literal["yes", "no", "unsure"]
 PRESENCES: tuple[Presence, ...] = ("no", "unsure", "yes")
-"""The answers, the least sure first."""
+"""Whether a scene holds something, the least certain first."""
 
 _NEIGHBORS = 8
 _LINK = 2.5
-"""Gaussians of one instance are at most this many times the usual distance to the sixth neighbor apart."""
+"""Largest distance between linked Gaussians, in median distances to the sixth neighbor."""
 _SMALLEST_SHARE = 0.1
-"""A cluster with less than this share of the largest one's opacity is not an instance."""
+"""A cluster with less than this share of the largest cluster's opacity is not an instance."""
 _CONVINCING = 0.65
-"""An instance counts from this share of the best one's height above the threshold. Chosen on the second demo scene:
-of 14 wrong instances of 34 prompts the best has 0.60; of the right ones one ("something made of metal") has 0.43, all
-others 1."""
+"""Smallest peak of an instance above the threshold, as a share of the best instance's. Chosen on the second demo
+scene: the best of 14 wrong instances of 34 prompts has 0.60; of the right ones, one has 0.43 and all others 1."""
 _PEAK_COUNT = 20
 _FAINT = 0.1
-"""Gaussians fainter than this join clusters but do not hold them together."""
+"""Gaussians of lower opacity join clusters but do not link them."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Selection:
-    """Gaussians of a scene with the scores that chose them.
+    """Gaussians of a scene with the scores that selected them.
+
+    ``len(selection)`` is the number of Gaussians, ``selection.count`` the number of instances.
 
     Args:
         gaussians: The scene's Gaussians.
-        cameras: Its views by name: they say what is up and which view shows the selection best.
-        mask: Which Gaussians belong to it ``[N]`` bool.
+        cameras: Its views by name, for the up direction and the best view.
+        mask: The selected Gaussians ``[N]`` bool.
         scores: Relevancy of every Gaussian ``[N]`` in 0..1.
-        threshold: Score from which a Gaussian was chosen.
-        present: Whether the scene holds what was asked for; "yes" for selections that were made by hand.
+        threshold: Smallest score of a selected Gaussian.
+        present: Whether the scene holds what was asked for; "yes" for selections made by hand.
         phrase: What was asked for.
-        world: Up and scale of the scene; none takes up from the cameras.
+        world: Up and scale of the scene; None takes up from the cameras.
     """
 
     gaussians: Gaussians
-    cameras: Mapping[str, Camera] = field(repr=False)
+    cameras: Mapping[str, Camera]
     mask: Tensor
     scores: Tensor
     threshold: float = 0.5
     present: Presence = "yes"
     phrase: str = ""
-    world: World | None = field(default=None, repr=False)
+    world: World | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.gaussians),)
@@ -80,15 +81,26 @@ class Selection:
     # -- what it is
 
     def __len__(self) -> int:
-        return self.count
+        return self.num_gaussians
 
     def __bool__(self) -> bool:
-        return self.count > 0
+        return self.num_gaussians > 0
+
+    def __repr__(self) -> str:
+        return (
+            f"Selection({self.phrase!r}, present={self.present!r}, gaussians={self.num_gaussians}, "
+            f"threshold={self.threshold:.3g})"
+        )
 
     @cached_property
-    def count(self) -> int:
+    def num_gaussians(self) -> int:
         """Number of Gaussians."""
         return int(self.mask.sum())
+
+    @property
+    def count(self) -> int:
+        """Number of instances."""
+        return len(self.instances)
 
     @property
     def indices(self) -> Tensor:
@@ -97,7 +109,7 @@ class Selection:
 
     @property
     def selected(self) -> Gaussians:
-        """Its Gaussians alone."""
+        """The selected Gaussians."""
         return self.gaussians.select(self.mask)
 
     @cached_property
@@ -108,12 +120,12 @@ class Selection:
 
     @cached_property
     def up(self) -> Up:
-        """The scene's up direction: as its world says, else from its cameras (z where there are none)."""
+        """The scene's up direction: that of its world, else of its cameras (z if there are none)."""
         return (self.world or World.of_cameras(self.cameras.values())).up
 
     @cached_property
     def box(self) -> Box:
-        """The upright box around it: center, axes (rows), half sizes, in world units.
+        """The upright bounding box: center, axes (rows), half sizes, in world units.
 
         Raises:
             QueryError: If nothing is selected.
@@ -125,22 +137,22 @@ class Selection:
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """Middle of its box ``[3]``."""
+        """Center of the box ``[3]``, world units."""
         return self.box.center
 
     @property
     def size(self) -> NDArray[np.float64]:
-        """Extent along the axes of its box ``[3]``, world units; the last one is its height."""
+        """Extent along the axes of the box ``[3]``, world units; the last one is the height."""
         return 2 * self.box.half_sizes
 
     @property
     def size_meters(self) -> NDArray[np.float64] | None:
-        """`size` in meters; None where nobody has said how long a unit is (``lexsplat scale``)."""
+        """`size` in meters; None if the scale of the scene is unknown (``lexsplat scale``)."""
         scale = self.world.meters_per_unit if self.world else None
         return None if scale is None else self.size * scale
 
     def distance_to(self, other: Selection) -> float:
-        """Distance between the middles of the boxes of two selections, world units.
+        """Distance between the centers of the boxes of two selections, world units.
 
         Raises:
             QueryError: If one is empty.
@@ -149,7 +161,7 @@ class Selection:
 
     @cached_property
     def instances(self) -> list[Selection]:
-        """Its connected clusters, the largest first; specks are left out."""
+        """Its connected clusters without specks, the largest first."""
         return self.clusters(_SMALLEST_SHARE)
 
     def clusters(self, smallest: float = 0.0) -> list[Selection]:
@@ -164,7 +176,7 @@ class Selection:
 
     @cached_property
     def best_view(self) -> str:
-        """Name of the view that shows most of it; "" where there are no views or nothing is selected."""
+        """Name of the view in which it covers most pixels; "" if there are no views or nothing is selected."""
         names = _promising_views(self)
         if not names:
             return ""
@@ -185,7 +197,7 @@ class Selection:
         return replace(self, mask=~self.mask, scores=1 - self.scores, phrase=f"not {self.phrase}".strip())
 
     def grow(self, distance: float | None = None) -> Selection:
-        """It and the Gaussians within ``distance`` (world units; none takes the spacing of its Gaussians)."""
+        """The union with the Gaussians within ``distance`` (world units; None derives it from the spacing)."""
         if not self:
             return self
         reach = self._reach(distance)
@@ -194,7 +206,7 @@ class Selection:
         return replace(self, mask=self.mask | self._tensor(np.isfinite(apart)))
 
     def shrink(self, distance: float | None = None) -> Selection:
-        """It without the Gaussians within ``distance`` of one that does not belong to it."""
+        """The Gaussians that are farther than ``distance`` from every Gaussian outside the selection."""
         outside = (~self.mask & (self.gaussians.opacities >= _FAINT)).cpu().numpy()
         if not self or not outside.any():
             return self
@@ -203,26 +215,26 @@ class Selection:
         return replace(self, mask=self.mask & ~self._tensor(np.isfinite(apart)))
 
     def largest(self) -> Selection:
-        """Its largest instance alone; itself when nothing is selected."""
+        """The largest instance; the selection itself if it is empty."""
         return self.instances[0] if self.instances else self
 
     def without_specks(self) -> Selection:
-        """Only what belongs to an instance."""
+        """The Gaussians that belong to an instance."""
         mask = torch.zeros_like(self.mask)
         for instance in self.instances:
             mask |= instance.mask
         return replace(self, mask=mask)
 
     def convincing(self) -> Selection:
-        """Only instances that answer about as well as the best one does.
+        """The instances whose peak is close to that of the best instance.
 
-        Asked for an apple, a threshold that the apple's rim calls for is passed by a duck's back as well; but the
-        duck peaks far below the apple. Two apples peak alike.
+        For the prompt "apple", part of a duck may exceed the threshold that keeps the rim of the apple, but the duck
+        peaks far below the apple. Two apples have similar peaks.
         """
         if len(self.instances) < 2:
             return self
         peaks = [
-            float(one.scores[one.mask].topk(min(_PEAK_COUNT, one.count)).values.mean())
+            float(one.scores[one.mask].topk(min(_PEAK_COUNT, len(one))).values.mean())
             for one in self.instances
         ]
         limit = self.threshold + _CONVINCING * (max(peaks) - self.threshold)
@@ -233,26 +245,36 @@ class Selection:
         return replace(self, mask=mask)
 
     def within(self, mask: Tensor) -> Selection:
-        """What of it lies in a mask ``[N]``."""
+        """The intersection with a mask ``[N]``."""
         return replace(self, mask=self.mask & mask.to(self.mask.device))
 
-    def to_json(self) -> dict[str, Any]:
-        """What ``lexsplat find --json`` says of it, without the Gaussians themselves."""
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: presence, threshold and the place of each instance, without the Gaussians.
+
+        If the scene does not hold what was asked for ("present" is "no"), "count" is 0 and "instances" is empty,
+        even if some Gaussians exceed the threshold.
+        """
+        instances = [] if self.present == "no" else self.instances
         return {
             "phrase": self.phrase,
             "present": self.present,
-            "gaussians": self.count,
+            "count": len(instances),
+            "gaussians": self.num_gaussians,
             "threshold": round(float(self.threshold), 4),
-            "best_view": self.best_view,
-            "instances": [instance.geometry() for instance in self.instances],
+            "best_view": self.best_view if instances else "",
+            "instances": [instance.geometry() for instance in instances],
         }
 
     def geometry(self) -> dict[str, Any]:
-        """Count, score, place and size as plain numbers, in world units; the size in meters too where known."""
+        """Number of Gaussians, score, box and best view as plain data, in world units; in meters too if known.
+
+        Raises:
+            QueryError: If nothing is selected.
+        """
         box, meters = self.box, self.size_meters
         known = {} if meters is None else {"size_meters": [round(float(v), 5) for v in meters]}
         return {
-            "gaussians": self.count,
+            "gaussians": self.num_gaussians,
             "score": round(self.score, 4),
             "center": [round(float(v), 5) for v in box.center],
             "size": [round(float(v), 5) for v in 2 * box.half_sizes],
@@ -287,7 +309,7 @@ class Selection:
         return torch.from_numpy(array).to(self.mask.device)
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers ``[M, 3]`` and opacities ``[M]`` of its Gaussians."""
+        """Centers ``[M, 3]`` and opacities ``[M]`` of the selected Gaussians."""
         means = self.gaussians.means[self.mask].detach().cpu().double().numpy()
         return means, self.gaussians.opacities[self.mask].detach().cpu().double().numpy()
 
@@ -299,7 +321,7 @@ class Selection:
         return self._spacing() * _LINK
 
     def _spacing(self) -> float:
-        """Usual distance from one of its Gaussians to the sixth nearest."""
+        """Median distance from a selected Gaussian to its sixth neighbor."""
         points, _ = self._points()
         sample = points[:: max(1, len(points) // 4096)]
         neighbors = min(7, len(points))
@@ -309,7 +331,7 @@ class Selection:
         return float(np.median(apart[:, -1]))
 
     def _clusters(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """Cluster of each of its Gaussians ``[M]`` and the opacity in each cluster ``[C]``."""
+        """Cluster of each selected Gaussian ``[M]`` and the total opacity of each cluster ``[C]``."""
         points, opacities = self._points()
         if len(points) < 2:
             return np.zeros(len(points), np.intp), opacities[:1]
@@ -323,13 +345,13 @@ class Selection:
         rows, columns = np.nonzero(np.isfinite(apart))
         edges = (np.ones(len(rows)), (rows, neighbors[rows, columns]))
         _, found = connected_components(coo_array(edges, shape=(len(firm), len(firm))), directed=False)
-        _, nearest = tree.query(points)  # the faint ones go with the firm one nearest to them
+        _, nearest = tree.query(points)  # faint Gaussians join the cluster of the nearest firm one
         labels = found[nearest].astype(np.intp)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 
 def _promising_views(selection: Selection, count: int = 8) -> list[str]:
-    """The views in which the selection would be largest if nothing stood before it."""
+    """The views in which the selection would be largest without occlusion."""
     if not selection or not selection.cameras:
         return []
     points, weights = selection._points()
@@ -352,7 +374,7 @@ def _promising_views(selection: Selection, count: int = 8) -> list[str]:
 
 @torch.no_grad()
 def _visible_share(selection: Selection, camera: Camera) -> float:
-    """Share of the image that shows the selection, with what stands before it in place."""
+    """Share of the image that the selection covers, with occlusion."""
     small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 120))
     carried = selection.mask[:, None].float()
     return float(render(selection.gaussians, small, features=carried, color=False).features.mean())

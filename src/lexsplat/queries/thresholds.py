@@ -1,26 +1,41 @@
 """Masks from relevancies: by a fixed threshold (the paper's 0.5) or an automatic one for each prompt.
 
-The automatic threshold is found from the scene alone and never sees the truth. Whether a prompt is in the scene at
-all has a say too: `lexsplat.queries.presence.found_thresholds`, which every question goes through, puts 0.5
-where it is
-not. Dimension letters are those of `lexsplat.queries.relevancy`.
+The automatic threshold comes from the scene alone, never from ground truth: from relevancy maps of training views
+(`scene_thresholds`), and 0.5 for what the scene does not hold (`lexsplat.queries.presence`). Dimension letters are
+those of `lexsplat.queries.relevancy`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import QueryableField, QueryConfig, render_relevancy
+from lexsplat.queries.selection import Presence
+from lexsplat.runtime.errors import QueryError
+from lexsplat.runtime.sampling import evenly
 
 BORDER = 0.5
 """Relevancy at which a prompt and a canonical phrase are equally near; the paper's threshold."""
+THRESHOLD_VIEWS = 8
+"""Number of training views that the threshold of a scene comes from, at most."""
+_LONG_SIDE = 320
+"""Longer side of their renderings in pixels, at most."""
 _TOP_SHARE = 5e-4
-"""What samples reach is the mean of the best 0.05 percent of them."""
+"""The peak of the samples is the mean of their best 0.05 percent."""
+
+
+def check_threshold(threshold: float) -> float:
+    """The threshold as a float.
+
+    Raises:
+        QueryError: If it is not a number in 0..1.
+    """
+    if isinstance(threshold, bool) or not hasattr(threshold, "__float__") or not 0 <= float(threshold) <= 1:
+        raise QueryError("threshold", expected="a number in 0..1", found=repr(threshold)[:40])
+    return float(threshold)
 
 
 def masks(relevancy: Tensor, thresholds: float | Tensor) -> Tensor:
@@ -28,7 +43,7 @@ def masks(relevancy: Tensor, thresholds: float | Tensor) -> Tensor:
 
     Args:
         relevancy: ``[P, ...]``.
-        thresholds: One for all, or one for each prompt ``[P]``.
+        thresholds: One for all prompts, or one for each ``[P]``.
     """
     limits = torch.as_tensor(thresholds, dtype=relevancy.dtype, device=relevancy.device)
     if limits.ndim == 1:
@@ -44,27 +59,26 @@ def automatic_threshold(
     min_contrast: float = 0.05,
     pull: float = 1.0,
 ) -> Tensor:
-    """A threshold for each prompt from relevancies all over the scene; it never sees the truth.
+    """A threshold for each prompt from relevancies all over the scene, without ground truth.
 
-    Otsu's method on a histogram whose counts are raised to ``tempering``. Otsu wants classes of like size and
-    splits the background when an object covers a percent of the scene; the square root lets the object count
-    (1 is plain Otsu). Where a gap separates the classes, the middle of the gap is taken. If the means of the two
-    classes lie on either side of 0.5, where relevancy itself puts the border, the cut is moved there.
+    Otsu's method on a histogram whose counts are raised to ``tempering``. Otsu's method favors classes of similar
+    size and splits the background when an object covers one percent of the scene; the square root gives the object
+    more weight (1 is plain Otsu). Where a gap separates the classes, the cut is the middle of the gap. If the means
+    of the two classes lie on either side of 0.5, the cut moves there.
 
-    Where something is over 0.5, the class above the cut has to be so on average, too: otherwise the cut has parted
-    what is a little like the prompt from what is not like it at all (half of a bear, asked for its nose), and what
-    lies above is split again.
+    If some samples exceed 0.5, the mean of the class above the cut has to exceed it too. Otherwise the cut has
+    separated what resembles the prompt a little from what does not resemble it at all (half of a bear, for the
+    prompt "nose of the bear"), and the class above is split again.
 
-    A prompt without contrast (the 99.8th percentile less than ``min_contrast`` above the median: an absent
-    object, or one that is everywhere) has no two classes. It gets 0.5, where relevancy itself says whether
-    the prompt or a canonical phrase is nearer.
+    A prompt without contrast has no two classes: the 99.8th percentile is less than ``min_contrast`` above the
+    median, as for an object that is absent or everywhere. Its threshold is 0.5.
 
     Args:
-        samples: Relevancy ``[P, S]`` in 0..1, of pixels of several views (`scene_threshold`) or of Gaussians.
-        weights: Weight of each sample ``[S]``, such as the visibility of Gaussians; all equal when left out.
+        samples: Relevancy ``[P, S]`` in 0..1, of pixels of several views (`scene_thresholds`) or of Gaussians.
+        weights: Weight of each sample ``[S]``, such as the opacity of Gaussians; None weighs all samples equally.
         tempering: Exponent on the histogram in 0..1.
-        min_contrast: Least contrast that is split.
-        pull: How far the cut is moved towards 0.5, in 0..1.
+        min_contrast: Smallest contrast that is split.
+        pull: How far the cut moves towards 0.5, in 0..1.
 
     Returns:
         Thresholds ``[P]`` in 0..1, float32 on the CPU, for `masks`.
@@ -78,25 +92,25 @@ def automatic_threshold(
     return torch.tensor([_tempered_otsu(row, shares.double(), tempering, min_contrast, pull) for row in rows])
 
 
-def scene_threshold(
-    field: QueryableField,
-    gaussians: Gaussians,
+def scene_thresholds(
+    relevancy: Callable[[Camera], Tensor],
     cameras: Sequence[Camera],
-    positives: Tensor,
-    negatives: Tensor,
-    config: QueryConfig | None = None,
+    presences: Sequence[Presence] | None = None,
     *,
-    long_side: int = 320,
+    long_side: int = _LONG_SIDE,
 ) -> Tensor:
-    """`automatic_threshold` ``[P]`` from renderings of a few views that are not evaluated (training views).
+    """The automatic threshold ``[P]`` of each prompt in a scene: the one rule for masks and selections.
+
+    The thresholds are `automatic_threshold` of small renderings of `THRESHOLD_VIEWS` evenly chosen views. Prompts
+    that the scene does not hold get 0.5, where next to nothing is marked: they have no two classes, and a cut would
+    mark whatever resembles the prompt a little more than the rest, such as a whole table for a mug's handle that the
+    encoder does not see. "unsure" prompts keep their cut: a guess with the doubt beside it is more useful than an
+    empty image.
 
     Args:
-        field: The language of the scene.
-        gaussians: Its geometry.
-        cameras: Views to look from, spread over the scene; they are rendered small.
-        positives: Text embeddings of the prompts ``[P, D]``.
-        negatives: Text embeddings of the negatives ``[M, D]``.
-        config: Form, temperature, coverage.
+        relevancy: Renders the maps ``[P, H, W]`` of the prompts in a view.
+        cameras: All views to choose from, none of which is evaluated: the training views.
+        presences: Whether the scene holds each prompt; None for methods that cannot tell.
         long_side: Longer side of the renderings in pixels, at most.
 
     Raises:
@@ -105,14 +119,18 @@ def scene_threshold(
     if not cameras:
         raise ValueError("an automatic threshold needs at least one camera")
     maps = []
-    for camera in cameras:
+    for camera in evenly(cameras, THRESHOLD_VIEWS):
         small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
-        maps.append(render_relevancy(field, gaussians, small, positives, negatives, config).flatten(1).cpu())
-    return automatic_threshold(torch.cat(maps, dim=1))
+        maps.append(relevancy(small).flatten(1).cpu())
+    found = automatic_threshold(torch.cat(maps, dim=1))
+    absent = torch.tensor(
+        [presence == "no" for presence in presences or ["yes"] * len(found)], dtype=torch.bool
+    )
+    return torch.where(absent, torch.full_like(found, BORDER), found)
 
 
 def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: float, pull: float) -> float:
-    """The cut through one prompt's samples; samples above a cut that reach 0.5 only in part are cut again."""
+    """The cut through one prompt's samples; the class above it is cut again while its mean is below 0.5."""
     reached = _top_mean(row, shares) > BORDER
     while True:
         found = _best_cut(row, shares, tempering, min_contrast)
@@ -126,7 +144,7 @@ def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: 
 
 
 def _top_mean(row: Tensor, shares: Tensor) -> float:
-    """The mean of the best `_TOP_SHARE` of weighted samples."""
+    """Mean of the best `_TOP_SHARE` of weighted samples."""
     values, order = row.sort(descending=True)
     weights = shares[order]
     limit = float(weights.sum()) * _TOP_SHARE
@@ -137,7 +155,7 @@ def _top_mean(row: Tensor, shares: Tensor) -> float:
 def _best_cut(
     row: Tensor, shares: Tensor, tempering: float, min_contrast: float
 ) -> tuple[float, float, float] | None:
-    """Otsu's cut on the tempered histogram and the means on either side; None where there is no contrast."""
+    """Otsu's cut on the tempered histogram and the means on either side; None without contrast."""
     bins = 512
     seen = row[shares > 0]
     low, high = float(seen.min()), float(seen.max())
@@ -157,7 +175,7 @@ def _best_cut(
     first = (heights * centers).cumsum(0)[:-1]
     lower, upper = first / below, ((heights * centers).sum() - first) / above
     between = below * above * (lower - upper) ** 2
-    # All cuts inside a gap are equally good: take the middle of the best run.
+    # All cuts inside a gap score the same: take the middle of the best run.
     best = torch.nonzero(between >= between.max() * (1 - 1e-12)).flatten()
     cut = low + width * (float(best.double().mean()) + 1)
     place = int(best[0])

@@ -30,7 +30,10 @@ def choose_device(wanted: str) -> str:
 
     Raises:
         BackendError: If CUDA is asked for and there is none.
+        ValueError: If the name is another one.
     """
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"device must be auto, cpu or cuda, got {wanted!r}")
     if wanted == "cpu":
         return "cpu"
     available = torch.cuda.is_available()

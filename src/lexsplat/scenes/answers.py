@@ -1,32 +1,89 @@
-"""What the commands ``query``, ``evaluate`` and ``info`` answer: plain data for JSON, pictures for people."""
+"""Answers to prompts: in Python, as plain data for JSON, and as images."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from lexsplat.geometry.world import world_of
 from lexsplat.language.methods import METHODS
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.phrases import parse
 from lexsplat.queries.relevancy import check_prompts
+from lexsplat.queries.selection import Presence, Selection
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
 
 MAX_DEFAULT_VIEWS = 6
-"""How many held-out views a query without ``--view`` draws."""
+"""Number of held-out views that a query without ``--view`` renders, at most."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Answers:
+    """Scores, threshold and presence of every prompt in a scene, from `Scene.ask`.
+
+    Args:
+        prompts: The prompts, P of them.
+        scores: Relevancy of every Gaussian ``[P, N]`` in 0..1.
+        thresholds: Smallest score of a selected Gaussian for each prompt ``[P]``.
+        presences: Whether the scene holds what each prompt names.
+        scene: The scene that was asked.
+        automatic: Whether the thresholds come from the scene; False if they were given.
+    """
+
+    prompts: tuple[str, ...]
+    scores: Tensor
+    thresholds: Tensor
+    presences: tuple[Presence, ...]
+    scene: Scene
+    automatic: bool = True
+
+    def __len__(self) -> int:
+        return len(self.prompts)
+
+    def __repr__(self) -> str:
+        parts = zip(self.prompts, self.presences, self.thresholds.tolist())
+        return f"Answers({', '.join(f'{p!r}: {present} (threshold {t:.3g})' for p, present, t in parts)})"
+
+    def selection(self, index: int) -> Selection:
+        """The Gaussians that match a prompt, without specks.
+
+        With an automatic threshold, instances that score far worse than the best one are left out as well
+        (`Selection.convincing`).
+        """
+        scores, threshold = self.scores[index], float(self.thresholds[index])
+        selection = Selection(
+            self.scene.gaussians,
+            self.scene.cameras,
+            scores >= threshold,
+            scores,
+            threshold,
+            self.presences[index],
+            self.prompts[index],
+            self.scene.world,
+        ).without_specks()
+        return selection.convincing() if self.automatic else selection
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""
+        return {"answers": [self.selection(index).to_dict() for index in range(len(self))]}
 
 
 def answer_queries(
     scene: Scene,
-    prompts: Sequence[str],
+    prompts: str | Sequence[str],
     views: Sequence[str],
     threshold: float | None,
     folder: Path,
@@ -37,23 +94,19 @@ def answer_queries(
         scene: The scene to ask.
         prompts: What to look for.
         views: Names of views; none means up to `MAX_DEFAULT_VIEWS` held-out views.
-        threshold: Relevancy from which a pixel belongs to a mask; none chooses one for each prompt.
+        threshold: Relevancy threshold of the masks; None derives one for each prompt.
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go.
 
     Returns:
         ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "best_view", "gaussians",
-        "present" ("yes", "no" or "unsure": is it in the scene at all?) and "views".
+        "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
 
     Raises:
-        QueryError: If a prompt is empty or a view is unknown.
+        QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
     """
-    prompts = check_prompts(prompts)
     names = [scene.view(name).name for name in views] or _default_views(scene)
-    if threshold is None:
-        thresholds = scene.thresholds(prompts).tolist()
-    else:
-        thresholds = [float(threshold)] * len(prompts)
-    scores = scene.scores(prompts)
+    found = scene.ask(prompts, threshold)
+    thresholds = found.thresholds.tolist()
     answers: list[dict[str, Any]] = [
         {
             "prompt": prompt,
@@ -61,16 +114,16 @@ def answer_queries(
             "peak": 0.0,
             "best_view": names[0],
             "gaussians": int((score >= limit).sum()),
-            "present": scene.presence_classifier.judge(score),
+            "present": present,
             "views": {},
         }
-        for prompt, limit, score in zip(prompts, thresholds, scores)
+        for prompt, limit, score, present in zip(found.prompts, thresholds, found.scores, found.presences)
     ]
     for name in names:
-        picture = _to_uint8(scene.render(name).image)
-        relevancy = scene.relevancy(prompts, name).cpu().numpy()
+        image = _to_uint8(scene.render(name).image)
+        relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
-            answer["views"][name] = _write_pictures(folder, answer["prompt"], name, picture, values, limit)
+            answer["views"][name] = _write_images(folder, answer["prompt"], name, image, values, limit)
             if values.max() > answer["peak"]:
                 answer["peak"], answer["best_view"] = float(values.max()), name
     return {
@@ -82,32 +135,34 @@ def answer_queries(
 
 def find_phrases(
     scene: Scene,
-    phrases: Sequence[str],
+    phrases: str | Sequence[str],
     view: str | None = None,
     threshold: float | None = None,
 ) -> dict[str, Any]:
-    """What ``lexsplat find`` says: the things that phrases ask for, in 3D.
+    """The document of ``lexsplat find --json``: what phrases name, in 3D.
 
     Args:
         scene: The scene to ask.
         phrases: What to look for, with relations (`lexsplat.queries.phrases`).
-        view: Name of the view whose left and right are meant; none takes one for each relation.
-        threshold: Relevancy from which a Gaussian belongs to a thing; none chooses one for each.
+        view: Name of the view that "left" and "right" refer to; None takes one for each relation.
+        threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
         ``{"scene", "up", "meters_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
-        "count", "threshold", "best_view" and "instances" with center, size and axes in world units, and
-        "size_meters" where the scale is known.
+        "count", "gaussians", "threshold", "best_view" and "instances" with center, size and axes in world units,
+        and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and "instances" is empty.
 
     Raises:
-        QueryError: If a phrase is empty or the view is unknown.
+        QueryError: If a phrase is empty, the view is unknown, or the threshold is not in 0..1.
     """
-    answers = []
-    for phrase in check_prompts(phrases):
-        found = scene.find(phrase, view, threshold=threshold)
-        entry = found.to_json()
-        known = {"phrase": phrase, "understood": str(parse(phrase)), "count": len(entry["instances"])}
-        answers.append({**entry, **known})
+    answers = [
+        {
+            **scene.find(phrase, view, threshold=threshold).to_dict(),
+            "phrase": phrase,
+            "understood": str(parse(phrase)),
+        }
+        for phrase in check_prompts(phrases)
+    ]
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         **scene.world.to_json(),
@@ -117,12 +172,11 @@ def find_phrases(
 
 def _default_views(scene: Scene) -> list[str]:
     held_out = [name for name, view in scene.views.items() if view.split == "test"]
-    names = held_out or list(scene.views)
-    return names[:: max(1, len(names) // MAX_DEFAULT_VIEWS)][:MAX_DEFAULT_VIEWS]
+    return evenly(held_out or list(scene.views), MAX_DEFAULT_VIEWS)
 
 
-def _write_pictures(
-    folder: Path, prompt: str, name: str, picture: np.ndarray, relevancy: np.ndarray, threshold: float
+def _write_images(
+    folder: Path, prompt: str, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
 ) -> dict[str, Any]:
     mask = relevancy >= threshold
     row, column = np.unravel_index(int(relevancy.argmax()), relevancy.shape)
@@ -130,7 +184,7 @@ def _write_pictures(
     heatmap_path = stem.with_name(stem.name + ".png")
     mask_path = stem.with_name(stem.name + ".mask.png")
     for path, pixels in (
-        (heatmap_path, overlay_heatmap(picture, relevancy)),
+        (heatmap_path, overlay_heatmap(image, relevancy)),
         (mask_path, mask.astype(np.uint8) * 255),
     ):
         with atomic_path(path) as temporary:
@@ -145,7 +199,7 @@ def _write_pictures(
 
 
 def file_name(prompt: str) -> str:
-    """A file name for a prompt: its letters and digits, in any alphabet, joined by underscores."""
+    """A file name for a prompt: its letters and digits, of any alphabet, joined by underscores."""
     return re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80] or "prompt"
 
 
@@ -154,7 +208,7 @@ def _to_uint8(image: torch.Tensor) -> np.ndarray:
 
 
 def scene_facts(folder: SceneFolder) -> dict[str, Any]:
-    """What ``lexsplat info`` says about a scene folder."""
+    """The document of ``lexsplat info --json``: facts about a scene folder."""
     record = folder.record
     views = folder.read_cameras()
     splits = [view.split for view in views.values()]

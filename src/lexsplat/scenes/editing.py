@@ -1,8 +1,8 @@
 """Editing a scene: delete, keep, recolor, move, duplicate; undo, redo; a journal on disk.
 
-The built scene is never changed. An `Editor` holds what was done since and writes every step into a journal, a
-line of JSON each, so that an edit can be gone on with, replayed on a copy or discarded. `Editor.save` makes a new
-scene folder. Rows of the language field follow their Gaussians, and colors turn with what turns.
+The built scene is never changed. An `Editor` holds the steps since then and appends each to a journal as one line of
+JSON, so that an edit can be continued, replayed on a copy or discarded. `Editor.save` makes a new scene folder. The
+rows of the language field follow their Gaussians, and view-dependent colors rotate with them.
 """
 
 from __future__ import annotations
@@ -31,15 +31,17 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.transforms import moved
+from lexsplat.scenes.transforms import transformed
 
 Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 JOURNAL_VERSION = 1
 MAX_GROWTH = 16
-"""How many times as many Gaussians as before edits may make: a journal of copies of copies would fill any memory."""
+"""Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
 _DEFLATE = 1032
-"""Bytes at most that one compressed byte can stand for."""
+"""Largest compression ratio of DEFLATE."""
+_RENAMED_KINDS = {"recolour": "recolor"}
+"""Steps of journals that were written before the renames, and their present names."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,10 @@ class Step:
     """One edit.
 
     Args:
-        kind: What is done.
-        mask: To which Gaussians ``[N]`` bool, of those there are at this point.
+        kind: The operation.
+        mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
         values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center".
-        phrase: What was asked for, for people.
+        phrase: What was asked for, for display.
     """
 
     kind: Kind
@@ -77,19 +79,21 @@ class Step:
         """The inverse of `to_json`.
 
         Raises:
-            ValueError: If the data are no step.
+            ValueError: If the data are not a step.
         """
         try:
-            count, kind = data["gaussians"], data["step"]
+            count, kind = data["gaussians"], _RENAMED_KINDS.get(data["step"], data["step"])
             raw = base64.b64decode(data["mask"])
             if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
-                raise ValueError(f"no step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100])
+                raise ValueError(
+                    f"not a step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100]
+                )
             packed = zlib.decompressobj().decompress(raw, count // 8 + 1)
             bits = np.unpackbits(np.frombuffer(packed, np.uint8))[:count]
         except (KeyError, TypeError, binascii.Error, zlib.error) as error:
-            raise ValueError(f"no step: {error!r}") from error
+            raise ValueError(f"not a step: {error!r}") from error
         if kind not in get_args(Kind) or len(bits) != count:
-            raise ValueError(f"no step: {kind!r}")
+            raise ValueError(f"not a step: {kind!r}")
         known = ("color", "strength", "rotation", "scale", "translation", "center")
         values = {name: data[name] for name in known if name in data}
         return cls(kind, torch.from_numpy(bits.astype(bool)), values, str(data.get("phrase", "")))
@@ -99,7 +103,7 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     """The scene after one step.
 
     Raises:
-        ValueError: If the step is for another number of Gaussians, or its numbers make no sense.
+        ValueError: If the step is for another number of Gaussians, or its numbers are invalid.
     """
     if len(step.mask) != len(gaussians):
         raise ValueError(f"a step for {len(step.mask)} Gaussians does not fit {len(gaussians)}")
@@ -118,9 +122,9 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     else:
         numbers = {name: step.values.get(name) for name in ("rotation", "translation", "center")}
         arrays = {name: np.array(value, float) for name, value in numbers.items() if value is not None}
-        changed = moved(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
+        changed = transformed(changed, scale=float(step.values.get("scale", 1.0)), **arrays)
         if changed.find_invalid():
-            raise ValueError(f"the move leads to {changed.find_invalid()}")
+            raise ValueError(f"the transformed Gaussians have {changed.find_invalid()}")
     tensors: dict[str, Any] = {}
     for name, tensor in gaussians.tensors().items():
         tensors[name] = tensor.clone()
@@ -129,12 +133,12 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
 
 
 def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
-    """Another color with the old shading: brighter parts stay brighter.
+    """The Gaussians in another color with their old shading: brighter parts stay brighter.
 
     Args:
-        gaussians: A thing.
-        color: RGB in 0..1 that the thing has on average afterwards (as far as it does not clip).
-        strength: 0 leaves it, 1 leaves nothing of the old hue and of view-dependent color.
+        gaussians: The Gaussians of an object.
+        color: Mean RGB in 0..1 afterwards (unless it clips).
+        strength: 0 changes nothing, 1 removes the old hue and the view-dependent color.
 
     Raises:
         ValueError: If a number is out of range.
@@ -158,13 +162,13 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
 
 @dataclass(frozen=True)
 class Motion:
-    """How a selection moves: x -> scale R (x - center) + center + translation.
+    """A similarity transform of a selection: x -> scale R (x - center) + center + translation.
 
     Args:
-        translation: Shift ``[3]``, world units.
-        rotation: R ``[3, 3]``, a proper rotation; none does not turn.
+        translation: ``[3]``, world units.
+        rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
-        center: Fixed point of turning and scaling ``[3]``; none takes the middle of the selection's box.
+        center: Fixed point of rotation and scaling ``[3]``; None takes the center of the selection's box.
     """
 
     translation: Sequence[float] = (0.0, 0.0, 0.0)
@@ -173,10 +177,10 @@ class Motion:
     center: Sequence[float] | None = None
 
     def values(self, chosen: Selection) -> dict[str, Any]:
-        """The numbers of a `Step` that moves ``chosen``; they are tried out first.
+        """The numbers of a `Step` that moves ``chosen``; checked by a trial.
 
         Raises:
-            ValueError: If the rotation is none or the scale is not positive.
+            ValueError: If the rotation is not a rotation or the scale is not positive.
         """
         middle = np.zeros(3)
         if self.center is not None:
@@ -185,7 +189,7 @@ class Motion:
             middle = chosen.center
         turn = np.eye(3) if self.rotation is None else np.asarray(self.rotation, float)
         shift = np.asarray(self.translation, float)
-        moved(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
+        transformed(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
         return {
             "rotation": turn.tolist(),
             "scale": float(self.scale),
@@ -199,7 +203,7 @@ class Editor:
 
     Args:
         scene: The scene as it was built.
-        journal: Where the steps are kept; none keeps them in memory only. Steps that are there are done again.
+        journal: File of the steps, whose steps are replayed if it exists; None keeps steps in memory only.
 
     Raises:
         FileFormatError: If the journal is damaged.
@@ -218,7 +222,7 @@ class Editor:
             except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise FileFormatError(
                     journal,
-                    expected="steps that can be done",
+                    expected="steps that can be replayed",
                     found=repr(error)[:200],
                     remedy="discard the edit",
                 ) from error
@@ -226,7 +230,7 @@ class Editor:
     # -- steps
 
     def select(self, phrase: str, threshold: float | None = None) -> Selection:
-        """What answers to a phrase in the scene as it is now."""
+        """The Gaussians that match a phrase in the edited scene."""
         return self.scene.select(phrase, threshold)
 
     def delete(self, chosen: Selection) -> None:
@@ -238,28 +242,28 @@ class Editor:
         self._do("keep", chosen)
 
     def recolor(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
-        """Give a selection another color, RGB in 0..1; its shading stays (`recolored`)."""
-        recolored(chosen.selected, color, strength)  # raises before the journal knows
+        """Give a selection another color, RGB in 0..1, with its old shading (`recolored`)."""
+        recolored(chosen.selected, color, strength)  # raises before the journal changes
         self._do("recolor", chosen, color=[float(c) for c in color], strength=float(strength))
 
     def move(self, chosen: Selection, motion: Motion) -> None:
-        """Shift, turn and scale a selection.
+        """Translate, rotate and scale a selection.
 
         Raises:
-            ValueError: If the motion is none (see `lexsplat.scenes.transforms.moved`).
+            ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
         self._do("move", chosen, **motion.values(chosen))
 
     def duplicate(self, chosen: Selection, motion: Motion) -> None:
-        """Add a copy of a selection, moved as `move` does.
+        """Add a copy of a selection, transformed as by `move`.
 
         Raises:
-            ValueError: If the motion is none (see `lexsplat.scenes.transforms.moved`).
+            ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
         self._do("duplicate", chosen, **motion.values(chosen))
 
     def undo(self) -> bool:
-        """Take the last step back; False if there is none."""
+        """Undo the last step; False if there is none."""
         if not self.steps:
             return False
         self.undone.append(self.steps.pop())
@@ -268,7 +272,7 @@ class Editor:
         return True
 
     def redo(self) -> bool:
-        """Do the last undone step again; False if there is none."""
+        """Redo the last undone step; False if there is none."""
         if not self.undone:
             return False
         self._advance(self.undone.pop())
@@ -276,13 +280,13 @@ class Editor:
         return True
 
     def discard(self) -> None:
-        """Forget all steps and delete the journal."""
+        """Drop all steps and delete the journal."""
         self.steps, self.undone, self.scene = [], [], self.original
         if self.journal is not None:
             self.journal.unlink(missing_ok=True)
 
     def save(self, output: Path) -> SceneFolder:
-        """Write the scene as it is now into a new folder; the steps are in its ``scene.json``.
+        """Write the edited scene into a new folder; its ``scene.json`` lists the steps.
 
         Raises:
             SceneFolderError: If the folder exists, or the scene was not opened from one.
@@ -308,14 +312,14 @@ class Editor:
         with atomic_path(folder.language_path) as temporary:
             write_field(self.scene.field, {"reconstruction": str(reconstruction)}, temporary)
         folder.record["stages"] = stages
-        folder.save()  # last: a folder without finished stages is no scene
+        folder.save()  # last: a folder without finished stages is not a scene
         return folder
 
     # -- inside
 
     def _do(self, kind: Kind, chosen: Selection, **values: Any) -> None:
         if len(chosen.mask) != len(self.scene.gaussians):
-            raise ValueError("the selection is of the scene before an edit: select again")
+            raise ValueError("the selection was made before the last edit: select again")
         if not chosen:
             raise QueryError(
                 chosen.phrase or "selection",
@@ -330,7 +334,7 @@ class Editor:
 
     def _advance(self, step: Step) -> None:
         if len(self.scene.gaussians) > MAX_GROWTH * max(len(self.original.gaussians), 1):
-            raise ValueError(f"edits may make at most {MAX_GROWTH} times as many Gaussians")
+            raise ValueError(f"edits may grow a scene to at most {MAX_GROWTH} times its Gaussians")
         self.scene = self.scene.with_content(*apply(step, self.scene.gaussians, self.scene.field))
         self.steps.append(step)
 
@@ -341,15 +345,15 @@ class Editor:
 
     def _header(self) -> dict[str, Any]:
         folder = self.original.folder
-        made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint") if folder else None
+        reconstruction = folder.record["stages"].get("reconstruct", {}).get("fingerprint") if folder else None
         return {
             "journal": JOURNAL_VERSION,
             "gaussians": len(self.original.gaussians),
-            "reconstruction": made_from,
+            "reconstruction": reconstruction,
         }
 
     def _write(self, entry: dict[str, Any]) -> None:
-        """Append a line and wait until it is on the disk: a crash later loses nothing of it."""
+        """Append a line and wait until it is on the disk, so that a later crash does not lose it."""
         if self.journal is None:
             return
         self.journal.parent.mkdir(parents=True, exist_ok=True)
@@ -367,7 +371,7 @@ class Editor:
                 path, expected="a readable journal", found=str(error), remedy="discard the edit"
             ) from error
         if lines[-1]:
-            logging.getLogger("lexsplat").warning("%s: the last line is cut off and left out", path)
+            logging.getLogger("lexsplat").warning("%s: the last line is cut off and ignored", path)
             path.write_text("\n".join([*lines[:-1], ""]), encoding="utf-8")
         for number, line in enumerate(lines[:-1], start=1):
             try:

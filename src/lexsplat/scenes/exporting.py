@@ -1,9 +1,8 @@
-"""A scene, or what was found in it, as a file for other programs. The ending of the name says which format."""
+"""Export of a scene, or of selections of it, for other programs. The file name's ending selects the format."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -29,16 +28,16 @@ from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
 from lexsplat.scenes.scene import Scene
 
 SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".glb")
-"""Endings of files that hold Gaussians or their points."""
+"""Formats of Gaussians or their points."""
 LABEL_ENDINGS = (".csv", ".json")
-"""Endings of files that hold labels."""
+"""Formats of labels."""
 
 
 def ending_of(path: Path) -> str:
-    """Which of the known endings a name has.
+    """The known ending of a file name, which selects the format.
 
     Raises:
-        SceneFolderError: If none.
+        SceneFolderError: If it has none.
     """
     name = path.name.lower()
     for ending in (*SPLAT_ENDINGS, *LABEL_ENDINGS):
@@ -57,23 +56,24 @@ def export_gaussians(
     *,
     language: StoredLanguage | None = None,
     world: World | None = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write Gaussians in the format of the name's ending.
 
     Args:
-        gaussians: What to write.
+        gaussians: The Gaussians.
         path: ``.ply``, ``.points.ply``, ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat`` or ``.glb``.
-        language: Codes to write along, where the format has room: in ``.ply`` (the codebook goes into a file
-            beside it) and ``.glb``.
-        world: Up and scale of the scene, for ``.glb``: it has y up, and meters where the scale is known. The other
-            formats keep the scene's axes and units, so that they go with its cameras.
+        language: Codes to include, in ``.ply`` (the codebook goes into a file beside it) and ``.glb``.
+        world: Up and scale of the scene, for ``.glb``: it has y up, and meters if the scale is known. The other
+            formats keep the scene's axes and units, so that they match its cameras.
+        overwrite: Replace files that exist.
 
     Returns:
         The files that were written.
 
     Raises:
-        SceneFolderError: If the ending is unknown, or the format has no room for language.
-        QueryError: If there is nothing to write.
+        SceneFolderError: If the ending is unknown, the format cannot hold language, or a file exists.
+        QueryError: If there are no Gaussians.
         BackendError: If the format needs a library that is not installed.
     """
     ending = ending_of(path)
@@ -97,6 +97,9 @@ def export_gaussians(
     written = [path]
     if language is not None and ending == ".ply":
         written.append(codebook_path(path))
+    if not overwrite:
+        refuse_existing(written)
+    if len(written) > 1 and language is not None:
         with atomic_path(written[-1]) as temporary:
             write_codebook(language, temporary)
     with atomic_path(path) as temporary:
@@ -104,37 +107,26 @@ def export_gaussians(
     return written
 
 
-def found_by(
-    scene: Scene,
-    phrases: Sequence[str],
-    view: str | None = None,
-    threshold: float | None = None,
-) -> list[Selection]:
-    """What answers to each phrase, relations and all, under the phrase as it was written.
-
-    Args:
-        scene: The scene.
-        phrases: What to look for (`lexsplat.queries.phrases`).
-        view: Whose left and right are meant; none takes one for each relation.
-        threshold: Score from which a Gaussian was found; none chooses one for each phrase.
-
-    Raises:
-        QueryError: If a phrase is empty or the view is unknown.
-    """
-    return [replace(scene.find(phrase, view, threshold=threshold), phrase=phrase) for phrase in phrases]
-
-
 def export_scene(
-    scene: Scene, path: Path, *, found: Sequence[Selection] = (), language: bool = False
+    scene: Scene,
+    path: Path,
+    *,
+    found: Sequence[Selection] = (),
+    language: bool = False,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write a scene, or selections of it, or which Gaussian belongs to which selection.
 
     Args:
         scene: The scene.
-        path: A splat format (see `export_gaussians`); ``.csv`` for a line for each Gaussian; ``.json`` for what
-            was found, with boxes and indices.
-        found: Selections, from `found_by`; splat formats then hold only them.
-        language: Write codes and codebook along.
+        path: A splat format (see `export_gaussians`); ``.csv`` for one line per Gaussian; ``.json`` for the
+            selections with boxes and indices.
+        found: Selections (`Scene.find`); splat formats then hold only their Gaussians.
+        language: Include codes and codebook.
+        overwrite: Replace files that exist; files of the scene itself are never replaced.
+
+    Returns:
+        The files that were written.
 
     Raises:
         QueryError: If nothing is selected.
@@ -142,7 +134,11 @@ def export_scene(
     """
     ending = ending_of(path)
     _check_language_fits(path, language)
+    if scene.folder is not None:
+        scene.folder.refuse_own_file(path)
     if ending in LABEL_ENDINGS and found:
+        if not overwrite:
+            refuse_existing([path])
         with atomic_path(path) as temporary:
             if ending == ".csv":
                 labels, scores = best_labels(found)
@@ -164,14 +160,30 @@ def export_scene(
             )
         gaussians = gaussians.select(mask)
         stored = stored.select(mask.cpu()) if stored else None
-    return export_gaussians(gaussians, path, language=stored, world=scene.world)
+    return export_gaussians(gaussians, path, language=stored, world=scene.world, overwrite=overwrite)
+
+
+def refuse_existing(files: Sequence[Path]) -> None:
+    """Refuse to replace files.
+
+    Raises:
+        SceneFolderError: If one exists.
+    """
+    for path in files:
+        if path.exists():
+            raise SceneFolderError(
+                path,
+                expected="a new file",
+                found="one that exists",
+                remedy="give another name, or allow overwriting",
+            )
 
 
 def _check_language_fits(path: Path, language: bool) -> None:
-    """Refuse language for a format that cannot hold it.
+    """Refuse language in a format that cannot hold it.
 
     Raises:
-        SceneFolderError: If the ending of the name is another than ``.ply`` or ``.glb``.
+        SceneFolderError: If the ending is neither ``.ply`` nor ``.glb``.
     """
     if language and ending_of(path) not in (".ply", ".glb"):
         raise SceneFolderError(
@@ -180,9 +192,9 @@ def _check_language_fits(path: Path, language: bool) -> None:
 
 
 def best_labels(found: Sequence[Selection]) -> tuple[Tensor, Tensor]:
-    """The phrase that claims each Gaussian: its number or -1, and its score, both ``[N]``.
+    """The selection that claims each Gaussian: its number or -1, and its score, both ``[N]``.
 
-    Where several do, the one that is furthest above its own threshold, relative to what is left above it.
+    If several do, the one with the largest margin above its own threshold, relative to the range above it.
     """
     scores = torch.stack([selection.scores for selection in found])
     limits = scores.new_tensor([selection.threshold for selection in found])[:, None]
@@ -194,11 +206,15 @@ def best_labels(found: Sequence[Selection]) -> tuple[Tensor, Tensor]:
 
 
 def labels_as_json(found: Sequence[Selection]) -> dict[str, object]:
-    """What was found, with the indices of the Gaussians of every instance."""
+    """The selections as plain data, with the indices of the Gaussians of every instance.
+
+    Unlike `Selection.to_dict`, it lists instances whatever "present" is: what was selected is what is exported.
+    """
     entries = []
     for selection in found:
-        entry = selection.to_json()
-        for place, instance in zip(entry["instances"], selection.instances):
-            place["indices"] = instance.indices.tolist()
-        entries.append(entry)
+        instances = [
+            {**instance.geometry(), "indices": instance.indices.tolist()} for instance in selection.instances
+        ]
+        listed = {"count": len(instances), "best_view": selection.best_view, "instances": instances}
+        entries.append({**selection.to_dict(), **listed})
     return {"gaussians": len(found[0].mask), "labels": entries}

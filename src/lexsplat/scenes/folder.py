@@ -1,16 +1,16 @@
-"""What a built scene is on disk: plain files, each written whole or not at all.
+"""A built scene on disk: plain files, each written completely or not at all.
 
 ::
 
-    scene.json            format_version, config, provenance, what each finished stage was made from
+    scene.json            format_version, config, provenance, fingerprint of each finished stage
     cameras.json          views, intrinsics, poses, split
     gaussians.ply         the standard 3DGS PLY
     language.safetensors  the language field with its codebook
-    codes/NAME.png        8-bit code index maps of the training views
-    checkpoints/          what going on needs: codebook, features
+    codes/NAME.png        8-bit code index maps of the training views, for methods that use them
+    checkpoints/          what resuming needs: codebook, features
 
-A stage is finished when ``scene.json`` says so; the record is written after the stage's files. Its
-*fingerprint* is a hash of everything the result depends on, so a later build can tell what it may keep.
+A stage is finished when ``scene.json`` lists it; the record is written after the stage's files. The
+*fingerprint* of a stage is a hash of everything its result depends on, so a later build knows what it can keep.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import contextlib
 import dataclasses
 import io
 import os
-import re
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -34,86 +33,22 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, read_json, remove_left_overs, to_json, write_json
-
-FORMAT_VERSION = 1
-"""Raised when a reader of the old layout would misread the new one."""
+from lexsplat.scenes.records import FORMAT_VERSION, read_record
 
 SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
-"""What a scene is made of."""
-
+"""The files of a finished scene."""
 
 BUNDLED_SCENE = Path(__file__).resolve().parents[1] / "demo" / "scene"
-"""The finished demo scene: what the word ``demo`` means where a scene folder is asked for."""
+"""The bundled demo scene: the word ``demo`` stands for it wherever a scene folder is expected."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StoredView:
-    """A view as the scene folder remembers it: enough to render, without the photo."""
+    """A view as the scene folder stores it: enough to render, without the photo."""
 
     name: str
     camera: Camera
     split: str
-
-
-def _checked_record(record: Any, path: Path) -> dict[str, Any]:
-    """The content of ``scene.json``, of the types that the rest relies on.
-
-    Raises:
-        SceneFolderError: If it is of another format version.
-        FileFormatError: If an entry is of a wrong type.
-    """
-    version = record.get("format_version") if isinstance(record, dict) else None
-    if version != FORMAT_VERSION or not isinstance(record.get("stages"), dict):
-        raise SceneFolderError(
-            path,
-            expected=f"format_version {FORMAT_VERSION}",
-            found=repr(version)[:60],
-            remedy="build the scene again with this version of lexsplat",
-        )
-    config = record.get("config", {})
-    scale = config.get("downscale") if isinstance(config, dict) else None
-    stages = all(isinstance(stage, dict) for stage in record["stages"].values())
-    encoder = record["stages"].get("features", {}).get("clip_hash") if stages else None
-    sound = {
-        "stages": stages,
-        # It becomes part of a file name.
-        "clip_hash": encoder is None or (isinstance(encoder, str) and re.fullmatch(r"[\w-]+", encoder)),
-        "config": isinstance(config, dict) and isinstance(config.get("clip", ""), str),
-        "downscale": scale is None or (isinstance(scale, (int, float)) and 0 < scale < 1e6),
-        "provenance": isinstance(record.get("provenance", {}), dict),
-        "warnings": isinstance(record.get("warnings", []), list),
-        "capture": isinstance(record.get("capture"), (str, type(None))),
-        "images": isinstance(record.get("images"), (str, type(None))),
-    }
-    wrong = [name for name, holds in sound.items() if not holds]
-    if wrong:
-        raise FileFormatError(
-            path, expected=f"{wrong[0]} as a build writes it", found="something else", remedy="build again"
-        )
-    return record
-
-
-_RENAMED_SETTINGS = {"averaging": "averaged", "embedding": "trained", "lifting": "lifted"}
-
-
-def _in_todays_words(record: dict[str, Any]) -> dict[str, Any]:
-    """A checked record whose stage, encoders, settings and scale have the names of today.
-
-    Scene folders of format version 1 that were written before the renames say ``embed``, ``embedded`` and
-    ``metres_per_unit``.
-    """
-    stages = {("language" if name == "embed" else name): facts for name, facts in record["stages"].items()}
-    config = {_RENAMED_SETTINGS.get(name, name): value for name, value in record.get("config", {}).items()}
-    for encoder in ("clip", "dino"):
-        if config.get(encoder) == "embedded":
-            config[encoder] = "bundled"
-    renamed = {**record, "stages": stages, **({"config": config} if config else {})}
-    world = record.get("world")
-    if isinstance(world, dict) and "metres_per_unit" in world:
-        renamed["world"] = {
-            ("meters_per_unit" if name == "metres_per_unit" else name): value for name, value in world.items()
-        }
-    return renamed
 
 
 def _stored_view(entry: Any, path: Path) -> StoredView:
@@ -121,7 +56,7 @@ def _stored_view(entry: Any, path: Path) -> StoredView:
 
     Raises:
         CaptureError: If its name leads out of the folder.
-        KeyError, TypeError, ValueError, OverflowError: If something is missing or makes no sense.
+        KeyError, TypeError, ValueError, OverflowError: If an entry is missing or invalid.
     """
     name, split, width, height = entry["name"], entry["split"], entry["width"], entry["height"]
     if not isinstance(name, str) or split not in ("train", "test"):
@@ -142,7 +77,7 @@ class SceneFolder:
 
     Args:
         root: The folder.
-        content: Where record, cameras, Gaussians and language lie, if not there (`lexsplat.scenes.previous`).
+        content: Where record, cameras, Gaussians and language are, if not in ``root`` (`lexsplat.scenes.previous`).
 
     Raises:
         SceneFolderError: If there is a ``scene.json`` of another format version.
@@ -153,11 +88,11 @@ class SceneFolder:
         self.content = self.root if content is None else content
         self.record: dict[str, Any] = {"format_version": FORMAT_VERSION, "stages": {}}
         if self._record_path.exists():
-            self.record = _in_todays_words(_checked_record(read_json(self._record_path), self._record_path))
+            self.record = read_record(read_json(self._record_path), self._record_path)
 
     @classmethod
     def open(cls, root: Path) -> SceneFolder:
-        """Open a folder that a build has made; the word ``demo`` is the scene that ships with the package.
+        """Open a folder that a build has made; the word ``demo`` stands for the bundled scene.
 
         Raises:
             SceneFolderError: If it is not a scene folder.
@@ -165,18 +100,18 @@ class SceneFolder:
         if str(root) == "demo" and not Path(root).exists():
             root = BUNDLED_SCENE
         if not (Path(root) / "scene.json").is_file():
-            found = "no such folder" if not Path(root).is_dir() else "no scene.json in it"
+            found = "no scene.json in it" if Path(root).is_dir() else "a file" if Path(root).exists() else ""
             raise SceneFolderError(
                 root,
                 expected="a scene folder",
-                found=found,
+                found=found or "no such folder",
                 remedy="make one with: lexsplat build CAPTURE --output SCENE",
             )
         return cls(root)
 
     @property
     def is_bundled(self) -> bool:
-        """Whether this is the scene that ships with the package: it is read, never written."""
+        """Whether this is the bundled scene, which is never written."""
         return self.root.resolve() == BUNDLED_SCENE
 
     @property
@@ -204,29 +139,29 @@ class SceneFolder:
         return self.root / "checkpoints" / "features"
 
     def code_map_path(self, name: str) -> Path:
-        """``codes/NAME.png`` for the view ``name``: its folders stay, its suffix becomes .png."""
+        """``codes/NAME.png`` for the view ``name``: subfolders are kept, the suffix becomes .png."""
         return self.root / "codes" / Path(name).with_suffix(".png")
 
     def refuse_own_file(self, path: Path) -> None:
-        """Refuse to write what would take the place of a file that the scene is made of, or of its measurements.
+        """Refuse a path at which the scene keeps a file of its own.
 
         Raises:
-            SceneFolderError: If ``path`` is one.
+            SceneFolderError: If ``path`` is a file of the scene, its measurements or its viewer.
         """
         own = {self.root / name for name in (*SCENE_FILES, "metrics.json", "metrics.csv", "viewer.json")}
         if path.resolve() in {file.resolve() for file in own}:
             raise SceneFolderError(
                 path,
-                expected="a file beside the scene's own",
+                expected="a path other than the scene's own files",
                 found="one of them",
                 remedy="give another name",
             )
 
     def refuse_foreign_files(self) -> None:
-        """Refuse a folder in which a build would take the place of files that no build has made.
+        """Refuse a folder in which a build would replace files of another program.
 
         Raises:
-            SceneFolderError: If there are some: ``scene.json`` is the first file of a build.
+            SceneFolderError: If it has such files but no ``scene.json``, the first file of a build.
         """
         there = [name for name in SCENE_FILES if (self.root / name).exists()]
         if there and "scene.json" not in there:
@@ -239,26 +174,26 @@ class SceneFolder:
 
     # -- stages
 
-    def is_finished(self, stage: str, made_from: str) -> bool:
-        """Whether ``stage`` is finished and was made from the same things (see `fingerprint`)."""
-        return self.record["stages"].get(stage, {}).get("fingerprint") == made_from
+    def is_finished(self, stage: str, fingerprint: str) -> bool:
+        """Whether ``stage`` is finished with this fingerprint."""
+        return self.record["stages"].get(stage, {}).get("fingerprint") == fingerprint
 
-    def finish(self, stage: str, made_from: str, seconds: float, **facts: Any) -> None:
+    def finish(self, stage: str, fingerprint: str, seconds: float, **facts: Any) -> None:
         """Record that the files of ``stage`` are complete."""
         self.record["stages"][stage] = {
-            "fingerprint": made_from,
+            "fingerprint": fingerprint,
             "seconds": round(seconds, 3),
             **to_json(facts),
         }
         self.save()
 
     def reopen(self, stage: str) -> None:
-        """Forget that ``stage`` was finished: its files are about to change."""
+        """Remove ``stage`` from the record: its files are about to change."""
         if self.record["stages"].pop(stage, None) is not None:
             self.save()
 
     def stage_seconds(self) -> dict[str, float]:
-        """Seconds each finished stage took."""
+        """Duration of each finished stage in seconds."""
         return {name: stage.get("seconds", 0.0) for name, stage in self.record["stages"].items()}
 
     def save(self) -> None:
@@ -267,14 +202,14 @@ class SceneFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder for one builder; the lock goes when the process does, however it ends.
+        """Lock the folder for one build; the lock ends with the process, however it ends.
 
         Raises:
-            SceneFolderError: If another process builds here.
+            SceneFolderError: If another process holds the lock.
         """
         try:
             import fcntl
-        except ImportError:  # Windows has no flock; two builders there are the user's care.
+        except ImportError:  # Windows has no flock: two builds there are not detected
             yield
             return
         self.root.mkdir(parents=True, exist_ok=True)
@@ -286,7 +221,7 @@ class SceneFolder:
                 holder = file.read(20).strip() or "another process"
                 raise SceneFolderError(
                     self.root,
-                    expected="a folder nobody builds in",
+                    expected="a folder that no other process builds in",
                     found=f"process {holder} at work",
                     remedy="wait for it or give another --output",
                 ) from error
@@ -297,7 +232,7 @@ class SceneFolder:
             yield
 
     def withdraw(self) -> None:
-        """Take back the record of a build that ended before anything was made; a folder that holds more stays."""
+        """Remove the record of a build that ended before its first stage; a folder with other files stays."""
         files = [path for path in self.root.rglob("*") if not path.is_dir()]
         begun = {self.root / name for name in (".lock", "scene.json", "cameras.json")}
         if self.record["stages"] or not set(files) <= begun:
@@ -337,7 +272,7 @@ class SceneFolder:
         try:
             views = [_stored_view(entry, path) for entry in content["views"]]
             if len({view.name for view in views}) < len(views):
-                raise ValueError("a view twice")
+                raise ValueError("duplicate views")
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise FileFormatError(
                 path,
@@ -379,14 +314,14 @@ class SceneFolder:
                     raise FileFormatError(path, expected="an 8-bit gray PNG", found=f"mode {image.mode}")
                 if len(_pixel_data(content, image.size)) != image.height * (image.width + 1):
                     raise FileFormatError(
-                        path, expected=f"{image.width}x{image.height} codes", found="others"
+                        path, expected=f"{image.width}x{image.height} codes", found="another number"
                     )
                 return np.array(image)
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, zlib.error) as error:
             raise FileFormatError(path, expected="a code index map", found=str(error)) from error
 
     def bytes_on_disk(self, *paths: Path) -> int:
-        """Bytes of the given files and folders (those that exist)."""
+        """Total size in bytes of the given files and folders, as far as they exist."""
         total = 0
         for path in paths:
             files = path.rglob("*") if path.is_dir() else [path]
@@ -395,9 +330,9 @@ class SceneFolder:
 
 
 def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:
-    """The unpacked pixels of an 8-bit gray PNG with the filter byte of each row; at most one byte too many.
+    """The decompressed pixels of an 8-bit gray PNG with the filter byte of each row; at most one byte too many.
 
-    Pillow fills up with zeros what a PNG promises and does not hold, and zero is a code.
+    Pillow fills the missing pixels of a truncated PNG with zeros, and zero is a code.
     """
     packed, place = [], 8
     while place + 8 <= len(content):

@@ -1,8 +1,8 @@
-"""What a scene was before it is built again: questions are answered from there until the new one is whole.
+"""The previous version of a scene, which answers queries while the scene is rebuilt.
 
-A build keeps the files that answer questions in ``SCENE/previous/`` before it changes the first of them, says so in
-the record (``building``), and lets go of them when its last stage is finished. They are links to the same data,
-which cost nothing: files are never changed in place (`lexsplat.runtime.files`).
+Before a build changes the first file that queries read, it keeps these files in ``SCENE/previous/`` and marks the
+record (``building``); it removes them when its last stage is finished. They are hard links and take no space, as
+files are never changed in place (`lexsplat.runtime.files`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FOLDER = "previous"
 
 
 def keep_previous(folder: SceneFolder) -> None:
-    """Keep a whole scene and mark its record; what an interrupted build has begun is not whole and not kept.
+    """Keep a finished scene and mark its record; the unfinished result of an interrupted build is not kept.
 
     The caller holds the lock of the folder and saves the record.
     """
@@ -32,7 +32,7 @@ def keep_previous(folder: SceneFolder) -> None:
     if whole and not folder.record.get("building"):
         drop_previous(folder)
         made = Path(tempfile.mkdtemp(prefix=".previous.", dir=folder.root))
-        # Whoever may read the scene may read what is kept of it; a temporary folder is its owner's alone.
+        # A temporary folder is private to its owner; the kept files are as readable as the scene.
         made.chmod(stat.S_IMODE(folder.root.stat().st_mode))
         for name in SCENE_FILES:
             _link(folder.root / name, made / name)
@@ -41,7 +41,7 @@ def keep_previous(folder: SceneFolder) -> None:
 
 
 def drop_previous(folder: SceneFolder) -> None:
-    """Let go of what was kept. Who is reading it at this moment finds files missing, and the new scene whole."""
+    """Remove the previous version. A reader that finds files missing meanwhile finds the new scene finished."""
     for left in folder.root.glob(".previous.*"):
         shutil.rmtree(left, ignore_errors=True)
     kept = folder.root / FOLDER
@@ -52,17 +52,17 @@ def drop_previous(folder: SceneFolder) -> None:
 
 
 def previous_of(folder: SceneFolder) -> SceneFolder | None:
-    """The scene that is kept in a folder, if there is one; what is written goes to the folder itself."""
+    """The previous version in a folder, if there is one; it reads from there and writes to the folder itself."""
     if not (folder.root / FOLDER / "scene.json").is_file():
         return None
     return SceneFolder(folder.root, content=folder.root / FOLDER)
 
 
 def require_current(folder: SceneFolder) -> None:
-    """Refuse to change, or to measure, a scene that is about to be replaced.
+    """Refuse to change or measure a scene that is being rebuilt.
 
     Raises:
-        SceneFolderError: If the folder was opened from what is kept.
+        SceneFolderError: If the folder was opened from its previous version.
     """
     if folder.content != folder.root:
         raise SceneFolderError(

@@ -1,12 +1,10 @@
-"""Giving a scene its scale by one distance that is known, and its up direction, after it was built."""
+"""The scale of a built scene, from one known distance, and its up direction."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from lexsplat.geometry.world import World, stored_world, world_of
 from lexsplat.queries.selection import Selection
@@ -18,38 +16,29 @@ log = logging.getLogger("lexsplat")
 
 
 def length_between(scene: Scene, first: str, second: str) -> float:
-    """Distance in world units between the middles of two things, found by phrases.
+    """Distance in world units between the centers of two objects, found by phrases.
 
     Raises:
         QueryError: If one is not found, or they are the same.
     """
     things = [the_thing(scene, phrase) for phrase in (first, second)]
-    return _positive(things[0].distance_to(things[1]), f"{first} and {second}")
+    return positive_length(things[0].distance_to(things[1]), f"{first} and {second}")
 
 
 def height_of(scene: Scene, phrase: str) -> float:
-    """How high a thing is, found by a phrase, in world units.
+    """Height in world units of an object, found by a phrase.
 
     Raises:
         QueryError: If it is not found.
     """
-    return _positive(float(the_thing(scene, phrase).size[2]), phrase)
-
-
-def length_of_points(first: Sequence[float], second: Sequence[float]) -> float:
-    """Distance in world units between two points ``[3]``.
-
-    Raises:
-        QueryError: If they are the same.
-    """
-    return _positive(float(np.linalg.norm(np.subtract(first, second))), "the two points")
+    return positive_length(float(the_thing(scene, phrase).size[2]), phrase)
 
 
 def the_thing(scene: Scene, phrase: str) -> Selection:
-    """The largest thing that answers to a phrase; a warning tells where there are several or perhaps none.
+    """The largest instance that matches a phrase; logs a warning if there are several or perhaps none.
 
     Raises:
-        QueryError: If nothing answers.
+        QueryError: If nothing matches.
     """
     found = scene.find(phrase)
     if not found:
@@ -57,7 +46,7 @@ def the_thing(scene: Scene, phrase: str) -> Selection:
     if found.present != "yes":
         log.warning("%s: perhaps not in this scene; check with: lexsplat find", phrase)
     if len(found.instances) > 1:
-        log.warning("%s: %d found, the largest is meant", phrase, len(found.instances))
+        log.warning("%s: %d found, taking the largest", phrase, len(found.instances))
     return found.largest()
 
 
@@ -67,22 +56,22 @@ def store_world(
     up: Sequence[float] | None = None,
     meters_per_unit: float | None = None,
 ) -> World:
-    """Write a new up direction or scale into ``scene.json``; what is left out stays.
+    """Write a new up direction or scale into ``scene.json``; None keeps the stored value.
 
     Args:
         root: The scene folder.
         up: World direction ``[3]`` away from the ground.
-        meters_per_unit: Meters that one world unit is long.
+        meters_per_unit: Length of a world unit in meters.
 
     Raises:
-        SceneFolderError: If the scene is the one that ships, or another process builds there.
-        ValueError: If a number makes no sense.
+        SceneFolderError: If the scene is the bundled one, or another process builds there.
+        ValueError: If a number is invalid.
     """
     if root.is_bundled:
         raise SceneFolderError(
             "demo",
             expected="a scene folder of your own",
-            found="the scene that ships with lexsplat",
+            found="the bundled scene",
             remedy="make your own copy of it with: lexsplat demo",
         )
     with root.locked():
@@ -98,7 +87,12 @@ def store_world(
     return world
 
 
-def _positive(length: float, subject: str) -> float:
+def positive_length(length: float, subject: str) -> float:
+    """The length itself.
+
+    Raises:
+        QueryError: If it is not positive.
+    """
     if not length > 0:
-        raise QueryError(subject, expected="a distance", found="none between them")
+        raise QueryError(subject, expected="a positive distance", found=f"{length:g}")
     return length

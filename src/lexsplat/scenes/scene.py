@@ -1,9 +1,10 @@
-"""A finished scene, open for questions: the Python face of lexsplat.
+"""A built scene, open for queries: the Python face of lexsplat.
 
 import lexsplat
 scene = lexsplat.open_scene("output/demo")
-relevancy = scene.relevancy(["red apple"], view="frame_0005.jpg")  # [1, H, W]
-scores = scene.scores(["red apple"])  # [1, N], one for each Gaussian
+relevancy = scene.relevancy("red apple", view="frame_0005.jpg")  # [1, H, W]
+answers = scene.ask(["red apple", "mug"])  # scores, thresholds and presence of each prompt
+apple = scene.find("red apple left of the mug")  # a Selection: instances, boxes, best view
 """
 
 from __future__ import annotations
@@ -11,48 +12,54 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from lexsplat.features.text import TextCache, encode_each
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
-from lexsplat.language.fields import LanguageField, field_from_tensors
-from lexsplat.queries.phrases import parse
+from lexsplat.language.fields import LanguageField
+from lexsplat.queries.phrases import parse, things_of
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier, found_thresholds
+from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
 from lexsplat.queries.relations import answer
 from lexsplat.queries.relevancy import (
-    CANONICAL_PHRASES,
     QueryConfig,
+    Question,
     check_prompts,
     embed_prompts,
     gaussian_relevancy,
     render_relevancy,
 )
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.thresholds import check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
-from lexsplat.runtime.errors import FileFormatError, ModelError, QueryError, SceneFolderError
-from lexsplat.runtime.files import read_tensors
+from lexsplat.runtime.device import choose_device
+from lexsplat.runtime.errors import ModelError, QueryError
+from lexsplat.scenes.answers import Answers
 from lexsplat.scenes.folder import SceneFolder, StoredView
-from lexsplat.scenes.previous import previous_of
+from lexsplat.scenes.reading import read_scene
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import ImageTextEncoder
 
 
 class Scene:
-    """Gaussians, their language and the views they were made from.
+    """Gaussians, their language, and the views they were built from.
+
+    Wherever a list of prompts is expected, a single text is one prompt. Wherever a view is expected, the name of a
+    view (with or without suffix), a `StoredView` or any `Camera` will do.
 
     Args:
         gaussians: Geometry and appearance.
         field: Their language.
         views: The views by name.
-        clip: Name or folder of the encoder the language was made with.
-        query: How questions are answered.
-        folder: Where the scene was opened from, if from disk.
+        clip: Name or folder of the text encoder that belongs to the language.
+        query: How text is compared with the scene.
+        folder: The folder that the scene was opened from, if any.
     """
 
     def __init__(
@@ -65,12 +72,27 @@ class Scene:
         folder: SceneFolder | None = None,
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
-        self.clip, self.query, self.folder = clip, query or QueryConfig(), folder
+        self.clip, self.folder = clip, folder
+        self.query = query or QueryConfig()
         self._encoder: ImageTextEncoder | None = None
         self._cache: TextCache | None = None
         self._texts: dict[str, Tensor] = {}
-        self._judge: PresenceClassifier | None = None
         self._world: World | None = None
+
+    def __repr__(self) -> str:
+        place = f", folder={str(self.folder.root)!r}" if self.folder else ""
+        return f"Scene(gaussians={len(self.gaussians)}, views={len(self.views)}, method={self.field.method!r}{place})"
+
+    @property
+    def query(self) -> QueryConfig:
+        """How text is compared with the scene."""
+        return self._query
+
+    @query.setter
+    def query(self, query: QueryConfig) -> None:
+        self._query = query
+        self._classifier: PresenceClassifier | None = None
+        self._thresholds: dict[str, float] = {}
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
@@ -80,31 +102,28 @@ class Scene:
 
     # -- text
 
-    def embed(self, prompts: Sequence[str]) -> Tensor:
+    def embed(self, prompts: str | Sequence[str]) -> Tensor:
         """Unit text embeddings ``[P, D]``; each prompt is encoded once.
 
         Raises:
             QueryError: If there is no prompt or one is empty.
             ModelError: If the text encoder cannot be loaded.
         """
-        import torch
-
-        if not prompts:
-            raise QueryError("query", expected="at least one prompt", found="none")
+        prompts = check_prompts(prompts)
         new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._texts]
-        if new:  # by one call: the cache on disk is written once
+        if new:  # in one call, so that the cache on disk is written once
             self._texts.update(zip(new, embed_prompts(new, self.encode_text, self.query.templates)))
         return torch.stack([self._texts[prompt] for prompt in prompts])
 
     def encode_text(self, texts: list[str]) -> Tensor:
-        """Embeddings ``[T, D]`` of whole sentences, by the encoder the language was made with.
+        """Embeddings ``[T, D]`` of whole sentences, from the encoder that belongs to the language.
 
-        They are kept in the scene folder, so that a question asked twice loads no model.
+        The scene folder caches them, so that a known prompt needs no model.
 
         Raises:
-            ModelError: If the encoder cannot be loaded, or is not the one the language was made with.
+            ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
         """
-        known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
+        known = self._encoder_hash
         writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
         if self.folder is None or known is None or not writable:
             return encode_each(self._load_encoder(known), texts)
@@ -113,17 +132,21 @@ class Scene:
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     def encoder_identity(self) -> dict[str, str]:
-        """Name and content hash (where known) of the encoder of the texts, for files of other programs."""
-        known = self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
+        """Name and content hash (if known) of the text encoder, for files of other programs."""
+        known = self._encoder_hash
         return {"encoder": self.clip, **({"encoder_hash": known} if known else {})}
 
     def preload(self) -> None:
-        """Load the text encoder now, so that the first question need not wait for it.
+        """Load the text encoder, so that the first query does not wait for it.
 
         Raises:
             ModelError: If it cannot be loaded.
         """
-        self._load_encoder(self.encoder_identity().get("encoder_hash"))
+        self._load_encoder(self._encoder_hash)
+
+    @property
+    def _encoder_hash(self) -> str | None:
+        return self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
 
     def _load_encoder(self, known: str | None) -> ImageTextEncoder:
         from lexsplat.features.encoders import load_clip
@@ -133,102 +156,146 @@ class Scene:
         if known is not None and self._encoder.content_hash != known:
             raise ModelError(
                 self.clip,
-                expected="the encoder the scene was made with",
+                expected="the encoder that the scene was built with",
                 found="another one",
-                remedy="name the right one with --clip, or build the scene again with this one",
+                remedy="give the right one with --clip, or build the scene again with this one",
             )
         return self._encoder
 
-    def _negatives(self) -> Tensor:
-        return self.embed(list(self.query.negatives or CANONICAL_PHRASES))
+    def _question(self, prompts: str | Sequence[str]) -> Question:
+        return Question(self.embed(prompts), self.embed(self.query.negatives), self.query)
 
     # -- answers
 
-    def relevancy(self, prompts: Sequence[str], view: str | Camera) -> Tensor:
-        """Relevancy maps ``[P, H, W]`` in 0..1 of the prompts in a view (a name or any camera)."""
-        camera = view if isinstance(view, Camera) else self.view(view).camera
-        positives = self.embed(prompts)
-        return render_relevancy(self.field, self.gaussians, camera, positives, self._negatives(), self.query)
-
-    def scores(self, prompts: Sequence[str]) -> Tensor:
-        """Relevancy ``[P, N]`` in 0..1 of every Gaussian for the prompts."""
-        return gaussian_relevancy(self.field, self.embed(prompts), self._negatives(), self.query)
-
-    def thresholds(self, prompts: Sequence[str]) -> Tensor:
-        """An automatic threshold ``[P]`` for each prompt, from the scene alone; 0.5 for what is not there."""
-        return found_thresholds(self.presence_classifier, self.gaussians, self._threshold_cameras(),
-                                self.embed(prompts), self._negatives(), self.query)  # fmt: skip
-
-    def select(self, phrase: str, threshold: float | None = None) -> Selection:
-        """The Gaussians that answer to a phrase, as a set with instances, boxes and a best view.
+    def ask(self, prompts: str | Sequence[str], threshold: float | None = None) -> Answers:
+        """Scores, threshold and presence of each prompt; every mask and selection of the scene reads them.
 
         Args:
-            phrase: What to look for.
-            threshold: Score from which a Gaussian belongs to it; none chooses one from the scene, and leaves out
-                instances that answer far worse than the best one (`Selection.convincing`).
+            prompts: What to look for.
+            threshold: Smallest score of a selected Gaussian, in 0..1; None derives one for each prompt from the
+                training views (`lexsplat.queries.thresholds.scene_thresholds`).
 
         Raises:
-            QueryError: If the phrase is empty.
+            QueryError: If there is no prompt, one is empty, or the threshold is not in 0..1.
+            ModelError: If the text encoder cannot be loaded.
         """
-        (phrase,) = check_prompts([phrase])
-        scores = self.scores([phrase])[0]
-        limit = float(self.thresholds([phrase])[0]) if threshold is None else float(threshold)
-        present = self.presence_classifier.judge(scores)
-        chosen = Selection(
-            self.gaussians, self.cameras, scores >= limit, scores, limit, present, phrase, self.world
-        )
-        chosen = chosen.without_specks()
-        return chosen.convincing() if threshold is None else chosen
+        prompts = check_prompts(prompts)
+        given = None if threshold is None else check_threshold(threshold)
+        question = self._question(prompts)
+        scores = gaussian_relevancy(self.field, question)
+        presences = tuple(self.presence_classifier.classify(row) for row in scores)
+        if given is None:
+            thresholds = self._automatic_thresholds(prompts, question, presences)
+        else:
+            thresholds = torch.full((len(prompts),), given)
+        return Answers(tuple(prompts), scores, thresholds, presences, self, automatic=given is None)
 
-    @property
-    def presence_classifier(self) -> PresenceClassifier:
-        """What decides whether a phrase is in the scene at all; made when it is first needed."""
-        if self._judge is None:
-            references = self.embed(list(REFERENCE_PHRASES))
-            self._judge = PresenceClassifier(
-                self.gaussians, self.field, references, self._negatives(), self.query.temperature
-            )
-        return self._judge
+    def relevancy(self, prompts: str | Sequence[str], view: str | StoredView | Camera) -> Tensor:
+        """Relevancy maps ``[P, H, W]`` of the prompts in a view, in 0..1.
 
-    def find(
-        self, phrase: str, view: str | Camera | None = None, *, threshold: float | None = None
-    ) -> Selection:
-        """What a phrase with relations asks for, such as "mug on the cloth" (`lexsplat.queries.phrases`).
+        Raises:
+            QueryError: If a prompt is empty or the view is unknown.
+        """
+        camera = self.camera(view)
+        return render_relevancy(self.field, self.gaussians, camera, self._question(prompts))
+
+    def scores(self, prompts: str | Sequence[str]) -> Tensor:
+        """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
+        return gaussian_relevancy(self.field, self._question(prompts))
+
+    def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
+        """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
+        return self.ask(prompts).thresholds
+
+    def select(self, phrase: str, threshold: float | None = None) -> Selection:
+        """The Gaussians that match a phrase, with instances, boxes and a best view.
 
         Args:
             phrase: What to look for.
-            view: Whose left and right are meant; none takes the view that shows best what they refer to.
+            threshold: Smallest score of a selected Gaussian, in 0..1; None derives one from the scene and drops
+                instances that score far worse than the best one (`Selection.convincing`).
+
+        Raises:
+            QueryError: If the phrase is empty or not a single text, or the threshold is not in 0..1.
+        """
+        return self.ask(_one_phrase(phrase), threshold).selection(0)
+
+    def find(
+        self,
+        phrase: str,
+        view: str | StoredView | Camera | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Selection:
+        """The Gaussians that match a phrase with relations, such as "mug on the cloth".
+
+        `lexsplat.queries.phrases` describes the grammar.
+
+        Args:
+            phrase: What to look for.
+            view: The view that "left" and "right" refer to; None takes the one that shows the reference best.
             threshold: See `select`.
 
         Raises:
-            QueryError: If the phrase has an empty part.
+            QueryError: If a part of the phrase is empty, the view is unknown, or the threshold is not in 0..1.
         """
-        chosen = view if view is None or isinstance(view, Camera) else self.view(view).camera
+        parsed = parse(_one_phrase(phrase))
+        chosen = None if view is None else self.camera(view)
+        things = things_of(parsed)
+        answers = self.ask(things, threshold)
 
         def viewer(reference: Selection) -> Camera | None:
             return chosen or self.cameras.get(reference.best_view)
 
-        return answer(parse(phrase), lambda text: self.select(text, threshold), viewer)
+        return answer(parsed, lambda text: answers.selection(things.index(text)), viewer)
 
-    def click(self, view: str | Camera, x: float, y: float, *, similarity: float | None = None) -> Selection:
-        """What a click on a picture hits: the surface there and what is joined to it and says the same.
+    def click(
+        self, view: str | StoredView | Camera, x: float, y: float, *, similarity: float | None = None
+    ) -> Selection:
+        """The surface at a pixel, and what is connected to it and means the same.
 
         Args:
-            view: Name of a view, or any camera.
-            x: Pixels from the left, 0.5 being the middle of the first.
+            view: The view that was clicked.
+            x: Pixels from the left; the first pixel's center is 0.5.
             y: Pixels from the top.
-            likeness: How alike in language a Gaussian must be, in 0..1; none finds a limit in the scene.
+            similarity: Smallest similarity in language, in 0..1; None derives it from the scene.
 
         Raises:
-            QueryError: If the pixel lies outside the picture or shows nothing.
+            QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
-        camera = view if isinstance(view, Camera) else self.view(view).camera
-        hit = surface_at(self.gaussians, camera, x, y)
+        hit = surface_at(self.gaussians, self.camera(view), x, y)
         return select_hit(hit, self.gaussians, self.field, self.cameras, similarity, self.world)
 
     @property
+    def presence_classifier(self) -> PresenceClassifier:
+        """Decides whether the scene holds a phrase at all; made at first use."""
+        if self._classifier is None:
+            references = self._question(REFERENCE_PHRASES)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, references)
+        return self._classifier
+
+    def _automatic_thresholds(
+        self, prompts: Sequence[str], question: Question, presences: Sequence[Presence]
+    ) -> Tensor:
+        """The threshold ``[P]`` of each prompt; known ones are not computed again."""
+        new = [place for place, prompt in enumerate(prompts) if prompt not in self._thresholds]
+        if new:
+            asked = Question(question.positives[new], question.negatives, question.config)
+            views = list(self.views.values())
+            training = [view.camera for view in views if view.split == "train"]
+            found = scene_thresholds(
+                lambda camera: render_relevancy(self.field, self.gaussians, camera, asked),
+                training or [view.camera for view in views],
+                [presences[place] for place in new],
+            )
+            self._thresholds.update(zip((prompts[place] for place in new), found.tolist()))
+        return torch.tensor([self._thresholds[prompt] for prompt in prompts])
+
+    # -- views
+
+    @property
     def world(self) -> World:
-        """Which way is up, and what a unit is in meters, where that is known (``lexsplat scale``)."""
+        """The up direction, and the length of a unit in meters if known (``lexsplat scale``)."""
         if self._world is None:
             self._world = world_of(self.folder.record if self.folder else {}, self.cameras)
         return self._world
@@ -238,20 +305,35 @@ class Scene:
         """The cameras of all views by name."""
         return {name: view.camera for name, view in self.views.items()}
 
-    def render(self, view: str | Camera) -> Rendering:
-        """The scene in color."""
-        import torch
+    def render(self, view: str | StoredView | Camera) -> Rendering:
+        """The scene in color.
 
-        camera = view if isinstance(view, Camera) else self.view(view).camera
+        Raises:
+            QueryError: If the view is unknown.
+        """
         with torch.no_grad():
-            return render(self.gaussians, camera)
+            return render(self.gaussians, self.camera(view))
+
+    def camera(self, view: str | StoredView | Camera) -> Camera:
+        """The camera of a view.
+
+        Raises:
+            QueryError: If the view is unknown.
+        """
+        if isinstance(view, Camera):
+            return view
+        return view.camera if isinstance(view, StoredView) else self.view(view).camera
 
     def view(self, name: str) -> StoredView:
         """The view called ``name``, with or without its suffix.
 
         Raises:
-            QueryError: If there is none.
+            QueryError: If there is none, or several match.
         """
+        if not isinstance(name, str):
+            raise QueryError(
+                "view", expected="the name of a view, a StoredView or a Camera", found=repr(name)[:60]
+            )
         if name in self.views:
             return self.views[name]
         matches = [view for key, view in self.views.items() if Path(key).stem == Path(name).stem]
@@ -260,103 +342,43 @@ class Scene:
             raise QueryError(
                 f"view {name!r}",
                 expected="the name of a view",
-                found="none such" if not matches else f"{len(matches)} such",
+                found="no match" if not matches else f"{len(matches)} matches",
                 remedy=f"the scene has {len(self.views)} views, such as {known}",
             )
         return matches[0]
 
-    def _threshold_cameras(self) -> list[Camera]:
-        """Up to eight training cameras, spread over the capture."""
-        cameras = [view.camera for view in self.views.values() if view.split == "train"]
-        step = max(1, len(cameras) // 8)
-        return cameras[::step][:8]
+
+def _one_phrase(phrase: str) -> str:
+    """A phrase without surrounding space.
+
+    Raises:
+        QueryError: If it is empty or not a single text.
+    """
+    if not isinstance(phrase, str):
+        raise QueryError(
+            "phrase",
+            expected="one phrase as text",
+            found=repr(phrase)[:60],
+            remedy="ask several at once with scene.ask",
+        )
+    return check_prompts(phrase)[0]
 
 
 def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> Scene:
-    """Open a scene folder for questions.
+    """Open a scene folder for queries.
 
     Args:
-        path: A folder that ``lexsplat build`` or ``lexsplat demo`` made, or the word ``demo`` for the scene that
-            ships with the package.
+        path: A folder made by ``lexsplat build`` or ``lexsplat demo``, or the word ``demo`` for the bundled scene.
         device: "auto", "cpu" or "cuda".
         clip: Name or folder of the text encoder, if it is not where the build found it.
 
     Raises:
         SceneFolderError: If the folder is not a finished scene.
         FileFormatError: If one of its files is damaged.
+        BackendError: If "cuda" is asked for and there is no CUDA device.
+        ValueError: If the device is not one of the three.
     """
-    from lexsplat.runtime.device import choose_device
-
     place = choose_device(device)
-    folder, cameras, gaussians, field = _read_whole(Path(path), place)
-    clip = clip or folder.record.get("config", {}).get("clip", "bundled")
-    return Scene(gaussians, field, cameras, clip, folder=folder)
-
-
-_Content = tuple[SceneFolder, dict[str, StoredView], Gaussians, LanguageField]
-_ATTEMPTS = 5
-"""A build may end, and the next begin, while a scene is read; more often than this it is no coincidence."""
-
-
-def _read_whole(path: Path, device: str) -> _Content:
-    """The scene in a folder, or while that is built again, the scene before.
-
-    Raises:
-        SceneFolderError: If there is neither.
-        FileFormatError: If a file is damaged.
-    """
-    attempts = 0
-    while True:
-        folder = SceneFolder.open(path)
-        attempts += 1
-        try:
-            kept = previous_of(folder) if folder.record.get("building") else None
-            return _read_content(kept or folder, device)
-        except (SceneFolderError, FileFormatError):
-            if attempts == _ATTEMPTS or _state(SceneFolder.open(path)) == _state(folder):
-                raise
-
-
-def _state(folder: SceneFolder) -> tuple[Any, Any]:
-    """What a build changes in the record before it touches a file."""
-    return folder.record["stages"], folder.record.get("building")
-
-
-def _read_content(folder: SceneFolder, device: str) -> _Content:
-    """One version of a scene.
-
-    Raises:
-        SceneFolderError: If it is not whole.
-        FileFormatError: If a file is damaged.
-    """
-    if "language" not in folder.record["stages"] or not folder.language_path.exists():
-        finished = ", ".join(folder.record["stages"]) or "none"
-        raise SceneFolderError(
-            folder.root,
-            expected="a scene with language",
-            found=f"finished stages: {finished}",
-            remedy="run the build again to finish it",
-        )
-    cameras, gaussians = folder.read_cameras(), folder.read_gaussians()
-    tensors, metadata = read_tensors(folder.language_path)
-    # A build takes a stage out of the record before it touches its files: what was read is of one build if the record
-    # is still the same.
-    changed = _state(SceneFolder(folder.root, folder.content)) != _state(folder)
-    try:
-        field = field_from_tensors({name: tensor.to(device) for name, tensor in tensors.items()}, metadata)
-    except ValueError as error:
-        raise FileFormatError(
-            folder.language_path,
-            expected="a language field",
-            found=str(error)[:200],
-            remedy="run the build again",
-        ) from error
-    made_from = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
-    if changed or metadata.get("reconstruction") != made_from or len(field.uncertainties) != len(gaussians):
-        raise SceneFolderError(
-            folder.root,
-            expected="language made for these Gaussians",
-            found="files that change" if changed else "language of an earlier reconstruction",
-            remedy="the scene is being rebuilt or was left half way: run the build again",
-        )
-    return folder, cameras, gaussians.to(device), field
+    found = read_scene(Path(path), place)
+    clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
+    return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder)

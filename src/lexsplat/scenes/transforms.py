@@ -1,7 +1,7 @@
-"""Moving Gaussians as a body: rotate, scale, shift. Their colors turn with them.
+"""Similarity transforms of Gaussians: rotation, scale and translation, colors included.
 
-Spherical harmonics are a function of the viewing direction in the world, so a body that turns needs its
-coefficients turned: within a degree they mix among themselves, by a matrix that depends on the rotation alone.
+Spherical harmonics are a function of the viewing direction in the world, so rotating a body rotates its
+coefficients: within a degree they mix by a matrix that depends on the rotation alone.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lexsplat.rendering.kernels.spherical_harmonics import basis_at
 _DIRECTIONS = 64
 
 
-def moved(
+def transformed(
     gaussians: Gaussians,
     *,
     rotation: NDArray[np.float64] | None = None,
@@ -32,14 +32,14 @@ def moved(
     """The Gaussians after x -> scale R (x - center) + center + translation.
 
     Args:
-        gaussians: What moves.
-        rotation: R ``[3, 3]``, a proper rotation; none when left out.
+        gaussians: The Gaussians to transform.
+        rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes and distances, positive.
-        translation: Shift ``[3]``, world units.
-        center: Fixed point of rotation and scaling ``[3]``; the origin when left out.
+        translation: ``[3]``, world units; None is zero.
+        center: Fixed point of rotation and scaling ``[3]``; None is the origin.
 
     Raises:
-        ValueError: If R is no rotation or the scale is not positive.
+        ValueError: If R is not a rotation, the scale is not positive, or a number is not finite.
     """
     if not (math.isfinite(scale) and scale > 0):
         raise ValueError(f"scale must be positive, got {scale:g}")
@@ -66,10 +66,10 @@ def moved(
 
 
 def rotated_harmonics(shN: Tensor, rotation: NDArray[np.float64]) -> Tensor:
-    """Coefficients ``[N, (degree + 1)^2 - 1, 3]`` of a body that was turned by ``rotation [3, 3]``.
+    """Coefficients ``[N, (degree + 1)^2 - 1, 3]`` of a body after ``rotation [3, 3]``.
 
-    What the turned body shows in direction d is what the body showed in direction R^T d. The matrix of each degree is
-    the least-squares solution over many directions, which is exact, as the harmonics of a degree are closed under
+    The rotated body has in direction d the color that the body has in direction R^T d. The matrix of each degree is
+    the least-squares solution over many directions. It is exact, as the harmonics of a degree are closed under
     rotation.
     """
     degree = round((shN.shape[1] + 1) ** 0.5) - 1

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import CodeField, LanguageField
 from lexsplat.queries.heatmaps import PEAK_FLOOR, colorize
-from lexsplat.queries.picking import field_scores
 from lexsplat.queries.thresholds import automatic_threshold
 
 Mode = Literal["photo", "relevancy", "language", "codes", "uncertainty", "depth"]
@@ -257,7 +256,7 @@ def language_colors(language: LanguageField) -> NDArray[np.uint8]:
     count = len(language.uncertainties)
     colors = np.tile(np.array(_PLAIN, dtype=np.uint8), (count, 1))
     ones = torch.ones(len(codewords), 1, device=language.uncertainties.device)
-    known = field_scores(language, ones)[:, 0].cpu().numpy() > 0.5
+    known = language.scores(ones)[:, 0].cpu().numpy() > 0.5
     places = np.flatnonzero(known)
     if len(places) < 2:
         return colors
@@ -269,7 +268,7 @@ def language_colors(language: LanguageField) -> NDArray[np.uint8]:
     directions = torch.linalg.eigh(covariance).eigenvectors[:, -3:].flip(-1)
     signs = directions.gather(0, directions.abs().argmax(0, keepdim=True)).sign()
     table = (codewords @ (directions * signs)).float().to(ones.device)
-    coordinates = field_scores(language, table).cpu().numpy()[known]
+    coordinates = language.scores(table).cpu().numpy()[known]
     low, high = np.percentile(coordinates, [2, 98], axis=0)
     spread = np.where(high - low > 1e-9, high - low, np.inf)
     unit = np.clip((coordinates - low) / spread, 0, 1)

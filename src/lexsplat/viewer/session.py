@@ -20,6 +20,7 @@ from lexsplat.queries.heatmaps import overlay_mask
 from lexsplat.queries.phrases import Thing, parse
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
+from lexsplat.queries.relevancy import Question as TextQuestion
 from lexsplat.queries.relevancy import check_prompts, probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
@@ -193,7 +194,7 @@ class Session:
     def _provisional_threshold(self, scores: NDArray[np.float32]) -> float:
         """A threshold in milliseconds. It is 0.5 for an absent object, as the automatic one will be."""
         presence = self._presence  # None until `warm_up` has embedded the reference phrases
-        if presence is not None and presence.judge(torch.from_numpy(scores)) == "no":
+        if presence is not None and presence.classify(torch.from_numpy(scores)) == "no":
             return BORDER
         return quick_threshold(scores, self._opacities)
 
@@ -222,10 +223,9 @@ class Session:
         probabilities = shares @ scene.field.select(hit.indices).code_probabilities()
         vocabulary = self.history.vocabulary
         with self._encoding:
-            positives, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
-        relevancy = probability_relevancy(
-            probabilities[None], scene.field.codebook.clip, positives, negatives, scene.query
-        )[0]
+            words, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
+        asked = TextQuestion(words, negatives, scene.query)
+        relevancy = probability_relevancy(probabilities[None], scene.field.codebook.clip, asked)[0]
         order = relevancy.argsort(descending=True)[:count].tolist()
         phrases = [(vocabulary[i], float(relevancy[i])) for i in order]
         threshold = float(selection.threshold)

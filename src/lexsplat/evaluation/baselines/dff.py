@@ -22,7 +22,7 @@ from lexsplat.evaluation.baselines.feature_rendering import (
 )
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
+from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -57,31 +57,31 @@ class DistilledFeatures:
     def __init__(self, features: Tensor, *, method: str = "dff") -> None:
         self.features, self.method = features, method
 
-    def relevancy(
-        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
-    ) -> Tensor:
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature, times how much is covered."""
-        positives, negatives = unit_texts(positives, negatives)
+        positives, negatives = unit_texts(question.positives, question.negatives)
         cosines, alpha = render_cosines(gaussians, camera, self.features, torch.cat([positives, negatives]))
         split = len(positives)
-        found = pairwise_relevancy(cosines[..., :split], cosines[..., split:], config.temperature)
+        found = pairwise_relevancy(cosines[..., :split], cosines[..., split:], question.config.temperature)
         return (found * alpha[..., None]).permute(2, 0, 1).contiguous()
 
-    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
+    def gaussian_scores(self, question: Question) -> Tensor | None:
         """Scores ``[P, N]``, 0 for a Gaussian that was never seen."""
-        return feature_scores(self.features, positives, negatives, config)
+        return feature_scores(self.features, question)
 
     def tensors(self) -> dict[str, Tensor]:
         """The features, in half precision."""
         return {"features": self.features.half()}
 
 
-def feature_scores(features: Tensor, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor:
+def feature_scores(features: Tensor, question: Question) -> Tensor:
     """LERF's relevancy of features ``[N, D]``: ``[P, N]``, 0 for zero features."""
-    positives, negatives = (text.to(features.device) for text in unit_texts(positives, negatives))
+    positives, negatives = (
+        text.to(features.device) for text in unit_texts(question.positives, question.negatives)
+    )
     lengths = features.norm(dim=1, keepdim=True)
     unit = features / lengths.clamp_min(1e-12)
-    found = pairwise_relevancy(unit @ positives.T, unit @ negatives.T, config.temperature)
+    found = pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
     return (found * (lengths > 0)).T.contiguous()
 
 

@@ -32,7 +32,7 @@ from lexsplat.evaluation.baselines.feature_rendering import (
 from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
+from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.rendering import render
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -70,25 +70,25 @@ class ScaledFeatures:
     def __init__(self, features: Tensor, scales: Tensor) -> None:
         self.features, self.scales = features, scales
 
-    def relevancy(
-        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
-    ) -> Tensor:
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]``, each at the scale where it is highest."""
-        positives, negatives = unit_texts(positives, negatives)
+        positives, negatives = unit_texts(question.positives, question.negatives)
         best: Tensor | None = None
         for features in self.features:
             cosines, alpha = render_cosines(gaussians, camera, features, torch.cat([positives, negatives]))
             split = len(positives)
-            found = pairwise_relevancy(cosines[..., :split], cosines[..., split:], config.temperature)
+            found = pairwise_relevancy(
+                cosines[..., :split], cosines[..., split:], question.config.temperature
+            )
             maps = (found * alpha[..., None]).permute(2, 0, 1)
             best = maps if best is None else torch.where(_higher(maps, best)[:, None, None], maps, best)
         if best is None:
             raise ValueError("there is no scale")
         return best.contiguous()
 
-    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
+    def gaussian_scores(self, question: Question) -> Tensor | None:
         """Scores ``[P, N]``, each at the scale where it is highest."""
-        scores = torch.stack([feature_scores(f, positives, negatives, config) for f in self.features])
+        scores = torch.stack([feature_scores(f, question) for f in self.features])
         chosen = scores.amax(-1).argmax(0)
         return scores[chosen, torch.arange(scores.shape[1], device=scores.device)]
 

@@ -15,7 +15,7 @@ from lexsplat.evaluation.baselines.feature_rendering import resized_map, unit_te
 from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import QueryConfig, pairwise_relevancy
+from lexsplat.queries.relevancy import Question, pairwise_relevancy
 
 
 class ViewFeatures:
@@ -32,9 +32,7 @@ class ViewFeatures:
         self._names = {camera.viewmat.tobytes(): name for name, camera in cameras.items()}
         self._maps = maps
 
-    def relevancy(
-        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
-    ) -> Tensor:
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]``: relevancy of the cells, enlarged.
 
         Raises:
@@ -43,12 +41,12 @@ class ViewFeatures:
         name = self._names.get(camera.viewmat.tobytes())
         if name is None:
             raise ValueError("features of a view are known only from the poses of the capture")
-        positives, negatives = unit_texts(positives, negatives)
+        positives, negatives = unit_texts(question.positives, question.negatives)
         clip = torch.nn.functional.normalize(self._maps[name].clip.float(), dim=-1)
-        found = pairwise_relevancy(clip @ positives.T, clip @ negatives.T, config.temperature)
+        found = pairwise_relevancy(clip @ positives.T, clip @ negatives.T, question.config.temperature)
         return resized_map(found, camera).permute(2, 0, 1).clamp(0, 1).contiguous()
 
-    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
+    def gaussian_scores(self, question: Question) -> Tensor | None:
         """None: there is nothing in 3D."""
         return None
 

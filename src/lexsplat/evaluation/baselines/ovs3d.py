@@ -30,7 +30,7 @@ from lexsplat.evaluation.baselines.feature_rendering import (
 )
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.queries.relevancy import QueryConfig, Question
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -78,27 +78,25 @@ class ClassFeatures:
     def __init__(self, features: Tensor, classes: Tensor) -> None:
         self.features, self.classes = features, classes
 
-    def relevancy(
-        self, gaussians: Gaussians, camera: Camera, positives: Tensor, negatives: Tensor, config: QueryConfig
-    ) -> Tensor:
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]``: each prompt against the best other class; the negatives have no part."""
-        (positives,) = unit_texts(positives)
+        (positives,) = unit_texts(question.positives)
         cosines, alpha = render_cosines(
             gaussians, camera, self.features, torch.cat([positives, self.classes.to(positives)])
         )
         return (
-            (self._against_others(cosines, positives, config) * alpha[..., None])
+            (self._against_others(cosines, positives, question.config) * alpha[..., None])
             .permute(2, 0, 1)
             .contiguous()
         )
 
-    def gaussian_scores(self, positives: Tensor, negatives: Tensor, config: QueryConfig) -> Tensor | None:
+    def gaussian_scores(self, question: Question) -> Tensor | None:
         """Scores ``[P, N]``."""
-        (positives,) = unit_texts(positives)
+        (positives,) = unit_texts(question.positives)
         lengths = self.features.norm(dim=1, keepdim=True)
         texts = torch.cat([positives, self.classes.to(positives)]).to(self.features.device)
         cosines = (self.features / lengths.clamp_min(1e-12)) @ texts.T
-        return (self._against_others(cosines, positives, config) * (lengths > 0)).T.contiguous()
+        return (self._against_others(cosines, positives, question.config) * (lengths > 0)).T.contiguous()
 
     def _against_others(self, cosines: Tensor, positives: Tensor, config: QueryConfig) -> Tensor:
         own, classes = cosines[..., : len(positives)], cosines[..., len(positives) :]

@@ -179,7 +179,8 @@ class TrainedField(nn.Module):
             tensors["semantics"],
             tensors["uncertainty_logits"],
             SmoothingMLP(tensors["smoother.center"], tensors["smoother.extent"], num_frequencies),
-            normalize_rendering=metadata.get("normalize_rendering") == "true",
+            normalize_rendering="true"
+            in (metadata.get("normalize_rendering"), metadata.get("normalise_rendering")),
             method=metadata.get("method", "trained"),
         )
         own = {name: value for name, value in tensors.items() if not name.startswith("codebook.")}

@@ -17,7 +17,7 @@ import numpy as np
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
 from lexsplat.scenes.formats.ply import read_ply, write_ply
-from lexsplat.scenes.transforms import moved
+from lexsplat.scenes.transforms import transformed
 
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
@@ -60,14 +60,14 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
             gaussians = read_ply(plain, certain_opacities=True)
         except FileFormatError as error:  # what it says of the file in between is of no use to anybody
             raise FileFormatError(path, expected=f"a {kind} file", found="damaged content") from error
-    return moved(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians
+    return transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians
 
 
 def _converted(gaussians: Gaussians, path: Path, kind: str) -> bytes:
     library = _library(path)
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "plain.ply"
-        write_ply(moved(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians, plain)
+        write_ply(transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians, plain)
         answer = library.convert(plain.read_bytes(), "ply", kind)
     if "data" not in answer:
         raise FileFormatError(path, expected=f"a {kind} file", found=str(answer.get("error")))

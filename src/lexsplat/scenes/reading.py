@@ -1,0 +1,105 @@
+"""Reading a scene folder as a whole, also while a build is changing it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields import LanguageField, field_from_tensors
+from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.files import read_tensors
+from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.previous import previous_of
+
+_ATTEMPTS = 5
+"""How often reading is tried again because a build has changed the folder in the meantime."""
+
+
+@dataclass(frozen=True)
+class SceneContent:
+    """One version of a scene.
+
+    Args:
+        folder: Where it was read.
+        views: The views by name.
+        gaussians: Geometry and appearance.
+        field: Their language.
+    """
+
+    folder: SceneFolder
+    views: dict[str, StoredView]
+    gaussians: Gaussians
+    field: LanguageField
+
+
+def read_scene(path: Path, device: str) -> SceneContent:
+    """The scene in a folder, or its previous version while it is being rebuilt.
+
+    Raises:
+        SceneFolderError: If there is neither.
+        FileFormatError: If a file is damaged.
+    """
+    attempts = 0
+    while True:
+        folder = SceneFolder.open(path)
+        attempts += 1
+        try:
+            kept = previous_of(folder) if folder.record.get("building") else None
+            return _read_content(kept or folder, device)
+        except (SceneFolderError, FileFormatError):
+            if attempts == _ATTEMPTS or _state(SceneFolder.open(path)) == _state(folder):
+                raise
+
+
+def _state(folder: SceneFolder) -> tuple[Any, Any]:
+    """The part of the record that a build changes before it touches a file."""
+    return folder.record["stages"], folder.record.get("building")
+
+
+def _read_content(folder: SceneFolder, device: str) -> SceneContent:
+    """One version of a scene.
+
+    Raises:
+        SceneFolderError: If it is incomplete.
+        FileFormatError: If a file is damaged.
+    """
+    if "language" not in folder.record["stages"] or not folder.language_path.exists():
+        finished = ", ".join(folder.record["stages"]) or "none"
+        raise SceneFolderError(
+            folder.root,
+            expected="a scene with language",
+            found=f"finished stages: {finished}",
+            remedy="run the build again to finish it",
+        )
+    views, gaussians = folder.read_cameras(), folder.read_gaussians()
+    tensors, metadata = read_tensors(folder.language_path)
+    # A build removes a stage from the record before it touches its files: if the record is unchanged, all files are
+    # of one build.
+    changed = _state(SceneFolder(folder.root, folder.content)) != _state(folder)
+    try:
+        field = field_from_tensors({name: tensor.to(device) for name, tensor in tensors.items()}, metadata)
+    except ValueError as error:
+        raise FileFormatError(
+            folder.language_path,
+            expected="a language field",
+            found=str(error)[:200],
+            remedy="run the build again",
+        ) from error
+    reconstruction = folder.record["stages"].get("reconstruct", {}).get("fingerprint")
+    if changed:
+        raise SceneFolderError(
+            folder.root,
+            expected="files that do not change",
+            found="a build at work",
+            remedy="another process is rebuilding the scene: try again when it is finished",
+        )
+    if metadata.get("reconstruction") != reconstruction or len(field.uncertainties) != len(gaussians):
+        raise SceneFolderError(
+            folder.root,
+            expected="language made for these Gaussians",
+            found="language of an earlier reconstruction",
+            remedy="run the build again to finish it",
+        )
+    return SceneContent(folder, views, gaussians.to(device), field)

@@ -1,0 +1,214 @@
+"""A scene answers prompts once, the same way everywhere, and refuses what it cannot answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from support.viewer_scene import ball_scene
+
+import lexsplat
+from lexsplat.queries import thresholds as threshold_rule
+from lexsplat.queries.relevancy import Question, gaussian_relevancy, render_relevancy
+from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.scenes import scene as scene_module
+from lexsplat.scenes.answers import _default_views, find_phrases
+from lexsplat.scenes.exporting import export_gaussians, export_scene
+from lexsplat.scenes.folder import BUNDLED_SCENE, StoredView
+from lexsplat.scenes.scene import open_scene
+
+BALLS = ["ball 0", "ball 1", "ball 2"]
+
+
+@pytest.fixture
+def made():
+    """A scene of five balls, "ball 0" to "ball 4", and what is known about it."""
+    return ball_scene(per_ball=80)
+
+
+@pytest.fixture
+def scene(made):
+    return made[0]
+
+
+def test_an_answer_is_made_of_scores_thresholds_and_presences(scene):
+    answers = scene.ask(BALLS)
+    question = Question(scene.embed(BALLS), scene.embed(list(scene.query.negatives)), scene.query)
+    assert torch.equal(answers.scores, gaussian_relevancy(scene.field, question))
+    training = [view.camera for view in scene.views.values() if view.split == "train"]
+    expected = threshold_rule.scene_thresholds(
+        lambda camera: render_relevancy(scene.field, scene.gaussians, camera, question),
+        training,
+        answers.presences,
+    )
+    torch.testing.assert_close(answers.thresholds, expected)
+    assert answers.presences == tuple(scene.presence_classifier.classify(row) for row in answers.scores)
+    assert answers.prompts == tuple(BALLS)
+    assert len(answers) == 3
+
+
+def test_one_question_gives_one_threshold_and_one_presence_everywhere(scene):
+    answers = scene.ask(BALLS)
+    for index, prompt in enumerate(BALLS):
+        limit = pytest.approx(float(answers.thresholds[index]))
+        assert float(scene.thresholds(prompt)[0]) == limit
+        for found in (scene.select(prompt), scene.find(prompt), answers.selection(index)):
+            assert (found.threshold, found.present) == (limit, answers.presences[index])
+            assert torch.equal(found.mask, answers.selection(index).mask)
+        (entry,) = find_phrases(scene, prompt)["phrases"]
+        assert entry["threshold"] == pytest.approx(float(answers.thresholds[index]), abs=1e-4)
+        assert entry["present"] == answers.presences[index]
+
+
+def test_the_ball_that_is_asked_for_is_selected(made):
+    scene, ground_truth = made
+    found = scene.find("ball 2")
+    assert (found.count, len(found), found.num_gaussians) == (1, 80, 80)
+    assert np.array_equal(found.mask.numpy(), ground_truth.labels == 2)
+    both = scene.find("ball 0 and ball 1")
+    assert both.count == 2
+
+
+def test_a_known_prompt_renders_no_views_again(scene, monkeypatch):
+    rendered = []
+    original = scene_module.render_relevancy
+
+    def render(field, gaussians, camera, question):
+        rendered.append(len(question))
+        return original(field, gaussians, camera, question)
+
+    monkeypatch.setattr(scene_module, "render_relevancy", render)
+    training = sum(view.split == "train" for view in scene.views.values())
+    first = scene.ask(["ball 0", "ball 1"])
+    assert rendered == [2] * training
+    again = scene.ask(["ball 1", "ball 2", "ball 0"])
+    assert rendered == [2] * training + [1] * training
+    assert float(again.thresholds[2]) == float(first.thresholds[0])
+    scene.ask(BALLS, 0.3)
+    scene.find("ball 0 nearest to ball 1")
+    assert len(rendered) == 2 * training
+    scene.query = replace(scene.query, temperature=20.0)
+    scene.ask("ball 0")
+    assert len(rendered) == 3 * training, "other settings, other thresholds"
+
+
+def test_a_given_threshold_is_taken_as_it_is(scene):
+    answers = scene.ask(BALLS, 0.25)
+    assert answers.thresholds.tolist() == [0.25] * 3
+    assert not answers.automatic
+    assert scene.select("ball 1", 0.25).threshold == 0.25
+
+
+def test_a_single_text_is_one_prompt(scene):
+    view = next(iter(scene.views))
+    assert scene.embed("ball 1").shape == (1, 32)
+    assert scene.scores("ball 1").shape == (1, 400)
+    assert scene.thresholds("ball 1").shape == (1,)
+    assert scene.relevancy("ball 1", view).shape == (1, 72, 96)
+    assert scene.ask("ball 1").prompts == ("ball 1",)
+
+
+def test_a_view_is_named_with_or_without_suffix_or_given_as_a_camera(scene):
+    stored = scene.views["view2"]
+    expected = scene.relevancy(BALLS, "view2")
+    for view in (stored, stored.camera, "view2.jpg"):
+        assert torch.equal(scene.relevancy(BALLS, view), expected)
+        assert scene.render(view).image.shape == (72, 96, 3)
+        assert scene.find("ball 0 left of ball 1", view) is not None
+
+
+@pytest.mark.parametrize("wrong", ["nowhere", 3, None, ("view2",)])
+def test_an_unknown_view_is_refused(scene, wrong):
+    with pytest.raises(QueryError, match="view"):
+        scene.relevancy("ball 0", wrong)
+    with pytest.raises(QueryError, match="view"):
+        scene.render(wrong)
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 2, float("nan"), float("inf"), "high"])
+def test_a_threshold_outside_the_unit_interval_is_refused(scene, wrong):
+    for ask in (scene.ask, scene.select):
+        with pytest.raises(QueryError, match=r"threshold: expected a number in 0\.\.1"):
+            ask("ball 0", wrong)
+    with pytest.raises(QueryError, match="threshold"):
+        scene.find("ball 0", threshold=wrong)
+
+
+@pytest.mark.parametrize("wrong", [["ball 0"], 7, None, ""])
+def test_a_selection_is_of_one_phrase(scene, wrong):
+    for ask in (scene.select, scene.find):
+        with pytest.raises(QueryError):
+            ask(wrong)
+
+
+@pytest.mark.parametrize("wrong", [[], "", ["ball 0", " "], [None], 5])
+def test_what_is_no_prompt_is_refused(scene, wrong):
+    for ask in (scene.ask, scene.scores, scene.embed):
+        with pytest.raises(QueryError):
+            ask(wrong)
+
+
+def test_what_the_scene_does_not_hold_has_no_instances_in_json(scene):
+    scene.presence_classifier.classify = lambda scores: "no"
+    (entry,) = find_phrases(scene, "ball 0")["phrases"]
+    assert (entry["present"], entry["count"], entry["instances"]) == ("no", 0, [])
+    assert entry["threshold"] == 0.5
+    assert scene.ask("ball 0").to_dict()["answers"][0]["count"] == 0
+
+
+def test_representations_are_short(scene):
+    assert repr(scene) == "Scene(gaussians=400, views=6, method='lifted')"
+    assert repr(scene.ask(["ball 0"], 0.5)) == "Answers('ball 0': yes (threshold 0.5))"
+    assert len(repr(scene.find("ball 0"))) < 100
+
+
+def test_default_views_are_spread_over_the_held_out_ones(scene):
+    camera = scene.views["view0"].camera
+    scene.views = {f"v{n:02}": StoredView(f"v{n:02}", camera, "test") for n in range(11)}
+    assert _default_views(scene) == ["v00", "v02", "v04", "v06", "v08", "v10"]
+
+
+def test_an_export_replaces_a_file_only_when_told(scene, tmp_path):
+    file = tmp_path / "all.ply"
+    file.write_bytes(b"of another program")
+    for write in (lambda **told: export_scene(scene, file, **told),
+                  lambda **told: export_gaussians(scene.gaussians, file, **told)):  # fmt: skip
+        with pytest.raises(SceneFolderError, match="expected a new file, found one that exists"):
+            write()
+    assert file.read_bytes() == b"of another program"
+    labels = tmp_path / "labels.json"
+    labels.write_text("{}")
+    with pytest.raises(SceneFolderError, match="expected a new file"):
+        export_scene(scene, labels, found=[scene.find("ball 0")])
+    assert export_scene(scene, file, overwrite=True) == [file]
+    assert file.stat().st_size > 1000
+
+
+def test_an_export_never_replaces_a_file_of_the_scene(tmp_path):
+    opened = open_scene("demo", device="cpu")
+    with pytest.raises(SceneFolderError, match="scene's own files"):
+        export_scene(opened, BUNDLED_SCENE / "gaussians.ply", overwrite=True)
+
+
+def test_what_is_no_scene_folder_is_refused_with_what_it_is(tmp_path):
+    with pytest.raises(SceneFolderError, match="found a file"):
+        open_scene(BUNDLED_SCENE / "gaussians.ply")
+    with pytest.raises(SceneFolderError, match="no such folder"):
+        open_scene(tmp_path / "nowhere")
+    with pytest.raises(SceneFolderError, match=r"no scene\.json"):
+        open_scene(tmp_path)
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:1", "", "CPU"])
+def test_an_unknown_device_is_refused(device):
+    with pytest.raises(ValueError, match="device must be auto, cpu or cuda"):
+        open_scene("demo", device=device)
+
+
+def test_the_front_door_shows_the_public_names():
+    names = {"open_scene", "build", "Scene", "Selection"}
+    assert names <= set(dir(lexsplat))
+    assert names <= set(lexsplat.__all__)
+    assert all(callable(getattr(lexsplat, name)) for name in names)
+    with pytest.raises(AttributeError):
+        _ = lexsplat.nothing
