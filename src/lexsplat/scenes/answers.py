@@ -28,7 +28,7 @@ def answer_queries(
     prompts: Sequence[str],
     views: Sequence[str],
     threshold: float | None,
-    folder: Path,
+    folder: Path | None,
 ) -> dict[str, Any]:
     """Answer prompts in views, and write a heatmap and a mask for each pair.
 
@@ -37,7 +37,7 @@ def answer_queries(
         prompts: What to look for.
         views: Names of views; none means up to `MAX_DEFAULT_VIEWS` held-out views.
         threshold: Relevancy from which a pixel belongs to a mask; none chooses one for each prompt.
-        folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go.
+        folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; none writes no images.
 
     Returns:
         ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "best_view", "gaussians",
@@ -121,10 +121,17 @@ def _default_views(scene: Scene) -> list[str]:
 
 
 def _write_pictures(
-    folder: Path, prompt: str, name: str, picture: np.ndarray, relevancy: np.ndarray, threshold: float
+    folder: Path | None, prompt: str, name: str, picture: np.ndarray, relevancy: np.ndarray, threshold: float
 ) -> dict[str, Any]:
     mask = relevancy >= threshold
     row, column = np.unravel_index(int(relevancy.argmax()), relevancy.shape)
+    answer: dict[str, Any] = {
+        "peak": round(float(relevancy.max()), 4),
+        "peak_pixel": [int(column), int(row)],
+        "mask_share": round(float(mask.mean()), 5),
+    }
+    if folder is None:
+        return answer
     stem = folder / file_name(prompt) / Path(name).with_suffix("")
     heatmap_path = stem.with_name(stem.name + ".png")
     mask_path = stem.with_name(stem.name + ".mask.png")
@@ -134,13 +141,7 @@ def _write_pictures(
     ):
         with atomic_path(path) as temporary:
             Image.fromarray(pixels).save(temporary, format="PNG")
-    return {
-        "peak": round(float(relevancy.max()), 4),
-        "peak_pixel": [int(column), int(row)],
-        "mask_share": round(float(mask.mean()), 5),
-        "heatmap": str(heatmap_path),
-        "mask": str(mask_path),
-    }
+    return {**answer, "heatmap": str(heatmap_path), "mask": str(mask_path)}
 
 
 def file_name(prompt: str) -> str:
