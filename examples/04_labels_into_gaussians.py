@@ -1,9 +1,9 @@
-"""Put per-pixel labels of your own onto Gaussians, without training.
-
-Whatever tool labeled your images, if the labels are small integers per pixel, one pass over the views tells
-for every Gaussian how much of each label it carries.
+"""Put labels of pixels onto Gaussians, without training.
 
     python examples/04_labels_into_gaussians.py
+
+The labels may come from any tool, if they are small integers for each pixel. One pass over the views sums, for each
+Gaussian, the weight with which it contributes to pixels of each label.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ labels = np.arange(600) % 2
 points[:, 0] += np.where(labels == 0, -0.8, 0.8)
 gaussians = gaussians_from_points(points, np.ones((600, 3)), sh_degree=0, opacity=0.7)
 
-# The "label images": here simply left and right halves of what the cameras see.
+# Label images of five views. Here they are the left and the right half of each image.
 histogram = torch.zeros(600, 2)
 for angle in np.linspace(-0.5, 0.5, 5):
     position = [3 * np.sin(angle), -3 * np.cos(angle), 0.6]
@@ -30,10 +30,10 @@ for angle in np.linspace(-0.5, 0.5, 5):
     histogram += accumulate_codes(gaussians, camera, label_map, num_codes=2)
 
 found = histogram.argmax(dim=1).numpy()
-seen = histogram.sum(dim=1).numpy() > 0.01  # what is hidden in every view gets no label
-print(f"{(found == labels)[seen].mean():.1%} of the {seen.sum()} Gaussians in sight carry the right label")
+seen = histogram.sum(dim=1).numpy() > 0.01  # a Gaussian that is hidden in all views receives no label
+print(f"{(found == labels)[seen].mean():.1%} of the {seen.sum()} visible Gaussians carry the right label")
 
-# A label image of any view is then a rendering like any other.
+# The shares of labels are rendered like any other feature.
 shares = histogram / histogram.sum(dim=1, keepdim=True).clamp_min(1e-8)
 image = render(gaussians, camera, features=shares, color=False).features  # [H, W, 2]
-print(f"left third shows label {int(image[:, :50].sum((0, 1)).argmax())}")
+print(f"the left third of the last view shows label {int(image[:, :50].sum((0, 1)).argmax())}")

@@ -1,115 +1,141 @@
-"""The command line: ``lexsplat COMMAND``. Errors are one line and exit status 1, wrong usage is 2.
+"""The command line: ``lexsplat COMMAND``. Errors are one line with exit status 1; wrong usage has exit status 2.
 
-Each command is a dataclass in a file of its name: fields are options, the docstring is the help, `run` does it.
+Each command is a dataclass in a module of its own: fields are options, the docstring is the help page, `run` does the
+work. Only the module of the given command is imported: ``lexsplat --version`` and ``lexsplat --help`` answer at once.
 """
 
 from __future__ import annotations
 
+import difflib
+import importlib
 import logging
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
-
-import tyro
+from typing import NamedTuple, NoReturn
 
 from lexsplat import __version__
-from lexsplat.cli.ablate import Ablate
-from lexsplat.cli.build import Build, Language, Reconstruct
-from lexsplat.cli.compare import Compare
-from lexsplat.cli.demo import Demo
-from lexsplat.cli.edit import Edit
-from lexsplat.cli.evaluate import Evaluate
-from lexsplat.cli.export import Export
-from lexsplat.cli.find import Find
-from lexsplat.cli.info import Info
-from lexsplat.cli.poses import Poses
-from lexsplat.cli.query import Query
-from lexsplat.cli.scale import Scale
-from lexsplat.cli.view import View
 from lexsplat.runtime.errors import STOPPED, LexsplatError
 
-Command = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Build, tyro.conf.subcommand("build")]
-    | Annotated[Poses, tyro.conf.subcommand("poses")]
-    | Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
-    | Annotated[Language, tyro.conf.subcommand("language")]
-    | Annotated[Query, tyro.conf.subcommand("query")]
-    | Annotated[Find, tyro.conf.subcommand("find")]
-    | Annotated[Scale, tyro.conf.subcommand("scale")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-    | Annotated[Edit, tyro.conf.subcommand("edit")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Info, tyro.conf.subcommand("info")]
-)
+
+class CommandEntry(NamedTuple):
+    """Where a command is defined, and what it does in a few words."""
+
+    module: str
+    name: str
+    summary: str
+
+
+COMMANDS = {
+    "demo": CommandEntry("demo", "Demo", "build, query and evaluate a bundled capture"),
+    "build": CommandEntry("build", "Build", "make a searchable scene from photos or a video"),
+    "poses": CommandEntry("poses", "Poses", "estimate the cameras of photos or a video"),
+    "reconstruct": CommandEntry("build", "Reconstruct", "only the first stage of build: 3D Gaussians"),
+    "language": CommandEntry("build", "Language", "the later stages of build: language on the Gaussians"),
+    "query": CommandEntry("query", "Query", "heatmaps, masks and scores for free text"),
+    "find": CommandEntry("find", "Find", "where things are in 3D, how many and how large"),
+    "scale": CommandEntry("scale", "Scale", "set the length of a meter and the up direction of a scene"),
+    "evaluate": CommandEntry("evaluate", "Evaluate", "measure a scene on its held-out views"),
+    "ablate": CommandEntry("ablate", "Ablate", "measure the method without its parts"),
+    "compare": CommandEntry("compare", "Compare", "measure several methods side by side"),
+    "edit": CommandEntry("edit", "Edit", "delete, recolor, move or duplicate things by words"),
+    "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
+    "view": CommandEntry("view", "View", "show and search a scene in the browser"),
+    "info": CommandEntry("info", "Info", "show what a scene folder contains"),
+}
+"""Commands by name, in the order of the help page."""
+
+ALIASES = {"embed": "language"}
+"""Other names of commands."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status."""
+    """Run one command; returns the exit status.
+
+    Raises:
+        SystemExit: With status 2 after wrong usage, with status 0 after the help page of a command.
+    """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr)
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments[:1] == ["embed"]:  # the name of the command before "language"
-        arguments[0] = "language"
-    if arguments[:1] in (["--version"], ["-V"]):
-        print(f"lexsplat {__version__}")
-        return 0
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        command = tyro.cli(
-            Command,  # type: ignore[arg-type]
-            prog="lexsplat",
-            description="Search a place with words: photos in, 3D Gaussians that carry language out.",
-            args=arguments,
-        )
-    except KeyboardInterrupt:
-        return _stopped()
-    except BrokenPipeError:  # of a long --help, as below
-        return _seen_enough()
-    except ValueError as error:  # settings check themselves when they are made
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    try:
-        command.run()
+        status = _run(words)
+        sys.stdout.flush()  # here, so that a reader that has ended is noticed below
+        return status
     except LexsplatError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
-        return _stopped()
+        print(STOPPED, file=sys.stderr)
+        return 130  # as shells report Ctrl-C
     except BrokenPipeError:
-        return _seen_enough()
+        # The reader of the output has ended, as in `lexsplat info SCENE | head`: the rest is discarded.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (MemoryError, RuntimeError) as error:
-        # torch says with a RuntimeError what Python says with a MemoryError.
-        wants_memory = any(
-            words in str(error) for words in ("allocate memory", "not enough memory", "out of memory")
+        # torch raises RuntimeError where Python raises MemoryError.
+        out_of_memory = any(
+            phrase in str(error) for phrase in ("allocate memory", "not enough memory", "out of memory")
         )
-        if not (isinstance(error, MemoryError) or wants_memory):
+        if not (isinstance(error, MemoryError) or out_of_memory):
             raise
         remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
-        print(f"error: memory: expected more of it, found the end of it; {remedy}", file=sys.stderr)
-        return 1
+        print(f"error: memory: expected more, found none left; {remedy}", file=sys.stderr)
     except UnicodeEncodeError as error:
-        # The system has names of any bytes; camera files, JSON and reports have letters.
+        # File names may hold any bytes; camera files, JSON and reports hold text.
         subject = ascii(str(error.object))[1:100]
         remedy = "rename the file or folder"
         print(f"error: {subject}: expected names in UTF-8, found other bytes; {remedy}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        # A full disk or a folder without permission: the system's words and the file are the whole story.
+    except OSError as error:  # such as a full disk or a folder without permission
         print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
-        return 1
+    return 1
+
+
+def _run(words: list[str]) -> int:
+    if not words:
+        print(overview(), file=sys.stderr)
+        return 2
+    name, *rest = words
+    if name in ("--version", "-V"):
+        print(f"lexsplat {__version__}")
+        return 0
+    if name in ("--help", "-h", "--help-all"):
+        print(overview())
+        return 0
+    name = ALIASES.get(name, name)
+    if name not in COMMANDS:
+        _refuse(name)
+    from lexsplat.cli.arguments import parse
+
+    entry = COMMANDS[name]
+    command = getattr(importlib.import_module(f"lexsplat.cli.{entry.module}"), entry.name)
+    parse(command, name, rest).run()
     return 0
 
 
-def _seen_enough() -> int:
-    """Whoever read our output has what they wanted, as in `lexsplat info SCENE | head`: the rest goes nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+def overview() -> str:
+    """The page of ``lexsplat --help``."""
+    width = max(map(len, COMMANDS))
+    commands = (f"  {name:<{width}}  {entry.summary}" for name, entry in COMMANDS.items())
+    return "\n".join(
+        (
+            "usage: lexsplat COMMAND ...",
+            "",
+            "Search a place with words: photos in, 3D Gaussians that carry language out.",
+            "",
+            *commands,
+            "",
+            "lexsplat COMMAND --help   the options that people use",
+            "lexsplat --version        the version",
+        )
+    )
 
 
-def _stopped() -> int:
-    """Say so, with the status that shells give to Ctrl-C."""
-    print(STOPPED, file=sys.stderr)
-    return 130
+def _refuse(name: str) -> NoReturn:
+    """State which commands there are, and end the program with the status of wrong usage."""
+    if name.startswith("-"):
+        message = f"{name}: expected a command before the options; see lexsplat --help"
+    else:
+        close = difflib.get_close_matches(name, [*COMMANDS, *ALIASES], n=1)
+        hint = f"did you mean {close[0]}?" if close else "see lexsplat --help"
+        message = f"{name}: no such command; {hint}"
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
-import tyro
-
+from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.cli.options import PromptListName, Settings, check_seeds, print_json_file
+from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds, print_json_file
 from lexsplat.language.methods import MethodName
 from lexsplat.pipeline.config import BuildConfig
 
@@ -18,28 +17,26 @@ from lexsplat.pipeline.config import BuildConfig
 class Ablate:
     """Measure the method without its parts, as in the paper's Table 2, over several seeds.
 
-    Gaussians and features are made once, codebooks once a setting and seed. Writes ablation.json, .csv, .tex and
-    .html. Run it again with the same output to go on where it stopped.
+    Gaussians and features are made once, codebooks once for each setting and seed. Writes ablation.json, .csv, .tex
+    and a report into the output folder. Run the same command again to continue after an interruption.
 
     Args:
-        capture: Folder with photos, cameras and masks; "demo" or "second" for the scenes that ship.
-        output: Where everything goes.
+        capture: Folder with photos, cameras and ground truth, or the word "demo" or "second" for a bundled capture.
+        output: Folder for all results.
         seeds: Seeds of codebook and language.
-        variants: Which rows; none takes all that make a difference for the method.
-        methods: Which ways to the language, beside each other; none takes that of the settings (trained).
-        wrong_labels: Stress test: replace the code of this share of the pixels by a random one, others in every
+        variants: Rows to measure.
+        methods: Methods to measure side by side.
+        wrong_labels: Stress test: share of the pixels whose code is replaced by a random one, drawn anew for each
             view.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what
-        lies in or beside
-            the capture.
-        prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
-        forms: How codes and text are compared, each beside the others; the paper's is "feature".
-        as_in_paper: Fit and train as the paper does (30,000 steps) instead of our short settings.
+        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
+        prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
+        forms: How codes and text are compared, measured side by side. The paper's form is "feature".
+        as_in_paper: Fit and train as long as the paper (30,000 steps).
         json: Print ablation.json on standard output.
-        settings: What is made and how; ``--seed`` is the seed of the Gaussians.
+        settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
-    capture: tyro.conf.Positional[str]
+    capture: CaptureArgument
     output: Path
     seeds: tuple[int, ...] = (0, 1, 2)
     variants: tuple[
@@ -63,10 +60,19 @@ class Ablate:
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
 
-    def __post_init__(self) -> None:
+    essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    defaults: ClassVar[dict[str, str]] = {
+        "variants": "all that differ for the method",
+        "methods": "the method of the settings",
+        "masks": "the ground truth in the capture or beside it",
+        "prompt_list": "the prompts of the ground truth",
+    }
+
+    def check(self) -> None:
+        """Refuse invalid options."""
         check_seeds(self.seeds)
         if not self.forms:
-            raise ValueError("--forms takes at least one of feature, code")
+            raise ValueError("--forms needs at least one of feature, code")
         if not 0 <= self.wrong_labels <= 1:
             raise ValueError(f"--wrong-labels must be in 0..1, got {self.wrong_labels:g}")
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
-import tyro
-
+from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import (
     ALL_PROTOCOLS,
+    CaptureArgument,
     PromptListName,
     ProtocolName,
     Settings,
@@ -24,25 +24,24 @@ from lexsplat.pipeline.config import BuildConfig
 class Compare:
     """Measure several methods on the same Gaussians and the same features, in the columns of the paper's Table 1.
 
-    Ours, and what the paper compares with, rebuilt from the ideas of their papers (docs/evaluation.md says how).
-    Writes comparison.json, .csv, .tex and .html. Run it again with the same output to go on where it stopped.
+    The methods of lexsplat and those that the paper compares with, rebuilt after their papers (docs/evaluation.md).
+    Writes comparison.json, .csv, .tex and a report into the output folder. Run the same command again to continue
+    after an interruption.
 
     Args:
-        capture: Folder with photos, cameras and masks; "demo" or "second" for the scenes that ship.
-        output: Where everything goes; that of ``ablate`` shares its Gaussians and features.
-        methods: Which rows. "-feature" is the paper's form of relevancy in place of our default.
+        capture: Folder with photos, cameras and ground truth, or the word "demo" or "second" for a bundled capture.
+        output: Folder for all results. ``ablate`` with the same folder uses the same Gaussians and features.
+        methods: Rows to measure. "-feature" is the paper's form of relevancy in place of our default.
         seeds: Seeds of codebook and language.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what
-        lies in or beside
-            the capture.
-        prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
+        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
+        prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
-        lpips: Measure LPIPS if it is installed.
+        lpips: Measure LPIPS if it is installed; --no-lpips leaves it out.
         json: Print comparison.json on standard output.
-        settings: What is made and how; ``--seed`` is the seed of the Gaussians.
+        settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
-    capture: tyro.conf.Positional[str]
+    capture: CaptureArgument
     output: Path
     methods: tuple[
         Literal[
@@ -58,7 +57,14 @@ class Compare:
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
-    def __post_init__(self) -> None:
+    essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    defaults: ClassVar[dict[str, str]] = {
+        "masks": "the ground truth in the capture or beside it",
+        "prompt_list": "the prompts of the ground truth",
+    }
+
+    def check(self) -> None:
+        """Refuse invalid options."""
         check_seeds(self.seeds)
 
     def run(self) -> None:

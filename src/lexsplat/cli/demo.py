@@ -1,10 +1,10 @@
-"""``lexsplat demo``: everything, on the scene that ships."""
+"""``lexsplat demo``: the whole system on a bundled capture."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from lexsplat.cli.options import Device, print_evaluation
 from lexsplat.language.methods import MethodName
@@ -13,17 +13,17 @@ from lexsplat.pipeline.config import BuildConfig
 
 @dataclasses.dataclass
 class Demo:
-    """Run the whole system on the scene that ships with lexsplat, and show what it can do.
+    """Build, query and evaluate a bundled capture.
 
     Reconstructs the scene, extracts language features with the bundled encoders, fits the codebook, makes the
-    language field, answers queries on held-out views, and evaluates them against exact masks. Needs no network
-    and no GPU. Run it again to go on where it stopped.
+    language field, answers queries on held-out views and compares the answers with exact masks. Needs no network
+    and no GPU. Run the same command again to continue after an interruption.
 
     Args:
-        output: Folder for everything that is written.
-        scene: Which bundled scene: the table top of the pictures, or the second, smaller one.
-        method: How language gets into the Gaussians (see ``lexsplat build --help``).
-        device: Where to compute.
+        output: Folder for all results.
+        scene: Which bundled capture: the table top, or the second and smaller one.
+        method: How language is put on the Gaussians (see lexsplat build --help).
+        device: "auto" takes CUDA where there is a GPU.
         seed: Seed of all randomness.
         iterations: Reconstruction steps.
     """
@@ -35,11 +35,14 @@ class Demo:
     seed: int = 0
     iterations: int | None = None
 
-    def __post_init__(self) -> None:
+    defaults: ClassVar[dict[str, str]] = {"method": "averaged", "iterations": "chosen for the device"}
+
+    def check(self) -> None:
+        """Refuse invalid options."""
         BuildConfig(seed=self.seed, iterations=self.iterations)
 
     def run(self) -> None:
-        """Build, evaluate, print the table."""
+        """Build, evaluate and print the table."""
         from lexsplat.cli.progress import ProgressBars
         from lexsplat.evaluation.demo import run_demo
 

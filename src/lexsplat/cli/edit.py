@@ -5,24 +5,43 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
-from lexsplat.cli.options import Device, check_relevancy, open_scene
+from lexsplat.cli.options import Device, SceneArgument, check_threshold, confirmed, open_scene
+from lexsplat.cli.values import Color
 from lexsplat.runtime.errors import QueryError
 
 if TYPE_CHECKING:
     from lexsplat.scenes.editing import Editor
     from lexsplat.scenes.scene import Scene
 
+CHANGES = ("delete", "keep", "recolor", "move", "duplicate")
+ACTIONS = (*CHANGES, "undo", "redo", "list", "discard", "save")
+Action = tyro.conf.Positional[
+    Annotated[
+        str,
+        PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="{" + ",".join(ACTIONS) + "}",
+            instance_from_str=lambda words: words[0].replace("colour", "color"),
+            is_instance=lambda value: value in ACTIONS,
+            str_from_instance=lambda value: [value],
+            choices=(*ACTIONS, "recolour"),
+        ),
+        tyro.conf.arg(help_behavior_hint="(required)"),
+    ]
+]
+
 
 @dataclasses.dataclass
 class Edit:
-    """Change a scene by words: delete, keep, recolor, move or duplicate what is found; undo, redo; save as another.
+    """Change a scene by words: delete, keep, recolor, move or duplicate what is found; undo, redo; save a new scene.
 
-    The scene itself stays as it was built. Steps are kept in SCENE/edits.jsonl until they are discarded (those of
-    ``demo`` in demo_edits.jsonl here); other commands see them in what "save" writes:
+    The scene stays as it was built. Steps are kept in SCENE/edits.jsonl (for "demo" in demo_edits.jsonl in the
+    working directory) until they are discarded. Other commands see the steps in the scene that "save" writes:
 
         lexsplat edit SCENE delete --select "red mug"
         lexsplat edit SCENE duplicate --select "red apple" --by 0.5 0 0
@@ -30,52 +49,60 @@ class Edit:
         lexsplat edit SCENE save --output SCENE2
 
     Args:
-        scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
-        action: What to do; "list" shows the steps.
-        select: What to do it to; phrases may relate things (see `lexsplat find --help`).
-        view: Whose left and right a phrase means; none takes the view that shows the other thing best.
-        threshold: Relevancy from which a Gaussian is meant; none chooses one.
-        grow: Widen the selection by this distance, world units.
-        shrink: Narrow the selection by this distance, world units.
-        largest: Only the largest thing found.
-        color: Red, green and blue in 0..1, for recolor.
-        strength: How much of the new color, in 0..1.
-        by: Shift in world units, for move and duplicate.
-        turn: Degrees about the up direction, anticlockwise from above.
-        scale: Factor on its size.
+        scene: A scene folder, or the word "demo" for the bundled scene.
+        action: What to do; "list" shows the steps, "discard" deletes all of them.
+        select: What to change; phrases may relate things (see lexsplat find --help).
+        view: Name of the view that left and right refer to.
+        threshold: Relevancy from which a Gaussian is selected.
+        grow: Widen the selection by this distance in units of the scene.
+        shrink: Narrow the selection by this distance in units of the scene.
+        largest: Change only the largest of the things found.
+        color: New color for recolor: three numbers in 0..1, "#ff8800" or a name such as orange.
+        strength: Share of the new color, in 0..1.
+        by: Shift in units of the scene, for move and duplicate.
+        turn: Degrees about the up direction, counterclockwise from above.
+        scale: Factor on the size.
         output: The new scene folder, for save.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
+        yes: Discard all steps without asking.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
     """
 
-    scene: tyro.conf.Positional[str]
-    action: tyro.conf.Positional[
-        Literal["delete", "keep", "recolor", "move", "duplicate", "undo", "redo", "list", "discard", "save"]
-    ]
+    scene: SceneArgument
+    action: Action
     select: str | None = None
     view: str | None = None
     threshold: float | None = None
     grow: float | None = None
     shrink: float | None = None
     largest: bool = False
-    color: tuple[float, float, float] | None = None
+    color: Color = None
     strength: float = 1.0
     by: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn: float = 0.0
     scale: float = 1.0
     output: Path | None = None
+    yes: bool = False
     clip: str | None = None
     device: Device = "auto"
 
-    def __post_init__(self) -> None:
+    defaults: ClassVar[dict[str, str]] = {
+        "view": "the view that shows the other thing best",
+        "threshold": "chosen for each phrase",
+        "clip": "the encoder of the build",
+    }
+    synonyms: ClassVar[dict[str, str]] = {"--colour": "--color"}
+
+    def check(self) -> None:
+        """Refuse options that are missing or have no meaning for the action."""
         needs = {"delete": "select", "keep": "select", "recolor": "color", "save": "output"}
-        if self.action in ("delete", "keep", "recolor", "move", "duplicate") and not self.select:
-            raise ValueError(f'{self.action} needs --select "what"')
+        if self.action in CHANGES and not self.select:
+            raise ValueError(f"{self.action} needs --select PHRASE")
         if self.action in needs and getattr(self, needs[self.action]) is None:
             raise ValueError(f"{self.action} needs --{needs[self.action]}")
         if self.action in ("move", "duplicate") and not any((*self.by, self.turn, self.scale - 1)):
             raise ValueError(f"{self.action} needs --by, --turn or --scale")
-        check_relevancy(self.threshold)
+        check_threshold(self.threshold)
         self._check_numbers()
 
     def _check_numbers(self) -> None:
@@ -84,13 +111,13 @@ class Edit:
         if self.scale <= 0:
             raise ValueError(f"scale must be positive, got {self.scale:g}")
         if not all(0 <= value <= 1 for value in (*(self.color or ()), self.strength)):
-            raise ValueError("--color is three numbers in 0..1, and --strength one in 0..1")
+            raise ValueError("--color needs three numbers in 0..1, and --strength one in 0..1")
         for name, value in (("grow", self.grow), ("shrink", self.shrink)):
             if value is not None and not 0 <= value < math.inf:
-                raise ValueError(f"--{name} must not be negative or endless, got {value:g}")
+                raise ValueError(f"--{name} must not be negative or infinite, got {value:g}")
 
     def run(self) -> None:
-        """Do one thing and say what the scene is now."""
+        """Do one action and print the steps and the size of the edited scene."""
         from lexsplat.scenes.editing import Editor
         from lexsplat.scenes.previous import require_current
 
@@ -99,19 +126,27 @@ class Edit:
             require_current(scene.folder)
         journal = _journal_of(scene)
         if self.action == "discard":
-            journal.unlink(missing_ok=True)
+            self._discard(journal)
         editor = Editor(scene, journal)
         if self.action in ("undo", "redo") and not getattr(editor, self.action)():
             print(f"nothing to {self.action}")
         elif self.action == "save" and self.output:
-            print(
-                f"{editor.save(self.output).root}: written; the steps stay in {journal} until you discard them"
-            )
-        elif self.action in ("delete", "keep", "recolor", "move", "duplicate"):
+            saved = editor.save(self.output).root
+            print(f"{saved}: written; the steps stay in {journal} until you discard them")
+        elif self.action in CHANGES:
             self._change(editor)
         for number, step in enumerate(editor.steps, start=1):
             print(f"{number}. {step}")
         print(f"{len(editor.scene.gaussians):,} Gaussians, {len(editor.undone)} steps undone")
+
+    def _discard(self, journal: Path) -> None:
+        if not journal.exists():
+            return
+        if not (self.yes or confirmed(f"Discard all steps in {journal}?")):
+            raise QueryError(
+                journal, expected="agreement", found="none", remedy="give --yes to discard all steps"
+            )
+        journal.unlink()
 
     def _change(self, editor: Editor) -> None:
         from lexsplat.geometry.rotations import rotation_about
@@ -129,14 +164,14 @@ class Edit:
                 getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
             else:
                 getattr(editor, self.action)(chosen)
-        except ValueError as error:  # numbers that only together, or only for these Gaussians, lead too far
+        except ValueError as error:  # numbers that are only invalid together or for these Gaussians
             raise QueryError(
                 self.action, expected="Gaussians that can be drawn afterwards", found=str(error)
             ) from error
 
 
 def _journal_of(scene: Scene) -> Path:
-    """Where the steps are kept; the scene that ships is never written to."""
+    """File of the steps; the bundled scene is never written to."""
     if scene.folder is None or scene.folder.is_bundled:
         return Path("demo_edits.jsonl")
     return scene.folder.root / "edits.jsonl"

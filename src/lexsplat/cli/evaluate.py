@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
-
-import tyro
+from typing import ClassVar, Literal
 
 from lexsplat.cli.options import (
     ALL_PROTOCOLS,
     Device,
     PromptListName,
     ProtocolName,
+    SceneArgument,
     open_scene,
     print_evaluation,
     print_json,
@@ -21,25 +20,23 @@ from lexsplat.cli.options import (
 
 @dataclasses.dataclass
 class Evaluate:
-    """Measure a scene on its held-out views: picture quality, and language where there are masks.
+    """Measure a scene on its held-out views: image quality, and language where there is ground truth.
 
     Writes metrics.json, metrics.csv, metrics.tex, report.html and heatmaps/ into the scene folder.
 
     Args:
         scene: A scene folder.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels; none takes what
-        lies in or beside
-            the capture.
-        prompt_list: Ask the words of the paper's supplement or of the released code, for scenes of the paper.
+        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
+        prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
-        capture: Where the photos are now, if they have moved.
-        form: See ``lexsplat query --help``.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
+        capture: Folder of the photos.
+        form: How codes and text are compared (see lexsplat query --help).
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
         json: Print metrics.json on standard output.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: SceneArgument
     masks: Path | None = None
     prompt_list: PromptListName | None = None
     protocols: tuple[ProtocolName, ...] = ALL_PROTOCOLS
@@ -48,6 +45,14 @@ class Evaluate:
     clip: str | None = None
     device: Device = "auto"
     json: bool = False
+
+    defaults: ClassVar[dict[str, str]] = {
+        "masks": "the ground truth in the capture or beside it",
+        "prompt_list": "the prompts of the ground truth",
+        "capture": "where the build found it",
+        "form": "the form of the scene",
+        "clip": "the encoder of the build",
+    }
 
     def run(self) -> None:
         """Evaluate and print the table."""

@@ -4,65 +4,99 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import ClassVar
 
-import tyro
-
-from lexsplat.cli.options import PRESENCE, Device, check_relevancy, open_scene
+from lexsplat.cli.options import (
+    PRESENCE,
+    Device,
+    FileArgument,
+    SceneArgument,
+    check_threshold,
+    confirmed,
+    open_folder,
+    open_scene,
+)
+from lexsplat.runtime.errors import SceneFolderError
 
 
 @dataclasses.dataclass
 class Export:
-    """Write a scene, or what was found in it, for other programs. The ending of the name says the format.
+    """Write a scene, or what was found in it, for other programs. The ending of the file name selects the format.
 
     .ply (the standard of 3D Gaussian Splatting), .splat, .glb (glTF with KHR_gaussian_splatting), .points.ply (a
-    plain point cloud); .spz, .compressed.ply and .ksplat with `pip install "lexsplat[formats]"`; .csv and .json for
+    plain point cloud); .spz, .compressed.ply and .ksplat with pip install "lexsplat[formats]"; .csv and .json for
     labels (see docs/formats.md).
 
     Args:
-        scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
+        scene: A scene folder, or the word "demo" for the bundled scene.
         file: The file to write.
-        select: Write only what answers to these phrases (see `lexsplat find --help`); in .csv and .json, which
-            Gaussian answers to which.
-        view: Whose left and right a phrase means; none takes the view that shows the other thing best.
-        language: Write codes and codebook along (.ply and .glb).
-        threshold: Relevancy from which a Gaussian answers; none chooses one for each phrase.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
+        select: Write only what matches these phrases (see lexsplat find --help). In .csv and .json: which Gaussian
+            matches which phrase.
+        view: Name of the view that left and right refer to.
+        language: Include codes and codebook (.ply and .glb).
+        force: Replace a file that exists without asking.
+        threshold: Relevancy from which a Gaussian matches.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
     """
 
-    scene: tyro.conf.Positional[str]
-    file: tyro.conf.Positional[Path]
+    scene: SceneArgument
+    file: FileArgument
     select: tuple[str, ...] = ()
     view: str | None = None
     language: bool = False
+    force: bool = False
     threshold: float | None = None
     clip: str | None = None
     device: Device = "auto"
 
-    def __post_init__(self) -> None:
-        check_relevancy(self.threshold)
+    defaults: ClassVar[dict[str, str]] = {
+        "view": "the view that shows the other thing best",
+        "threshold": "chosen for each phrase",
+        "clip": "the encoder of the build",
+    }
+
+    def check(self) -> None:
+        """Refuse invalid options."""
+        check_threshold(self.threshold)
 
     def run(self) -> None:
         """Write the file."""
         from lexsplat.geometry.world import world_of
         from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene
-        from lexsplat.scenes.folder import SceneFolder
 
         ending_of(self.file)
-        SceneFolder.open(Path(self.scene)).refuse_own_file(self.file)
+        folder = open_folder(self.scene)
+        folder.refuse_own_file(self.file)
+        if not self.force:
+            _refuse_existing(self.file)
         if self.select or self.language:
-            scene = open_scene(self.scene, self.device, self.clip)
+            scene = open_scene(str(folder.root), self.device, self.clip)
             found = [
                 dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
                 for phrase in self.select
             ]
             for selection in found:
                 print(f"{selection.phrase}: {len(selection):,} Gaussians{PRESENCE[selection.present]}")
-            files = export_scene(scene, self.file, found=found, language=self.language)
+            files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:
-            folder = SceneFolder.open(Path(self.scene))
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
             world = world_of(folder.record, cameras)
-            files = export_gaussians(folder.read_gaussians(), self.file, world=world)
-        for file in files:
+            files = export_gaussians(folder.read_gaussians(), self.file, world=world, overwrite=True)
+        for file in files:  # an existing file was confirmed above
             print(f"{file}: {file.stat().st_size:,} bytes")
+
+
+def _refuse_existing(file: Path) -> None:
+    """Ask before an existing file is replaced.
+
+    Raises:
+        SceneFolderError: If the file exists and the user does not agree or cannot be asked.
+    """
+    if file.exists() and not confirmed(f"{file} exists. Replace it?"):
+        raise SceneFolderError(
+            file,
+            expected="a new file",
+            found="a file that exists",
+            remedy="give another name, or --force to replace it",
+        )

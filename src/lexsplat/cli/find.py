@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, ClassVar
 
-import tyro
-
-from lexsplat.cli.options import Device, check_relevancy, open_scene, print_json
+from lexsplat.cli.options import (
+    Device,
+    PhrasesArgument,
+    SceneArgument,
+    check_phrases,
+    check_threshold,
+    open_scene,
+    print_json,
+)
 
 
 @dataclasses.dataclass
@@ -15,29 +22,37 @@ class Find:
 
     Phrases may relate things: "mug on the cloth", "largest book", "fruit but not the banana", "how many apples",
     "chair next to the table" (left of, right of, in front of, behind, on, under, above, below, inside, next to,
-    nearest to). Put words into quotation marks inside the phrase to keep them together. Places are in the scene's
-    units; sizes are in meters once the scale is known (see `lexsplat scale`).
+    nearest to). Quotation marks inside the phrase keep words together. Positions are in the units of the scene; sizes
+    are in meters once the scale is known (see lexsplat scale).
 
     Args:
-        scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
+        scene: A scene folder, or the word "demo" for the bundled scene.
         phrases: What to look for.
-        view: Whose left and right are meant; none takes the view that shows the other thing best.
-        threshold: Relevancy from which a Gaussian belongs to a thing; none chooses one for each.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
-        json: Print one JSON document on standard output.
+        view: Name of the view that left and right refer to.
+        threshold: Relevancy from which a Gaussian belongs to a thing.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
+        json: Print one JSON document on standard output (docs/schemas/find.json).
     """
 
-    scene: tyro.conf.Positional[str]
-    phrases: tyro.conf.Positional[tuple[str, ...]]
+    scene: SceneArgument
+    phrases: PhrasesArgument
     view: str | None = None
     threshold: float | None = None
     clip: str | None = None
     device: Device = "auto"
     json: bool = False
 
-    def __post_init__(self) -> None:
-        check_relevancy(self.threshold)
+    defaults: ClassVar[dict[str, str]] = {
+        "view": "the view that shows the other thing best",
+        "threshold": "chosen for each phrase",
+        "clip": "the encoder of the build",
+    }
+
+    def check(self) -> None:
+        """Refuse invalid options."""
+        check_phrases(self.phrases)
+        check_threshold(self.threshold)
 
     def run(self) -> None:
         """Find and print."""
@@ -49,14 +64,18 @@ class Find:
             print_json(answers)
             return
         for answer in answers["phrases"]:
-            count = answer["count"]
-            weak = " that is a little like it" if answer["present"] == "no" and count else ""
-            print(f"{answer['phrase']}: present: {answer['present']}, {count} found{weak}")
-            for number, thing in enumerate(answer["instances"], start=1):
-                center = ", ".join(f"{v:.2f}" for v in thing["center"])
-                meters = thing.get("size_meters")
-                size = " x ".join(f"{v:.2f}" for v in thing["size"])
-                if meters is not None:
-                    size = " x ".join(f"{v:.3f}" for v in meters) + " m"
-                print(f"  {number}. at ({center}), size {size}, score {thing['score']:.2f}, "
-                      f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}")  # fmt: skip
+            _print_answer(answer)
+
+
+def _print_answer(answer: dict[str, Any]) -> None:
+    understood = f" (understood as {answer['understood']})"
+    print(f"{answer['phrase']}: present: {answer['present']}, {answer['count']} found{understood}")
+    for number, thing in enumerate(answer["instances"], start=1):
+        center = ", ".join(f"{v:.2f}" for v in thing["center"])
+        size = " x ".join(f"{v:.2f}" for v in thing["size"])
+        if thing.get("size_meters") is not None:
+            size = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m"
+        print(
+            f"  {number}. at ({center}), size {size}, score {thing['score']:.2f}, "
+            f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
+        )

@@ -1,33 +1,29 @@
-"""``lexsplat info``: what is in a scene folder."""
+"""``lexsplat info``: what a scene folder contains."""
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
-import tyro
-
-from lexsplat.cli.options import print_json
+from lexsplat.cli.options import SceneArgument, open_folder, print_json
 
 
 @dataclasses.dataclass
 class Info:
-    """Say what is in a scene folder.
+    """Show what a scene folder contains.
 
     Args:
-        scene: A scene folder.
+        scene: A scene folder, or the word "demo" for the bundled scene.
         json: Print one JSON document on standard output.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: SceneArgument
     json: bool = False
 
     def run(self) -> None:
         """Print the facts."""
         from lexsplat.scenes.answers import scene_facts
-        from lexsplat.scenes.folder import SceneFolder
 
-        facts = scene_facts(SceneFolder.open(Path(self.scene)))
+        facts = scene_facts(open_folder(self.scene))
         if self.json:
             print_json(facts)
             return

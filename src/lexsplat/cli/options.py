@@ -1,8 +1,9 @@
-"""What several commands share: options, opening a scene, printing."""
+"""What several commands share: placeholders, checks, opening a scene, asking on a terminal, printing."""
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,6 +14,7 @@ from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.runtime.device import check_seed
 
 if TYPE_CHECKING:
+    from lexsplat.scenes.folder import SceneFolder
     from lexsplat.scenes.scene import Scene
 
 # tyro offers --iterations for this one; the settings of the reconstruction do not depend on tyro.
@@ -23,37 +25,74 @@ PromptListName = Literal["paper", "released"]
 ProtocolName = Literal["strict", "official", "lerf-2d", "lerf-3d"]
 ALL_PROTOCOLS: tuple[ProtocolName, ...] = ("strict", "official", "lerf-2d", "lerf-3d")
 
+_REQUIRED = "(required)"
+SceneArgument = tyro.conf.Positional[
+    Annotated[str, tyro.conf.arg(metavar="SCENE", help_behavior_hint=_REQUIRED)]
+]
+CaptureArgument = tyro.conf.Positional[
+    Annotated[str, tyro.conf.arg(metavar="CAPTURE", help_behavior_hint=_REQUIRED)]
+]
+PhrasesArgument = tyro.conf.Positional[
+    Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...", help_behavior_hint=_REQUIRED)]
+]
+FileArgument = tyro.conf.Positional[
+    Annotated[Path, tyro.conf.arg(metavar="FILE", help_behavior_hint=_REQUIRED)]
+]
+
 PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probably not in this scene"}
-"""What is said behind an answer, for each verdict on whether the thing is in the scene at all."""
+"""What is printed behind an answer, by its value of ``present``."""
 
 
 def open_scene(path: str, device: str, clip: str | None) -> Scene:
-    """The scene a command was given, ready to be asked."""
+    """Open the scene of a command with its encoders."""
     from lexsplat.scenes import scene as search
 
+    note_hidden("demo", path)
     return search.open_scene(path, device=device, clip=clip)
 
 
+def open_folder(path: str) -> SceneFolder:
+    """Open the scene folder of a command that needs no encoder."""
+    from lexsplat.scenes.folder import SceneFolder
+
+    note_hidden("demo", path)
+    return SceneFolder.open(Path(path))
+
+
+def note_hidden(word: str, given: str) -> None:
+    """State on standard error that a folder of the working directory hides what is bundled under its name."""
+    if given == word and Path(given).exists():
+        print(f"note: {word} is the folder in the working directory, not what is bundled", file=sys.stderr)
+
+
+def confirmed(question: str) -> bool:
+    """Whether the user agrees; False where no terminal can be asked."""
+    if not sys.stdin.isatty():
+        return False
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
 def print_json(document: Any) -> None:
-    """One JSON document on standard output."""
+    """Print one JSON document on standard output."""
     print(json.dumps(document, indent=2, ensure_ascii=False))
 
 
+def print_json_file(path: Path) -> None:
+    """Print a JSON document that a command has written."""
+    print_json(json.loads(path.read_text(encoding="utf-8")))
+
+
 def print_evaluation(result: dict, folder: Path) -> None:
-    """The table of one evaluated scene, and where its report lies."""
+    """Print the table of one evaluated scene and the path of its report."""
     from lexsplat.evaluation.report import format_table
 
     print(format_table(result))
     print(f"report: {folder / 'report.html'}")
 
 
-def print_json_file(path: Path) -> None:
-    """One JSON document that a command has written, on standard output."""
-    print_json(json.loads(path.read_text(encoding="utf-8")))
-
-
-def check_relevancy(threshold: float | None) -> None:
-    """Refuse a threshold that no relevancy can be compared with.
+def check_threshold(threshold: float | None) -> None:
+    """Refuse a threshold of relevancy outside 0..1.
 
     Raises:
         ValueError: It is given and not in 0..1.
@@ -62,11 +101,21 @@ def check_relevancy(threshold: float | None) -> None:
         raise ValueError(f"threshold must be in 0..1, got {threshold:g}")
 
 
-def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Refuse an empty list of seeds, and seeds that are none.
+def check_phrases(phrases: tuple[str, ...]) -> None:
+    """Refuse a command without phrases.
 
     Raises:
-        ValueError: There is none, or it is negative or too large.
+        ValueError: There is none.
+    """
+    if not phrases:
+        raise ValueError('at least one PHRASE is needed, such as "red apple"')
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Refuse an empty list of seeds and invalid seeds.
+
+    Raises:
+        ValueError: There is none, or one is negative or too large.
     """
     if not seeds:
         raise ValueError("at least one seed is needed")

@@ -1,4 +1,4 @@
-"""``lexsplat poses``: where the photos were taken."""
+"""``lexsplat poses``: the cameras of photos."""
 
 from __future__ import annotations
 
@@ -14,39 +14,45 @@ from lexsplat.captures.sfm.photos import PoseConfig
 from lexsplat.runtime.device import check_seed
 from lexsplat.runtime.memory import parse_bytes
 
+PhotosArgument = tyro.conf.Positional[
+    Annotated[Path, tyro.conf.arg(metavar="CAPTURE", help_behavior_hint="(required)")]
+]
+
 
 @dataclasses.dataclass
 class Poses:
     """Estimate the cameras of photos, or of a video, and write them as a COLMAP model.
 
-    ``build`` does this by itself where there are no cameras; this is for looking at them first, or for use in other
-    programs. The output is a COLMAP project: ``sparse/0``, and ``images`` with the frames of a video, with upright
-    copies of photos that are stored turned, or linked to the photos. ``lexsplat build OUTPUT`` goes on from it.
+    build runs the same step where there are no cameras. Use this command to inspect the cameras first, or to use
+    them in other programs. The output is a COLMAP project: sparse/0, and images/ with the frames of a video, with
+    upright copies of photos that are stored turned, or linked to the photos. Continue with lexsplat build OUTPUT.
 
     Args:
-        photos: Folder of photos that overlap by 60 to 80 percent, with ``masks/`` if wanted; or a video.
-        output: Folder to write into.
-        frames: How many frames a video is sampled to.
+        photos: Folder of photos that overlap by 60 to 80 percent, optionally with masks/; or a video.
+        output: Folder for the COLMAP project.
+        frames: Number of frames that are taken from a video.
         seed: Seed of all randomness.
-        memory: Host memory that may be taken, beside the libraries: decides how much is done at once.
-        settings: How photos are compared and placed.
+        memory: Memory budget, such as 4GB, beside what the libraries need. It determines how many photos are
+            processed at once.
+        settings: Settings of structure from motion.
     """
 
-    photos: tyro.conf.Positional[Path]
+    photos: PhotosArgument
     output: Path
     frames: int = DEFAULT_FRAMES
     seed: int = 0
     memory: str = "4GB"
     settings: Annotated[PoseConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=PoseConfig)
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Refuse invalid options."""
         if self.frames < 3:
             raise ValueError(f"frames must be at least 3, got {self.frames}")
         check_seed(self.seed)
         parse_bytes(self.memory)
 
     def run(self) -> None:
-        """Write the model and say how many photos were placed, and which were not."""
+        """Write the model and state how many photos are registered, and which are not."""
         from lexsplat.captures import poses_from_photos
         from lexsplat.captures.readers.video import is_video, sample_video
         from lexsplat.cli.progress import ProgressBars
@@ -65,6 +71,6 @@ class Poses:
         print(f"{self.output / 'sparse' / '0'}: {result.note}")
         images = self.output / "images"
         if not images.exists() and result.images.resolve() != self.output.resolve():
-            with contextlib.suppress(OSError):  # a system without links: the photos stay where they are
+            with contextlib.suppress(OSError):  # without symbolic links the photos stay where they are
                 images.symlink_to(result.images.resolve(), target_is_directory=True)
         print(f"next: lexsplat build {self.output} --output SCENE")

@@ -1,4 +1,4 @@
-"""Progress drawn in a terminal, or told in plain lines where there is none."""
+"""Progress as bars in a terminal, as plain lines elsewhere; both state rate and time left."""
 
 from __future__ import annotations
 
@@ -25,28 +25,36 @@ _SECONDS_BETWEEN_LINES = 15.0
 
 
 class _RateColumn(ProgressColumn):
-    """Units a second, or seconds a unit where that reads better."""
+    """The column of the rate."""
 
     def render(self, task: Task) -> Text:
         return Text(format_rate(task.finished_speed or task.speed), style="dim")
 
 
 def format_rate(per_second: float | None) -> str:
-    """A rate for people: "12.3/s", or "4.1 s each" below one a second, "" if unknown."""
+    """A rate in words: "12.3/s", or "4.1 s each" below one per second; "" if unknown."""
     if not per_second:
         return ""
     return f"{per_second:.1f}/s" if per_second >= 1 else f"{1 / per_second:.1f} s each"
 
 
+def format_seconds(seconds: float) -> str:
+    """A duration as "1:02:03" or "2:03"."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
 class ProgressBars:
     """A listener (see `lexsplat.runtime.progress`) that shows stages with rate and time left on standard error.
 
-    Use it as a context manager; call the instance with events.
+    Use it as a context manager, and call the instance with events.
     """
 
     def __init__(self) -> None:
         self.console = Console(stderr=True)
         self._tasks: dict[str, TaskID] = {}
+        self._starts: dict[str, tuple[float, int]] = {}  # time and units done at the first event of a stage
         self._last_line: dict[str, float] = {}
         self._progress = Progress(
             TextColumn("{task.description:<13}"),
@@ -77,17 +85,24 @@ class ProgressBars:
         if self.console.is_terminal:
             self._draw(event, text)
         else:
-            self._say(event, text)
+            self._print_line(event, text)
 
     def _draw(self, event: Event, text: str) -> None:
         if event.stage not in self._tasks:
             self._tasks[event.stage] = self._progress.add_task(event.stage, total=event.total, metrics="")
         self._progress.update(self._tasks[event.stage], completed=event.done, total=event.total, metrics=text)
 
-    def _say(self, event: Event, text: str) -> None:
+    def _print_line(self, event: Event, text: str) -> None:
         now = time.monotonic()
-        started = event.stage not in self._last_line
-        due = now - self._last_line.get(event.stage, 0.0) >= _SECONDS_BETWEEN_LINES
-        if started or due or event.done >= event.total:
-            self._last_line[event.stage] = now
-            self.console.print(f"{event.stage}: {event.done}/{event.total} {text}".rstrip(), highlight=False)
+        started, done_before = self._starts.setdefault(event.stage, (now, event.done))
+        is_first = event.stage not in self._last_line
+        is_due = now - self._last_line.get(event.stage, 0.0) >= _SECONDS_BETWEEN_LINES
+        if not (is_first or is_due or event.done >= event.total):
+            return
+        self._last_line[event.stage] = now
+        rate = (event.done - done_before) / (now - started) if now > started else 0.0
+        speed = format_rate(rate)
+        if rate and event.done < event.total:
+            speed += f", {format_seconds((event.total - event.done) / rate)} left"
+        parts = (f"{event.stage}: {event.done}/{event.total}", speed, text)
+        self.console.print(" ".join(part for part in parts if part), highlight=False, soft_wrap=True)

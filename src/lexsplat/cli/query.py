@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import tyro
-
-from lexsplat.cli.options import PRESENCE, Device, check_relevancy, open_scene, print_json
+from lexsplat.cli.options import (
+    PRESENCE,
+    Device,
+    PhrasesArgument,
+    SceneArgument,
+    check_phrases,
+    check_threshold,
+    open_scene,
+    print_json,
+)
 from lexsplat.queries.relevancy import QueryConfig
 
 if TYPE_CHECKING:
@@ -17,29 +24,30 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass
 class Query:
-    """Ask where something is: heatmaps, masks and scores for free text.
+    """Show where things are: heatmaps, masks and scores for free text.
 
     Args:
-        scene: A scene folder, or ``demo`` for the scene that ships with lexsplat.
+        scene: A scene folder, or the word "demo" for the bundled scene.
         prompts: What to look for, such as "red apple" "something to sit on".
-        view: Names of the views to answer in; none takes the held-out views.
-        output: Folder for the pictures; none takes ``SCENE/heatmaps``, or ``demo_heatmaps`` here for ``demo``.
-        threshold: Relevancy from which a pixel belongs to the mask; none chooses one for each prompt from the
-            scene alone. The paper's is 0.5.
+        view: Names of the views to answer in.
+        output: Folder for the images.
+        pictures: Write a heatmap and a mask for each prompt and view; --no-pictures writes none.
+        threshold: Relevancy from which a pixel belongs to the mask. The paper's is 0.5.
         form: How codes and text are compared: "feature" blends features, then compares (the paper); "code"
-            compares each code, then blends. None takes the scene's default.
-        negatives: Phrases a prompt has to beat; none takes "object", "things", "stuff", "texture".
-        temperature: Factor on cosines; none takes 10.
-        template: Sentence with {} for the prompt, such as "a photo of a {}"; may be given several times.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
-        json: Print one JSON document on standard output.
+            compares each code, then blends.
+        negatives: Phrases that a prompt is compared with.
+        temperature: Factor on cosine similarities.
+        template: Sentences with {} in place of the prompt, such as "a photo of a {}".
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
+        json: Print one JSON document on standard output (docs/schemas/query.json).
     """
 
-    scene: tyro.conf.Positional[str]
-    prompts: tyro.conf.Positional[tuple[str, ...]]
+    scene: SceneArgument
+    prompts: PhrasesArgument
     view: tuple[str, ...] = ()
     output: Path | None = None
+    pictures: bool = True
     threshold: float | None = None
     form: Literal["feature", "code"] | None = None
     negatives: tuple[str, ...] = ()
@@ -49,12 +57,25 @@ class Query:
     device: Device = "auto"
     json: bool = False
 
-    def __post_init__(self) -> None:
-        check_relevancy(self.threshold)
+    defaults: ClassVar[dict[str, str]] = {
+        "view": "the held-out views",
+        "output": 'SCENE/heatmaps; demo_heatmaps for "demo"',
+        "threshold": "chosen for each prompt from the scene alone",
+        "form": "the form of the scene",
+        "negatives": '"object" "things" "stuff" "texture"',
+        "temperature": "10",
+        "template": "those of the scene",
+        "clip": "the encoder of the build",
+    }
+
+    def check(self) -> None:
+        """Refuse invalid options."""
+        check_phrases(self.prompts)
+        check_threshold(self.threshold)
         self._changed(QueryConfig())
 
     def _changed(self, config: QueryConfig) -> QueryConfig:
-        """The scene's way of answering with what was asked for on the command line."""
+        """The scene's settings of relevancy, with those given on the command line."""
         changes: dict[str, Any] = {
             "form": self.form,
             "negatives": self.negatives or None,
@@ -64,12 +85,12 @@ class Query:
         return dataclasses.replace(config, **{name: v for name, v in changes.items() if v is not None})
 
     def run(self) -> None:
-        """Answer and write pictures."""
+        """Answer and write images."""
         from lexsplat.scenes.answers import answer_queries
 
         scene = open_scene(self.scene, self.device, self.clip)
         scene.query = self._changed(scene.query)
-        folder = self.output or _pictures_folder(scene)
+        folder = (self.output or _images_folder(scene)) if self.pictures else None
         answers = answer_queries(scene, self.prompts, self.view, self.threshold, folder)
         if self.json:
             print_json(answers)
@@ -80,11 +101,12 @@ class Query:
                 f"threshold {answer['threshold']:.2f}, {answer['gaussians']} Gaussians"
                 f"{PRESENCE[answer['present']]}"
             )
-        print(f"pictures in {folder}")
+        if folder:
+            print(f"images in {folder}")
 
 
-def _pictures_folder(scene: Scene) -> Path:
-    """Where answers go unless told otherwise; the scene that ships is never written to."""
+def _images_folder(scene: Scene) -> Path:
+    """Folder for images if none is given; the bundled scene is never written to."""
     if scene.folder is None or scene.folder.is_bundled:
         return Path("demo_heatmaps")
     return scene.folder.root / "heatmaps"

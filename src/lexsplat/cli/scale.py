@@ -1,45 +1,43 @@
-"""``lexsplat scale``: what a scene's unit is in meters, and which way is up."""
+"""``lexsplat scale``: the length of a meter and the up direction of a scene."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
+from typing import ClassVar
 
-import tyro
-
-from lexsplat.cli.options import Device, open_scene, print_json
+from lexsplat.cli.options import Device, SceneArgument, open_folder, open_scene, print_json
+from lexsplat.cli.values import Length
 from lexsplat.geometry.world import World, parse_vector, world_of
 
 
 @dataclasses.dataclass
 class Scale:
-    """Tell a scene how long something in it is, so that sizes are in meters from then on.
+    """Set the length of a meter and the up direction of a scene; without options, show both.
 
-    Photos alone do not say how large things are; one distance that you know does:
+    Photos alone do not determine how large things are. One distance that you know does:
 
-        lexsplat scale SCENE --distance 0.35 --between "mug" "lamp"           # middle to middle
-        lexsplat scale SCENE --distance 0.095 --height-of "mug"
-        lexsplat scale SCENE --distance 1.2 --points 0.1,0.2,0 0.9,0.2,0.4    # as `lexsplat find` prints places
-        lexsplat scale SCENE --up 0,0,1                                       # where the cameras misled
+        lexsplat scale SCENE --distance 35cm --between "mug" "lamp"           # center to center
+        lexsplat scale SCENE --distance 9.5cm --height-of "mug"
+        lexsplat scale SCENE --distance 1.2 --points 0.1,0.2,0 0.9,0.2,0.4    # as lexsplat find prints positions
+        lexsplat scale SCENE --up 0,0,1                                       # if the estimate is wrong
 
-    Without options it says what is known. `find`, `info` and glTF exports then are in meters; what is stored keeps
-    its units. Nothing is built again.
+    find, info and exports to glTF then use meters. The stored scene keeps its units, and nothing is built again.
 
     Args:
         scene: A scene folder.
-        distance: The distance in meters.
-        between: Two phrases: it is that between the middles of these things.
-        height_of: A phrase: it is the height of this thing.
-        points: Two places as x,y,z: it is that between them.
-        up: Direction away from the ground, as x,y,z in the scene's axes.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
-        json: Print one JSON document on standard output.
+        distance: The known distance: a number in meters, or with a unit, such as 9.5cm.
+        between: Two phrases: the distance between the centers of these things.
+        height_of: A phrase: the height of this thing.
+        points: Two positions as x,y,z: the distance between them.
+        up: Direction away from the ground, as x,y,z in the axes of the scene.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
+        json: Print one JSON document on standard output (docs/schemas/scale.json).
     """
 
-    scene: tyro.conf.Positional[str]
-    distance: float | None = None
+    scene: SceneArgument
+    distance: Length = None
     between: tuple[str, str] | None = None
     height_of: str | None = None
     points: tuple[str, str] | None = None
@@ -48,31 +46,31 @@ class Scale:
     device: Device = "auto"
     json: bool = False
 
-    def __post_init__(self) -> None:
+    defaults: ClassVar[dict[str, str]] = {"up": "from the cameras", "clip": "the encoder of the build"}
+
+    def check(self) -> None:
+        """Refuse invalid options."""
         ways = sum(way is not None for way in (self.between, self.height_of, self.points))
         if (self.distance is None) != (ways == 0) or ways > 1:
             raise ValueError(
-                "--distance METERS goes with one of --between A B, --height-of A, --points X,Y,Z X,Y,Z"
+                "--distance LENGTH goes with one of --between A B, --height-of A, --points X,Y,Z X,Y,Z"
             )
         if self.distance is not None and not 0 < self.distance < float("inf"):
             raise ValueError(f"distance must be positive, got {self.distance:g}")
         for text in self.points or ():
             parse_vector(text)
         if self.up is not None:
-            World.of_cameras([]).with_up(parse_vector(self.up))  # refuses a direction that is none
+            World.of_cameras([]).with_up(parse_vector(self.up))  # raises for an invalid direction
 
     def run(self) -> None:
-        """Measure, store, print."""
-        from lexsplat.scenes.folder import SceneFolder
+        """Measure, store and print."""
         from lexsplat.scenes.scale import store_world
 
-        folder = SceneFolder.open(Path(self.scene))
-        scale = None
+        folder = open_folder(self.scene)
+        length, scale = None, None
         if self.distance is not None:
-            length = self._length()
+            length = self._length(str(folder.root.resolve()))
             scale = self.distance / length
-            if not self.json:
-                print(f"{self.distance:g} m are {length:.4g} units")
         up = parse_vector(self.up) if self.up else None
         changes = up is not None or scale is not None
         if changes:
@@ -83,18 +81,20 @@ class Scale:
         if self.json:
             print_json(world.to_json())
             return
+        if length is not None:
+            print(f"{self.distance:g} m is {length:.4g} units")
         direction = ", ".join(f"{v:.3f}" for v in world.up.direction)
         known = world.meters_per_unit
         print("scale: not known" if known is None else f"scale: one unit is {known:.4g} m")
-        print(f"up: ({direction}) from the {world.source}{'' if world.up.reliable else ', unsure'}")
+        print(f"up: ({direction}) from the {world.source}{'' if world.up.reliable else ', uncertain'}")
 
-    def _length(self) -> float:
+    def _length(self, folder: str) -> float:
         """The given distance as it is in the scene, in world units."""
         from lexsplat.scenes.scale import height_of, length_between, positive_length
 
         if self.points is not None:
             return positive_length(math.dist(*map(parse_vector, self.points)), "the two points")
-        scene = open_scene(self.scene, self.device, self.clip)
+        scene = open_scene(folder, self.device, self.clip)
         if self.between is not None:
             return length_between(scene, *self.between)
         return height_of(scene, self.height_of or "")

@@ -4,30 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from typing import ClassVar
 
-import tyro
-
-from lexsplat.cli.options import Device, open_scene
+from lexsplat.cli.options import Device, SceneArgument, open_scene
 
 
 @dataclasses.dataclass
 class View:
-    """Look at a scene in the browser, and search it there.
+    """Show and search a scene in the browser.
 
-    Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
+    Only this machine can connect unless --host allows others. Ctrl-C stops the server.
 
     Args:
-        scene: A scene folder.
-        host: Address to listen on. 0.0.0.0 lets everyone who can reach this machine in: there is no password.
-        port: Port to listen on; the next free one is taken if it is in use.
-        name: Host name under which the page is opened, where that is neither an address nor localhost; may be
-            given several times.
-        splats: How many Gaussians the browser draws at most.
-        clip: Text encoder, if it is not where the build found it.
-        device: Where to compute.
+        scene: A scene folder, or the word "demo" for the bundled scene.
+        host: Address to listen on. There is no password: 0.0.0.0 admits everyone who can reach this machine.
+        port: Port to listen on. The next free port is used if it is taken.
+        name: Host names under which the page may be opened, beside localhost and addresses.
+        splats: Maximum number of Gaussians that the browser draws.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: SceneArgument
     host: str = "127.0.0.1"
     port: int = 8080
     name: tuple[str, ...] = ()
@@ -35,7 +33,10 @@ class View:
     clip: str | None = None
     device: Device = "auto"
 
-    def __post_init__(self) -> None:
+    defaults: ClassVar[dict[str, str]] = {"clip": "the encoder of the build"}
+
+    def check(self) -> None:
+        """Refuse invalid options."""
         if not 0 <= self.port <= 65535:
             raise ValueError(f"port must be in 0..65535, got {self.port}")
         if self.splats < 1:
@@ -47,7 +48,7 @@ class View:
 
         scene = open_scene(self.scene, self.device, self.clip)
         viewer = ViewerServer(scene, ViewerConfig(self.host, self.port, self.name, self.splats))
-        print(f"{self.scene} is shown at {viewer.url} (Ctrl-C ends it)", flush=True)
+        print(f"{self.scene} is shown at {viewer.url} (Ctrl-C stops the server)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             wait_for_interrupt()
         viewer.stop()

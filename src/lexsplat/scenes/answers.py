@@ -86,7 +86,7 @@ def answer_queries(
     prompts: str | Sequence[str],
     views: Sequence[str],
     threshold: float | None,
-    folder: Path,
+    folder: Path | None,
 ) -> dict[str, Any]:
     """Answer prompts in views, and write a heatmap and a mask for each pair.
 
@@ -95,7 +95,7 @@ def answer_queries(
         prompts: What to look for.
         views: Names of views; none means up to `MAX_DEFAULT_VIEWS` held-out views.
         threshold: Relevancy threshold of the masks; None derives one for each prompt.
-        folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go.
+        folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
         ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "best_view", "gaussians",
@@ -176,10 +176,17 @@ def _default_views(scene: Scene) -> list[str]:
 
 
 def _write_images(
-    folder: Path, prompt: str, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
+    folder: Path | None, prompt: str, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
 ) -> dict[str, Any]:
     mask = relevancy >= threshold
     row, column = np.unravel_index(int(relevancy.argmax()), relevancy.shape)
+    answer: dict[str, Any] = {
+        "peak": round(float(relevancy.max()), 4),
+        "peak_pixel": [int(column), int(row)],
+        "mask_share": round(float(mask.mean()), 5),
+    }
+    if folder is None:
+        return answer
     stem = folder / file_name(prompt) / Path(name).with_suffix("")
     heatmap_path = stem.with_name(stem.name + ".png")
     mask_path = stem.with_name(stem.name + ".mask.png")
@@ -189,13 +196,7 @@ def _write_images(
     ):
         with atomic_path(path) as temporary:
             Image.fromarray(pixels).save(temporary, format="PNG")
-    return {
-        "peak": round(float(relevancy.max()), 4),
-        "peak_pixel": [int(column), int(row)],
-        "mask_share": round(float(mask.mean()), 5),
-        "heatmap": str(heatmap_path),
-        "mask": str(mask_path),
-    }
+    return {**answer, "heatmap": str(heatmap_path), "mask": str(mask_path)}
 
 
 def file_name(prompt: str) -> str:

@@ -1,0 +1,218 @@
+"""From the words of a command line to a command: tyro with short help pages and plain placeholders.
+
+A command class may have these attributes beside its fields:
+
+- ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
+- ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
+- ``defaults``: what help pages state as the default of an option that is None or empty;
+- ``synonyms``: other spellings of options.
+
+Its method ``check``, if it has one, raises ValueError for options that are invalid together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import shutil
+import sys
+import textwrap
+import types
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+HELP = ("-h", "--help")
+HELP_ALL = "--help-all"
+ESSENTIAL_SETTINGS = (
+    "clip", "dino", "device", "method", "as_in_paper", "iterations", "downscale", "test_every", "seed", "memory",
+)  # fmt: skip
+"""Settings of a build that people use."""
+
+_PLACEHOLDERS = {"clip": "NAME", "dino": "NAME", "memory": "SIZE", "up": "X,Y,Z", "height_of": "PHRASE"}
+_SETTINGS_DEFAULTS = {
+    "downscale": "chosen for the device",
+    "iterations": "chosen for the device",
+    "up": "from the cameras",
+}
+
+CommandT = TypeVar("CommandT")
+REGISTRY = ConstructorRegistry()
+
+
+def parse(command: type[CommandT], name: str, words: Sequence[str]) -> CommandT:
+    """Parse the words behind the name of a command.
+
+    Raises:
+        SystemExit: With status 2 after wrong usage, with status 0 after help.
+    """
+    program = f"lexsplat {name}"
+    words = [_in_our_spelling(word, getattr(command, "synonyms", {})) for word in words]
+    if HELP_ALL in words:
+        _print_help(command, program, set(getattr(command, "unused", ())))
+    if any(word in HELP for word in words):
+        _print_help(command, program, _not_essential(command))
+    try:
+        parsed = tyro.cli(command, prog=program, args=words, registry=REGISTRY)
+        if hasattr(parsed, "check"):
+            parsed.check()
+        return parsed
+    except ValueError as error:  # raised by the checks of a command or of its settings
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def _in_our_spelling(word: str, synonyms: dict[str, str]) -> str:
+    option, equals, value = word.partition("=")
+    return synonyms.get(option, option) + equals + value
+
+
+def _not_essential(command: type) -> set[str]:
+    """Names of the fields, of a command and of its settings, that the short help page leaves out."""
+    essential = getattr(command, "essential", None)
+    settings = _settings_class(command)
+    if essential is None or settings is None:
+        return set()
+    return {field.name for field in dataclasses.fields(settings)} - set(essential)
+
+
+def _settings_class(command: type) -> type | None:
+    hint = get_type_hints(command).get("settings")
+    return hint if inspect.isclass(hint) and dataclasses.is_dataclass(hint) else None
+
+
+def _print_help(command: type, program: str, hidden: set[str]) -> None:
+    """Print a help page without the given settings and end the program."""
+    print(_description(command), end="\n\n")
+    try:
+        tyro.cli(
+            _help_page(command, hidden, getattr(command, "defaults", {})),
+            prog=program,
+            description="",  # tyro would reflow it
+            args=["--help"],
+            config=(tyro.conf.FlagCreatePairsOff,),
+            registry=REGISTRY,
+        )
+    finally:
+        if hidden - set(getattr(command, "unused", ())):
+            print(f"More options: {program} {HELP_ALL}")
+
+
+def _description(command: type) -> str:
+    """What a docstring states before its arguments, wrapped; indented blocks stay as they are."""
+    width = min(shutil.get_terminal_size().columns, 80)
+    blocks = (inspect.getdoc(command) or "").split("\nArgs:")[0].strip().split("\n\n")
+    return "\n\n".join(block if block.startswith(" ") else textwrap.fill(block, width) for block in blocks)
+
+
+def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
+    """A dataclass of the same name for help only: fields suppressed, placeholders and defaults in words."""
+    hints = get_type_hints(kind, include_extras=True)
+    fields = []
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
+        default: Any = field.default
+        factory: Any = field.default_factory
+        if field.name == "settings" and factory is not dataclasses.MISSING:
+            example = factory()
+            page = _help_page(type(example), hidden, _SETTINGS_DEFAULTS)
+            values = {part.name: getattr(example, part.name) for part in dataclasses.fields(example)}
+            hint = Annotated[page, tyro.conf.arg(name="")]  # as `options.Settings`
+            factory = _maker(page, values)
+        elif get_origin(hint) is not Annotated:
+            hint = Annotated[hint, _in_words(field.name, default, defaults)]
+        if field.name in hidden:
+            hint = Annotated[hint, tyro.conf.Suppress]
+        fields.append((field.name, hint, dataclasses.field(default=default, default_factory=factory)))
+    frozen = kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
+    page = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=frozen)
+    page.__doc__ = re.sub(
+        r"\n {8,}", " ", (inspect.getdoc(kind) or "").replace("`", "")
+    )  # an entry is one line
+    return page
+
+
+def _maker(page: type, values: dict[str, Any]) -> Any:
+    return lambda: page(**values)
+
+
+def _in_words(name: str, default: Any, defaults: dict[str, str]) -> Any:
+    hint = None
+    if default is None or default == ():
+        hint = f"(default: {defaults.get(name, 'none')})"
+    elif default is False or default is True:
+        hint = ""
+    return tyro.conf.arg(metavar=_PLACEHOLDERS.get(name), help_behavior_hint=hint)
+
+
+@REGISTRY.primitive_rule
+def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Numbers, refused in plain words."""
+    kind = info.type
+    if kind not in (int, float):
+        return None
+    expected = "a whole number" if kind is int else "a number"
+
+    def read(words: list[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"expected {expected}, found {words[0]!r}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, (int, float)),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+@REGISTRY.primitive_rule
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """``FLOAT`` in place of ``{None}|FLOAT``; the word None stays accepted."""
+    options = get_args(info.type)
+    if (
+        get_origin(info.type) not in (Union, types.UnionType)
+        or len(options) != 2
+        or type(None) not in options
+    ):
+        return None
+    inner = _spec(next(option for option in options if option is not type(None)), info)
+    if inner is None:
+        return None
+    spec = inner
+    return dataclasses.replace(
+        spec,
+        choices=None if spec.choices is None else (*spec.choices, "None"),
+        instance_from_str=lambda words: None if words == ["None"] else spec.instance_from_str(words),
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: ["none"] if value is None else spec.str_from_instance(value),
+    )
+
+
+@REGISTRY.primitive_rule
+def _several(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """``STR ...`` in place of ``[STR [STR ...]]``, "none" in place of nothing."""
+    arguments = get_args(info.type)
+    if get_origin(info.type) is not tuple or len(arguments) != 2 or arguments[1] is not Ellipsis:
+        return None
+    spec = _spec(arguments[0], info)
+    if spec is None or spec.nargs != 1:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=f"{spec.metavar} ...",
+        instance_from_str=lambda words: tuple(spec.instance_from_str([word]) for word in words),
+        is_instance=lambda values: isinstance(values, tuple) and all(map(spec.is_instance, values)),
+        str_from_instance=lambda values: [w for v in values for w in spec.str_from_instance(v)] or ["none"],
+        choices=spec.choices,
+    )
+
+
+def _spec(kind: Any, info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, set(info.markers)))
+    return spec if isinstance(spec, PrimitiveConstructorSpec) else None

@@ -1,0 +1,113 @@
+"""``lexsplat build``: what it writes, what it keeps, what it makes anew, what it never replaces."""
+
+import json
+import os
+import shutil
+
+import pytest
+from conftest import QUICK_BUILD as QUICK
+from support.command_line import fails_in_one_line, modified
+
+from lexsplat import cli, open_scene
+from lexsplat.features import hub
+
+pytestmark = pytest.mark.xdist_group("built")
+
+
+def test_build_writes_the_scene_folder_of_the_design(built):
+    names = {p.name for p in built.iterdir()}
+    assert {"scene.json", "cameras.json", "gaussians.ply", "language.safetensors"} <= names
+    record = json.loads((built / "scene.json").read_text())
+    assert list(record["stages"]) == ["reconstruct", "features", "language"]
+    assert record["stages"]["language"]["codes"] == 16
+    views = json.loads((built / "cameras.json").read_text())["views"]
+    held_out = [v["name"] for v in views if v["split"] == "test"]
+    assert held_out == ["view_02.png", "view_06.png", "view_10.png"], "views with masks are held out"
+    assert not list((built / "checkpoints" / "features").glob("*.dino.*")), "averaged features need no DINO"
+
+
+def test_a_method_that_uses_code_maps_writes_them(built, tiny_capture, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(built, copy)
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "trained"]) == 0
+    record = json.loads((copy / "scene.json").read_text())
+    assert set(record["stages"]) == {"reconstruct", "features", "codebook", "language"}
+    assert list((copy / "checkpoints" / "features").glob("*.dino.*"))
+    codes = {p.stem for p in (copy / "codes").iterdir()}
+    assert codes.isdisjoint({"view_02", "view_06", "view_10"}), "held-out views take no part in the codebook"
+    assert len(codes) == 9
+
+
+def test_building_again_changes_no_result(built, tiny_capture):
+    before = modified(built)
+    assert cli.main(["build", str(tiny_capture), "--output", str(built), *QUICK]) == 0
+    after = modified(built)
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed <= {"scene.json", "cameras.json", ".lock"}
+
+
+def test_a_changed_setting_reruns_only_the_stages_that_depend_on_it(built, tiny_capture, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(built, copy)
+    before = modified(copy)
+    # Features are averaged: no other way to the language, nor how much is kept in memory, has a part in it.
+    idle = ["--trained.no-use-smoothing", "--features.dino-stride", "9"]
+    idle += ["--features.random-crops", "7", "--memory", "3GB"]
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, *idle]) == 0
+    after = modified(copy)
+    assert {name for name in before if after[name] != before[name]} <= {"scene.json", "cameras.json", ".lock"}
+    arguments = [*QUICK, "--averaged.top", "3"]
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *arguments]) == 0
+    after = modified(copy)
+    assert after["language.safetensors"] != before["language.safetensors"]
+    for kept in before:
+        if kept.startswith("checkpoints/features/") or kept == "gaussians.ply":
+            assert after[kept] == before[kept], kept
+
+
+def test_other_bundled_encoders_make_new_features(built, tiny_capture, tmp_path, monkeypatch, capsys):
+    # As after an update of lexsplat: the scene was built with the encoders of the version before.
+    copy, encoders = tmp_path / "copy", tmp_path / "encoders"
+    shutil.copytree(built, copy)
+    shutil.copytree(hub.BUNDLED_ENCODERS, encoders)
+    monkeypatch.setattr(hub, "BUNDLED_ENCODERS", encoders)
+    config = json.loads((encoders / "clip" / "config.json").read_text())
+    (encoders / "clip" / "config.json").write_text(json.dumps(config | {"logit_scale_init_value": 2.5}))
+    before = modified(copy)
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK]) == 0
+    after = modified(copy)
+    assert after["language.safetensors"] != before["language.safetensors"]
+    assert after["gaussians.ply"] == before["gaussians.ply"]
+    assert cli.main(["query", str(copy), "red ball", "--json"]) == 0
+
+
+def test_a_trained_language_makes_a_scene_that_answers(built, tiny_capture, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(built, copy)
+    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "trained"]) == 0
+    scene = open_scene(copy, device="cpu")
+    assert scene.field.method == "trained"
+    relevancy = scene.relevancy(["red apple"], "view_02")
+    assert relevancy.shape == (1, 72, 96)
+    assert float(relevancy.max()) > float(relevancy.min())
+
+
+@pytest.mark.parametrize("name", ["gaussians.ply", "cameras.json"])
+def test_a_build_never_replaces_files_of_another_program(tiny_capture, tmp_path, capsys, name):
+    """The folder of a 3DGS training has a cameras.json, too."""
+    output = tmp_path / "output"
+    output.mkdir()
+    (output / name).write_text("mine")
+    arguments = ["build", str(tiny_capture), "--output", str(output), *QUICK]
+    fails_in_one_line(capsys, arguments, name, "another --output")
+    assert [path.name for path in output.iterdir()] == [name]
+    assert (output / name).read_text() == "mine"
+
+
+def test_a_second_process_on_one_output_folder_is_refused(tiny_capture, tmp_path, capsys):
+    from lexsplat.scenes.folder import SceneFolder
+
+    with SceneFolder(tmp_path / "out").locked():
+        for arguments in (["poses", str(tiny_capture / "images")], ["build", str(tiny_capture), *QUICK]):
+            arguments += ["--output", str(tmp_path / "out")]
+            fails_in_one_line(capsys, arguments, f"process {os.getpid()} at work", "another --output")

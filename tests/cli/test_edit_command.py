@@ -1,0 +1,160 @@
+"""``lexsplat edit``: steps by words, undone, saved and discarded."""
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.command_line import Terminal, fails_in_one_line, modified
+
+from lexsplat import cli, open_scene
+from lexsplat.scenes.folder import BUNDLED_SCENE
+
+pytestmark = pytest.mark.xdist_group("built")
+
+
+def without_texts(times):
+    """Without the cache of texts, which every question may add to."""
+    return {name: time for name, time in times.items() if not name.startswith("checkpoints/texts/")}
+
+
+def test_an_edit_is_undone_redone_and_saved_and_the_new_scene_answers(built, tiny_capture, tmp_path, capsys):
+    copy, saved = tmp_path / "copy", tmp_path / "saved"
+    shutil.copytree(built, copy)
+    before = without_texts(modified(copy))
+    original = open_scene(built, device="cpu")
+    answering = original.scores(["blue ball"])[0] >= 0.13
+    rest = ~original.find("blue ball", threshold=0.13).mask  # without the strays that belong to no thing
+    assert 20 < int((~rest).sum()) < len(rest) / 2
+    strays = int((answering & rest).sum())
+    assert strays < 0.3 * int(answering.sum())
+    everything = f"{len(rest):,} Gaussians"
+
+    def edit(*arguments: str) -> str:
+        capsys.readouterr()
+        assert cli.main(["edit", str(copy), *arguments]) == 0
+        return capsys.readouterr().out.splitlines()[-1]
+
+    less = f"{int(rest.sum()):,} Gaussians"
+    assert edit("delete", "--select", "blue ball", "--threshold", "0.13") == f"{less}, 0 steps undone"
+    assert edit("undo") == f"{everything}, 1 steps undone"
+    assert edit("redo") == f"{less}, 0 steps undone"
+    edit("save", "--output", str(saved))
+    assert edit("discard", "--yes") == f"{everything}, 0 steps undone"
+    assert without_texts(modified(copy)) == before, "the scene itself stays as it was built"
+
+    arguments = [
+        "query",
+        str(saved),
+        "red apple",
+        "blue ball",
+        "--view",
+        "view_06.png",
+        "--threshold",
+        "0.13",
+        "--json",
+    ]
+    assert cli.main([*arguments, "--output", str(tmp_path / "answers")]) == 0
+    apple, ball = json.loads(capsys.readouterr().out)["prompts"]
+    assert ball["gaussians"] == strays
+    column, row = apple["views"]["view_06.png"]["peak_pixel"]
+    ground_truth = tiny_capture / "segmentations" / "view_06"
+    assert np.asarray(Image.open(ground_truth / "red apple.png"))[row, column], (
+        "the apple is still found where it is"
+    )
+    reopened = open_scene(saved, device="cpu")
+    assert np.array_equal(reopened.gaussians.means, original.gaussians.means[rest])
+    there = np.asarray(Image.open(ground_truth / "blue ball.png")) > 0
+    with_ball, without = (
+        s.relevancy(["blue ball"], "view_06.png")[0].numpy()[there].mean() for s in (original, reopened)
+    )
+    assert without < 0.67 * with_ball, "what stood behind answers less"
+
+
+def test_the_journal_holds_the_motions_of_the_command_line(built, tmp_path, capsys):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    thing = ("--select", "blue ball", "--threshold", "0.13", "--largest")
+    motion = ("--by", "0.5", "0", "0.25", "--turn", "90", "--scale", "1.5")
+    assert cli.main(["edit", str(copy), "move", *thing, *motion]) == 0
+    assert cli.main(["edit", str(copy), "duplicate", *thing, "--by", "0", "0", "1"]) == 0
+    _, moved, copied = map(json.loads, (copy / "edits.jsonl").read_text().splitlines())
+    assert moved["step"] == "move"
+    assert moved["translation"] == [0.5, 0.0, 0.25]
+    assert moved["scale"] == 1.5
+    turn = np.array(moved["rotation"])
+    assert np.trace(turn) == pytest.approx(1)  # 1 + 2 cos 90 degrees
+    assert copied["step"] == "duplicate"
+    assert copied["translation"] == [0.0, 0.0, 1.0]
+    assert np.array(copied["rotation"]) == pytest.approx(np.eye(3))
+    assert "2. duplicate blue ball" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["move", "--select", "red apple"], "move needs --by, --turn or --scale"),
+        (["duplicate", "--select", "red apple"], "duplicate needs --by, --turn or --scale"),
+        (["move", "--select", "red apple", "--scale", "-1"], "scale must be positive"),
+        (["move", "--select", "red apple", "--by", "nan", "0", "0"], "finite"),
+        (["recolor", "--select", "red apple", "--color", "2", "0", "0"], "in 0..1"),
+        (["recolor", "--select", "red apple", "--color", "1", "0", "0", "--strength", "3"], "in 0..1"),
+        (["delete", "--select", "red apple", "--threshold", "3"], "in 0..1"),
+        (["delete", "--select", "red apple", "--grow", "-1"], "not be negative"),
+    ],
+)
+def test_invalid_edits_are_wrong_usage(built, arguments, words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["edit", str(built), *arguments])
+    assert ended.value.code == 2
+    assert words in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert not (built / "edits.jsonl").exists()
+
+
+def test_an_edit_that_selects_nothing_states_a_remedy(built, capsys):
+    assert cli.main(["edit", str(built), "delete", "--select", "red apple", "--threshold", "1"]) == 1
+    assert "found nothing; try other words or a lower threshold" in capsys.readouterr().err
+
+
+def test_an_edit_with_an_invalid_result_ends_in_one_line_and_adds_no_step(built, tmp_path, capsys):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    thing = ("--select", "blue ball", "--threshold", "0.13", "--largest")
+    for motion in (["--by", "1e300", "0", "0"], ["--scale", "1e30"]):
+        fails_in_one_line(capsys, ["edit", str(copy), "move", *thing, *motion], "move", "Gaussians")
+    assert cli.main(["edit", str(copy), "list"]) == 0
+    assert not (copy / "edits.jsonl").exists()
+
+
+def test_edits_of_the_bundled_scene_are_kept_in_the_working_directory(tmp_path, monkeypatch, capsys):
+    before = {path: path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")}
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["edit", "demo", "delete", "--select", "red apple"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["demo_edits.jsonl"]
+    less = capsys.readouterr().out.splitlines()[-1]
+    assert cli.main(["edit", "demo", "list"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == less
+    assert cli.main(["edit", "demo", "save", "--output", "mine"]) == 0
+    assert "demo_edits.jsonl" in capsys.readouterr().out, "the steps are kept"
+    assert len(open_scene("mine").gaussians) < len(open_scene("demo").gaussians)
+    assert cli.main(["edit", "demo", "discard", "--yes"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert {path: path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")} == before
+
+
+def test_discard_asks_before_it_deletes_steps(built, tmp_path, monkeypatch, capsys):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    discard = ["edit", str(copy), "discard"]
+    assert cli.main(discard) == 0, "nothing to discard"
+    assert cli.main(["edit", str(copy), "delete", "--select", "blue ball", "--threshold", "0.13"]) == 0
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))  # not a terminal
+    fails_in_one_line(capsys, discard, "--yes")
+    monkeypatch.setattr("sys.stdin", Terminal("n\n"))
+    fails_in_one_line(capsys, discard, "--yes")
+    assert (copy / "edits.jsonl").exists()
+    monkeypatch.setattr("sys.stdin", Terminal("y\n"))
+    assert cli.main(discard) == 0
+    assert not (copy / "edits.jsonl").exists()

@@ -1,0 +1,44 @@
+"""``lexsplat export``: which files it writes and which it never replaces."""
+
+import shutil
+
+import pytest
+from support.command_line import Terminal, fails_in_one_line
+
+from lexsplat import cli
+
+pytestmark = pytest.mark.xdist_group("built")
+
+
+def test_export_writes_the_standard_ply(built, tmp_path):
+    assert cli.main(["export", str(built), str(tmp_path / "a.ply")]) == 0
+    assert (tmp_path / "a.ply").read_bytes() == (built / "gaussians.ply").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["gaussians.ply", "codes/../gaussians.ply", "metrics.json", "scene.json"])
+def test_an_export_never_replaces_a_file_of_its_scene(built, tmp_path, capsys, name):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    before = (copy / "gaussians.ply").read_bytes()
+    fails_in_one_line(
+        capsys, ["export", str(copy), str(copy / name), "--select", "blue ball"], "another name"
+    )
+    assert (copy / "gaussians.ply").read_bytes() == before
+    assert cli.main(["export", str(copy), str(copy / "copy.ply")]) == 0
+
+
+def test_an_export_asks_before_it_replaces_a_file(built, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "mine.ply"
+    file.write_text("mine")
+    command = ["export", str(built), str(file)]
+    fails_in_one_line(capsys, command, "mine.ply", "--force")  # pytest gives no terminal
+    monkeypatch.setattr("sys.stdin", Terminal("\n"))
+    fails_in_one_line(capsys, command, "mine.ply", "--force")
+    assert file.read_text() == "mine"
+    monkeypatch.setattr("sys.stdin", Terminal("yes\n"))
+    assert cli.main(command) == 0
+    assert file.read_bytes() == (built / "gaussians.ply").read_bytes()
+    file.write_text("mine")
+    monkeypatch.setattr("sys.stdin", Terminal("n\n"))
+    assert cli.main([*command, "--force"]) == 0
+    assert file.read_bytes() == (built / "gaussians.ply").read_bytes()

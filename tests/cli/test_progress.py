@@ -1,0 +1,53 @@
+"""Progress on standard error: rate and time left, in bars and in lines."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from lexsplat.cli import progress
+from lexsplat.cli.progress import ProgressBars, format_rate, format_seconds
+from lexsplat.runtime.progress import Event
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_lines_state_rate_and_time_left(clock, capsys):
+    with ProgressBars() as bars:
+        bars(Event("reconstruct", 1000, 3000))  # continued from a checkpoint
+        for done in range(1100, 3001, 100):
+            clock[0] += 10
+            bars(Event("reconstruct", done, 3000, {"psnr": 21.5}))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "reconstruct: 1000/3000"
+    assert lines[1] == "reconstruct: 1200/3000 10.0/s, 3:00 left psnr 21.5"
+    assert lines[-1] == "reconstruct: 3000/3000 10.0/s psnr 21.5"
+    assert len(lines) == 11
+
+
+def test_stages_that_are_kept_are_one_line(clock, capsys):
+    with ProgressBars() as bars:
+        bars(Event("features", 9, 9, {"kept": 1.0}))
+    assert capsys.readouterr().err == "features: 9/9 kept from the last run\n"
+
+
+def test_bars_in_a_terminal_state_rate_and_time_left(monkeypatch):
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
+    )
+    with ProgressBars() as bars:
+        for done in range(1, 4):
+            bars(Event("reconstruct", done, 100, {"psnr": 20.0}))
+    assert "3/100" in screen.getvalue()
+    assert "psnr 20" in screen.getvalue()
+
+
+def test_rates_and_durations_in_words():
+    assert [format_rate(rate) for rate in (None, 0.0, 12.34, 0.25)] == ["", "", "12.3/s", "4.0 s each"]
+    assert [format_seconds(seconds) for seconds in (5, 65, 3723.4)] == ["0:05", "1:05", "1:02:03"]

@@ -1,0 +1,75 @@
+"""``lexsplat query`` and ``lexsplat find``: answers for people and as JSON."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.command_line import fails_in_one_line
+
+from lexsplat import cli, open_scene
+
+pytestmark = pytest.mark.xdist_group("built")
+
+
+def test_query_writes_images_and_json(built, tmp_path, capsys):
+    arguments = ["query", str(built), "red apple", "blue ball", "--view", "view_02.png", "--json"]
+    assert cli.main([*arguments, "--output", str(tmp_path)]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert [p["prompt"] for p in answer["prompts"]] == ["red apple", "blue ball"]
+    for prompt in answer["prompts"]:
+        view = prompt["views"]["view_02.png"]
+        heatmap, mask = Image.open(view["heatmap"]), np.array(Image.open(view["mask"]))
+        assert heatmap.size == (96, 72)
+        assert set(np.unique(mask)) <= {0, 255}
+        assert view["mask_share"] == pytest.approx((mask > 0).mean(), abs=1e-4)
+        assert 0 <= prompt["threshold"] <= 1
+
+
+def test_query_without_pictures_writes_no_file(built, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = [
+        "query",
+        str(built),
+        "red apple",
+        "--view",
+        "view_02.png",
+        "--output",
+        "images",
+        "--no-pictures",
+    ]
+    assert cli.main([*arguments, "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)["prompts"][0]["views"]["view_02.png"]) == {
+        "peak", "peak_pixel", "mask_share",
+    }  # fmt: skip
+    assert cli.main(arguments) == 0
+    assert "images" not in capsys.readouterr().out
+    assert not (tmp_path / "images").exists()
+
+
+def test_find_prints_positions_in_3d(built, capsys):
+    assert cli.main(["find", str(built), "red apple", "red apple left of the blue ball", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    scene = open_scene(built)
+    first, second = answer["phrases"]
+    assert answer["up"]["direction"] == pytest.approx([0, 0, 1], abs=1e-3), (
+        "the cameras of the capture are level"
+    )
+    assert first["count"] == len(first["instances"]) == len(scene.select("red apple").instances)
+    centers = [instance.center.tolist() for instance in scene.select("red apple").instances]
+    assert np.allclose([found["center"] for found in first["instances"]], centers, atol=1e-4)
+    assert second["understood"] == '("red apple" left of "blue ball")'
+    assert first["present"] in ("yes", "no", "unsure")
+    assert cli.main(["find", str(built), "red apple"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{first['count']} found" in printed
+    assert f"understood as {first['understood']}" in printed
+    assert cli.main(["find", str(built), "on the table"]) == 1
+
+
+def test_an_empty_prompt_is_refused(built, capsys):
+    fails_in_one_line(capsys, ["query", str(built), "  "], "prompt")
+
+
+def test_an_unknown_view_is_refused_with_the_names_of_views(built, capsys):
+    fails_in_one_line(capsys, ["query", str(built), "x", "--view", "nowhere"], "nowhere", "view_01.png")

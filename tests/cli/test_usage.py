@@ -1,0 +1,245 @@
+"""Help pages, wrong usage, Ctrl-C and closed pipes of the command line."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+
+from lexsplat import cli
+from lexsplat.cli.arguments import parse
+from lexsplat.cli.build import Reconstruct
+from lexsplat.cli.captures import capture_and_settings
+from lexsplat.cli.edit import Edit
+from lexsplat.cli.values import parse_length
+from lexsplat.pipeline.config import BuildConfig
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["build"],
+        ["build", "x", "--output", "y", "--memory", "plenty"],
+        ["build", "x", "--output", "y", "--downscale", "-1"],
+        ["build", "x", "--output", "y", "--iterations", "0"],
+        ["build", "x", "--output", "y", "--reconstruction.iterations", "5"],
+        ["build", "x", "--output", "y", "--features.memory", "5"],
+        ["build", "x", "--output", "y", "--test-every", "1"],
+        ["build", "x", "--output", "y", "--codebook.num-codes", "300"],
+        ["query", "x", "apple", "--threshold", "nan"],
+        ["query", "x", "apple", "--template", "no braces"],
+        ["query", "x", "apple", "--temperature", "-1"],
+        ["build", "x", "--output", "y", "--seed", "-1"],
+        ["build", "x", "--output", "y", "--seed", str(2**70)],
+        ["build", "x", "--output", "y", "--reconstruction.max-gaussians", "0"],
+        ["language", "x", "--output", "y", "--splats", "z.ply", "--joint", "--method", "trained"],
+        ["poses", "x", "--output", "y", "--memory", "plenty"],
+        ["poses", "x", "--output", "y", "--seed", "-1"],
+        ["demo", "--iterations", "0"],
+        ["demo", "--seed", "-1"],
+        ["compare", "x", "--output", "y", "--seeds", "-1"],
+        ["edit", "x", "delete", "--select", "a", "--threshold", "nan"],
+        ["edit", "x", "delete", "--select", "a", "--grow", "-1"],
+        ["edit", "x", "delete", "--select", "a", "--shrink", "inf"],
+        ["edit", "x", "move", "--select", "a", "--by", "nan", "0", "0"],
+        ["edit", "x", "move", "--select", "a", "--turn", "inf"],
+        ["edit", "x", "move", "--select", "a", "--scale", "0"],
+        ["edit", "x", "recolor", "--select", "a", "--color", "255", "0", "0"],
+        ["edit", "x", "recolor", "--select", "a", "--color", "1", "0", "0", "--strength", "2"],
+        ["export", "x", "a.ply", "--select", "a", "--threshold", "nan"],
+        ["edit", "x", "recolor", "--select", "a", "--color", "#ff88"],
+        ["edit", "x", "recolor", "--select", "a", "--color", "reddish"],
+        ["scale", "x", "--up", "0,0,0"],
+        ["scale", "x", "--distance", "9.5qm", "--height-of", "a"],
+        ["scale", "x", "--distance", "-1cm", "--height-of", "a"],
+        ["query", "x"],
+        ["find", "x"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_has_status_2_and_no_traceback(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main(arguments)
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+STOPPED = "stopped; run the same command again to go on\n"
+
+
+def test_ctrl_c_during_parsing_ends_in_one_line(monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tyro, "cli", interrupted)
+    assert cli.main(["info", "demo"]) == 130
+    assert capsys.readouterr().err == STOPPED
+
+
+def test_ctrl_c_during_imports_ends_in_one_line():
+    interrupting = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background is started with it ignored
+from lexsplat.__main__ import main
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+sys.argv = ["lexsplat", "info", "demo"]
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", interrupting], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, STOPPED)
+
+
+def test_version_is_printed(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("lexsplat 0.")
+
+
+def test_the_package_runs_as_a_module_too():
+    answer = subprocess.run([sys.executable, "-m", "lexsplat", "--version"], capture_output=True, text=True)
+    assert (answer.returncode, answer.stdout.split()[0]) == (0, "lexsplat")
+
+
+@pytest.mark.parametrize("arguments", [("build", "--help"), ("info", "demo")])
+def test_a_closed_pipe_ends_a_command_quietly(arguments):
+    command = [sys.executable, "-m", "lexsplat", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()  # as `| head` does, before the first line
+        error = process.stderr.read()
+    assert "Traceback" not in error
+    assert "Broken pipe" not in error
+    assert process.returncode == 0
+
+
+def run_elsewhere(arguments: list[str]) -> subprocess.CompletedProcess:
+    """A command in a process of its own, which prints the loaded modules at its end."""
+    code = (
+        "import sys\n"
+        "from lexsplat.__main__ import main\n"
+        f"sys.argv = {['lexsplat', *arguments]!r}\n"
+        "try: status = main()\n"
+        "except SystemExit as ended: status = ended.code\n"
+        "print('LOADED', *(m for m in ('torch', 'numpy', 'tyro') if m in sys.modules))\n"
+        "sys.exit(status)"
+    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"), [(["--version"], 0), (["--help"], 0), ([], 2), (["querry"], 2), (["--seed"], 2)]
+)
+def test_what_needs_no_command_loads_no_libraries(arguments, status):
+    done = run_elsewhere(arguments)
+    assert done.returncode == status
+    assert done.stdout.splitlines()[-1] == "LOADED"
+
+
+def test_a_mistyped_command_gets_a_suggestion(capsys):
+    for word, hint in (
+        ("querry", "did you mean query?"),
+        ("embedd", "did you mean embed?"),
+        ("xyz", "--help"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            cli.main([word])
+        assert ended.value.code == 2
+        assert hint in capsys.readouterr().err
+
+
+def test_the_overview_lists_every_command(capsys):
+    assert cli.main(["--help"]) == 0
+    page = capsys.readouterr().out
+    for name, entry in cli.COMMANDS.items():
+        assert f"  {name} " in page
+        assert entry.summary in page
+
+
+def help_page(capsys, *arguments: str) -> str:
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*arguments])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def options_of(page: str) -> set[str]:
+    return {
+        word
+        for line in page.splitlines()
+        if line.startswith("│ -")
+        for word in re.findall(r"--[\w.-]+", line)
+    }
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_pages_have_words_for_placeholders_and_defaults(command, capsys):
+    page = help_page(capsys, command, "--help")
+    positionals = page.split("─ options")[0]
+    assert "STR" not in positionals
+    assert "(default: )" not in page
+    assert "None" not in page
+    assert "`" not in page
+    assert len(options_of(page)) <= 30
+
+
+@pytest.mark.parametrize("command", ["build", "reconstruct", "language", "compare", "ablate"])
+def test_help_shows_what_people_use_and_help_all_the_rest(command, capsys):
+    short = help_page(capsys, command, "--help")
+    assert {"--output", "--device", "--iterations", "--downscale", "--seed", "--memory"} <= options_of(short)
+    assert f"lexsplat {command} --help-all" in short
+    whole = options_of(help_page(capsys, command, "--help-all"))
+    assert options_of(short) < whole
+    assert "--reconstruction.max-gaussians" in whole - options_of(short)
+    assert ("--codebook.num-codes" in whole) == (command != "reconstruct")
+    assert ("--clip" in whole) == (command != "reconstruct")
+
+
+def test_the_help_page_that_an_error_names_is_that_of_the_command(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["query", "x", "apple", "--threshold", "abc"])
+    error = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "expected a number, found 'abc'" in error
+    assert "lexsplat query --help" in error
+
+
+def test_reconstruct_accepts_the_options_of_build():
+    words = ["x", "--output", "y", "--clip", "bundled", "--codebook.num-codes", "16"]
+    assert parse(Reconstruct, "reconstruct", words).settings.codebook.num_codes == 16
+
+
+def test_other_spellings_are_accepted():
+    words = ["x", "recolour", "--select", "a", "--colour", "#ff8000"]
+    edit = parse(Edit, "edit", words)
+    assert edit.action == "recolor"
+    assert edit.color == pytest.approx((1, 128 / 255, 0))
+    assert parse(Edit, "edit", [*words[:-1], "orange"]).color == pytest.approx((1, 165 / 255, 0))
+    assert parse(Edit, "edit", [*words[:-1], "1", "0.5", "0"]).color == (1, 0.5, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "meters"),
+    [("9.5cm", 0.095), ("0.095", 0.095), ("95 mm", 0.095), ("2ft", 0.6096), ("1e-1m", 0.1)],
+)
+def test_lengths_have_units(text, meters):
+    assert parse_length(text) == pytest.approx(meters)
+
+
+def test_a_folder_that_hides_a_bundled_scene_is_noted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["info", "demo"]) == 0
+    assert capsys.readouterr().err == ""
+    (tmp_path / "demo").mkdir()
+    assert cli.main(["info", "demo"]) == 1
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[0]
+        .startswith("note: demo is the folder in the working directory")
+    )
+    assert capture_and_settings("demo", BuildConfig()) == (Path("demo"), BuildConfig())
+    assert "note: demo" in capsys.readouterr().err
