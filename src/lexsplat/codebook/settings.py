@@ -48,7 +48,7 @@ class CodebookConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.num_codes <= MAX_CODES:
             raise ValueError(
-                f"num_codes must be 1 to {MAX_CODES} because an index map has one byte a pixel, "
+                f"num_codes must be 1 to {MAX_CODES} because an index map holds one byte a pixel, "
                 f"got {self.num_codes}"
             )
         if self.init not in ("kmeans", "uniform"):
