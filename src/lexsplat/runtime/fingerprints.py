@@ -1,4 +1,4 @@
-"""Hashes that tell whether something has changed since a result was made from it."""
+"""Hashes that detect whether the inputs of a result have changed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from lexsplat.runtime.files import to_json
 
 
 def fingerprint(*parts: Any) -> str:
-    """A short hash of JSON-like values and dataclasses: equal for equal content, in every process."""
+    """A short hash of JSON-like values and dataclasses; equal content has equal hashes in every process."""
     text = json.dumps([to_json(part) for part in parts], sort_keys=True, ensure_ascii=False)
     return hashlib.blake2b(text.encode("utf-8"), digest_size=12).hexdigest()
 
 
 def file_hash(path: Path) -> str:
-    """Of the content."""
+    """Hash of the content of a file."""
     digest = hashlib.blake2b(digest_size=12)
     with open(path, "rb") as file:
         while block := file.read(1 << 20):
