@@ -1,6 +1,6 @@
 """The photometric loss and its gradient in three sweeps over the rows of an image (Numba, CPU).
 
-Images are ``[H, W3]`` with ``W3 = 3 W``: the colors are interleaved, so a horizontal tap is a shift by three and every
+Images are ``[H, W3]`` with ``W3 = 3 W``: the colors are interleaved, so a horizontal tap is a shift by 3 and every
 inner loop runs over contiguous memory. This module is separate from `image_losses` so that Numba is imported only
 when a loss is computed on a CPU.
 """
