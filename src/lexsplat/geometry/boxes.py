@@ -1,7 +1,7 @@
-"""Which way is up, and upright oriented boxes around points.
+"""The up direction, and upright oriented boxes around points.
 
-A box stands upright: one of its axes is gravity's, the other two are turned so that its footprint is smallest.
-Things in a room stand upright, and such a box is stable where a free one would tumble between views of a ball.
+One axis of a box is vertical; the other two are rotated to the smallest footprint. Objects in a room stand upright,
+and an upright box is stable for round objects, whose free box would have a random orientation.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from lexsplat.geometry.cameras import Camera
 
 _ANGLES = np.radians(np.arange(0.0, 90.0, 2.0))
-_SAMPLE = 4096  # points that decide how a box is turned
+_SAMPLE = 4096  # points that determine the rotation of a box
 
 
 class Box(NamedTuple):
     """An oriented box.
 
     Args:
-        center: Its middle ``[3]``, world units.
-        axes: Its directions as rows ``[3, 3]``, of unit length, right-handed; the last one points up.
+        center: Center ``[3]``, world units.
+        axes: Axes as rows ``[3, 3]``, of unit length, right-handed; the last one points up.
         half_sizes: Half of its extent along each of the axes ``[3]``, world units.
     """
 
@@ -40,11 +40,11 @@ class Box(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Its volume in cubed world units."""
+        """Volume in cubic world units."""
         return float(np.prod(2 * self.half_sizes))
 
     def contains(self, points: NDArray, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which points ``[M, 3]`` lie in it, or at most ``margin`` outside along an axis."""
+        """Which points ``[M, 3]`` are inside, or at most ``margin`` outside along each axis."""
         local = np.abs((np.asarray(points) - self.center) @ self.axes.T)
         return np.asarray((local <= self.half_sizes + margin).all(-1))
 
@@ -55,7 +55,7 @@ class Up:
 
     Args:
         direction: World direction ``[3]`` of unit length.
-        reliable: Whether the cameras say so with one voice; photos held at odd angles do not.
+        reliable: Whether the cameras agree; photos taken at odd angles do not.
     """
 
     direction: NDArray[np.float64]
@@ -63,11 +63,11 @@ class Up:
 
 
 def gravity_up(cameras: Iterable[Camera]) -> Up:
-    """Up from how the photos were held.
+    """Estimate the up direction from the camera poses.
 
-    People hold cameras level: their x axes lie in the horizontal plane, whatever the pitch. Up is therefore the
-    direction that is least along all x axes; where all cameras stand side by side and look the same way (their
-    x axes agree, so that a whole plane of directions would do) it is the mean of the images' up directions.
+    People hold cameras level: the x axes are horizontal, whatever the pitch. Up is therefore the direction most
+    orthogonal to all x axes. If all cameras look the same way, their x axes agree and leave a plane of directions;
+    then up is the mean of the images' up directions.
 
     Raises:
         ValueError: If there is no camera.
@@ -88,12 +88,12 @@ def gravity_up(cameras: Iterable[Camera]) -> Up:
 
 
 def fit_box(points: NDArray, up: NDArray, weights: NDArray | None = None, *, trim: float = 0.01) -> Box:
-    """The upright box with the smallest footprint that holds all but the outermost points.
+    """The upright box with the smallest footprint around all but the outermost points.
 
     Args:
         points: ``[M, 3]``, M > 0, world units.
         up: World direction of one axis ``[3]``.
-        weights: How much each point counts ``[M]``; all the same when left out.
+        weights: Weight of each point ``[M]``; default is equal weights.
         trim: Share of the weight that may lie beyond each end of each axis, in 0..0.5.
 
     Raises:
@@ -112,7 +112,7 @@ def fit_box(points: NDArray, up: NDArray, weights: NDArray | None = None, *, tri
         low, high = _ends(plane @ _turn(angle).T, flat_shares, trim)
         areas.append(float(np.prod(high - low)))
     smallest = min(areas)
-    # A ball has no direction: the first angle that is nearly as good keeps its box from spinning.
+    # Round objects have no best angle; the first nearly optimal one keeps the box stable.
     angle = next(a for a, area in zip(_ANGLES, areas) if area <= smallest * 1.02 + 1e-12)
     turn = _turn(angle)
     axes = np.stack([*(turn @ np.stack([first, second])), upwards])

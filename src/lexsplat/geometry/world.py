@@ -1,12 +1,12 @@
-"""What the numbers of a scene mean in the world: which way is up, and how long its unit is.
+"""The up direction and the scale of a scene.
 
-Photos alone leave both open. Up is estimated from how the cameras were held and can be given; a scene has a length in
-meters once one distance in it is known (``lexsplat scale``). Both are kept in ``scene.json`` as ``world``::
+Photos alone determine neither. Up is estimated from the camera poses and can be given; the scale is known once a
+distance in the scene has been given (``lexsplat scale``). Both are stored in ``scene.json`` as ``world``::
 
     {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "user"},
      "meters_per_unit": 0.41 | null, "poses": "..."}
 
-"poses" is a fingerprint of the cameras: what a user has said holds as long as they stay where they are.
+"poses" is a fingerprint of the camera poses; stored values are valid only for these poses.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class World:
 
     Args:
         up: The direction away from the ground.
-        source: Who says so: the cameras, or the user.
-        meters_per_unit: Meters that one world unit is long; None where nobody has said.
+        source: Origin of the up direction: the cameras, or the user.
+        meters_per_unit: Length of a world unit in meters; None if unknown.
 
     Raises:
         ValueError: If the scale is not positive and finite.
@@ -50,12 +50,12 @@ class World:
 
     @classmethod
     def of_cameras(cls, cameras: Iterable[Camera]) -> World:
-        """Up from how the photos were held (z where there are none), no scale."""
+        """Up estimated from the cameras (z if there are none), without scale."""
         cameras = list(cameras)
         return cls(gravity_up(cameras) if cameras else Up(np.array([0.0, 0.0, 1.0]), False))
 
     def with_up(self, direction: Iterable[float]) -> World:
-        """The same with another up, as the user says.
+        """The same world with an up direction given by the user.
 
         Raises:
             ValueError: If the direction is not three finite numbers, or all are 0.
@@ -67,11 +67,11 @@ class World:
         return replace(self, up=Up(vector / length, True), source="user")
 
     def meters(self, length: float) -> float | None:
-        """A length in world units in meters; None where the scale is not known."""
+        """A length in world units, in meters; None if the scale is unknown."""
         return None if self.meters_per_unit is None else float(length) * self.meters_per_unit
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for ``scene.json`` and for people's programs."""
+        """Plain data for ``scene.json`` and for JSON output."""
         direction = [round(float(v), 6) + 0.0 for v in self.up.direction]
         return {
             "up": {"direction": direction, "reliable": self.up.reliable, "from": self.source},
@@ -101,14 +101,14 @@ class World:
 
 
 def world_of(record: Mapping[str, Any], cameras: Mapping[str, Camera]) -> World:
-    """What is known of the world of a scene.
+    """Up and scale of a scene.
 
     Args:
         record: The content of its ``scene.json``.
-        cameras: Its cameras by name; they say what is up where nothing is stored for just these.
+        cameras: Its cameras by name; they determine up if nothing is stored for their poses.
 
     Raises:
-        SceneFolderError: If what is stored is damaged.
+        SceneFolderError: If the stored data are damaged.
     """
     stored = record.get("world")
     if isinstance(stored, Mapping) and stored.get("poses") == _poses_of(cameras):
@@ -117,7 +117,7 @@ def world_of(record: Mapping[str, Any], cameras: Mapping[str, Camera]) -> World:
 
 
 def stored_world(world: World, cameras: Mapping[str, Camera]) -> dict[str, Any]:
-    """What goes into ``scene.json`` under ``world``; `world_of` reads it."""
+    """The entry ``world`` of ``scene.json``; `world_of` reads it."""
     return {**world.to_json(), "poses": _poses_of(cameras)}
 
 

@@ -1,4 +1,4 @@
-"""The optimizers of the reconstruction: one Adam for each parameter, and their state as named tensors."""
+"""The optimizers of the reconstruction: one Adam per parameter, and its state as named tensors."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 
 
 class Adam(torch.optim.Adam):
-    """Adam with the epsilon of 3DGS, all its arithmetic in one pass over memory.
+    """Adam with the epsilon of 3DGS, in one pass over memory.
 
-    On CUDA it is torch's fused Adam. On a CPU it is our kernel: torch's synchronizes its OpenMP threads by
-    spinning, which takes ten times as long as the arithmetic when another process wants the cores.
+    On CUDA this is torch's fused Adam, on a CPU our kernel. torch's fused Adam on a CPU gives results that differ in
+    the last bit.
 
-    Every number is stepped, also of Gaussians that the view does not show: their moments decay and move them on, so
-    leaving them out would be another optimizer.
+    Every number is updated, including those of Gaussians that the view does not show: their moments decay and still
+    move them, so that skipping them would be a different optimizer.
 
     Args:
-        parameter: The one parameter it changes, float32.
+        parameter: The parameter to optimize, float32.
         rate: Learning rate.
     """
 
@@ -29,7 +29,7 @@ class Adam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Change the parameter by its gradient; do nothing where it has none."""
+        """Update the parameter by its gradient, if it has one."""
         group = self.param_groups[0]
         (parameter,) = group["params"]
         if parameter.device.type != "cpu" or closure is not None:
@@ -67,16 +67,16 @@ def _adam_on_cpu(
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Copies of the state of an optimizer of one parameter; empty before its first step."""
+    """Copies of the state of an optimizer with one parameter; empty before its first step."""
     (parameter,) = optimizer.param_groups[0]["params"]
     return {name: value.clone() for name, value in optimizer.state[parameter].items()}
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Give an optimizer of one parameter the state that `optimizer_tensors` returned.
+    """Restore the state that `optimizer_tensors` returned, for an optimizer with one parameter.
 
     Raises:
-        ValueError: If the state is of another parameter.
+        ValueError: If the state belongs to another parameter.
     """
     (parameter,) = optimizer.param_groups[0]["params"]
     check_moments(tensors, parameter)
@@ -86,11 +86,15 @@ def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, 
 
 
 def check_moments(tensors: Mapping[str, Tensor], parameter: Tensor) -> None:
-    """Raises ValueError if the state of an Adam is not one of this parameter, or none that a step could leave."""
+    """Validate the state of an Adam optimizer.
+
+    Raises:
+        ValueError: If the state belongs to another parameter, or cannot result from a step.
+    """
     if not tensors:
         return
     if not {"step", "exp_avg", "exp_avg_sq"} <= tensors.keys() or tensors["step"].numel() != 1:
-        raise ValueError("the state of an optimizer lacks something")
+        raise ValueError("the state of an optimizer is incomplete")
     if not 0 <= float(tensors["step"]) < 1e9:
         raise ValueError(f"the state of an optimizer is of step {float(tensors['step']):g}")
     for name in ("exp_avg", "exp_avg_sq"):
@@ -99,14 +103,14 @@ def check_moments(tensors: Mapping[str, Tensor], parameter: Tensor) -> None:
                 f"the state of an optimizer is of {list(tensors[name].shape)}, not {list(parameter.shape)}"
             )
         if not bool(torch.isfinite(tensors[name]).all()):
-            raise ValueError("the state of an optimizer has a number that is not finite")
+            raise ValueError("the state of an optimizer holds NaN or infinity")
 
 
 def with_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors with a prefix before every name."""
+    """The same tensors with ``prefix`` before every name."""
     return {f"{prefix}{name}": value for name, value in tensors.items()}
 
 
 def below_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose names start with a prefix, without it."""
+    """The tensors whose names start with ``prefix``, named without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -7,7 +7,7 @@ import numpy as np
 from lexsplat.rendering.kernels.jit import kernel, parallel
 
 NUMBERS_PER_PIECE = 65_536
-"""Work handed to a thread at a time: some tens of microseconds."""
+"""Numbers per work item of a thread: some tens of microseconds."""
 
 
 def adam_step(
@@ -24,11 +24,11 @@ def adam_step(
     """Update moments and values ``[n]`` float32 in place.
 
     Args:
-        values: What is optimized.
-        gradient: Its gradient.
+        values: The parameter.
+        gradient: Gradient of the loss.
         first: Running mean of the gradient.
-        second: Running mean of its square.
-        rate: Learning rate with both bias corrections in it.
+        second: Running mean of the squared gradient.
+        rate: Learning rate, including both bias corrections.
         epsilon: Added to the root of the second moment.
         beta1: Decay of the first moment.
         beta2: Decay of the second moment.

@@ -1,4 +1,4 @@
-"""Color changes between photos: an affine map for each, fitted together with the scene."""
+"""Exposure compensation: an affine color map per photo, optimized together with the scene."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lexsplat.reconstruction.adam import (
 
 
 class Exposures:
-    """An affine color change ``[3, 4]`` for each training photo, the identity at the start.
+    """An affine color map ``[3, 4]`` per training photo, initially the identity.
 
-    Photos of one capture can differ in exposure and white balance; without this the difference becomes color
-    that depends on the view, or haze.
+    Photos of one capture can differ in exposure and white balance. Without compensation, the difference turns into
+    view-dependent color or haze.
 
     Args:
         count: Number of training photos.
@@ -31,12 +31,12 @@ class Exposures:
         self._optimizer = Adam(self.matrices, rate)
 
     def apply(self, image: Tensor, index: int) -> Tensor:
-        """A rendered image ``[H, W, 3]`` as photo ``index`` would show it."""
+        """A rendered image ``[H, W, 3]`` with the colors of photo ``index``."""
         matrix = self.matrices[index]
         return image @ matrix[:, :3].T + matrix[:, 3]
 
     def optimize(self) -> None:
-        """Step, then take the mean change out: the scene keeps the average exposure of all photos."""
+        """Step, then remove the mean change, so that the scene keeps the average exposure of all photos."""
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
         with torch.no_grad():
@@ -44,15 +44,15 @@ class Exposures:
             self.matrices.add_(identity - self.matrices.mean(0))
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """What `load_state_tensors` needs to go on bit for bit."""
+        """Everything `load_state_tensors` needs to continue bit for bit."""
         state = with_prefix("optimizer/", optimizer_tensors(self._optimizer))
         return {"matrices": self.matrices.detach().clone(), **state}
 
     def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
-        """Go on where `state_tensors` was called.
+        """Continue where `state_tensors` was called.
 
         Raises:
-            ValueError: If the state is of another number of photos.
+            ValueError: If the state belongs to another number of photos.
         """
         if "matrices" not in tensors or tensors["matrices"].shape != self.matrices.shape:
             raise ValueError("the state of the exposures does not fit")

@@ -1,8 +1,8 @@
 """The photometric loss and its gradient in three sweeps over the rows of an image (Numba, CPU).
 
-Images are handled as ``[H, W3]`` with ``W3 = 3 W``: as the colors are interleaved, a horizontal tap is a
-shift by three and every inner loop runs over contiguous memory. Kept apart from `image_losses` so that Numba
-is imported only when a loss is computed on a CPU.
+Images are ``[H, W3]`` with ``W3 = 3 W``: the colors are interleaved, so a horizontal tap is a shift by 3 and every
+inner loop runs over contiguous memory. This module is separate from `image_losses` so that Numba is imported only
+when a loss is computed on a CPU.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ RADIUS = 5
 C1 = np.float32(0.01**2)
 C2 = np.float32(0.03**2)
 PIVOT = np.float32(0.5)
-"""Taken off the photo in products; covariances do not notice, and rounding errors are half as large."""
+"""Subtracted from the photo in products, which halves rounding errors and does not change covariances."""
 PIXELS_PER_PIECE = 16_384
-"""Work handed to a thread at a time: about half a millisecond."""
+"""Pixels per work item of a thread: about half a millisecond."""
 
 
 def photometric(
@@ -52,7 +52,7 @@ def photometric(
     products = np.empty((3, height, width3), np.float32)
     by_blurred = np.empty((3, height, width3), np.float32)
     gradient = np.empty((height, width3), np.float32)
-    # Summed at the end by numpy: a sum inside a kernel's loop would keep the loop from being vectorised.
+    # NumPy sums at the end, because a sum inside the kernel's loop would prevent its vectorization.
     scores = np.empty((height, width3), np.float32)
     differences = np.empty((height, width3), np.float32)
     weights = np.float32(l1_weight), np.float32(ssim_weight)
@@ -151,8 +151,8 @@ def _compare(
 ) -> None:
     """SSIM of every pixel and its derivative by the three blurred maps.
 
-    Written with differences: the variances of two nearly equal, bright images are small numbers beside the squares
-    whose difference they are, and float32 would lose them. With m, q, p the blurs of d, d^2, d (t - 1/2), and
+    It uses differences, because the variances of two nearly equal, bright images are small differences of large
+    squares, which float32 would lose. With m, q, p the blurs of d, d^2, d (t - 1/2), and
     a1 = 2 mt (mt + m) + C1, a2 = 2 (vt + p - m (mt - 1/2)) + C2, it is SSIM = a1 / (a1 + m^2) a2 / (a2 + q - m^2).
     """
     width3 = mean.shape[1]

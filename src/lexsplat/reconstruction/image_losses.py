@@ -1,9 +1,8 @@
 """Losses between a rendered image and a photo: L1 and D-SSIM, the photometric loss of 3DGS.
 
-SSIM uses an 11x11 Gaussian window with sigma 1.5 and reflects the image at its borders, so every pixel
-counts; torchmetrics does the same. The moments of a photo never change while a scene is trained, so
-`SSIMTarget` keeps them. On a CPU one kernel returns the loss and its analytic gradient; elsewhere the same
-formula runs in torch.
+SSIM uses an 11x11 Gaussian window with sigma 1.5 and reflects the image at its borders, as torchmetrics does, so
+that every pixel contributes. The moments of a photo are constant during a training, so `SSIMTarget` stores them. On a
+CPU one kernel returns the loss and its analytic gradient; elsewhere the same formula runs in torch.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 SMALLEST_SIDE = 6
-"""Images must be larger than the window's radius of 5 to be reflected."""
+"""Smallest image side in pixels: reflection needs more than the window's radius of 5."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,8 @@ def ssim_target(image: Tensor) -> SSIMTarget:
         )
     image = image.detach().contiguous()
     mean, variance = torch.empty_like(image), torch.empty_like(image)
-    for channel in range(3):  # one at a time: convolution in float64 unfolds its input eleven times
-        # In float64: the variance of what is bright and flat is lost in the rounding of its squares.
+    for channel in range(3):  # one at a time: a float64 convolution unfolds its input eleven times
+        # In float64, because rounding of the squares would swamp the variance of bright, flat areas.
         exact = image[..., channel : channel + 1].double()
         local = _blur(exact)
         mean[..., channel] = local[..., 0]
@@ -103,7 +102,7 @@ def _check_same_shape(image: Tensor, target: SSIMTarget) -> None:
 
 
 def _ssim_in_torch(image: Tensor, target: SSIMTarget) -> Tensor:
-    """With differences from the photo, as the kernel does it (see `image_loss_kernels`): they keep their digits."""
+    """SSIM from differences to the photo, which avoids cancellation, as in `image_loss_kernels`."""
     c1, c2 = 0.01**2, 0.03**2
     difference = image - target.image
     mean = _blur(difference)
@@ -125,7 +124,7 @@ def _blur(image: Tensor) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _taps(height: int, width: int) -> tuple[np.ndarray, ...]:
-    """Taps of the blur and of its transpose for images of one size, in the layout of the kernel."""
+    """Taps of the blur and of its transpose for one image size, in the layout of the kernel."""
     from lexsplat.reconstruction.image_loss_kernels import reflected_taps
 
     vertical, vertical_t = reflected_taps(height)
@@ -135,7 +134,7 @@ def _taps(height: int, width: int) -> tuple[np.ndarray, ...]:
 
 
 class _PhotometricOnCPU(torch.autograd.Function):
-    """``l1_weight L1 + ssim_weight (1 - SSIM)``; the kernel computes the gradient together with the value."""
+    """``l1_weight L1 + ssim_weight (1 - SSIM)``; the kernel computes value and gradient together."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: SSIMTarget, l1_weight: float, ssim_weight: float) -> Tensor:

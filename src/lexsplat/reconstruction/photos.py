@@ -1,7 +1,7 @@
-"""The photos a scene is trained on: loaded when first needed, kept as bytes while they fit into a budget.
+"""The training photos, loaded on first use and cached as bytes within a memory budget.
 
-What fits stays, nothing is thrown out: views are visited in random order, where a cache that evicts the oldest would
-miss almost always. A photo is the same (8 bits a channel) whether it comes from the cache or from its file.
+The cache never evicts: views are visited in random order, in which a least-recently-used cache would almost always
+miss. A photo has the same values (8 bits per channel) whether it comes from the cache or from its file.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class TrainingImages:
     """Photos and their SSIM moments by view name, for one image size at a time.
 
     Args:
-        views: The views that may be asked for.
-        memory: Bytes of host or device memory that the cache may take. Photos and their masks go first; moments,
-            which are eight times as large and quick to recompute, take what is left.
+        views: All training views.
+        memory: Budget of the cache in bytes of host or device memory. Photos and their masks have priority; SSIM
+            moments, which are eight times as large and quick to recompute, take the rest.
         shrink: Factor by which images are smaller than the views' cameras.
-        device: Where targets are needed.
+        device: Device of the targets.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class TrainingImages:
         self._moments: dict[str, tuple[Tensor, Tensor]] = {}
 
     def camera(self, name: str) -> Camera:
-        """Camera of the view at the size of its image here."""
+        """Camera of the view, with the size of its training image."""
         return self._cameras[name]
 
     def target(self, name: str) -> SSIMTarget:
-        """The photo of a view with its moments.
+        """The photo of a view with its SSIM moments.
 
         Raises:
             CaptureError: If the image file cannot be read.
@@ -68,7 +68,7 @@ class TrainingImages:
         return target
 
     def valid(self, name: str) -> Tensor | None:
-        """Which pixels of a view take part in the loss, ``[H, W]`` bool; None for all."""
+        """Pixels of a view that contribute to the loss, ``[H, W]`` bool; None for all."""
         if name not in self._valid:
             camera = self._cameras[name]
             mask = self._views[name].load_valid((camera.width, camera.height))
@@ -83,7 +83,7 @@ class TrainingImages:
 
     @property
     def cached_bytes(self) -> int:
-        """Memory the cache takes now."""
+        """Present size of the cache in bytes."""
         moments = sum(mean.nbytes + variance.nbytes for mean, variance in self._moments.values())
         masks = sum(valid.nbytes for valid in self._valid.values() if valid is not None)
         return moments + masks + sum(photo.nbytes for photo in self._photos.values())

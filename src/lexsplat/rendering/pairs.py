@@ -1,4 +1,4 @@
-"""The list of (tile, Gaussian) pairs of one view: what both passes of the CPU rasterizer read."""
+"""The (tile, Gaussian) pairs of one view, input of both passes of the CPU rasterizer."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from lexsplat.rendering.kernels import binning
 from lexsplat.rendering.kernels.jit import parallel
 
 STRIPS = 16
-"""Pieces in which Gaussians are counted and listed."""
+"""Number of parts in which Gaussians are counted and listed."""
 GRAIN = 2048
-"""Gaussians a thread takes at a time."""
+"""Gaussians per work item of a thread."""
 
 
 @dataclass(frozen=True)
 class TilePairs:
-    """Visible Gaussians in depth order and the tiles they touch.
+    """Visible Gaussians in depth order and the tiles they overlap.
 
     Args:
         width: Image width in pixels.
@@ -60,7 +60,7 @@ class TilePairs:
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
 
 
-def find_pairs(
+def find_pairs(  # eight parameters: the arrays of a projection, as the kernels take them
     means2d: NDArray[np.float32],
     conics: NDArray[np.float32],
     opacities: NDArray[np.float32],
@@ -70,7 +70,7 @@ def find_pairs(
     width: int,
     height: int,
 ) -> TilePairs:
-    """Sort by depth once, then count and list the pairs tile by tile.
+    """Sort by depth, then count and list the pairs of each tile.
 
     Args:
         means2d: Centers ``[N, 2]`` in pixels.

@@ -1,1 +1,1 @@
-"""How work runs and is kept: errors, progress, files, memory, devices, the training loop, the environment."""
+"""Infrastructure without domain knowledge: errors, progress, files, memory, devices, the training loop."""

@@ -1,4 +1,4 @@
-"""Where work runs: the device, how many threads share a sum, which seeds are taken."""
+"""The device, the number of threads, and the seeds that all libraries accept."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lexsplat.runtime.errors import BackendError
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch compute on one thread of the CPU inside, also as a decorator.
+    """Run torch on one CPU thread inside the block; also usable as a decorator.
 
-    Floating-point sums depend on their order in the last bit, and several threads order them by how many they are and
-    by how busy the machine is. What has to come out the same everywhere is computed by one.
+    The last bit of a floating-point sum depends on the order of addition, which depends on the number of threads and
+    on the load of the machine. One thread gives reproducible bits.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -26,11 +26,11 @@ def one_thread() -> Iterator[None]:
 
 
 def choose_device(wanted: str) -> str:
-    """ "cpu" or "cuda" from "auto", "cpu" or "cuda".
+    """Resolve "auto", "cpu" or "cuda" to "cpu" or "cuda".
 
     Raises:
-        BackendError: If CUDA is asked for and there is none.
-        ValueError: If the name is another one.
+        BackendError: If CUDA is requested but not available.
+        ValueError: If the name is not one of these.
     """
     if wanted not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device must be auto, cpu or cuda, got {wanted!r}")
@@ -44,7 +44,7 @@ def choose_device(wanted: str) -> str:
 
 
 def check_seed(seed: int) -> None:
-    """Refuse a seed that one of the libraries does not take.
+    """Refuse a seed that one of the libraries does not accept.
 
     Raises:
         ValueError: If it is negative or has more than 31 bits.

@@ -1,4 +1,4 @@
-"""What results were made with: the machine and the versions of what they depend on."""
+"""The machine and the versions of the packages that results depend on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch
 
 
 def machine_facts() -> dict[str, Any]:
-    """The machine, in words a reader of numbers needs."""
+    """The machine as JSON data: platform, CPU, cores, GPU and package versions."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {
         "platform": platform.platform(),
@@ -26,7 +26,7 @@ def machine_facts() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that have a say in results."""
+    """Versions of Python and of the packages that affect results."""
     found = {"python": platform.python_version()}
     for package in ("torch", "numpy", "numba", "gsplat", "pycolmap", "transformers"):
         try:
@@ -38,7 +38,7 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def code_identity() -> str:
-    """A hash of the program itself: measurements that are kept hold for the code that made them."""
+    """Hash of lexsplat's source code; stored measurements are valid for one version of it."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for file in sorted(package.rglob("*.py")):
         digest.update(file.relative_to(package).as_posix().encode() + b"\0")

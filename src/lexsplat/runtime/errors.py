@@ -1,23 +1,23 @@
-"""Errors a person can act on: one line that names the thing, what was expected, what was found, what to do.
+"""Errors that a user can act on: one line with the subject, the expectation, the finding and the remedy.
 
-Only the command line catches these; library code raises them for files, captures, models and backends.
-Bad arguments of Python functions raise ``ValueError`` as usual.
+Library code raises them for files, captures, models and backends; only the command line catches them. Invalid
+arguments of Python functions raise ``ValueError``.
 """
 
 from __future__ import annotations
 
 STOPPED = "stopped; run the same command again to go on"
-"""What Ctrl-C ends in, at any moment."""
+"""Message after Ctrl-C."""
 
 
 class LexsplatError(Exception):
     """Base of every error that has a remedy.
 
     Args:
-        subject: The file, value or option the error is about.
-        expected: What would have been right.
-        found: What was there instead.
-        remedy: What the person can do now.
+        subject: The file, value or option with the error.
+        expected: A valid content or value.
+        found: The actual content or value.
+        remedy: What the user can do.
     """
 
     def __init__(self, subject: object, *, expected: str = "", found: str = "", remedy: str = "") -> None:
@@ -48,32 +48,32 @@ def _rebuild(kind: type[LexsplatError], subject: str, fields: dict[str, str]) ->
 
 
 class CaptureError(LexsplatError):
-    """Photos, cameras or masks that cannot be used."""
+    """Photos, cameras or masks are unusable."""
 
 
 class FileFormatError(LexsplatError):
-    """A file whose content is not what its format promises."""
+    """The content of a file does not match its format."""
 
 
 class SceneFolderError(LexsplatError):
-    """A scene folder that is missing, unfinished or of another version."""
+    """A scene folder is missing, unfinished or of another version."""
 
 
 class ModelError(LexsplatError):
-    """An encoder that cannot be found or loaded."""
+    """An encoder cannot be found or loaded."""
 
 
 class BackendError(LexsplatError):
-    """A device or rasterizer that is not available here."""
+    """A device or rasterizer is not available."""
 
 
 class MemoryBudgetError(LexsplatError):
-    """A stage that cannot be done within the memory that it is given."""
+    """A stage does not fit into its memory budget."""
 
 
 class QueryError(LexsplatError):
-    """A question that cannot be asked, such as an empty prompt."""
+    """A query is invalid, such as an empty prompt."""
 
 
 class TrainingError(LexsplatError):
-    """Optimization that diverged or has nothing to optimize."""
+    """A training diverged or has nothing to optimize."""

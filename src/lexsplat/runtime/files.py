@@ -179,6 +179,8 @@ def _sort_metadata(path: Path) -> None:
     with open(path, "r+b") as file:
         length = int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(length))
+        if "__metadata__" not in header:
+            return
         header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
         content = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
         if len(content) > length:

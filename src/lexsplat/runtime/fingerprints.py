@@ -19,7 +19,7 @@ from lexsplat.runtime.files import to_json
 
 
 def fingerprint(*parts: Any) -> str:
-    """A short hash of JSON-like values and dataclasses: equal for equal content, in every process."""
+    """A short hash of JSON-like values and dataclasses; equal content has equal hashes in every process."""
     text = json.dumps([to_json(part) for part in parts], sort_keys=True, ensure_ascii=False)
     return hashlib.blake2b(text.encode("utf-8"), digest_size=12).hexdigest()
 

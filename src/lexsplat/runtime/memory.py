@@ -1,8 +1,8 @@
-"""What each stage needs of the memory that ``--memory`` grants: a function a stage, in bytes.
+"""Memory needs of the stages in bytes, one function per stage, and the checks against ``--memory``.
 
-A stage fits itself in by what decides nothing about its result (threads, blocks, what is kept between steps); where
-the least of that is too much, it is refused in one line before it starts. What the libraries and the encoders take
-by existing comes beside these numbers.
+A stage adapts to its budget with settings that do not affect the result: threads, block sizes, caches. If not even
+the minimum fits, the stage fails with a one-line error before it starts. The memory of the libraries and the encoders
+is not included in these numbers.
 """
 
 from __future__ import annotations
@@ -13,69 +13,69 @@ import re
 from lexsplat.runtime.errors import MemoryBudgetError
 
 DEFAULT_MEMORY = 4 << 30
-"""Bytes that stages may take where nobody says otherwise."""
+"""Default budget of a stage in bytes."""
 
 PHOTO_BYTES = 10
-"""A large photo on its way, a pixel: four bytes as it is decoded, and its mask or a turned copy."""
+"""Bytes per pixel of a large photo being read: four decoded, the rest for its mask or a rotated copy."""
 
 SMALL_PHOTO_BYTES = 32
-"""A photo that is worked on at once, a pixel: decoded, as floats, the map of its lens, and the result."""
+"""Bytes per pixel of a photo processed as a whole: decoded, as floats, the lens map, and the result."""
 
 MADE_BYTES = 24
-"""A picture that is made of a photo, a pixel: as floats, and once more while it is handed on."""
+"""Bytes per pixel of an image made from a photo: as floats, and a copy while it is passed on."""
 
 BAND_BYTES = 24 << 20
-"""The band of a large photo that is in work as floats (`lexsplat.captures.images.bands`)."""
+"""Bytes of the band of a large photo that is processed as floats (`lexsplat.captures.images.bands`)."""
 
 FRAMES_HELD = 17
-"""Frames that a decoder of videos refers to at most, beside one a thread."""
+"""Upper limit of the reference frames of a video decoder, in addition to one per thread."""
 
 SIFT_BYTES = 350
-"""Bytes a pixel of a photo in which features are sought: 17 levels of a scale space of twice the size, in floats."""
+"""Bytes per pixel of SIFT extraction: 17 float levels of a scale space of twice the image size."""
 
 FEATURE_BYTES = 700
-"""A feature that waits to be matched: 128 bytes, the same as floats, their index, and its place."""
+"""Bytes per feature to match: the descriptor as 128 bytes and as floats, its index and its position."""
 
 THREAD_BYTES = 16 << 20
-"""Stack and scratch of a thread."""
+"""Bytes of stack and scratch memory per thread."""
 
 CACHED_BLOCKS = 5
-"""pycolmap keeps the features of so many blocks of photos at most while it compares all pairs."""
+"""Upper limit of the blocks of photos whose features pycolmap caches in exhaustive matching."""
 
 SEQUENTIAL_BLOCKS = 5
-"""And so many times the overlap while it compares each photo with the next ones."""
+"""The same for sequential matching, in multiples of the overlap."""
 
 GAUSSIAN_BYTES = 1_700
-"""A Gaussian in training, with gradient, two moments of the optimizer and the last good state."""
+"""Bytes per Gaussian in training: parameters, gradient, two moments of the optimizer and the last good state."""
 
 
 def photo_bytes(photo: tuple[int, int], made: tuple[int, int] = (0, 0)) -> int:
-    """One photo read, turned, undistorted, masked, and made into a picture of another size.
+    """Reading, rotating, undistorting, masking and resizing one photo.
 
     Args:
         photo: Width and height of the photo.
-        made: Of the picture.
+        made: Width and height of the resulting image.
     """
     pixels, result = photo[0] * photo[1], made[0] * made[1] * MADE_BYTES
     return min(pixels * SMALL_PHOTO_BYTES, pixels * PHOTO_BYTES + BAND_BYTES) + result
 
 
 def video_bytes(frame: tuple[int, int], threads: int) -> int:
-    """Reading a video: frames that the decoder holds, of up to 10 bits, and one as a picture."""
+    """Reading a video: the decoder's frames of up to 10 bits, and one frame as an image."""
     return frame[0] * frame[1] * (3 * (FRAMES_HELD + threads) + 14) + threads * THREAD_BYTES
 
 
 def extraction_bytes(
     photo: tuple[int, int], max_side: int, max_features: int, threads: int, *, masked: bool = False
 ) -> int:
-    """Seeking features in photos of a size, so many at once.
+    """SIFT extraction in several photos at once.
 
     Args:
         photo: Width and height of the largest photo.
         max_side: Longest side to which photos are reduced first.
-        max_features: Features a photo.
-        threads: How many photos at once.
-        masked: Whether a mask of each photo is held too.
+        max_features: Maximum number of features per photo.
+        threads: Number of photos at once.
+        masked: Whether each photo has a mask.
     """
     pixels = photo[0] * photo[1]
     sought = pixels * min(1.0, max_side / max(photo)) ** 2
@@ -84,35 +84,35 @@ def extraction_bytes(
 
 
 def matching_bytes(features: int, photos: int, threads: int) -> int:
-    """Comparing photos of up to ``features`` features, ``photos`` of which are held at a time."""
+    """Matching photos of up to ``features`` features each, ``photos`` of which are cached at a time."""
     return photos * features * FEATURE_BYTES + threads * (2 * THREAD_BYTES + features * 2 * FEATURE_BYTES)
 
 
 def mapping_bytes(features: int, matches: int) -> int:
-    """Placing photos that have so many features and verified matches in all: the graph, the model, its adjustment."""
+    """Incremental mapping with the given total numbers of features and verified matches: graph, model, adjustment."""
     observations = min(features, 2 * matches)
     return features * 120 + matches * 48 + observations * 900
 
 
 def sample_bytes(rows: int, dimensions: int, codes: int, batch: int) -> int:
-    """Fitting ``codes`` codes to a sample of features: the sample, itself again as joint vectors, blocks, a batch."""
+    """Fitting ``codes`` codes to a sample of features: the sample, its joint vectors, blocks, and a batch."""
     return 4 * (rows * (2 * dimensions + 8) + 4 * batch * (dimensions + codes) + 6 * codes * dimensions)
 
 
 def require_sample(
     stage: str, what: str, rows: int, dimensions: int, codes: int, batch: int, memory: int, share: float
 ) -> None:
-    """Refuse a sample that does not fit into its share of the memory, with a sample and a budget that would.
+    """Refuse a sample that does not fit into its share of the memory; the error names a size and a budget that fit.
 
     Args:
-        stage: Its name, for people.
+        stage: Name of the stage in the error.
         what: The sample, such as "a sample of 50,000 features".
-        rows: Features in it.
-        dimensions: Of a feature.
-        codes: How many are fitted.
-        batch: Features a gradient step.
-        memory: Bytes there are.
-        share: Of them that the sample and the fit may take.
+        rows: Number of features in the sample.
+        dimensions: Dimensions of a feature.
+        codes: Number of codes.
+        batch: Features per gradient step.
+        memory: Budget in bytes.
+        share: Share of the budget for the sample and the fit, in 0..1.
 
     Raises:
         MemoryBudgetError: If they need more.
@@ -124,30 +124,30 @@ def require_sample(
 
 
 def gaussian_bytes(count: int) -> int:
-    """Training so many Gaussians on the host."""
+    """Training ``count`` Gaussians on the host."""
     return count * GAUSSIAN_BYTES
 
 
 def most_within(memory: int, need_of: dict[int, int]) -> int:
-    """The largest choice whose need fits, or the smallest of all where none does.
+    """The largest choice that fits into the memory, or the smallest choice if none fits.
 
     Args:
-        memory: Bytes there are.
-        need_of: Bytes by choice.
+        memory: Budget in bytes.
+        need_of: Need in bytes by choice.
     """
     fitting = [choice for choice, need in need_of.items() if need <= memory]
     return max(fitting) if fitting else min(need_of)
 
 
 def require(stage: str, need: int, memory: int, what: str, remedy: str) -> None:
-    """Refuse a stage that cannot be done within the budget.
+    """Refuse a stage that does not fit into the budget.
 
     Args:
-        stage: Its name, for people.
-        need: Bytes of the least it can do with.
-        memory: Bytes there are.
-        what: What needs them, such as "photos of 8000x6000 pixels".
-        remedy: What to do besides giving more memory.
+        stage: Name of the stage in the error.
+        need: Minimum need in bytes.
+        memory: Budget in bytes.
+        what: What needs the memory, such as "photos of 8000x6000 pixels".
+        remedy: Alternative to more memory.
 
     Raises:
         MemoryBudgetError: If ``need`` is more than ``memory``.
@@ -162,17 +162,17 @@ def require(stage: str, need: int, memory: int, what: str, remedy: str) -> None:
 
 
 def check_photo(photo: tuple[int, int], memory: int, made: tuple[int, int] = (0, 0)) -> None:
-    """Refuse a photo that cannot be read, and made into a picture, within the budget.
+    """Refuse a photo that cannot be read and resized within the budget.
 
     Raises:
-        MemoryBudgetError: With the memory it takes.
+        MemoryBudgetError: With the memory that it needs.
     """
     what = f"a photo of {photo[0]}x{photo[1]} pixels"
     require("photos", photo_bytes(photo, made), memory, what, "scale the photos down first")
 
 
 def size_text(count: int, *, up: bool = False) -> str:
-    """Bytes as ``--memory`` takes them: whole megabytes of 2^20, rounded up to the next where wanted."""
+    """A size in the form that ``--memory`` accepts: whole megabytes of 2^20 bytes, rounded down, or up if ``up``."""
     megabyte = 1 << 20
     if up:
         return f"{-(-count // megabyte)}MB"

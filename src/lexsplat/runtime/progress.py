@@ -1,4 +1,4 @@
-"""Progress as events: work reports, front ends draw. Nothing here prints."""
+"""Progress events: stages send them, front ends display them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Event:
-    """How far a stage is.
+    """Progress of a stage.
 
     Args:
         stage: Name of the stage, such as "reconstruct".
-        done: Units finished.
-        total: Units in all.
-        metrics: Numbers worth showing beside the bar, such as ``{"psnr": 31.2}``.
+        done: Finished units.
+        total: All units.
+        metrics: Numbers to show beside the bar, such as ``{"psnr": 31.2}``.
     """
 
     stage: str
@@ -24,7 +24,7 @@ class Event:
 
 
 Listener = Callable[[Event], None]
-"""What a front end passes in. It must return quickly and never raise."""
+"""Receives events. It must return quickly and never raise."""
 
 
 def silent(event: Event) -> None:

@@ -1,4 +1,4 @@
-"""Even subsets of sequences."""
+"""Evenly spaced subsets of sequences."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ T = TypeVar("T")
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:
-    """At most ``count`` items at even distances, in order; the first and the last are among them.
+    """At most ``count`` evenly spaced items in order, including the first and the last.
 
     Args:
-        items: What to choose from.
-        count: How many at most.
+        items: The sequence.
+        count: Maximum number of items.
     """
     if len(items) <= count:
         return list(items)

@@ -1,5 +1,5 @@
-"""Numba kernels of the CPU rasterizer. They see NumPy arrays only; autograd lives in `cpu_backend`.
+"""Numba kernels of the CPU rasterizer. They work on NumPy arrays; `cpu_backend` connects them to autograd.
 
-Every kernel takes ``start, stop`` first and does that range of its work items (Gaussians or tiles). It writes
-nothing outside its own items, so the result cannot depend on the number of threads.
+The first arguments of a kernel are ``start, stop``, the range of its work items (Gaussians or tiles). A kernel writes
+only to its own items, so the result does not depend on the number of threads.
 """

@@ -1,4 +1,4 @@
-"""What the annotations of kernels call their arrays."""
+"""Array types of the kernels' annotations."""
 
 from __future__ import annotations
 

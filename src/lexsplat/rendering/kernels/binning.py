@@ -1,10 +1,10 @@
-"""Which Gaussians touch which tile, nearest first.
+"""The Gaussians that overlap each tile, nearest first.
 
-A pair is one Gaussian in one tile. Pairs are listed twice: by tile (what blending reads) and by Gaussian (where
-gradients are summed); ``pairs`` links the first list to the second.
+A pair is one Gaussian in one tile. Pairs are listed twice: by tile (for blending) and by Gaussian (for the sum of
+gradients); ``pairs`` maps the first list to the second.
 
-Bounding boxes become integers in one place, `find_boxes`. Counting and filling only ever see those integers:
-computing a span twice in floating point can disagree by one pixel and would write outside the list.
+Only `find_boxes` rounds bounding boxes to integers, and counting and filling both read these integers: two
+floating-point computations of a span can differ by one pixel, which would write outside the list.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lexsplat.rendering.kernels.jit import kernel
 TILE = 16
 """Width and height of a tile in pixels."""
 SLACK = 1e-3
-"""Pixels added to every side of a box, so that rounding never cuts a contribution off."""
+"""Pixels added to every side of a box, so that rounding never cuts off a contribution."""
 RADIX_BITS = 11
 
 # Columns of the table of ellipses: center, half conic, opacity (padded to 32 bytes).

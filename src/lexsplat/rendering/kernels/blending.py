@@ -1,4 +1,4 @@
-"""Front-to-back blending, one tile after another: what the forward pass, its gradient and code weights share.
+"""Front-to-back blending, tile by tile: the parts shared by the forward pass, its gradient and code weights.
 
 A Gaussian is the outer loop and a row of sixteen pixels the inner step (see `lanes`). Per-tile arrays are flat:
 row j of the tile starts at 16 j, and row j of channel c of C at 16 (j C + c).
@@ -33,9 +33,9 @@ ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 ALPHA_THRESHOLD = np.float32(1.0 / 255.0)
 ALPHA_MAX = np.float32(0.999)
 TRANSMITTANCE_MIN = np.float32(1e-4)
-"""A pixel is finished before the Gaussian that would take its transmittance to this value or below."""
+"""A pixel is finished before the Gaussian that would reduce its transmittance to this value or below."""
 CHECK_EVERY = 16
-"""Gaussians between two looks at whether the whole tile is finished."""
+"""Gaussians between two checks whether the whole tile is finished."""
 
 # exp(-s) = P(-s / 8)^8 for 0 <= s <= 6, relative error 1e-6. Beyond s = ln 255 = 5.54 alpha is below its threshold.
 EIGHTH = np.float32(-0.125)
@@ -67,7 +67,7 @@ def start_tile(tile: int, tiles_x: int, width: int, height: int, live: F32) -> N
 
 @kernel
 def tile_finished(live: F32) -> bool:
-    """Whether no pixel can take more."""
+    """Whether all pixels are finished."""
     best = load(live, 0)
     for j in range(1, TILE):
         row = load(live, j * TILE)
@@ -98,7 +98,7 @@ def finish_pixels(before: Any, after: Any) -> Any:
 
 @kernel
 def pass_row(live: F32, j: int, row_alpha: Any) -> Any:
-    """Let row ``j`` of the pixels pass a Gaussian: writes ``live``, returns what the Gaussian weighs in each."""
+    """Composite a Gaussian onto row ``j`` of the pixels: updates ``live``, returns its weight in each pixel."""
     before = load(live, j * TILE)
     after = before * (ONE - row_alpha)
     store(live, j * TILE, finish_pixels(before, after))

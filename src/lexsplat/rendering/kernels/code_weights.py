@@ -1,7 +1,7 @@
-"""How much each Gaussian contributes to the pixels of each code: one scatter per pixel and Gaussian.
+"""Blending weight of each Gaussian at the pixels of each code: one scatter per pixel and Gaussian.
 
-A tile usually holds a handful of codes. Each pair keeps one number per code of its tile, so nothing is ever as
-large as Gaussians x codes except the result, and no two threads write the same number.
+A tile usually holds a handful of codes. Each pair stores one number per code of its tile, so only the result is as
+large as Gaussians x codes, and no two threads write the same number.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Projection of 3D Gaussians to ellipses on the image (EWA splatting), forward and backward.
 
-Arithmetic is float64 inside: it costs nothing here and thin Gaussians keep their determinant.
+Arithmetic is float64, which costs nothing here and preserves the determinant of thin Gaussians.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def project(
     radii: I32,
     extents: F32,
 ) -> None:
-    """Ellipse, effective opacity, depth and radius of each Gaussian; radius 0 where it cannot be seen."""
+    """Ellipse, effective opacity, depth and radius of each Gaussian; radius 0 if it is invisible."""
     rotation, axes, scale = np.empty(9), np.empty(9), np.empty(3)
     fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
     width, height, near = camera[WIDTH], camera[HEIGHT], camera[NEAR]
