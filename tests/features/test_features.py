@@ -526,7 +526,7 @@ def test_a_cache_that_cannot_be_written_is_reported_and_the_embedding_returned(t
     in_the_way.write_text("no folder")
     found = TextCache(in_the_way).encode("color", ["apple"], ColorEncoder)
     assert found.shape == (1, 4)
-    assert "not kept" in caplog.text
+    assert "not cached" in caplog.text
 
 
 def test_a_truncated_prompt_is_reported(caplog):

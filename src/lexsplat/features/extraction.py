@@ -224,8 +224,8 @@ class _Extraction:
         """Extract ``missing`` views; yields their names as they are finished."""
         if not missing:
             return
-        for name in missing:
-            self._todo.put(name)
+        for view in missing:
+            self._todo.put(view)
         threads = torch.get_num_threads()
         inner = max(1, threads // workers)
         torch.set_num_threads(inner)
