@@ -54,7 +54,7 @@ def test_a_question_colors_its_ball_at_once_and_selects_it_when_refined(session,
 def test_what_is_judged_absent_is_drawn_at_half_from_the_first_moment(balls, monkeypatch):
     fresh = Session(balls[0], Memory(vocabulary=WORDS))
     fresh.warm_up()
-    monkeypatch.setattr(type(fresh._judge), "judge", lambda self, scores: "no")
+    monkeypatch.setattr(type(fresh._judge), "classify", lambda self, scores: "no")
     question = fresh.ask("ball 3")
     assert question.layer.threshold == 0.5
     fresh.refine(question)
@@ -156,7 +156,7 @@ def test_a_click_names_and_selects_what_is_there(session, balls):
 
 def test_a_click_on_nothing_is_told(session, balls):
     camera = balls[1].cameras["view0"]
-    with pytest.raises(QueryError, match="something to be seen"):
+    with pytest.raises(QueryError, match="expected a surface"):
         session.what_is(camera, 0.5, 0.5)
 
 
