@@ -50,8 +50,7 @@ class Find:
             return
         for answer in answers["phrases"]:
             count = answer["count"]
-            weak = " that is a little like it" if answer["present"] == "no" and count else ""
-            print(f"{answer['phrase']}: present: {answer['present']}, {count} found{weak}")
+            print(f"{answer['phrase']}: present: {answer['present']}, {count} found")
             for number, thing in enumerate(answer["instances"], start=1):
                 center = ", ".join(f"{v:.2f}" for v in thing["center"])
                 meters = thing.get("size_meters")
