@@ -64,7 +64,7 @@ def test_a_mask_is_outlined_and_the_rest_dimmed():
 
 @pytest.mark.parametrize("draw", [heatmaps.overlay_heatmap, heatmaps.overlay_mask])
 def test_a_map_of_another_size_is_refused(draw):
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="differ in size"):
         draw(GRAY, np.zeros((5, 8)))
 
 

@@ -199,10 +199,10 @@ def test_what_is_no_scene_folder_is_refused_with_what_it_is(tmp_path):
         open_scene(tmp_path)
 
 
-@pytest.mark.parametrize("device", ["gpu", "cuda:1", "", "CPU"])
-def test_an_unknown_device_is_refused(device):
-    with pytest.raises(ValueError, match="device must be auto, cpu or cuda"):
-        open_scene("demo", device=device)
+def test_an_unknown_device_is_refused():
+    for device in ("gpu", "cuda:1", "", "CPU"):
+        with pytest.raises(ValueError, match="device must be auto, cpu or cuda"):
+            open_scene("demo", device=device)
 
 
 def test_the_front_door_shows_the_public_names():

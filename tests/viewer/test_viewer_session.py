@@ -54,7 +54,7 @@ def test_a_prompt_colors_its_ball_at_once_and_selects_it_when_refined(session, b
 def test_an_absent_object_has_the_threshold_one_half_before_and_after_refinement(balls, monkeypatch):
     fresh = Session(balls[0], History(vocabulary=WORDS))
     fresh.warm_up()
-    monkeypatch.setattr(type(fresh._presence), "judge", lambda self, scores: "no")
+    monkeypatch.setattr(type(fresh._presence), "classify", lambda self, scores: "no")
     question = fresh.ask("ball 3")
     assert question.layer.threshold == 0.5
     fresh.refine(question)
@@ -161,7 +161,7 @@ def test_a_click_names_and_selects_what_is_there(session, balls):
 
 def test_a_click_on_the_background_is_refused(session, balls):
     camera = balls[1].cameras["view0"]
-    with pytest.raises(QueryError, match="something to be seen"):
+    with pytest.raises(QueryError, match="expected a surface"):
         session.what_is(camera, 0.5, 0.5)
 
 

@@ -1,8 +1,8 @@
-"""Relevancy in color: a perceptually uniform scale, overlays on pictures, and a legend.
+"""Relevancy in color: a perceptually uniform scale, overlays on images, and a legend.
 
-The scale is computed, not copied: a path through the Oklab space whose lightness rises in equal steps from
-near black over violet and orange to pale yellow, as saturated as the screen allows. Equal differences in
-relevancy look about equally large, and the order survives gray printing and color blindness.
+The scale is a path through the Oklab space whose lightness rises in equal steps from near black over violet and
+orange to pale yellow, as saturated as sRGB allows. Equal differences in relevancy look about equally large, and the
+order survives grayscale printing and color blindness.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def color_scale() -> NDArray[np.uint8]:
     lightness = _LIGHTNESS[0] + (_LIGHTNESS[1] - _LIGHTNESS[0]) * steps
     hue = np.radians(_HUES[0] + (_HUES[1] - _HUES[0]) * steps)
     direction = np.stack([np.cos(hue), np.sin(hue)], axis=1)
-    # The largest chroma inside the screen's gamut, by bisection; then smoothed, so that color has no kinks.
+    # The largest chroma inside the sRGB gamut, by bisection, then smoothed to remove kinks.
     low, high = np.zeros(256), np.full(256, 0.4)
     for _ in range(30):
         middle = (low + high) / 2
@@ -72,14 +72,14 @@ def overlay_heatmap(
     high: float | None = None,
     strength: float = 0.85,
 ) -> NDArray[np.uint8]:
-    """A picture that recedes into gray, with relevancy glowing over it.
+    """An image faded to gray, with relevancy drawn over it in color.
 
     Args:
         image: ``[H, W, 3]``, bytes or floats in 0..1.
         relevancy: ``[H, W]`` in 0..1.
-        low: Relevancy that is not marked at all.
-        high: Relevancy in full color. None takes the map's own peak, but at least `PEAK_FLOOR` above
-            ``low``, so that a map in which nothing is relevant stays dark.
+        low: Relevancy that is not marked.
+        high: Relevancy in full color. None takes the peak of the map, but at least `PEAK_FLOOR` above ``low``, so
+            that a map without relevant pixels stays dark.
         strength: Opacity of the full color in 0..1.
 
     Returns:
@@ -88,11 +88,11 @@ def overlay_heatmap(
     Raises:
         ValueError: If the sizes disagree or ``low`` is not below ``high``.
     """
-    picture, values = np.asarray(image), np.asarray(relevancy, dtype=np.float32)
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.shape[:2] != values.shape:
-        raise ValueError(f"picture {list(picture.shape)} and relevancy {list(values.shape)} do not fit")
-    scale = 1 / 255 if picture.dtype == np.uint8 else 1.0
-    colors = np.clip(picture.astype(np.float32) * scale, 0, 1)
+    pixels, values = np.asarray(image), np.asarray(relevancy, dtype=np.float32)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.shape[:2] != values.shape:
+        raise ValueError(f"image {list(pixels.shape)} and relevancy {list(values.shape)} differ in size")
+    scale = 1 / 255 if pixels.dtype == np.uint8 else 1.0
+    colors = np.clip(pixels.astype(np.float32) * scale, 0, 1)
     if high is None:
         high = max(float(values.max()), low + PEAK_FLOOR)
     amount = _unit(values, low, high)
@@ -104,17 +104,17 @@ def overlay_heatmap(
 
 
 PEAK_FLOOR = 0.1
-"""Least span of relevancy that an overlay stretches over its colors."""
+"""Smallest range of relevancy that an overlay maps to its colors."""
 
 
 def overlay_mask(
     image: ArrayLike, mask: ArrayLike, color: tuple[int, int, int] = (255, 176, 32)
 ) -> NDArray[np.uint8]:
-    """A picture with a mask tinted and outlined, the rest dimmed: ``[H, W, 3]`` bytes."""
-    picture, inside = np.asarray(image), np.asarray(mask, dtype=bool)
-    if picture.shape[:2] != inside.shape:
-        raise ValueError(f"picture {list(picture.shape)} and mask {list(inside.shape)} do not fit")
-    colors = picture.astype(np.float32) * (1.0 if picture.dtype == np.uint8 else 255.0)
+    """An image with a mask tinted and outlined, and the rest dimmed: ``[H, W, 3]`` bytes."""
+    pixels, inside = np.asarray(image), np.asarray(mask, dtype=bool)
+    if pixels.shape[:2] != inside.shape:
+        raise ValueError(f"image {list(pixels.shape)} and mask {list(inside.shape)} differ in size")
+    colors = pixels.astype(np.float32) * (1.0 if pixels.dtype == np.uint8 else 255.0)
     tint = np.array(color, dtype=np.float32)
     result = np.where(inside[..., None], 0.55 * colors + 0.45 * tint, 0.45 * colors)
     padded = np.pad(inside, 1, mode="edge")
@@ -126,14 +126,14 @@ def overlay_mask(
 def legend(
     low: float = 0.0, high: float = 1.0, width: int = 256, label: str = "relevancy"
 ) -> NDArray[np.uint8]:
-    """A bar of the scale with its ends and a label under it: ``[34, width, 3]`` bytes, dark ground."""
+    """A color bar with its limits and a label below, on a dark background: ``[34, width, 3]`` bytes."""
     bar = color_scale()[np.linspace(0, 255, width).round().astype(int)]
-    picture = Image.new("RGB", (width, 34), (18, 18, 22))
-    picture.paste(Image.fromarray(np.repeat(bar[None], 14, axis=0)), (0, 0))
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default()
+    image = Image.new("RGB", (width, 34), (18, 18, 22))
+    image.paste(Image.fromarray(np.repeat(bar[None], 14, axis=0)), (0, 0))
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default()
     for text, x, anchor in ((f"{low:.2f}", 3, 0.0), (label, width / 2, 0.5), (f"{high:.2f}", width - 3, 1.0)):
         draw.text((x - anchor * draw.textlength(text, font=font), 18), text, fill=(220, 220, 226), font=font)
-    return np.asarray(picture)
+    return np.asarray(image)
 
 
 def _unit(values: ArrayLike, low: float, high: float) -> NDArray[np.float32]:

@@ -1,16 +1,16 @@
-"""What a phrase asks for: things, and how they stand to each other. A small grammar, no model.
+"""The grammar of phrases: things and the relations between them, without a language model.
 
 mug                          a thing; every word goes to the text encoder
-mug on the cloth             things by where they are
-mug not on the cloth         the others
-mug next to the duck on the table    read from the left: mug next to (duck on the table)
-apple and banana             both; also "or"
-fruit but not the banana     without; also "without", "except", "minus"
-largest book                 of several; also "biggest", "smallest"
+mug on the cloth             things by their place
+mug not on the cloth         all other mugs
+mug next to the duck on the table    right-associative: mug next to (duck on the table)
+apple and banana             the union; also "or"
+fruit but not the banana     the difference; also "without", "except", "minus"
+largest book                 one of several; also "biggest", "smallest"
 mug nearest to the lamp      also "closest to"
-how many apples              as "apple"; the answer has the count; also "how many apples are there"
-is there a mug               as "mug"; also "where is the mug"
-"something on wheels"        in quotation marks: one thing, whatever words it has
+how many apples              the same as "apple"; the result has the count; also "how many apples are there"
+is there a mug               the same as "mug"; also "where is the mug"
+"something on wheels"        in quotation marks: one thing, whatever its words
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _PLURALS = tuple(
 
 @dataclass(frozen=True)
 class Thing:
-    """Something to look for, in words for the text encoder."""
+    """A thing to look for, in words for the text encoder."""
 
     text: str
 
@@ -75,7 +75,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Related:
-    """Those of ``target`` that stand in a relation to one of ``reference``."""
+    """The instances of ``target`` that stand in a relation to an instance of ``reference``."""
 
     relation: RelationName
     target: Phrase
@@ -87,7 +87,7 @@ class Related:
 
 @dataclass(frozen=True)
 class Both:
-    """All of both."""
+    """The union of two phrases."""
 
     first: Phrase
     second: Phrase
@@ -98,7 +98,7 @@ class Both:
 
 @dataclass(frozen=True)
 class Except:
-    """The first without the second."""
+    """The first phrase without the second."""
 
     first: Phrase
     second: Phrase
@@ -109,7 +109,7 @@ class Except:
 
 @dataclass(frozen=True)
 class Pick:
-    """One of several."""
+    """One instance of several."""
 
     which: Literal["largest", "smallest"]
     target: Phrase
@@ -119,20 +119,20 @@ class Pick:
 
 
 MAX_PARTS = 100
-"""More parts than anybody asks for; each is answered within the one before."""
+"""Limit on the number of parts, and so on the depth of the recursion."""
 
 Phrase = Union[Thing, Related, Both, Except, Pick]  # noqa: UP007  (forward references)
 
 
 def parse(text: str) -> Phrase:
-    """What a phrase asks for.
+    """The parsed phrase.
 
     Raises:
-        QueryError: If it is empty, a part of it is, a quotation mark is missing, or it has too many parts.
+        QueryError: If a part is empty, a quotation mark is missing, or there are too many parts.
     """
     if text.count('"') % 2:
-        raise QueryError(f"phrase {text!r}", expected="quotation marks in pairs", found="one too many")
-    # Quoted parts hide from the grammar behind a sign that no pattern contains.
+        raise QueryError(f"phrase {text!r}", expected="quotation marks in pairs", found="an odd number")
+    # Quoted parts are replaced by a character that no pattern contains.
     quoted: list[str] = re.findall(r'"([^"]*)"', text)
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text)
@@ -156,7 +156,7 @@ def things_of(phrase: Phrase) -> list[str]:
 
 
 def _each(phrase: Phrase, keep: bool) -> Phrase:
-    """A counted phrase in the singular: an encoder is asked for one of what is counted. Quoted words stay."""
+    """A counted phrase in the singular, as the encoder is asked for one instance. Quoted words stay."""
     if keep:
         return phrase
     if isinstance(phrase, Thing):
@@ -168,14 +168,14 @@ def _each(phrase: Phrase, keep: bool) -> Phrase:
         return Both(_each(phrase.first, keep), _each(phrase.second, keep))
     if isinstance(phrase, Except):
         second = phrase.second
-        if isinstance(second, Related) and second.target == phrase.first:  # "not on": of the same things
+        if isinstance(second, Related) and second.target == phrase.first:  # "not on": the same things
             second = replace(second, target=_each(second.target, keep))
         return Except(_each(phrase.first, keep), second)
     return phrase
 
 
 def _singular(words: str) -> str:
-    """The last word without its plural's ending, by the rules of English spelling; irregular ones stay."""
+    """The last word in the singular, by the rules of English spelling; irregular plurals stay."""
     for ending, instead in _PLURALS:
         if (shorter := ending.sub(instead, words)) != words:
             return shorter
@@ -202,7 +202,7 @@ def _parse(words: str, quoted: list[str], whole: str, depth: int = 0) -> Phrase:
     if found := _RELATION.search(f" {bare} "):
         number = next(i for i in range(len(_WORDS)) if found.group(f"r{i}") is not None)
         target, reference = f" {bare} "[: found.start()], f" {bare} "[found.end() :]
-        # "something to sit on" ends in such a word, and relates to nothing.
+        # "something to sit on" ends in such a word but has no reference.
         if reference.strip() or " to " not in target:
             things = _parse(target, quoted, whole, depth)
             related = Related(_WORDS[number][1], things, _parse(reference, quoted, whole, depth))

@@ -1,8 +1,7 @@
-"""How selections stand to each other: left of, on, inside, nearest, ..., and the answer to a parsed phrase.
+"""Spatial relations between selections (left of, on, inside, nearest, ...), and the evaluation of parsed phrases.
 
-"Left", "right", "before" and "behind" are the viewer's, with feet on the ground: his axes are laid level by
-gravity. "On", "above", "under" are gravity's alone. Relations hold between instances, by their upright boxes and
-their points.
+"Left", "right", "in front of" and "behind" refer to a viewer whose axes are made horizontal by gravity. "On", "above"
+and "under" depend on gravity alone. Relations hold between instances, by their upright boxes and their points.
 """
 
 from __future__ import annotations
@@ -21,29 +20,29 @@ from lexsplat.queries.phrases import Both, Except, Phrase, Pick, RelationName, T
 from lexsplat.queries.selection import PRESENCES, Presence, Selection
 
 _CONE = 0.5
-"""Sideways means: at least this share of the level offset goes that way (within 60 degrees)."""
+"""Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
 _NEAR = 0.5
-"""Next to means: the gap is at most this many times the diagonal of the smaller footprint (tall things are no nearer
-to each other for being tall)."""
+"""Next to: the gap is at most this many diagonals of the smaller footprint (height does not count)."""
 _SUPPORT = 0.5
-"""On means: the gap below is at most this many times the thing's height. Feet of things are often left out of
-selections: they stand in their own shadow."""
+"""On: the gap below is at most this many heights of the object. Selections often miss the foot of an object, which
+lies in its own shadow."""
 _OVER = 0.3
-"""Over means: at least this share of the smaller of the two is over, or under, the other's footprint."""
+"""Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
 _INSIDE = 0.6
-"""Inside means: at least this share of it lies in the other's box."""
+"""Inside: at least this share of the object lies in the box of the other."""
 _SAME_SIZE = 0.1
-"""Two names of one thing have boxes whose volumes differ by less than this factor."""
+"""Two phrases name one object only if the smaller box has at least this share of the larger one's volume."""
 _SAMPLE = 4000
+"""Number of points per selection that relations are computed from, at most."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The axes that words of direction refer to, each ``[3]``, of unit length.
+    """The axes of a viewer that direction words refer to, unit vectors ``[3]``.
 
     Args:
-        right: To the viewer's right, level.
-        ahead: Away from the viewer, level.
+        right: To the viewer's right, horizontal.
+        ahead: Away from the viewer, horizontal.
         up: Away from the ground.
     """
 
@@ -53,9 +52,9 @@ class Frame:
 
 
 def frame_of(camera: Camera | None, up: NDArray[np.float64]) -> Frame:
-    """The frame of somebody who stands at a camera; any level directions where there is none.
+    """The frame of a viewer at a camera; arbitrary horizontal directions without one.
 
-    A camera that looks straight down has no level view direction: the top of its picture is then ahead.
+    A camera that looks straight down has no horizontal view direction: "ahead" is then the top of its image.
     """
     upwards = np.asarray(up, float) / np.linalg.norm(up)
     if camera is None:
@@ -70,9 +69,9 @@ def frame_of(camera: Camera | None, up: NDArray[np.float64]) -> Frame:
 
 
 def holds(relation: RelationName, target: Selection, reference: Selection, frame: Frame) -> bool:
-    """Whether one thing stands in a relation to another; both are single things (instances).
+    """Whether one instance stands in a relation to another.
 
-    "nearest to" compares several and is `nearest`.
+    "nearest to" compares several instances: see `nearest`.
 
     Raises:
         ValueError: If the relation is unknown or is "nearest to".
@@ -94,16 +93,16 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
         return bool(distance(target, reference) <= _NEAR * smaller) and not _over(target, reference, frame)
-    raise ValueError(f"no such relation between two things: {relation!r}")
+    raise ValueError(f"not a relation between two instances: {relation!r}")
 
 
 def related(relation: RelationName, targets: Selection, references: Selection, frame: Frame) -> Selection:
-    """Those instances of ``targets`` that stand in a relation to an instance of ``references``."""
+    """The instances of ``targets`` that stand in a relation to an instance of ``references``."""
     pairs = [
         target
         for target in targets.instances
         if any(
-            holds(relation, target, reference - target, frame)  # what both words mean supports nothing
+            holds(relation, target, reference - target, frame)  # shared Gaussians support nothing
             for reference in references.instances
             if not _same(target, reference)
         )
@@ -123,13 +122,13 @@ def nearest(targets: Selection, references: Selection) -> Selection:
 
 
 def distance(first: Selection, second: Selection) -> float:
-    """The gap between two selections: the least distance between their points, world units.
+    """The gap between two selections: the smallest distance between their points, world units.
 
     Raises:
         ValueError: If one is empty.
     """
     if not first or not second:
-        raise ValueError("an empty selection is nowhere")
+        raise ValueError("an empty selection has no place")
     apart, _ = cKDTree(_points(first)).query(_points(second))
     return float(np.quantile(apart, 0.002))  # one stray Gaussian does not close a gap
 
@@ -137,12 +136,12 @@ def distance(first: Selection, second: Selection) -> float:
 def answer(
     phrase: Phrase, select: Callable[[str], Selection], viewer: Callable[[Selection], Camera | None]
 ) -> Selection:
-    """The selection a phrase asks for.
+    """The selection that a phrase describes.
 
     Args:
         phrase: From `lexsplat.queries.phrases.parse`.
-        select: Finds a thing by its words.
-        viewer: Who looks, given what directions refer to.
+        select: The selection of a thing, by its text.
+        viewer: The camera of the viewer, given the reference of a direction.
     """
     if isinstance(phrase, Thing):
         return select(phrase.text)
@@ -166,7 +165,7 @@ def answer(
             frame = frame_of(viewer(references), references.up.direction)
             found = related(phrase.relation, targets, references, frame)
         present = min(found.present, references.present, key=PRESENCES.index)
-    # Nothing that fits is a "no", however sure the parts are.
+    # An empty result is a "no", whatever the presence of the parts.
     return replace(found, phrase=str(phrase), present=(present or found.present) if found else "no")
 
 
@@ -185,11 +184,11 @@ def _sideways(relation: str, target: Selection, reference: Selection, frame: Fra
 
 
 def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
-    """Whether the support has a surface below the target, about where the target ends.
+    """Whether the support has a surface below the target, close to the bottom of the target.
 
-    The ground below a thing was often never seen, so its surroundings are asked: what of the support lies in the
-    target's footprint, widened by half. What stands beside a cloth has the cloth's edge in there as well, so the two
-    must lie over each other first.
+    No view may have seen the ground below an object, so its surroundings count: the part of the support within the
+    target's footprint, widened by half. The edge of a cloth is in there for an object beside the cloth as well, so
+    the footprints must overlap first.
     """
     if not _overlap(target, support):
         return False
@@ -201,7 +200,7 @@ def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
         return False
     gap = float(np.median(local[below, 2])) + float(
         box.half_sizes[2]
-    )  # 0: the surface is where the thing ends
+    )  # 0: the surface is at the bottom of the target
     spacing = target._spacing()
     higher = float((target.center - support.center) @ frame.up) > 0
     surface = float(np.quantile(local[below, 2], 0.9)) + float(box.half_sizes[2])
@@ -211,7 +210,7 @@ def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
 
 
 def _stands_over(target: Selection, support: Selection, frame: Frame) -> bool:
-    """Whether the target is over the support and ends about where it does: a thing on a table with a cloth."""
+    """Whether the target is over the support with its bottom at the support's top: on a table under a cloth."""
     bottom = float(target.center @ frame.up) - float(target.box.half_sizes[2])
     top = float(support.center @ frame.up) + float(support.box.half_sizes[2])
     return _over(target, support, frame) and abs(bottom - top) <= _SUPPORT * float(
@@ -220,7 +219,7 @@ def _stands_over(target: Selection, support: Selection, frame: Frame) -> bool:
 
 
 def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
-    """Whether one is higher than the other, and over it."""
+    """Whether one object is higher than the other, and over it."""
     rise = float((upper.center - lower.center) @ frame.up)
     if rise < 0.8 * float(upper.box.half_sizes[2] + lower.box.half_sizes[2]):
         return False
@@ -228,7 +227,7 @@ def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
 
 
 def _overlap(first: Selection, second: Selection) -> bool:
-    """Whether two things lie over each other, seen from above."""
+    """Whether the footprints of two objects overlap, seen from above."""
     small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
     local = (_points(small) - large.center) @ large.box.axes[:2].T
     return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
@@ -240,7 +239,7 @@ def _points(selection: Selection) -> NDArray[np.float64]:
 
 
 def _same(first: Selection, second: Selection) -> bool:
-    """Whether two words mean one thing. A coin that its table's selection takes in is not the table."""
+    """Whether two phrases name one object. A coin within the selection of its table is not the table."""
     small, large = sorted((first, second), key=lambda s: s.box.volume)
     shared = int((first.mask & second.mask).sum())
     return shared > 0.5 * min(len(first), len(second)) and small.box.volume > _SAME_SIZE * large.box.volume
