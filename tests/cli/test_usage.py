@@ -169,18 +169,15 @@ def help_page(capsys, *arguments: str) -> str:
 
 
 def options_of(page: str) -> set[str]:
-    return {
-        word
-        for line in page.splitlines()
-        if line.startswith("│ -")
-        for word in re.findall(r"--[\w.-]+", line)
-    }
+    """The options that start a line of a help page, with or without a frame."""
+    lines = (line.strip("│ ") for line in page.splitlines())
+    return {word for line in lines if line.startswith("-") for word in re.findall(r"--[\w.-]*\w", line)}
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_help_pages_have_words_for_placeholders_and_defaults(command, capsys):
     page = help_page(capsys, command, "--help")
-    positionals = page.split("─ options")[0]
+    positionals = page.split("-h, --help")[0]
     assert "STR" not in positionals
     assert "(default: )" not in page
     assert "None" not in page
@@ -243,3 +240,20 @@ def test_a_folder_that_hides_a_bundled_scene_is_noted(tmp_path, monkeypatch, cap
     )
     assert capture_and_settings("demo", BuildConfig()) == (Path("demo"), BuildConfig())
     assert "note: demo" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("word", "folder"), [("demo", "tabletop"), ("second", "second")])
+def test_build_takes_the_words_of_bundled_captures(word, folder, tmp_path, monkeypatch):
+    from lexsplat.pipeline import build as module
+
+    received = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "build", lambda *arguments, **_: received.extend(arguments) or stop())
+
+    def stop():
+        raise KeyboardInterrupt
+
+    assert cli.main(["build", word, "--output", "scene"]) == 130
+    capture, output, settings = received
+    assert (capture.name, output) == (folder, Path("scene"))
+    assert (settings.clip, settings.codebook.num_codes) == ("bundled", 256)

@@ -24,7 +24,7 @@ def fails_in_one_line(capsys, arguments: list[str], *words: str) -> None:
     """A command ends with status 1 and one line that has these words."""
     assert cli.main(arguments) == 1
     captured = capsys.readouterr()
-    lines = [line for line in captured.err.splitlines() if line.startswith("error:")]
+    lines = [line for line in captured.err.replace("[y/N] ", "\n").splitlines() if line.startswith("error:")]
     assert len(lines) == 1, captured.err
     assert "Traceback" not in captured.err
     for word in words:

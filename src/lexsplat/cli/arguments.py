@@ -129,10 +129,15 @@ def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
         fields.append((field.name, hint, dataclasses.field(default=default, default_factory=factory)))
     frozen = kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
     page = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=frozen)
-    page.__doc__ = re.sub(
-        r"\n {8,}", " ", (inspect.getdoc(kind) or "").replace("`", "")
-    )  # an entry is one line
+    page.__doc__ = _arguments_section(kind)
     return page
+
+
+def _arguments_section(kind: type) -> str:
+    """The arguments of the docstrings of a class and its bases, one line each, without code marks."""
+    docs = [inspect.cleandoc(vars(base).get("__doc__") or "") for base in kind.__mro__[:-1]]
+    sections = [doc.partition("\nArgs:\n")[2].partition("\n\n")[0] for doc in docs]
+    return "Options.\n\nArgs:\n" + re.sub(r"\n {8,}", " ", "\n".join(filter(None, sections))).replace("`", "")
 
 
 def _maker(page: type, values: dict[str, Any]) -> Any:
