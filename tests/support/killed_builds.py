@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-STAGES = 4
 KILLS_A_SCENE = 7
 SHORTEST_STAGE = 0.2
 """Seconds of the codebook on a quick machine: a kill within them, after the stage before, is in it."""
@@ -58,7 +57,7 @@ def stages_done(output: Path) -> int:
 
 
 def main() -> None:
-    folder, kills, seed, *arguments = sys.argv[1:]
+    folder, kills, seed, stages, *arguments = sys.argv[1:]
     import transformers.models.auto.tokenization_auto
     import transformers.models.clip.modeling_clip
     import transformers.models.vit.modeling_vit  # noqa: F401  (seconds of imports, once, before the first fork)
@@ -70,7 +69,7 @@ def main() -> None:
         output = Path(folder) / f"scene_{len(finished)}"
         # The first kill of a scene waits for one of its stages, so that all stages are hit; the others come as they
         # come, most of them while the process starts or goes on with a training.
-        wanted = len(finished) % STAGES
+        wanted = len(finished) % int(stages)
         for number in range(KILLS_A_SCENE):
             if number:
                 result = attempt(arguments, output, float(rng.uniform(0.0, LONGEST_SECONDS)))
