@@ -1,4 +1,4 @@
-"""``lexsplat`` and ``python -m lexsplat``: the command line, also quiet when stopped while its libraries load."""
+"""``lexsplat`` and ``python -m lexsplat``: the command line, with a clean end on Ctrl-C from the first import."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lexsplat.runtime.errors import STOPPED
 def main() -> int:
     """Run one command; returns the exit status."""
     try:
-        from lexsplat import cli  # takes seconds, in which people change their minds
+        from lexsplat import cli
 
         return cli.main()
     except KeyboardInterrupt:

@@ -4,6 +4,7 @@ import json
 from html.parser import HTMLParser
 
 import pytest
+from support.command_line import fails_in_one_line
 
 from lexsplat import cli
 
@@ -41,3 +42,7 @@ def test_info_states_the_method_and_its_codes(built, capsys):
     facts = json.loads(capsys.readouterr().out)
     assert (facts["method"], facts["codes"], facts["dino"]) == ("averaged", 16, "not used")
     assert "weight_dropped" not in facts
+
+
+def test_ground_truth_that_is_given_and_missing_ends_in_one_line(built, tmp_path, capsys):
+    fails_in_one_line(capsys, ["evaluate", str(built), "--masks", str(tmp_path / "nowhere")], "nowhere")
