@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import lexsplat
+from lexsplat import build
 from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
-from lexsplat.pipeline.build import build
 from lexsplat.runtime.progress import Event
 
 words = sys.argv[1:]
