@@ -15,6 +15,8 @@ from support.report_pages import Page
 from lexsplat import cli
 from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
+from lexsplat.evaluation.ablate import AblationPlan
+from lexsplat.evaluation.ground_truth import GroundTruthSource
 from lexsplat.language.methods import METHODS
 from lexsplat.language.methods.averaged import Averaged
 from lexsplat.language.methods.trained import Trained
@@ -36,7 +38,7 @@ def colors():
 def ablated(tiny_capture, tmp_path_factory):
     """All variants with two seeds."""
     folder = tmp_path_factory.mktemp("ablation")
-    ablation.ablate(tiny_capture, folder, CONFIG, seeds=(0, 1))
+    ablation.ablate(tiny_capture, folder, CONFIG, AblationPlan(seeds=(0, 1)))
     return folder
 
 
@@ -88,12 +90,17 @@ def test_a_variant_that_no_method_has_is_refused_before_any_work(tiny_capture, t
     for methods in (("averaged",), ("trained", "averaged")):
         with pytest.raises(ValueError, match="with neighbors"):
             ablation.ablate(
-                tiny_capture, tmp_path / "a", CONFIG, methods=methods, variants=("with neighbors",)
+                tiny_capture,
+                tmp_path / "a",
+                CONFIG,
+                AblationPlan(methods=methods, variants=("with neighbors",)),
             )
     with pytest.raises(ValueError, match="averaged"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, methods=("averaged",), variants=("w/o MLP",))
+        ablation.ablate(
+            tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("averaged",), variants=("w/o MLP",))
+        )
     with pytest.raises(ValueError, match="lifted"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, methods=("lifted",))
+        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -103,13 +110,17 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     methods = ("trained", "averaged")
     rows = ablation.ablate(
-        tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=methods, variants=("full", "one code"),
-        wrong_labels=0.3,
-    )  # fmt: skip
+        tiny_capture,
+        tmp_path,
+        CONFIG,
+        AblationPlan(seeds=(0,), methods=methods, variants=("full", "one code"), wrong_labels=0.3),
+    )
     assert [row["name"] for row in rows] == ["trained: full", "averaged: full", "averaged: one code"]
     assert "trained has no variant 'one code': the row is left out" in caplog.text
     assert all(row["language_seconds"][0] > 0 and row["storage_bytes"][0] > 0 for row in rows)
-    clean = ablation.ablate(tiny_capture, tmp_path, CONFIG, seeds=(0,), methods=methods, variants=("full",))
+    clean = ablation.ablate(
+        tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), methods=methods, variants=("full",))
+    )
     assert len(fits) == 5, "other labels are other runs"
     wrong, right = fits[0][0].code_maps, fits[3][0].code_maps
     name = next(iter(wrong))
@@ -120,7 +131,10 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
 def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     rows = ablation.ablate(
-        tiny_capture, tmp_path, CONFIG, seeds=(0, 1), variants=("full",), forms=("feature", "code")
+        tiny_capture,
+        tmp_path,
+        CONFIG,
+        AblationPlan(seeds=(0, 1), variants=("full",), forms=("feature", "code")),
     )
     assert [row["name"] for row in rows] == ["full, feature", "full, code"]
     assert len(fits) == 2, "one for each seed"
@@ -134,7 +148,7 @@ def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_captur
     ]
     assert again["strict"] == known["strict"], "as if it stood alone"
     with pytest.raises(ValueError, match="form"):
-        ablation.ablate(tiny_capture, tmp_path, CONFIG, forms=())
+        ablation.ablate(tiny_capture, tmp_path, CONFIG, AblationPlan(forms=()))
 
 
 def test_wrong_labels_differ_in_every_view_and_keep_their_share():
@@ -187,7 +201,7 @@ def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_captur
         peaks = json.loads(facts["peaks"])
         assert peaks["peak_rss_bytes"] is None or peaks["peak_rss_bytes"] > 1e7
         write_tensors(path, tensors, {**facts, "peaks": json.dumps({"peak_rss_bytes": 10**15})})
-    rows = ablation.ablate(tiny_capture, tmp_path, CONFIG, seeds=(0,), variants=("full",))
+    rows = ablation.ablate(tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
     assert rows[0]["host_bytes"][0] in (None, 10**15)
 
 
@@ -198,7 +212,7 @@ def test_codebook_and_language_receive_the_memory_budget(ablated, tiny_capture, 
         experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
     )
     config = replace(CONFIG, memory="800MB")
-    ablation.ablate(tiny_capture, tmp_path, config, seeds=(0,), variants=("full",))
+    ablation.ablate(tiny_capture, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
     assert [*granted, fits[0][2].memory] == [parse_bytes("800MB")] * 2
 
 
@@ -215,7 +229,7 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
     missing.unlink()
     (ablated / "runs" / "full" / "seed-0.json").write_text("{")  # damaged
     next((ablated / "codebooks").glob("*.safetensors")).write_bytes(b"damaged")
-    ablation.ablate(tiny_capture, ablated, CONFIG, seeds=(0, 1))
+    ablation.ablate(tiny_capture, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
     assert [run.seed for _, _, run in fits] == [0, 1]
     again = json.loads(missing.read_text())["metrics"]["language"]
     assert again == language, "the same seed gives the same numbers"
@@ -228,15 +242,15 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
 def test_another_version_of_the_code_measures_again(ablated, tiny_capture, tmp_path, monkeypatch, fits):
     output = shutil.copytree(ablated, tmp_path / "ablated")
     monkeypatch.setattr(experiments, "code_identity", lambda: "another")
-    ablation.ablate(tiny_capture, output, CONFIG, variants=("full",), seeds=(0,))
+    ablation.ablate(tiny_capture, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
     assert [run.seed for _, _, run in fits] == [0]
 
 
 def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="seed"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, seeds=())
+        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
     with pytest.raises(ValueError, match="variants"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, variants=("w/o all",))
+        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -258,10 +272,14 @@ def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp
             mask = Image.open(folder / f"{old}.png")
             mask.save(ground_truth / folder.name / f"{new}.png", compress_level=0)
 
-    def measure(**options):
+    def measure(source=None):
         before = len(fits)
         rows = ablation.ablate(
-            capture, tmp_path / "out", CONFIG, seeds=(0,), methods=("trained",), variants=("full",), **options
+            capture,
+            tmp_path / "out",
+            CONFIG,
+            AblationPlan(seeds=(0,), methods=("trained",), variants=("full",)),
+            ground_truth=source,
         )
         record = json.loads((tmp_path / "out" / "ablation.json").read_text())
         return (
@@ -271,27 +289,27 @@ def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp
             record["ground_truth"],
         )
 
-    released = measure(masks=ground_truth, prompt_list="released")
+    released = measure(GroundTruthSource(ground_truth, "released"))
     assert released[:2] == (["stale bread"], 1), "no list has the blue ball"
     assert released[3] == {"folder": str(ground_truth), "layout": "segmentations", "prompt_list": "released"}
-    assert measure(masks=ground_truth, prompt_list="paper")[:2] == (["stable bread"], 1)
-    everything = measure(masks=ground_truth)
+    assert measure(GroundTruthSource(ground_truth, "paper"))[:2] == (["stable bread"], 1)
+    everything = measure(GroundTruthSource(ground_truth))
     assert everything[:2] == (["blue ball", "stale bread"], 1)
     moved = ground_truth.rename(tmp_path / "moved")
-    assert measure(masks=moved)[:3] == (everything[0], 0, everything[2]), (
+    assert measure(GroundTruthSource(moved))[:3] == (everything[0], 0, everything[2]), (
         "equal ground truth in another folder is the same"
     )
     for path in moved.rglob("stale bread.png"):
         size = path.stat().st_size
         Image.fromarray(255 - np.asarray(Image.open(path))).save(path, compress_level=0)
         assert path.stat().st_size == size
-    redrawn = measure(masks=moved)
+    redrawn = measure(GroundTruthSource(moved))
     assert redrawn[1] == 1, "other masks with the same names and sizes are other ground truth"
     assert redrawn[2] != everything[2]
     own = measure()
     assert own[:2] == (["blue ball", "red apple"], 1)
     with pytest.raises(CaptureError, match="the list 'paper'"):
-        measure(prompt_list="paper")
+        measure(GroundTruthSource(prompt_list="paper"))
 
 
 @pytest.mark.parametrize("command", ["ablate", "compare"])
@@ -318,6 +336,6 @@ def test_the_command_line_passes_ground_truth_and_protocols(tiny_capture, tmp_pa
     arguments = ["--masks", str(tmp_path), "--prompt-list", "released"]
     arguments += ["--protocols", "strict", "lerf-2d"] if command == "compare" else []
     assert cli.main([command, str(tiny_capture), "--output", str(tmp_path / "out"), *arguments]) == 0
-    assert (options["masks"], options["prompt_list"]) == (tmp_path, "released")
+    assert options["ground_truth"] == GroundTruthSource(tmp_path, "released")
     if command == "compare":
-        assert options["protocols"] == ("strict", "lerf-2d")
+        assert options["evaluation"].protocols == ("strict", "lerf-2d")

@@ -13,9 +13,10 @@ from support.experiments import CONFIG
 from support.report_pages import Page
 
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.evaluation import baselines
+from lexsplat.evaluation import EvaluationConfig, baselines
 from lexsplat.evaluation import compare as comparison
 from lexsplat.evaluation.baselines import feature_rendering
+from lexsplat.evaluation.compare import ComparisonPlan
 from lexsplat.runtime.memory import parse_bytes
 
 
@@ -30,9 +31,21 @@ def compared(tiny_capture, tmp_path_factory):
             comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
         )
         methods = ("averaged", "averaged-feature", *comparison.BASELINES)
-        comparison.compare(tiny_capture, folder, CONFIG, methods=methods, lpips=False)
+        comparison.compare(
+            tiny_capture,
+            folder,
+            CONFIG,
+            ComparisonPlan(methods=methods),
+            evaluation=EvaluationConfig(lpips=False),
+        )
         start = time.perf_counter()
-        comparison.compare(tiny_capture, folder, CONFIG, methods=methods, lpips=False)
+        comparison.compare(
+            tiny_capture,
+            folder,
+            CONFIG,
+            ComparisonPlan(methods=methods),
+            evaluation=EvaluationConfig(lpips=False),
+        )
         again = time.perf_counter() - start
     return folder, again
 
@@ -120,7 +133,7 @@ def test_the_report_shows_every_method_and_loads_nothing(compared):
 
 def test_unknown_methods_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="nerf"):
-        comparison.compare(tiny_capture, tmp_path / "a", CONFIG, methods=("nerf",))
+        comparison.compare(tiny_capture, tmp_path / "a", CONFIG, ComparisonPlan(methods=("nerf",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -131,7 +144,11 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
         shutil.copytree(folder / part, tmp_path / part)
     before = rows_of(folder)["averaged"]
     comparison.compare(
-        tiny_capture, tmp_path, CONFIG, methods=("averaged",), lpips=False, protocols=("lerf-2d",)
+        tiny_capture,
+        tmp_path,
+        CONFIG,
+        ComparisonPlan(methods=("averaged",)),
+        evaluation=EvaluationConfig(lpips=False, protocols=("lerf-2d",)),
     )
     (row,) = rows_of(tmp_path).values()
     language = json.loads((tmp_path / "runs" / "averaged" / "seed-0.json").read_text())["metrics"]["language"]
@@ -139,7 +156,9 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
     assert not {"official", "lerf_3d"} & set(language)
     assert row["mIoU"] == before["mIoU"], "strict is always measured, with the same result"
     with pytest.raises(ValueError, match="lerf-4d"):
-        comparison.compare(tiny_capture, tmp_path / "a", CONFIG, protocols=("lerf-4d",))
+        comparison.compare(
+            tiny_capture, tmp_path / "a", CONFIG, evaluation=EvaluationConfig(protocols=("lerf-4d",))
+        )
     assert not (tmp_path / "a").exists()
 
 
@@ -156,7 +175,13 @@ def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_p
 
     monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)
     config = replace(CONFIG, memory="800MB")
-    comparison.compare(tiny_capture, tmp_path, config, methods=("dff", "lerf", "3dovs"), lpips=False)
+    comparison.compare(
+        tiny_capture,
+        tmp_path,
+        config,
+        ComparisonPlan(methods=("dff", "lerf", "3dovs")),
+        evaluation=EvaluationConfig(lpips=False),
+    )
     assert granted == [parse_bytes("200MB")] * 3
 
 

@@ -12,11 +12,13 @@ import pytest
 import torch
 from support.tiny_capture import SPHERES, trace
 
-from lexsplat.captures import load_capture
+from lexsplat.captures import load_annotations, load_capture
 from lexsplat.evaluation import (
     EvaluationConfig,
+    GroundTruth,
     Metrics,
     PairResult,
+    Subject,
     ViewPictures,
     evaluate,
     measuring,
@@ -84,32 +86,32 @@ class PerfectField:
 
 
 @pytest.fixture(scope="module")
-def scene(tiny_capture):
+def capture(tiny_capture):
     return load_capture(tiny_capture)
 
 
 @pytest.fixture(scope="module")
-def gaussians(scene):
-    return gaussians_from_points(scene.points, scene.point_colors, sh_degree=0)
+def gaussians(capture):
+    return gaussians_from_points(capture.points, capture.point_colors, sh_degree=0)
 
 
 @pytest.fixture(scope="module")
-def perfect(scene, gaussians):
-    return evaluate(scene, gaussians, PerfectField(), encode_text, QUICK)
+def perfect(capture, gaussians):
+    return evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK)
 
 
-def larger_masks(scene, scale):
+def larger_masks(capture, scale):
     masks = {}
-    for view in scene.test_views:
+    for view in capture.test_views:
         camera = view.camera.resized(scale * view.camera.width, scale * view.camera.height)
         masks[view.name] = {prompt: things_seen(camera) == i for i, prompt in enumerate(SPHERES, start=1)}
     return masks
 
 
 @pytest.mark.parametrize("form", ["feature", "code"])
-def test_a_field_that_knows_the_truth_scores_one_everywhere(scene, gaussians, form):
+def test_a_field_that_knows_the_truth_scores_one_everywhere(capture, gaussians, form):
     config = replace(QUICK, query=QueryConfig(form=form))
-    language = evaluate(scene, gaussians, PerfectField(), encode_text, config).language
+    language = evaluate(capture, Subject(gaussians, PerfectField(), encode_text), config).language
     assert language["form"] == form
     strict = language["strict"]
     for kind in ("auto", "fixed", "oracle"):
@@ -119,16 +121,17 @@ def test_a_field_that_knows_the_truth_scores_one_everywhere(scene, gaussians, fo
     assert language["official"]["mAP"] == pytest.approx(1.01, abs=1e-6)
 
 
-def test_a_field_that_confuses_two_things_scores_zero(scene, gaussians):
-    metrics = evaluate(scene, gaussians, PerfectField(order=(0, 2, 1)), encode_text, QUICK)
+def test_a_field_that_confuses_two_things_scores_zero(capture, gaussians):
+    metrics = evaluate(capture, Subject(gaussians, PerfectField(order=(0, 2, 1)), encode_text), QUICK)
     assert metrics.language["strict"]["auto"]["mIoU"] == 0
     assert metrics.language["strict"]["localization"] == 0
     assert metrics.language["strict"]["mAP"] < 0.2
 
 
-def test_relevancy_is_rendered_at_the_size_of_the_truth(scene, gaussians):
+def test_relevancy_is_rendered_at_the_size_of_the_truth(capture, gaussians):
     field = PerfectField()
-    metrics = evaluate(scene, gaussians, field, encode_text, QUICK, masks=larger_masks(scene, 3))
+    subject, ground_truth = Subject(gaussians, field, encode_text), GroundTruth(larger_masks(capture, 3))
+    metrics = evaluate(capture, subject, QUICK, ground_truth=ground_truth)
     assert (288, 216) in field.sizes
     assert metrics.language["strict"]["auto"]["mIoU"] == pytest.approx(1)
     assert metrics.language["official"]["mPA"] < 1, (
@@ -136,64 +139,68 @@ def test_relevancy_is_rendered_at_the_size_of_the_truth(scene, gaussians):
     )
 
 
-def test_masks_larger_than_allowed_are_met_by_an_enlarged_map(scene, gaussians):
+def test_masks_larger_than_allowed_are_met_by_an_enlarged_map(capture, gaussians):
     field = PerfectField()
     config = replace(QUICK, max_pixels=96 * 72)
-    metrics = evaluate(scene, gaussians, field, encode_text, config, masks=larger_masks(scene, 3))
+    subject, ground_truth = Subject(gaussians, field, encode_text), GroundTruth(larger_masks(capture, 3))
+    metrics = evaluate(capture, subject, config, ground_truth=ground_truth)
     assert set(field.sizes) == {(96, 72)}
     assert 0.85 < metrics.language["strict"]["oracle"]["mIoU"] < 1
 
 
-def test_automatic_thresholds_never_see_the_truth(scene, gaussians, perfect):
+def test_automatic_thresholds_never_see_the_truth(capture, gaussians, perfect):
     wrong = {
         view.name: {prompt: ~mask for prompt, mask in prompts.items()}
-        for view, prompts in zip(scene.test_views, larger_masks(scene, 1).values())
+        for view, prompts in zip(capture.test_views, larger_masks(capture, 1).values())
     }
-    misled = evaluate(scene, gaussians, PerfectField(), encode_text, QUICK, masks=wrong)
+    subject = Subject(gaussians, PerfectField(), encode_text)
+    misled = evaluate(capture, subject, QUICK, ground_truth=GroundTruth(wrong))
     for prompt in WORDS:
         assert misled.thresholds[prompt]["auto"] == perfect.thresholds[prompt]["auto"]
     assert misled.language["strict"]["auto"]["mIoU"] == 0
     assert misled.language["strict"]["oracle"]["mIoU"] > 0.5
 
 
-def test_automatic_thresholds_look_at_training_views_only(scene, gaussians, monkeypatch):
+def test_automatic_thresholds_look_at_training_views_only(capture, gaussians, monkeypatch):
     cameras = []
     monkeypatch.setattr(
         measuring,
         "scene_thresholds",
         lambda relevancy, views, *rest: cameras.extend(views) or scene_thresholds(relevancy, views, *rest),
     )
-    evaluate(scene, gaussians, PerfectField(), encode_text, QUICK)
-    training = [view.camera for view in scene.train_views]
+    evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK)
+    training = [view.camera for view in capture.train_views]
     assert len(cameras) == len(training)
     assert all(camera is other for camera, other in zip(cameras, training))
 
 
-def test_masks_of_training_views_do_not_count(scene, gaussians):
-    masks = {scene.train_names[0]: {"red apple": np.ones((72, 96), bool)}}
-    assert evaluate(scene, gaussians, PerfectField(), encode_text, QUICK, masks=masks).language is None
+def test_masks_of_training_views_do_not_count(capture, gaussians):
+    masks = {capture.train_names[0]: {"red apple": np.ones((72, 96), bool)}}
+    subject = Subject(gaussians, PerfectField(), encode_text)
+    assert evaluate(capture, subject, QUICK, ground_truth=GroundTruth(masks)).language is None
 
 
 @pytest.mark.parametrize("masks", [{}, None])
-def test_without_masks_or_language_pictures_are_measured_alone(scene, gaussians, masks):
+def test_without_masks_or_language_pictures_are_measured_alone(capture, gaussians, masks):
     language = PerfectField() if masks is not None else None
-    metrics = evaluate(scene, gaussians, language, None, QUICK, masks=masks)
+    ground_truth = None if masks is None else GroundTruth(masks)
+    metrics = evaluate(capture, Subject(gaussians, language), QUICK, ground_truth=ground_truth)
     assert metrics.language is None
     assert metrics.speed["query_ms"] is None
     assert metrics.speed["rgb_fps"] > 0
-    assert set(metrics.quality["per_view"]) == set(scene.test_names)
+    assert set(metrics.quality["per_view"]) == set(capture.test_names)
 
 
-def test_masks_and_language_need_an_encoder(scene, gaussians):
+def test_masks_and_language_need_an_encoder(capture, gaussians):
     with pytest.raises(ValueError, match="encode_text"):
-        evaluate(scene, gaussians, PerfectField(), None, QUICK)
+        evaluate(capture, Subject(gaussians, PerfectField()), QUICK)
 
 
-def test_quality_is_the_mean_over_the_held_out_views(scene, gaussians, perfect):
+def test_quality_is_the_mean_over_the_held_out_views(capture, gaussians, perfect):
     from lexsplat.rendering import render
 
     values = []
-    for view in scene.test_views:
+    for view in capture.test_views:
         image = render(gaussians, view.camera).image.clamp(0, 1).numpy().astype(np.float64)
         values.append(-10 * np.log10(np.mean((image - view.load_image()) ** 2)))
     assert perfect.quality["psnr"] == pytest.approx(np.mean(values), abs=1e-4)
@@ -201,27 +208,30 @@ def test_quality_is_the_mean_over_the_held_out_views(scene, gaussians, perfect):
     assert ("lpips_reason" in perfect.quality) == (perfect.quality["lpips"] is None)
 
 
-def test_observers_see_every_view_once(scene, gaussians):
+def test_observers_see_every_view_once(capture, gaussians):
     seen: list[ViewPictures] = []
-    evaluate(scene, gaussians, PerfectField(), encode_text, QUICK, observer=seen.append)
-    assert [pictures.name for pictures in seen] == list(scene.test_names)
+    evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK, observer=seen.append)
+    assert [pictures.name for pictures in seen] == list(capture.test_names)
     for pictures in seen:
         assert pictures.photo.shape == pictures.image.shape == (72, 96, 3)
         assert set(pictures.relevancy) == set(pictures.ground_truth) == set(pictures.thresholds) == set(WORDS)
 
 
-def test_progress_is_told(scene, gaussians):
+def test_progress_is_told(capture, gaussians):
     events = []
-    evaluate(scene, gaussians, None, None, QUICK, listener=events.append)
+    evaluate(capture, Subject(gaussians), QUICK, listener=events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [
         ("evaluate", i, 3) for i in (1, 2, 3)
     ]
 
 
-def test_metrics_json_has_the_sections_of_the_design_and_is_strict_json(scene, gaussians):
-    metrics = evaluate(
-        scene, gaussians, PerfectField(), encode_text, QUICK, stage_seconds={"language": 1.5},
-        stored_bytes={"language_bytes": 7}, settings={"seed": 3}, machine={"cores": 2},
+def test_metrics_json_has_the_sections_of_the_design_and_is_strict_json(capture, gaussians):
+    metrics = evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK)
+    tensors = metrics.size["language_bytes"], metrics.size["gaussian_bytes"]
+    assert tensors == (10, 4 * 14 * len(gaussians)), "in memory, while nothing is known about files"
+    metrics = metrics.with_facts(
+        stage_seconds={"language": 1.5}, stored_bytes={"language_bytes": 7}, settings={"seed": 3},
+        machine={"cores": 2},
     )  # fmt: skip
     found = json.loads(json.dumps(metrics.to_json(), allow_nan=False))
     assert list(found) == ["quality", "language", "speed", "size", "config", "machine"]
@@ -234,10 +244,11 @@ def test_metrics_json_has_the_sections_of_the_design_and_is_strict_json(scene, g
     assert found["size"]["gaussian_bytes"] == 4 * 14 * len(gaussians)
     assert found["config"]["evaluation"]["query"]["form"] == "code"
     assert found["config"]["seed"] == 3
+    assert found["machine"] == {"cores": 2}
 
 
-def test_the_same_scene_gives_the_same_numbers_times_aside(scene, gaussians, perfect):
-    again = evaluate(scene, gaussians, PerfectField(), encode_text, QUICK).to_json()
+def test_the_same_scene_gives_the_same_numbers_times_aside(capture, gaussians, perfect):
+    again = evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK).to_json()
     first = perfect.to_json()
     for section in ("quality", "language", "config"):
         assert again[section] == first[section]
@@ -360,26 +371,26 @@ class PaintedScene:
         return {"owner": self.owner}
 
 
-def test_lerf_3d_scores_what_is_selected_in_space_and_any_method_can_be_measured(scene):
-    dense = gaussians_from_points(scene.points, scene.point_colors, sh_degree=0, opacity=0.95)
+def test_lerf_3d_scores_what_is_selected_in_space_and_any_method_can_be_measured(capture):
+    dense = gaussians_from_points(capture.points, capture.point_colors, sh_degree=0, opacity=0.95)
     config = replace(QUICK, protocols=("strict", "lerf-3d"))
-    language = evaluate(scene, dense, PaintedScene(dense), encode_text, config).language
+    language = evaluate(capture, Subject(dense, PaintedScene(dense), encode_text), config).language
     assert language["method"] == "painted"
     assert language["strict"]["auto"]["mIoU"] == 1
     assert 0.4 < language["lerf_3d"]["mIoU"] < 1, "the silhouette of sparse points is ragged"
     assert "official" not in language
     painted = PaintedScene(dense)
     painted.owner[:] = 0
-    missed = evaluate(scene, dense, painted, encode_text, config).language
+    missed = evaluate(capture, Subject(dense, painted, encode_text), config).language
     assert missed["lerf_3d"] == {"mIoU": 0, "acc_25": 0, "acc_50": 0}
 
 
-def test_boxes_of_the_annotation_decide_about_localization(scene, gaussians):
-    elsewhere = {v: {p: np.array([[0.0, 0.0, 1.0, 1.0]]) for p in WORDS} for v in scene.test_names}
-    right = evaluate(scene, gaussians, PerfectField(), encode_text, QUICK).language["lerf_2d"]
-    wrong = evaluate(scene, gaussians, PerfectField(), encode_text, QUICK, boxes=elsewhere).language[
-        "lerf_2d"
-    ]
+def test_boxes_of_the_annotation_decide_about_localization(capture, gaussians):
+    elsewhere = {v: {p: np.array([[0.0, 0.0, 1.0, 1.0]]) for p in WORDS} for v in capture.test_names}
+    ground_truth = GroundTruth(load_annotations(capture).masks, elsewhere)
+    subject = Subject(gaussians, PerfectField(), encode_text)
+    right = evaluate(capture, subject, QUICK).language["lerf_2d"]
+    wrong = evaluate(capture, subject, QUICK, ground_truth=ground_truth).language["lerf_2d"]
     assert wrong["localization"] == 0 < right["localization"]
     assert wrong["mIoU"] == right["mIoU"]
 

@@ -328,6 +328,8 @@ def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypa
         reconstruction=dataclasses.replace(CONFIG.reconstruction, max_gaussians=150),
     )  # fmt: skip
     capture = write_capture(tmp_path / "capture", views=5, width=40, height=30)
-    comparison.compare(capture, tmp_path / "out", config, methods=comparison.BASELINES, lpips=False)
+    plan = comparison.ComparisonPlan(methods=comparison.BASELINES)
+    evaluation = comparison.EvaluationConfig(lpips=False)
+    comparison.compare(capture, tmp_path / "out", config, plan, evaluation=evaluation)
     rows = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert set(comparison.BASELINES) <= set(json.dumps(rows).replace('"', " ").replace(",", " ").split())

@@ -68,6 +68,41 @@ def test_no_module_uses_pickle_eval_or_a_bare_except(path):
             pytest.fail(f"assert at {path.name}:{node.lineno}: raise an error with words instead")
 
 
+@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_no_module_has_more_than_450_lines(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 450
+
+
+def unexplained(source: str, most: int = 7) -> list[str]:
+    """Functions with more than ``most`` parameters, self and cls aside, and no comment in the line above."""
+    lines, found = source.splitlines(), []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            continue
+        given = node.args
+        every = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+        count = sum(1 for parameter in every if parameter and parameter.arg not in ("self", "cls"))
+        above = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)]) - 2
+        if count > most and not (above >= 0 and lines[above].strip().startswith("#")):
+            found.append(f"{node.name} has {count} parameters")
+    return found
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_functions_have_at_most_seven_parameters_or_a_reason_above(path):
+    if "kernels" in path.parts or path.stem.endswith(("_kernel", "_kernels")):
+        return  # kernels take arrays and numbers one by one
+    assert not unexplained(path.read_text(encoding="utf-8"))
+
+
+def test_parameters_of_all_kinds_are_counted_and_a_reason_stands_above_the_decorators():
+    eight = "def f(self, a, /, b, c, *d, e, g, h, **i): ..."
+    assert unexplained(eight) == ["f has 8 parameters"]
+    assert unexplained(f"class C:\n    # Why.\n    @wrap\n    {eight}") == []
+    assert unexplained(f"# Why.\n\n@wrap\n{eight}") == ["f has 8 parameters"]
+    assert unexplained(eight.replace(", **i", "")) == []
+
+
 def test_importing_lexsplat_does_not_load_the_heavy_libraries():
     heavy = ("torch", "transformers", "gsplat", "pycolmap")
     code = f"import sys, lexsplat; print([m for m in {heavy} if m in sys.modules])"

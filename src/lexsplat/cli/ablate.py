@@ -79,24 +79,21 @@ class Ablate:
     def run(self) -> None:
         """Measure and print the table."""
         from lexsplat.cli.progress import ProgressBars
+        from lexsplat.evaluation import GroundTruthSource
         from lexsplat.evaluation import ablate as ablation
         from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
         if self.as_in_paper:
             settings = ablation.as_in_paper(settings)
+        plan = ablation.AblationPlan(self.seeds, self.variants, self.methods, self.wrong_labels, self.forms)
         with ProgressBars() as bars:
             rows = ablation.ablate(
                 capture,
                 self.output,
                 settings,
-                seeds=self.seeds,
-                variants=self.variants,
-                methods=self.methods,
-                wrong_labels=self.wrong_labels,
-                forms=self.forms,
-                masks=self.masks,
-                prompt_list=self.prompt_list,
+                plan,
+                ground_truth=GroundTruthSource(self.masks, self.prompt_list),
                 listener=bars,
             )
         if self.json:

@@ -70,7 +70,8 @@ class Compare:
     def run(self) -> None:
         """Measure and print the table."""
         from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation.compare import compare
+        from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
+        from lexsplat.evaluation.compare import ComparisonPlan, compare
         from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
@@ -79,12 +80,9 @@ class Compare:
                 capture,
                 self.output,
                 settings,
-                methods=self.methods,
-                seeds=self.seeds,
-                lpips=self.lpips,
-                masks=self.masks,
-                prompt_list=self.prompt_list,
-                protocols=self.protocols,
+                ComparisonPlan(self.methods, self.seeds),
+                evaluation=EvaluationConfig(lpips=self.lpips, protocols=self.protocols),
+                ground_truth=GroundTruthSource(self.masks, self.prompt_list),
                 listener=bars,
             )
         if self.json:

@@ -1,10 +1,11 @@
 """Evaluation of a scene on held-out views: image quality, language, speed and size, as in the paper's Table 1."""
 
-from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
+from lexsplat.evaluation.ground_truth import GroundTruth, GroundTruthSource, Masks
+from lexsplat.evaluation.measuring import EvaluationConfig, Subject, evaluate
 from lexsplat.evaluation.memory import forget_peak_memory, peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import FieldMethod, Method
 from lexsplat.evaluation.protocols import PROTOCOLS
-from lexsplat.evaluation.results import THRESHOLD_KINDS, Masks, Metrics, PairResult, ViewPictures
+from lexsplat.evaluation.results import THRESHOLD_KINDS, Metrics, PairResult, ViewPictures
 from lexsplat.evaluation.summary import precision_curves, summarize_kinds, summarize_language
 
 __all__ = [
@@ -12,10 +13,13 @@ __all__ = [
     "THRESHOLD_KINDS",
     "EvaluationConfig",
     "FieldMethod",
+    "GroundTruth",
+    "GroundTruthSource",
     "Masks",
     "Method",
     "Metrics",
     "PairResult",
+    "Subject",
     "ViewPictures",
     "evaluate",
     "forget_peak_memory",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.captures.ground_truth.prompt_lists import PromptList
-from lexsplat.evaluation import EvaluationConfig
+from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
 from lexsplat.evaluation.experiments import Bench, Results
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
@@ -84,19 +83,42 @@ def as_in_paper(config: BuildConfig) -> BuildConfig:
     return replace(config, codebook=config.codebook.as_in_paper(), trained=config.trained.as_in_paper())
 
 
+@dataclass(frozen=True)
+class AblationPlan:
+    """The rows of an ablation, and how often each is measured.
+
+    Args:
+        seeds: Seeds of codebook and language.
+        variants: Names out of `VARIANTS`; empty takes all of each method.
+        methods: Names of methods; empty takes that of the settings. Rows of several are named "METHOD: VARIANT".
+        wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
+        forms: How codes and text are compared: "feature" as in the paper, "code". Names of rows end in the form if
+            there are several.
+
+    Raises:
+        ValueError: If there is no seed or form, or the share is not within 0..1.
+    """
+
+    seeds: Sequence[int] = (0, 1, 2)
+    variants: Sequence[str] = ()
+    methods: Sequence[MethodName] = ()
+    wrong_labels: float = 0.0
+    forms: Sequence[QueryForm] = ("feature",)
+
+    def __post_init__(self) -> None:
+        if not self.seeds or not self.forms:
+            raise ValueError("an ablation needs at least one seed and one form")
+        with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share before any work
+
+
 def ablate(
     source: Path,
     output: Path,
     config: BuildConfig,
+    plan: AblationPlan | None = None,
     *,
-    seeds: Sequence[int] = (0, 1, 2),
-    variants: Sequence[str] = (),
-    methods: Sequence[MethodName] = (),
-    wrong_labels: float = 0.0,
-    forms: Sequence[QueryForm] = ("feature",),
     evaluation: EvaluationConfig | None = None,
-    masks: Path | None = None,
-    prompt_list: PromptList | None = None,
+    ground_truth: GroundTruthSource | None = None,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
     """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
@@ -107,34 +129,27 @@ def ablate(
         source: Folder with photos, cameras and masks.
         output: Folder for everything that is written.
         config: Settings of the full method; ``config.seed`` is the seed of the Gaussians.
-        seeds: Seeds of codebook and language.
-        variants: Names out of `VARIANTS`; empty takes all of each method.
-        methods: Names of methods; empty takes that of the settings. Rows of several are named "METHOD: VARIANT".
-        wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
-        forms: How codes and text are compared: "feature" as in the paper, "code". Names of rows end in the form if
-            there are several.
+        plan: The rows and seeds; None takes all variants of the method of the settings.
         evaluation: How to measure; None takes `paper_evaluation`.
-        masks: Folder with ground truth in any layout of `lexsplat.captures.ground_truth`; None takes the capture's.
-        prompt_list: Use the prompts of the paper or of the released code, for captures named like its scenes.
+        ground_truth: Where the ground truth is read from; None takes the capture's.
         listener: Receives progress events.
 
     Returns:
         Rows as `report.table_rows` makes them.
 
     Raises:
-        ValueError: If a method or variant is unknown, no method has a variant, or there is no seed or form.
+        ValueError: If a method or variant is unknown, or no method has a variant.
         CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
-    plan = _plan(config, list(methods) or [config.method], variants)
-    if not seeds or not forms:
-        raise ValueError("an ablation needs at least one seed and one form")
-    with_wrong_labels({}, wrong_labels, 1, 0)  # refuses an invalid share before any work
+    plan = plan or AblationPlan()
+    seeds, forms, wrong_labels = plan.seeds, plan.forms, plan.wrong_labels
+    variants = _variants(config, list(plan.methods) or [config.method], plan.variants)
     measure = in_form(evaluation or paper_evaluation(), forms[0])
-    bench = Bench(source, output, config, measure, listener, masks=masks, prompt_list=prompt_list)
-    names = [_row(name, form, forms) for name, _, _ in plan for form in forms]
+    bench = Bench(source, output, config, measure, ground_truth, listener)
+    names = [_row(name, form, forms) for name, _, _ in variants for form in forms]
     results = Results(bench, "ablation", names, seeds, COLUMNS)
     for seed in seeds:  # seed by seed, so that an interrupted run leaves complete tables of fewer seeds
-        for name, method, variant in plan:
+        for name, method, variant in variants:
             settings = replace(changed(replace(bench.config, method=method), variant), seed=seed)
             made_from = [*language_settings(settings), *([wrong_labels] if wrong_labels else [])]
             make = partial(make_language, bench, settings, wrong_labels)
@@ -145,7 +160,7 @@ def ablate(
     return results.rows()
 
 
-def _plan(
+def _variants(
     config: BuildConfig, methods: Sequence[MethodName], variants: Sequence[str]
 ) -> list[tuple[str, MethodName, str]]:
     """Name, method and variant of every row. What some methods lack is named in a warning.

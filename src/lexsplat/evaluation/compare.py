@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lexsplat.captures.ground_truth.prompt_lists import PromptList
-from lexsplat.evaluation import PROTOCOLS, EvaluationConfig, baselines
+from lexsplat.evaluation import EvaluationConfig, GroundTruthSource, baselines
 from lexsplat.evaluation.ablate import in_form, language_settings, make_language
 from lexsplat.evaluation.experiments import Bench, Made, Results
 from lexsplat.evaluation.methods import Method
@@ -28,17 +27,35 @@ METHODS = (*OURS, *(f"{name}-feature" for name in OURS), *BASELINES)
 """Everything that can be compared."""
 
 
+@dataclass(frozen=True)
+class ComparisonPlan:
+    """The rows of a comparison, and how often each is measured.
+
+    Args:
+        methods: Names out of `METHODS`.
+        seeds: Seeds of codebook and language; one is enough for deterministic methods.
+
+    Raises:
+        ValueError: If a method is unknown, or there is no method or seed.
+    """
+
+    methods: Sequence[str] = ("averaged", "trained-feature", *BASELINES)
+    seeds: Sequence[int] = (0,)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.methods if name not in METHODS]
+        if unknown or not self.methods or not self.seeds:
+            raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown) or 'too few'}")
+
+
 def compare(
     source: Path,
     output: Path,
     config: BuildConfig,
+    plan: ComparisonPlan | None = None,
     *,
-    methods: Sequence[str] = ("averaged", "trained-feature", *BASELINES),
-    seeds: Sequence[int] = (0,),
-    lpips: bool = True,
-    masks: Path | None = None,
-    prompt_list: PromptList | None = None,
-    protocols: Sequence[str] = PROTOCOLS,
+    evaluation: EvaluationConfig | None = None,
+    ground_truth: GroundTruthSource | None = None,
     listener: Listener = silent,
 ) -> list[dict[str, Any]]:
     """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
@@ -51,33 +68,26 @@ def compare(
         source: Folder with photos, cameras and masks.
         output: Folder for everything that is written.
         config: Settings; ``config.seed`` is the seed of the Gaussians.
-        methods: Names out of `METHODS`.
-        seeds: Seeds of codebook and language; one is enough for deterministic methods.
-        lpips: Measure LPIPS if it is installed.
-        masks: Folder with ground truth in any layout of `lexsplat.captures.ground_truth`; None takes the capture's.
-        prompt_list: Use the prompts of the paper or of the released code, for captures named like its scenes.
-        protocols: Names out of `evaluation.PROTOCOLS`; "strict" is always measured.
+        plan: The rows and seeds; None takes the defaults.
+        evaluation: How to measure; None takes the defaults: all protocols.
+        ground_truth: Where the ground truth is read from; None takes the capture's.
         listener: Receives progress events.
 
     Returns:
         Rows as `report.table_rows` makes them.
 
     Raises:
-        ValueError: If a method or protocol is unknown, or there is no method or seed.
         CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown or not methods or not seeds:
-        raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown) or 'too few'}")
-    evaluation = EvaluationConfig(lpips=lpips, protocols=tuple(protocols))
-    bench = Bench(source, output, config, evaluation, listener, masks=masks, prompt_list=prompt_list)
-    shared = bench.evaluation
-    results = Results(bench, "comparison", methods, seeds)
-    for seed in seeds:
-        for name in methods:
+    plan = plan or ComparisonPlan()
+    shared = evaluation or EvaluationConfig()
+    bench = Bench(source, output, config, shared, ground_truth, listener)
+    results = Results(bench, "comparison", plan.methods, plan.seeds)
+    for seed in plan.seeds:
+        for name in plan.methods:
             bench.evaluation = in_form(shared, "feature") if name.endswith("-feature") else shared
             settings, make = _method(bench, name, seed)
-            results.add(bench.run(name, seed, settings, make, pictures=seed == seeds[0]))
+            results.add(bench.run(name, seed, settings, make, pictures=seed == plan.seeds[0]))
     return results.rows()
 
 

@@ -21,11 +21,13 @@ import torch
 from torch import Tensor
 
 from lexsplat.captures import Annotations, check_ground_truth_options, load_annotations
-from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
     EvaluationConfig,
+    GroundTruth,
+    GroundTruthSource,
     Metrics,
+    Subject,
     ViewPictures,
     evaluate,
     forget_peak_memory,
@@ -101,9 +103,8 @@ class Bench:
         output: Folder for everything that is written.
         config: Settings; ``config.seed`` is the seed of the Gaussians.
         evaluation: How runs are measured.
+        ground_truth: Where the ground truth is read from.
         listener: Receives progress events.
-        masks: Folder with ground truth in any layout of `lexsplat.captures.ground_truth`; None takes the capture's.
-        prompt_list: Use the prompts of the paper or of the released code, for captures named like its scenes.
 
     Raises:
         CaptureError: If there is no ground truth of held-out views.
@@ -115,11 +116,11 @@ class Bench:
         output: Path,
         config: BuildConfig,
         evaluation: EvaluationConfig,
+        ground_truth: GroundTruthSource | None = None,
         listener: Listener = silent,
-        *,
-        masks: Path | None = None,
-        prompt_list: PromptList | None = None,
     ) -> None:
+        ground_truth = ground_truth or GroundTruthSource()
+        masks, prompt_list = ground_truth.masks, ground_truth.prompt_list
         check_ground_truth_options(source, masks, prompt_list)
         self.output, self.listener = output, listener
         # Features are shared by methods that use DINO and others that do not, so they are made with both encoders.
@@ -298,14 +299,12 @@ class Bench:
         stages = {stage: shared[stage] for stage in ("reconstruct", "features")}
         return evaluate(
             self.capture,
-            self.gaussians,
-            language,
-            self.encode_text,
+            Subject(self.gaussians, language, self.encode_text),
             self.evaluation,
-            masks=self.ground_truth.masks,
-            boxes=self.ground_truth.boxes,
+            ground_truth=GroundTruth(self.ground_truth.masks, self.ground_truth.boxes),
             observer=observer,
             listener=self.listener,
+        ).with_facts(
             stage_seconds={**stages, **seconds},
             settings={"name": name},
             machine=machine_facts(),

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.captures.ground_truth.layouts import load_ground_truth
+from lexsplat.evaluation.ground_truth import GroundTruth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import FieldMethod, Method, method_presences
 from lexsplat.evaluation.metrics import (
@@ -36,7 +37,7 @@ from lexsplat.evaluation.metrics import (
     threshold_counts,
 )
 from lexsplat.evaluation.protocols import PROTOCOLS, lerf_2d_scores, official_scores, silhouette_iou
-from lexsplat.evaluation.results import Boxes, Masks, Metrics, PairResult, ViewPictures
+from lexsplat.evaluation.results import Metrics, PairResult, ViewPictures
 from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kinds, summarize_language
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
@@ -77,67 +78,69 @@ class EvaluationConfig:
             raise ValueError("timing_views and max_pixels must be positive")
 
 
+@dataclass(frozen=True)
+class Subject:
+    """What is measured.
+
+    Args:
+        gaussians: The reconstruction.
+        language: Its language field or another method; None measures images only.
+        encode_text: Texts to embeddings; needed if there are both masks and a language.
+    """
+
+    gaussians: Gaussians
+    language: LanguageField | Method | None = None
+    encode_text: TextEncoder | None = None
+
+
 def evaluate(
     capture: Capture,
-    gaussians: Gaussians,
-    language: LanguageField | Method | None,
-    encode_text: TextEncoder | None,
+    subject: Subject,
     config: EvaluationConfig | None = None,
     *,
-    masks: Masks | None = None,
-    boxes: Boxes | None = None,
+    ground_truth: GroundTruth | None = None,
     observer: Callable[[ViewPictures], None] | None = None,
     listener: Listener = silent,
-    stage_seconds: Mapping[str, float] | None = None,
-    stored_bytes: Mapping[str, int] | None = None,
-    settings: Mapping[str, Any] | None = None,
-    machine: Mapping[str, Any] | None = None,
-    prompt_kinds: Mapping[str, str] | None = None,
 ) -> Metrics:
     """Measure a scene on its held-out views, with one view in memory at a time.
 
     Args:
         capture: Photos, cameras and the split.
-        gaussians: The reconstruction.
-        language: Its language field or another method; None measures images only.
-        encode_text: Texts to embeddings; needed if there are masks.
+        subject: Gaussians, language and text encoder.
         config: Settings.
-        masks: Ground truth by view and prompt; None takes that of the capture
-            (`lexsplat.captures.load_annotations`). Training views are ignored.
-        boxes: Boxes by view and prompt for LangSplat's localization; None takes those of the masks.
+        ground_truth: What the language is measured against; None takes masks and boxes of the capture
+            (`lexsplat.captures.load_annotations`).
         observer: Receives the images of each held-out view once, for reports.
         listener: Receives progress events.
-        stage_seconds: Time of each stage of the build; copied into the result.
-        stored_bytes: "language_bytes" and "gaussian_bytes" on disk; None takes the size of the tensors.
-        settings: Settings of the build; copied into the result.
-        machine: Facts about the machine; copied into the result.
-        prompt_kinds: Kind of each prompt ("name", "color", "part", ...); adds the numbers of each kind.
+
+    Returns:
+        What was measured; `Metrics.with_facts` adds what is known of build and machine.
 
     Raises:
-        ValueError: If there are masks and a language but no ``encode_text``.
+        ValueError: If there are masks and a language but no text encoder.
     """
     config = config or EvaluationConfig()
-    if masks is None:
+    if ground_truth is None:
         from lexsplat.captures import load_annotations
 
         found = load_annotations(capture)
-        masks, boxes = found.masks, found.boxes if boxes is None else boxes
+        ground_truth = GroundTruth(found.masks, found.boxes)
+    language = subject.language
     method = language if language is None or isinstance(language, Method) else FieldMethod(language)
-    run = _Evaluation(capture, gaussians, method, config, masks, boxes or {})
+    run = _Evaluation(capture, subject.gaussians, method, config, ground_truth)
     if run.prompts:
-        run.embed(encode_text)
+        run.embed(subject.encode_text)
     quality = run.run(observer, listener)
     words = summarize_language(run.pairs, run.thresholds)
     if words is not None and method is not None:
         words = {"form": config.query.form, "method": method.method, **words}
-        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, prompt_kinds or {})
+        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, ground_truth.prompt_kinds)
     return Metrics(
         quality=quality,
         language=words,
-        speed={**run.speed(), "stage_seconds": dict(stage_seconds or {})},
-        size=_sizes(gaussians, method, stored_bytes or {}),
-        config={"evaluation": asdict(config), **dict(settings or {})},
-        machine=dict(machine or {}),
+        speed={**run.speed(), "stage_seconds": {}},
+        size=_sizes(subject.gaussians, method),
+        config={"evaluation": asdict(config)},
         curves=precision_curves(run.pairs),
         thresholds=run.thresholds,
         pairs=run.pairs,
@@ -153,11 +156,10 @@ class _Evaluation:
         gaussians: Gaussians,
         method: Method | None,
         config: EvaluationConfig,
-        masks: Masks,
-        boxes: Boxes,
+        ground_truth: GroundTruth,
     ) -> None:
         self.capture, self.gaussians, self.method, self.config = capture, gaussians, method, config
-        self.boxes = boxes
+        masks, self.boxes = ground_truth.masks, ground_truth.boxes
         self.views: list[View] = [capture.views[name] for name in capture.test_names]
         self.masks = {view.name: masks[view.name] for view in self.views if method and masks.get(view.name)}
         self.prompts = sorted({prompt for prompts in self.masks.values() for prompt in prompts})
@@ -325,14 +327,14 @@ class _Evaluation:
         return max(time.perf_counter() - start, 1e-9) / len(cameras)
 
 
-def _sizes(gaussians: Gaussians, method: Method | None, stored: Mapping[str, int]) -> dict[str, int | None]:
+def _sizes(gaussians: Gaussians, method: Method | None) -> dict[str, int | None]:
     def size(tensors: Mapping[str, Tensor]) -> int:
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
 
     return {
         "gaussians": len(gaussians),
-        "language_bytes": stored.get("language_bytes", size(method.tensors()) if method else 0),
-        "gaussian_bytes": stored.get("gaussian_bytes", size(gaussians.tensors())),
+        "language_bytes": size(method.tensors()) if method else 0,
+        "gaussian_bytes": size(gaussians.tensors()),
         "peak_rss_bytes": peak_memory(),
         "peak_gpu_bytes": peak_gpu_memory(gaussians.device),
     }

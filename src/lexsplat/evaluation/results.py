@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,6 @@ from lexsplat.evaluation.metrics import ThresholdCounts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 
 THRESHOLD_KINDS = ("auto", "fixed", "oracle")
-
-Masks = Mapping[str, Mapping[str, "Path | NDArray[np.bool_]"]]
-"""Ground truth by view and prompt: files or boolean arrays ``[H, W]``."""
-
-Boxes = Mapping[str, Mapping[str, NDArray[np.float64]]]
-"""Boxes ``[B, 4]`` (x0, y0, x1, y1 in pixels of the mask) by view and prompt."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +72,10 @@ class Metrics:
         language: "strict", "official", "lerf_2d", "lerf_3d", "per_prompt", "per_view", "form"; None for a scene
             without masks.
         speed: "render_fps" (color and the map of one prompt), "rgb_fps", "query_ms" (the map of one prompt in one
-            view, including the rendering of the language), "stage_seconds".
+            view, including the rendering of the language), "stage_seconds" (empty until `with_facts`).
         size: "gaussians", "language_bytes", "gaussian_bytes", "peak_rss_bytes", "peak_gpu_bytes".
-        config: Settings.
-        machine: Hardware and versions.
+        config: Settings of the evaluation, and those of the build (`with_facts`).
+        machine: Hardware and versions (`with_facts`).
         curves: Interpolated precision at the 101 recalls by prompt, over the pixels of all views.
         thresholds: ``{prompt: {kind: threshold}}``.
         pairs: ``{view: {prompt: PairResult}}``.
@@ -92,10 +86,34 @@ class Metrics:
     speed: dict[str, Any]
     size: dict[str, Any]
     config: dict[str, Any]
-    machine: dict[str, Any]
+    machine: dict[str, Any] = field(default_factory=dict)
     curves: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     thresholds: dict[str, dict[str, float]] = field(default_factory=dict)
     pairs: dict[str, dict[str, PairResult]] = field(default_factory=dict)
+
+    def with_facts(
+        self,
+        *,
+        stage_seconds: Mapping[str, float],
+        settings: Mapping[str, Any],
+        machine: Mapping[str, Any],
+        stored_bytes: Mapping[str, int] | None = None,
+    ) -> Metrics:
+        """The same results with facts that are known, not measured.
+
+        Args:
+            stage_seconds: Time of each stage of the build.
+            settings: Settings of the build, added to those of the evaluation.
+            machine: Facts about the machine.
+            stored_bytes: "language_bytes" and "gaussian_bytes" on disk; None keeps the size of the tensors.
+        """
+        return replace(
+            self,
+            speed={**self.speed, "stage_seconds": dict(stage_seconds)},
+            size={**self.size, **(stored_bytes or {})},
+            config={**self.config, **settings},
+            machine=dict(machine),
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``metrics.json``: plain types, 6 decimals, None for NaN and infinity."""

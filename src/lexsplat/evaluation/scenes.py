@@ -9,7 +9,8 @@ from typing import Any
 from lexsplat.captures.capture import Capture
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
-from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
+from lexsplat.evaluation.ground_truth import GroundTruth
+from lexsplat.evaluation.measuring import EvaluationConfig, Subject, evaluate
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
 from lexsplat.evaluation.report.page import write_report
@@ -66,18 +67,16 @@ def evaluate_scene(
             remedy="make your own copy of it with: lexsplat demo",
         )
     photos = load_photos(scene, capture)
-    ground_truth = load_annotations(photos, masks, prompt_list)
+    found = load_annotations(photos, masks, prompt_list)
     gallery = Gallery()
     metrics = evaluate(
         photos,
-        scene.gaussians,
-        scene.field,
-        scene.encode_text,
+        Subject(scene.gaussians, scene.field, scene.encode_text),
         EvaluationConfig(query=scene.query, protocols=tuple(protocols)),
-        masks=ground_truth.masks,
-        boxes=ground_truth.boxes,
+        ground_truth=GroundTruth(found.masks, found.boxes, _prompt_kinds(photos.root)),
         observer=gallery.add,
         listener=listener,
+    ).with_facts(
         stage_seconds=folder.stage_seconds(),
         stored_bytes={
             "language_bytes": folder.bytes_on_disk(folder.language_path),
@@ -85,10 +84,9 @@ def evaluate_scene(
         },
         settings={
             **record.get("config", {}),
-            "ground_truth": ground_truth.origin_facts(prompt_list) if ground_truth.masks else None,
+            "ground_truth": found.origin_facts(prompt_list) if found.masks else None,
         },
         machine=machine_facts(),
-        prompt_kinds=_prompt_kinds(photos.root),
     )
     result = metrics.to_json()
     write_json(folder.root / "metrics.json", result)

@@ -28,7 +28,8 @@ __all__ = [
 ]
 
 
-def reconstruct(  # eight parameters: two inputs, and what every stage takes
+# Eight parameters: two inputs, and the options that every stage takes.
+def reconstruct(
     capture: Capture,
     config: ReconstructionConfig,
     *,

@@ -10,6 +10,7 @@ NUMBERS_PER_PIECE = 65_536
 """Numbers per work item of a thread: some tens of microseconds."""
 
 
+# A numeric kernel: arrays and factors one by one, as Numba takes them.
 def adam_step(
     values: np.ndarray,
     gradient: np.ndarray,

@@ -34,7 +34,8 @@ def prepare(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Prep
         return PreparedView(module.__name__, projection, module.find_tiles(projection, camera), camera)
 
 
-def render(  # ten parameters: independent options of one operation, of which a call names one or two
+# Ten parameters: independent options of one operation, of which a call names one or two.
+def render(
     gaussians: Gaussians,
     camera: Camera,
     *,

@@ -60,7 +60,8 @@ class TilePairs:
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
 
 
-def find_pairs(  # eight parameters: the arrays of a projection, as the kernels take them
+# Eight parameters: the arrays of a projection, as the kernels take them.
+def find_pairs(
     means2d: NDArray[np.float32],
     conics: NDArray[np.float32],
     opacities: NDArray[np.float32],

@@ -99,6 +99,7 @@ def sample_bytes(rows: int, dimensions: int, codes: int, batch: int) -> int:
     return 4 * (rows * (2 * dimensions + 8) + 4 * batch * (dimensions + codes) + 6 * codes * dimensions)
 
 
+# Eight parameters: the subject of the error, the four numbers of `sample_bytes`, and the budget with its share.
 def require_sample(
     stage: str, what: str, rows: int, dimensions: int, codes: int, batch: int, memory: int, share: float
 ) -> None:
