@@ -159,7 +159,7 @@ def test_loads_as_a_scene_with_its_own_split_and_masks(name):
     for view, files in by_view.items():
         assert set(files) <= set(prompts)
         for path in files.values():
-            assert scenes.load_mask(path).shape == (
+            assert scene.views[view].load_mask(path).shape == (
                 scene.views[view].camera.height,
                 scene.views[view].camera.width,
             )

@@ -152,7 +152,8 @@ def embed(capture: Path, output: Path, built: Path, features: Path, *options: st
 def test_segments_of_another_program_answer_queries(tiny_capture, built, segments, tmp_path, capsys):
     output = tmp_path / "scene"
     assert (
-        embed(tiny_capture, output, built, segments, "--method", "trained", "--trained.iterations", "20") == 0
+        embed(tiny_capture, output, built, segments, "--method", "trained", "--trained.iterations", "300")
+        == 0
     )
     with Image.open(output / "codes" / "view_01.png") as image:
         codes = np.asarray(image)

@@ -127,7 +127,7 @@ def test_a_resumed_training_is_bit_identical(scene, tmp_path) -> None:
 
     class StopsAfterSeven(Checkpoint):
         def after_step(self, trainer) -> None:
-            if trainer.iteration == 7:
+            if trainer.steps_done == 7:
                 self.save(trainer)
                 raise KeyboardInterrupt
 

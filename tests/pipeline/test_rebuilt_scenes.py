@@ -95,7 +95,7 @@ def test_without_a_previous_scene_a_partial_rebuild_is_refused(scene):
     builder = Builder(scene)
     builder.begin(1)
     shutil.rmtree(scene / "previous")  # as if the folder was copied without it
-    with pytest.raises(SceneFolderError, match="being rebuilt"):
+    with pytest.raises(SceneFolderError, match="language of an earlier reconstruction"):
         open_scene(scene, device="cpu")
 
 

@@ -163,6 +163,6 @@ def test_splats_that_the_cameras_do_not_see_are_refused(built, tiny_capture, tmp
     write_splat(foreign, tmp_path / "far.splat")
     arguments = ["language", str(tiny_capture), "--output", str(tmp_path / "s"), "--splats"]
     assert cli.main([*arguments, str(tmp_path / "far.splat"), *QUICK]) == 1
-    assert "same axes" in capsys.readouterr().err
+    assert "in the axes and units of the cameras" in capsys.readouterr().err
     assert cli.main([*arguments, str(tmp_path / "absent.ply"), *QUICK]) == 1
     assert "no such file" in capsys.readouterr().err

@@ -157,7 +157,7 @@ def test_what_the_scene_does_not_hold_has_no_instances_in_json(scene):
 
 
 def test_representations_are_short(scene):
-    assert repr(scene) == "Scene(gaussians=400, views=6, method='lifted')"
+    assert repr(scene) == "Scene(gaussians=400, views=6, method='averaged')"
     assert repr(scene.ask(["ball 0"], 0.5)) == "Answers('ball 0': yes (threshold 0.5))"
     assert len(repr(scene.find("ball 0"))) < 100
 
