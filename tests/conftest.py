@@ -13,7 +13,10 @@ TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] 
 
 
 def pytest_collection_modifyitems(items):
-    """Tests marked ``gpu`` are skipped where there is no CUDA device."""
+    """Tests marked ``gpu`` are skipped without a CUDA device; tests of a scene built for them are slow."""
+    for item in items:
+        if "built" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
     import torch
 
     if torch.cuda.is_available():

@@ -244,6 +244,7 @@ def test_a_principal_point_far_outside_the_image_is_refused(tmp_path):
     fails(tmp_path, "cameras.bin", "principal point")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 def test_mutated_models_yield_a_capture_or_a_typed_error(tmp_path, suffix):
     rng = np.random.default_rng(0)

@@ -25,6 +25,8 @@ from lexsplat.captures.sfm.photos import find_photos
 from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
 from lexsplat.runtime.errors import CaptureError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):

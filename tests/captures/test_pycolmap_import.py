@@ -10,7 +10,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[2] / "src" / "lexsplat"
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no signals like these")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="no signals like these")]
 
 
 def test_only_one_module_imports_pycolmap():

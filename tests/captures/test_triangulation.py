@@ -7,6 +7,8 @@ from lexsplat.captures import initial_points, load_capture, random_points_in_fru
 from lexsplat.captures.sfm.triangulation import matching_pairs
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, look_at
 
+pytestmark = pytest.mark.slow
+
 SIZE = (160, 120)
 
 

@@ -178,6 +178,7 @@ def test_large_photos_and_masks_processed_in_bands_equal_those_processed_whole(
             np.testing.assert_allclose(view.valid_share(size), share, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_undistorting_a_large_photo_takes_a_fraction_of_its_size_in_floats(tmp_path):
     """Traced by Python, which excludes Pillow's decoded image of four bytes per pixel."""
     import tracemalloc

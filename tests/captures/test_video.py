@@ -17,6 +17,8 @@ from lexsplat.captures.readers.video import (
 )
 from lexsplat.runtime.errors import BackendError, CaptureError
 
+pytestmark = pytest.mark.slow
+
 av = pytest.importorskip("av", reason="needs the extra `video` (PyAV)")
 
 SIZE = (192, 128)

@@ -128,6 +128,7 @@ def test_an_edit_with_an_invalid_result_ends_in_one_line_and_adds_no_step(built,
     assert not (copy / "edits.jsonl").exists()
 
 
+@pytest.mark.slow
 def test_edits_of_the_bundled_scene_are_kept_in_the_working_directory(tmp_path, monkeypatch, capsys):
     before = {path: path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")}
     monkeypatch.chdir(tmp_path)

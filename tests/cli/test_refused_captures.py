@@ -85,6 +85,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_invalid_captures_end_in_one_line_without_output(tmp_path, capsys, kind):
     damage, word = DAMAGES[kind]

@@ -78,6 +78,7 @@ def test_ctrl_c_during_parsing_ends_in_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == STOPPED
 
 
+@pytest.mark.slow
 def test_ctrl_c_during_imports_ends_in_one_line():
     interrupting = """
 import os, signal, sys
@@ -107,6 +108,7 @@ def test_the_package_runs_as_a_module_too():
     assert (answer.returncode, answer.stdout.split()[0]) == (0, "lexsplat")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("build", "--help"), ("info", "demo")])
 def test_a_closed_pipe_ends_a_command_quietly(arguments):
     command = [sys.executable, "-m", "lexsplat", *arguments]

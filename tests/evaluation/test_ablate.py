@@ -25,6 +25,8 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.memory import parse_bytes
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", autouse=True)
 def colors():

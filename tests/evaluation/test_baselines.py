@@ -31,6 +31,8 @@ from lexsplat.features import FeatureMap
 from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.rendering import back_project, render
 
+pytestmark = pytest.mark.slow
+
 BALLS = len(CENTERS)
 DIM = BALLS + 1  # one direction for each ball, one for everything else
 WORDS = torch.eye(DIM)[:BALLS]

@@ -19,6 +19,8 @@ from lexsplat.evaluation.baselines import feature_rendering
 from lexsplat.evaluation.compare import ComparisonPlan
 from lexsplat.runtime.memory import parse_bytes
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def compared(tiny_capture, tmp_path_factory):

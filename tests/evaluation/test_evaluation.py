@@ -319,6 +319,7 @@ def test_peak_memory_is_in_bytes():
     assert peak_memory() is None or peak_memory() > 50e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are counted anew on Linux only")
 def test_what_was_freed_before_does_not_count_as_needed_after():
     script = """

@@ -10,7 +10,7 @@ from lexsplat.evaluation.report import Comparison, MeasuredMethod, write_compari
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(12)}
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
 
 @pytest.fixture(scope="module")

@@ -565,6 +565,7 @@ def test_the_sparse_settings_take_a_sixth_of_the_crops():
     assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
 
 
+@pytest.mark.slow
 def test_the_bundled_settings_and_encoders_find_the_red_half(tmp_path):
     """From photo to answer: the relevancy of a color is higher where the color is."""
     from lexsplat.features.encoders import load_clip, load_dino

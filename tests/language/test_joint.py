@@ -15,6 +15,8 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.runtime.training import Checkpoint
 
+pytestmark = pytest.mark.slow
+
 GEOMETRY = ReconstructionConfig(iterations=120, sh_degree=1, densify_min_every=10, max_gaussians=3000)
 LANGUAGE = TrainedConfig(pixel_sample=256, smoothing_sample=64)
 CODES = 4

@@ -46,7 +46,7 @@ GEOMETRY = ReconstructionConfig(
 LANGUAGE = TrainedConfig(iterations=4, pixel_sample=100, smoothing_sample=20)
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,8 @@ from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.folder import SceneFolder
 
+pytestmark = pytest.mark.slow
+
 QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4"]
 
 

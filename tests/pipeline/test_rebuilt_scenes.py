@@ -16,6 +16,8 @@ from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import drop_previous, keep_previous
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def scene(built, tmp_path):

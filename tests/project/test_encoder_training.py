@@ -13,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+pytestmark = pytest.mark.slow
+
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 SCENES = Path(str(resources.files("lexsplat"))) / "demo" / "scenes"
 CLIP = Path(str(resources.files("lexsplat"))) / "demo" / "encoders" / "clip"

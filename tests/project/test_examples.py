@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-pytestmark = pytest.mark.xdist_group("built")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("built")]
 
 
 def run(name: str, folder: Path, *arguments: object) -> str:

@@ -15,7 +15,7 @@ import pytest
 MAKEFILE = Path(__file__).parents[2] / "Makefile"
 TOOLS = ("make", "sh", "touch", "rm", "mkdir", "ln", "chmod", "cat", "cp", "dirname")
 
-pytestmark = pytest.mark.skipif(not shutil.which("make"), reason="make is not there")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not shutil.which("make"), reason="make is not there")]
 
 # Says its version, makes environments with itself as their Python, and notes what it was asked to do.
 STAND_IN = """#!/bin/sh

@@ -71,6 +71,7 @@ def test_find_in_a_scene_with_a_known_scale_answers_in_its_schema(tmp_path, caps
     assert found["phrases"][0]["instances"][0]["size_meters"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["built", "demo"])
 def test_info_and_scale_answer_in_their_schemas(request, capsys, scene):
     folder = "demo" if scene == "demo" else str(request.getfixturevalue("built"))

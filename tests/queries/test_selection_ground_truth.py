@@ -85,6 +85,7 @@ def turned(angle: float, center=(0.0, 0.0, 0.0), halves=(1.0, 0.5, 0.25)) -> Box
     return Box(np.array(center, float), axes, np.array(halves, float))
 
 
+@pytest.mark.slow
 @given(st.integers(0, 50))
 @settings(max_examples=25, deadline=None)
 def test_the_overlap_of_boxes_is_the_share_of_random_points_in_both(seed):

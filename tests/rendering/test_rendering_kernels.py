@@ -22,6 +22,8 @@ from lexsplat.rendering import cpu_backend, pairs
 from lexsplat.rendering.kernels import binning, blending, gradients, lanes
 from lexsplat.rendering.kernels.jit import parallel
 
+pytestmark = pytest.mark.slow
+
 # ------------------------------------------------------------------------------------------ against gsplat's twins
 
 

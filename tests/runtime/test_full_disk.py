@@ -15,6 +15,8 @@ import pytest
 
 from lexsplat.scenes.scene import open_scene
 
+pytestmark = pytest.mark.slow
+
 LONGEST = 3000
 """Seconds after which a command hangs, however busy the machine is: a build takes ten when it is not."""
 

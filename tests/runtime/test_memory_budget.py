@@ -25,6 +25,8 @@ from lexsplat.reconstruction import ReconstructionConfig, check_gaussians
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import MemoryBudgetError
 
+pytestmark = pytest.mark.slow
+
 MEGABYTE = 1 << 20
 VIEWS, WIDTH, HEIGHT = 50, 960, 720
 MEMORY = 80 * MEGABYTE

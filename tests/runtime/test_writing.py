@@ -8,7 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import lexsplat
+
+pytestmark = pytest.mark.slow
 
 WATCHED = """
 import json, os, sys

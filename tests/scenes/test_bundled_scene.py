@@ -53,6 +53,7 @@ def test_what_is_asked_for_is_where_the_exact_mask_says(scene, prompt):
     assert all(found)
 
 
+@pytest.mark.slow
 def test_the_command_line_answers_beside_the_user_and_leaves_the_package_alone(tmp_path, monkeypatch, capsys):
     before = snapshot()
     monkeypatch.chdir(tmp_path)

@@ -118,6 +118,7 @@ def _hold(root: str, ready, release) -> None:
         release.wait(30)
 
 
+@pytest.mark.slow
 def test_the_second_builder_is_told_who_is_at_work(tmp_path):
     context = multiprocessing.get_context("spawn")
     ready, release = context.Event(), context.Event()

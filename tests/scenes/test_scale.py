@@ -39,6 +39,7 @@ def test_up_comes_from_the_cameras_and_the_scale_from_nowhere(scene, capsys):
     assert (facts["up"]["from"], facts["meters_per_unit"]) == ("cameras", None)
 
 
+@pytest.mark.slow
 def test_one_distance_makes_sizes_metres(scene, capsys):
     pygltflib = pytest.importorskip("pygltflib")
     assert run("scale", scene, "--distance", 0.35, "--points", "0,0,0", "0,-0.7,0") == 0
@@ -58,6 +59,7 @@ def test_one_distance_makes_sizes_metres(scene, capsys):
     assert (scene.parent / "all.ply").read_bytes() == (scene / "gaussians.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_phrases_name_what_the_distance_is_between(scene, capsys):
     assert run("scale", scene, "--distance", 0.3, "--between", "red apple", "banana", "--json") == 0
     world = json.loads(capsys.readouterr().out)
@@ -68,6 +70,7 @@ def test_phrases_name_what_the_distance_is_between(scene, capsys):
     assert stored(scene)["meters_per_unit"] == pytest.approx(0.08 / found[0].size[2])
 
 
+@pytest.mark.slow
 def test_up_can_be_told_and_is_used_everywhere(scene, capsys):
     pygltflib = pytest.importorskip("pygltflib")
     assert run("scale", scene, "--up=-1,0,0") == 0

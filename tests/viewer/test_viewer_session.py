@@ -250,6 +250,7 @@ def test_an_orbit_keeps_height_and_distance_and_looks_at_its_target():
     assert np.allclose(np.diff(angles), 2 * np.pi / 12)
 
 
+@pytest.mark.slow
 @given(st.floats(0.1, 3.9), st.floats(-1.9, 1.9))
 @settings(deadline=None)
 def test_an_orbit_stays_within_the_arc_of_the_photos(width, start):
