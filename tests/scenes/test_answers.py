@@ -79,4 +79,4 @@ def test_prompt_lists_are_for_the_scenes_of_the_paper(built, tiny_capture, tmp_p
         "folder": str(bonsai / "segmentations"), "layout": "segmentations", "prompt_list": "paper",
     }  # fmt: skip
     report = (copy / "report.html").read_text()
-    assert f"<td>ground truth</td><td>{bonsai / 'segmentations'}, words of the list paper</td>" in report
+    assert f"<td>ground truth</td><td>{bonsai / 'segmentations'}, prompts of the list paper</td>" in report

@@ -358,7 +358,7 @@ class Results:
             },
             machine=machine_facts(),
         )
-        write_comparison(folder / "report.html", comparison)
+        write_comparison(folder / f"{self.stem}.html", comparison)
 
     def rows(self) -> list[dict[str, Any]]:
         """Rows of the table so far (`report.table_rows`)."""
