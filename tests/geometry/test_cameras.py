@@ -73,8 +73,8 @@ def test_extent_is_the_radius_times_1_1_and_1_for_a_point():
     [
         ({"K": np.eye(2)}, "K must be"),
         ({"viewmat": np.eye(3)}, "viewmat must be"),
-        ({"viewmat": np.full((4, 4), np.nan)}, "not finite"),
-        ({"K": np.diag([np.inf, 1, 1])}, "not finite"),
+        ({"viewmat": np.full((4, 4), np.nan)}, "NaN or infinity"),
+        ({"K": np.diag([np.inf, 1, 1])}, "NaN or infinity"),
         ({"width": 0}, "image size"),
         ({"K": np.diag([-1.0, 1, 1])}, "focal"),
     ],

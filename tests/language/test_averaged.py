@@ -235,7 +235,7 @@ def test_a_sample_that_does_not_fit_is_refused_with_one_that_does() -> None:
         field_from_means(found, CODES, AveragedConfig(), memory=2_000_000)
     message = str(refusal.value)
     fits = int(message.split("sample-size ")[1].split()[0].rstrip(".,)"))
-    enough = parse_bytes(message.split("give --memory ")[1].split(",")[0].replace(" ", ""))
+    enough = parse_bytes(message.split("use --memory ")[1].split(",")[0].replace(" ", ""))
     field_from_means(found, CODES, AveragedConfig(), memory=enough)
     assert 100 < fits < 5000
     field_from_means(found, replace(CODES, sample_size=fits), AveragedConfig(), memory=2_000_000)
