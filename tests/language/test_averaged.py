@@ -146,7 +146,7 @@ def test_known_labels_and_features_are_recovered(scene) -> None:
 
 
 def test_an_object_keeps_its_code_despite_random_disagreement(scene) -> None:
-    """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still says what it is."""
+    """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still identifies it."""
     generator = np.random.default_rng(1)
     wrong = {
         name: np.where(

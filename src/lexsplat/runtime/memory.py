@@ -25,7 +25,7 @@ MADE_BYTES = 24
 """Bytes per pixel of an image made from a photo: the floats and a temporary copy."""
 
 BAND_BYTES = 24 << 20
-"""Bytes of one band of a large photo, the part that is converted to floats at a time (`lexsplat.captures.images.bands`)."""
+"""Bytes of one band of a large photo, the unit of conversion to floats (`lexsplat.captures.images.bands`)."""
 
 FRAMES_HELD = 17
 """Maximum number of reference frames of a video decoder, in addition to one per thread."""
