@@ -32,7 +32,7 @@ def read_splats(path: Path) -> Gaussians:
         return read_splat(path)
     raise FileFormatError(
         path,
-        expected="a file name ending in .ply, .splat, .spz, .compressed.ply or .ksplat",
+        expected="a name that ends in .ply, .splat, .spz, .compressed.ply or .ksplat",
         found=repr(path.suffix),
     )
 
