@@ -32,9 +32,9 @@ def labels():
     finishes = {"table": "wooden", "wall": "brick", "cloth": "checkered", "floor": "tiled"}
     parts = {kind: [None] + [part for part, owners in OWNERS.items() if kind in owners] for kind in NAMES}
     return [
-        Label(kind, colour, finishes.get(kind), part)
+        Label(kind, color, finishes.get(kind), part)
         for kind in NAMES
-        for colour in COLOURS
+        for color in COLOURS
         for part in parts[kind]
     ]
 
@@ -66,8 +66,8 @@ def test_phrases_are_true_false_or_open_for_each_label(words, wanted, truth):
 
     phrase = Phrase(words, **wanted)
     for thing, expected in truth.items():
-        colour, kind, *part = thing.split()
-        assert phrase.of(Label(kind, colour, part=part[0] if part else None)) == expected, thing
+        color, kind, *part = thing.split()
+        assert phrase.of(Label(kind, color, part=part[0] if part else None)) == expected, thing
 
 
 def test_words_of_things_that_no_scene_holds_are_true_of_nothing():
@@ -406,7 +406,7 @@ def place_questions():
     ]  # fmt: skip
 
 
-def place_answers(frames, crops, seed=0, colourless=None, angles=None):
+def place_answers(frames, crops, seed=0, colorless=None, angles=None):
     from train_clip import ClipTraining, place_truth
     from truth import TruthTable
 
@@ -416,7 +416,7 @@ def place_answers(frames, crops, seed=0, colourless=None, angles=None):
         crops,
         TruthTable(frames.labels),
         np.zeros(count) if angles is None else angles,
-        np.zeros(count, bool) if colourless is None else np.array(colourless),
+        np.zeros(count, bool) if colorless is None else np.array(colorless),
         ClipTraining(dense=1.0),
         np.random.default_rng(seed),
     )
@@ -447,7 +447,7 @@ def test_colors_are_open_for_patches_of_gray_crops():
     from words import OPEN, TRUE
 
     frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
-    colored, gray = place_answers(frames, [crop, crop], colourless=[False, True])
+    colored, gray = place_answers(frames, [crop, crop], colorless=[False, True])
     assert (colored[:, 2] == TRUE).any()
     assert (gray[:, 2] == OPEN).all()
     assert (gray[:, 1] == TRUE).any(), "kinds are asked"
