@@ -61,19 +61,19 @@ def main() -> None:
     parser.add_argument("--only", choices=("presence", "accuracy"), help="measure only this")
     options = parser.parse_args()
     pairs = (item.split("=", 1) for item in options.ground_truth_of)
-    truths = {Path(key): Path(value) for key, value in pairs}
+    ground_truths = {Path(key): Path(value) for key, value in pairs}
     result: dict = {"scenes": {}}
     calibration = CALIBRATION
     if options.calibrate and options.only != "accuracy":
-        present, absent, _ = evidence(options.calibrate, truths[options.calibrate])
+        present, absent, _ = evidence(options.calibrate, ground_truths[options.calibrate])
         calibration = fit_calibration(list(present.values()), list(absent.values()))
         result["calibration"] = dataclasses.asdict(calibration)
     for folder in dict.fromkeys([*([options.calibrate] if options.calibrate else []), *options.scene]):
         measured = result["scenes"].setdefault(str(folder), {})
         if options.only != "accuracy":
-            measured["presence"] = presence(folder, truths[folder], calibration)
+            measured["presence"] = presence(folder, ground_truths[folder], calibration)
         if options.only != "presence":
-            measured["accuracy"] = accuracy(folder, truths[folder], options.stride)
+            measured["accuracy"] = accuracy(folder, ground_truths[folder], options.stride)
     print(json.dumps(result, indent=1))
     write_record(options.json, table_rows(result), **result)
 
@@ -152,12 +152,12 @@ def presence(folder: Path, ground_truth: Path, calibration) -> dict:
     groups = zip(("present", "absent", "wrong color"), evidence(folder, ground_truth))
     answer = {}
     for name, found in groups:
-        judged = {phrase: calibration.classify(e) for phrase, e in found.items()}
+        decisions = {phrase: calibration.classify(e) for phrase, e in found.items()}
         answer[name] = {
-            "phrases": len(judged),
-            **{word: sum(v == word for v in judged.values()) for word in ("yes", "unsure", "no")},
+            "phrases": len(decisions),
+            **{word: sum(v == word for v in decisions.values()) for word in ("yes", "unsure", "no")},
             "each": {
-                p: [judged[p], round(e.height, 2), round(e.rank, 2), round(e.peak, 3)]
+                p: [decisions[p], round(e.height, 2), round(e.rank, 2), round(e.peak, 3)]
                 for p, e in found.items()
             },
         }

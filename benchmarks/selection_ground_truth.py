@@ -154,6 +154,6 @@ def box_iou(first: Box, second: Box) -> float:
     try:
         inside = HalfspaceIntersection(halfspaces, found.x[:3])
         shared = float(ConvexHull(inside.intersections).volume)
-    except QhullError:  # thinner than Qhull can tell from a plane
+    except QhullError:  # too thin: Qhull treats it as a plane
         return 0.0
     return min(1.0, shared / (first.volume + second.volume - shared))

@@ -66,7 +66,7 @@ def clip_folder(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def pretended_gpu(monkeypatch):
-    """A GPU that is none, with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts what is waited for."""
+    """A pretended GPU with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts synchronizations."""
     from support import gsplat_kernels, pretended_gpu
 
     gsplat_kernels.install(monkeypatch)

@@ -166,7 +166,7 @@ def test_heic_photos_are_read(tmp_path):
     np.testing.assert_allclose(middles, expected, atol=8)
 
 
-def test_heic_without_the_library_says_which_extra_to_install(tmp_path, monkeypatch):
+def test_heic_without_the_library_names_the_extra_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic")
     with pytest.raises(CaptureError, match=r'pip install "lexsplat\[heic\]"'):

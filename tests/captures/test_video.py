@@ -72,7 +72,7 @@ def test_blurred_frames_are_skipped_and_the_count_is_exact(video, tmp_path):
     picture = np.asarray(Image.open(tmp_path / names[0]), dtype=float)
     left = int(positions()[numbers(names)[0]])
     difference = np.abs(picture[..., 1] - wallpaper()[:, left : left + SIZE[0]])
-    assert difference.mean() < 12, "the frame is the one that its name says"
+    assert difference.mean() < 12, "the frame is the one named"
 
 
 def test_frames_follow_the_motion_and_not_the_time(video):

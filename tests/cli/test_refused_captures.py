@@ -41,7 +41,7 @@ def test_an_unknown_encoder_is_refused_with_three_remedies(tiny_capture, tmp_pat
         "trained",
     ]
     fails_in_one_line(capsys, arguments, "nobody/nothing", "--dino bundled")
-    assert not (output / "gaussians.ply").exists(), "it is told before the long part"
+    assert not (output / "gaussians.ply").exists(), "the error precedes the reconstruction"
 
 
 def broken(tmp_path: Path, damage) -> Path:

@@ -94,7 +94,7 @@ def capture(tmp_path):
     return make_capture(tmp_path / "images")
 
 
-def test_the_maps_are_those_of_crops_embedded_one_by_one(capture, tmp_path):
+def test_maps_equal_those_of_crops_encoded_one_by_one(capture, tmp_path):
     maps = extract_features(capture, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path / "cache")
     assert list(maps) == list(capture.views)
     for name, view in capture.views.items():
@@ -483,7 +483,7 @@ def test_missing_and_mismatched_external_arrays_are_refused(capture, tmp_path):
 # -- texts
 
 
-def test_a_prompt_is_embedded_once_and_cached_on_disk(tmp_path):
+def test_a_prompt_is_encoded_once_and_cached_on_disk(tmp_path):
     encoder = ColorEncoder()
     cache = TextCache(tmp_path)
     prompts = ["red apple", 'äpfel\n"quoted"', "red apple", "__metadata__"]
@@ -501,7 +501,7 @@ def test_a_prompt_is_embedded_once_and_cached_on_disk(tmp_path):
     torch.testing.assert_close(TextCache(tmp_path).encode("color", prompts, never), found)
 
 
-def test_a_text_is_embedded_by_itself_and_the_file_written_once(tmp_path, monkeypatch):
+def test_texts_are_encoded_one_by_one_and_the_cache_is_written_once(tmp_path, monkeypatch):
     """In a batch, the last bits of an embedding depend on the other texts."""
     batches, written = [], []
 

@@ -14,10 +14,10 @@ def project(camera: Camera, point: np.ndarray) -> np.ndarray:
     return (camera.K @ local[:3])[:2] / local[2]
 
 
-def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
+def test_look_at_centers_the_target_and_orients_up():
     camera = look_at([3, 1, 2], [0.5, 0, 0], [0, 0, 1], 64, 48, 0.9)
     assert project(camera, np.array([0.5, 0, 0])) == pytest.approx([32, 24])
-    assert project(camera, np.array([0.5, 0, 0.1]))[1] < 24  # image y grows downwards
+    assert project(camera, np.array([0.5, 0, 0.1]))[1] < 24  # image y points down
     assert np.linalg.det(camera.viewmat[:3, :3]) == pytest.approx(1)
 
 
@@ -45,7 +45,7 @@ def test_opengl_identity_looks_along_minus_z_with_y_up():
 
 
 @given(st.integers(1, 300), st.integers(1, 300))
-def test_resizing_keeps_where_a_ray_falls_relative_to_the_image(width, height):
+def test_resizing_preserves_relative_image_positions(width, height):
     camera = Camera(64, 48, K, np.eye(4))
     point = np.array([0.1, -0.05, 1.0])
     before = project(camera, point) / [64, 48]
@@ -54,7 +54,7 @@ def test_resizing_keeps_where_a_ray_falls_relative_to_the_image(width, height):
     assert project(resized, point) / [width, height] == pytest.approx(before)
 
 
-def test_downscaling_rounds_sizes_and_keeps_a_pixel():
+def test_downscaling_rounds_sizes_to_at_least_one_pixel():
     camera = Camera(799, 532, K, np.eye(4))
     assert (camera.downscaled(4).width, camera.downscaled(4).height) == (200, 133)
     assert (camera.downscaled(10_000).width, camera.downscaled(10_000).height) == (1, 1)
@@ -73,12 +73,12 @@ def test_extent_is_the_radius_times_1_1_and_1_for_a_point():
     [
         ({"K": np.eye(2)}, "K must be"),
         ({"viewmat": np.eye(3)}, "viewmat must be"),
-        ({"viewmat": np.full((4, 4), np.nan)}, "not finite"),
-        ({"K": np.diag([np.inf, 1, 1])}, "not finite"),
+        ({"viewmat": np.full((4, 4), np.nan)}, "NaN or infinity"),
+        ({"K": np.diag([np.inf, 1, 1])}, "NaN or infinity"),
         ({"width": 0}, "image size"),
         ({"K": np.diag([-1.0, 1, 1])}, "focal"),
     ],
 )
-def test_impossible_cameras_are_refused(change, message):
+def test_invalid_cameras_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Camera(**{"width": 4, "height": 4, "K": np.eye(3), "viewmat": np.eye(4), **change})

@@ -1,4 +1,4 @@
-"""The Gaussians' two forms, and how they start from points."""
+"""Stored and activated parameters of Gaussians, and their initialization from points."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def some_points(count: int = 50, seed: int = 0) -> tuple[np.ndarray, np.ndarray]
     return rng.normal(size=(count, 3)).astype(np.float32), rng.uniform(size=(count, 3)).astype(np.float32)
 
 
-def test_first_scales_are_the_mean_distance_to_three_neighbors():
+def test_initial_scales_are_the_mean_distance_to_three_neighbors():
     points, colors = some_points()
     distances, _ = NearestNeighbors(n_neighbors=4).fit(points).kneighbors(points)
     gaussians = gaussians_from_points(points, colors)
@@ -21,7 +21,7 @@ def test_first_scales_are_the_mean_distance_to_three_neighbors():
     np.testing.assert_allclose(gaussians.scales.numpy(), expected, rtol=1e-5)
 
 
-def test_first_color_seen_is_the_color_of_the_point():
+def test_the_initial_color_is_that_of_the_point():
     points, colors = some_points()
     gaussians = gaussians_from_points(points, colors, sh_degree=2)
     np.testing.assert_allclose((0.5 + SH_C0 * gaussians.sh0[:, 0]).numpy(), colors, atol=1e-6)
@@ -29,7 +29,7 @@ def test_first_color_seen_is_the_color_of_the_point():
     assert not gaussians.shN.any()
 
 
-def test_the_callers_points_are_not_changed_with_the_gaussians():
+def test_changing_the_gaussians_does_not_change_the_points():
     points, colors = some_points()
     before = points.copy(), colors.copy()
     for tensor in gaussians_from_points(points, colors).tensors().values():
@@ -38,7 +38,7 @@ def test_the_callers_points_are_not_changed_with_the_gaussians():
     np.testing.assert_array_equal(colors, before[1])
 
 
-def test_first_opacity_is_the_one_asked_for():
+def test_the_initial_opacity_is_the_given_one():
     points, colors = some_points()
     torch.testing.assert_close(
         gaussians_from_points(points, colors, opacity=0.3).opacities, torch.full((50,), 0.3)
@@ -59,7 +59,7 @@ def test_fewer_points_than_neighbors_are_enough(count):
     assert torch.isfinite(gaussians.log_scales).all()
 
 
-def test_an_outlier_does_not_get_a_size_beyond_all_others():
+def test_the_size_of_an_outlier_is_limited():
     points, colors = some_points(200)
     points[0] = 1e6
     scales = gaussians_from_points(points, colors).scales
@@ -98,7 +98,7 @@ def test_detach_ends_the_gradient_history_and_shares_the_values():
         (np.full((4, 3), np.nan), "must be finite"),
     ],
 )
-def test_points_that_cannot_be_used_are_refused(points, message):
+def test_invalid_points_are_refused(points, message):
     with pytest.raises(ValueError, match=message):
         gaussians_from_points(points, np.zeros((len(points), 3)))
 

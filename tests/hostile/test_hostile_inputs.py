@@ -40,7 +40,7 @@ PROCESSES = 2
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory):
-    """The report of every reader. The processes share the readers: each takes the next one that is left."""
+    """The report of every reader. The processes share the readers: each takes the next unclaimed reader."""
     shared = Path("/dev/shm")
     base = tmp_path_factory.mktemp("hostile")
     claims = base / "claims"

@@ -146,7 +146,7 @@ def test_known_labels_and_features_are_recovered(scene) -> None:
 
 
 def test_an_object_keeps_its_code_despite_random_disagreement(scene) -> None:
-    """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still says what it is."""
+    """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still identifies it."""
     generator = np.random.default_rng(1)
     wrong = {
         name: np.where(
@@ -235,7 +235,7 @@ def test_a_sample_that_does_not_fit_is_refused_with_one_that_does() -> None:
         field_from_means(found, CODES, AveragedConfig(), memory=2_000_000)
     message = str(refusal.value)
     fits = int(message.split("sample-size ")[1].split()[0].rstrip(".,)"))
-    enough = parse_bytes(message.split("give --memory ")[1].split(",")[0].replace(" ", ""))
+    enough = parse_bytes(message.split("use --memory ")[1].split(",")[0].replace(" ", ""))
     field_from_means(found, CODES, AveragedConfig(), memory=enough)
     assert 100 < fits < 5000
     field_from_means(found, replace(CODES, sample_size=fits), AveragedConfig(), memory=2_000_000)

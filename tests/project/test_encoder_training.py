@@ -1,4 +1,4 @@
-"""The language that the embedded encoders are trained on says what is true: phrases, crops, held-out pairs."""
+"""Training data of the bundled encoders: ground truth of phrases and crops, and held-out pairs."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def labels():
     finishes = {"table": "wooden", "wall": "brick", "cloth": "checkered", "floor": "tiled"}
     parts = {kind: [None] + [part for part, owners in OWNERS.items() if kind in owners] for kind in NAMES}
     return [
-        Label(kind, colour, finishes.get(kind), part)
+        Label(kind, color, finishes.get(kind), part)
         for kind in NAMES
-        for colour in COLOURS
+        for color in COLOURS
         for part in parts[kind]
     ]
 
@@ -63,13 +63,13 @@ def test_a_phrase_made_for_a_label_is_true_of_it(seed):
         ("yellow thing", {"colour": "yellow"}, {"gold ring": -1}),
     ],
 )  # fmt: skip
-def test_phrases_are_true_false_or_open_of_what_they_should(words, wanted, truth):
+def test_phrases_are_true_false_or_open_for_each_label(words, wanted, truth):
     from words import Label, Phrase
 
     phrase = Phrase(words, **wanted)
     for thing, expected in truth.items():
-        colour, kind, *part = thing.split()
-        assert phrase.of(Label(kind, colour, part=part[0] if part else None)) == expected, thing
+        color, kind, *part = thing.split()
+        assert phrase.of(Label(kind, color, part=part[0] if part else None)) == expected, thing
 
 
 def test_words_of_things_that_no_scene_holds_are_true_of_nothing():
@@ -81,7 +81,7 @@ def test_words_of_things_that_no_scene_holds_are_true_of_nothing():
     assert all(Phrase("zebra", unknown=True).of(label) == FALSE for label in labels())
 
 
-def test_no_scene_that_ships_holds_a_pair_kept_from_training():
+def test_bundled_scenes_contain_no_held_out_pair():
     from layouts import LAYOUTS
     from words import HELD_OUT_PAIRS
 
@@ -124,7 +124,7 @@ def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
 
 @settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_no_phrase_is_trained_that_names_a_pair_kept_from_training(seed):
+def test_no_training_phrase_names_a_held_out_pair(seed):
     # It could only be wrong, and would be learnt as the name of nothing.
     from words import HELD_OUT_PAIRS, any_phrase, near_miss
 
@@ -142,18 +142,18 @@ def test_a_made_up_word_is_none_that_means_something():
     words = {_made_up_word(rng) for _ in range(500)}
     assert len(words) > 300
     assert not words & _KNOWN_WORDS
-    assert {"metal", "paper", "fur", "wooden"} <= _KNOWN_WORDS, "of these some can come of the syllables"
+    assert {"metal", "paper", "fur", "wooden"} <= _KNOWN_WORDS, "the syllables can form some of these"
 
 
-def test_turned_hues_take_red_to_green_and_leave_grey():
+def test_rotated_hues_map_red_to_green_and_keep_gray():
     from train_clip import turned_hues
 
-    colours = np.array([[[200, 0, 0], [90, 90, 90], [0, 200, 0]]], np.uint8)
-    turned = turned_hues(colours, 120.0).astype(int)
+    colors = np.array([[[200, 0, 0], [90, 90, 90], [0, 200, 0]]], np.uint8)
+    turned = turned_hues(colors, 120.0).astype(int)
     assert np.abs(turned - [[[0, 200, 0], [90, 90, 90], [0, 0, 200]]]).max() <= 1
 
 
-def test_no_hue_is_turned_so_that_a_kind_looks_as_it_was_kept_from_training():
+def test_rotated_hues_never_produce_a_held_out_pair():
     from train_clip import fair_angle
     from words import Label
 
@@ -165,7 +165,7 @@ def test_no_hue_is_turned_so_that_a_kind_looks_as_it_was_kept_from_training():
     assert min(angles) < 60
 
 
-def test_what_is_blue_is_not_told_to_be_no_bear_since_blue_bears_are_kept_from_training():
+def test_held_out_pairs_are_not_trained_as_negatives():
     from crops import cut
     from train_clip import leave_open
     from truth import TruthTable
@@ -183,12 +183,12 @@ def test_what_is_blue_is_not_told_to_be_no_bear_since_blue_bears_are_kept_from_t
     assert truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [OPEN, OPEN, FALSE, TRUE, FALSE]]
 
 
-def test_texts_whose_colours_add_to_kinds_alike_cost_nothing():
+def test_the_composition_loss_of_additive_colors_is_zero():
     import torch
     from train_clip import composition_loss
 
-    kinds, colours = torch.randn(2, 8), torch.randn(2, 8)
-    corners = torch.stack([kinds[k] + colours[c] for k in (0, 1) for c in (0, 1)])
+    kinds, colors = torch.randn(2, 8), torch.randn(2, 8)
+    corners = torch.stack([kinds[k] + colors[c] for k in (0, 1) for c in (0, 1)])
     assert float(composition_loss(corners)) == pytest.approx(0, abs=1e-10)
     corners[3] += torch.eye(8)[0]
     assert float(composition_loss(corners)) == pytest.approx(1, abs=1e-5)
@@ -310,7 +310,7 @@ def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
     assert asked.count("handle") / len(asked) == pytest.approx(8 / 21, abs=0.06)
 
 
-def test_what_a_part_lies_beside_can_be_said_not_to_show_it():
+def test_crops_beside_a_part_can_be_negatives_of_the_part():
     from crops import cut
     from truth import BESIDE, TruthTable
     from words import FALSE, OPEN, TRUE, Phrase
@@ -353,7 +353,7 @@ def test_a_patch_of_a_crop_shows_what_lies_in_it_all_of_it_weighing_the_same():
         patch_crop(crop, 0, 7)
 
 
-def test_where_nothing_is_weighs_in_a_patch_and_is_no_label():
+def test_background_counts_as_area_of_a_patch_but_is_no_label():
     from crops import Frame, cut, patch_crop
 
     codes = np.full((24, 24), -1, np.int32)
@@ -408,7 +408,7 @@ def place_questions():
     ]  # fmt: skip
 
 
-def place_answers(frames, crops, seed=0, colourless=None, angles=None):
+def place_answers(frames, crops, seed=0, colorless=None, angles=None):
     from train_clip import ClipTraining, place_truth
     from truth import TruthTable
 
@@ -418,13 +418,13 @@ def place_answers(frames, crops, seed=0, colourless=None, angles=None):
         crops,
         TruthTable(frames.labels),
         np.zeros(count) if angles is None else angles,
-        np.zeros(count, bool) if colourless is None else np.array(colourless),
+        np.zeros(count, bool) if colorless is None else np.array(colorless),
         ClipTraining(dense=1.0),
         np.random.default_rng(seed),
     )
 
 
-def test_a_handle_is_asked_for_at_its_patches_and_is_false_at_the_patches_of_the_body():
+def test_a_handle_is_true_at_its_patches_and_false_at_those_of_the_body():
     from words import FALSE, OPEN, TRUE
 
     # Four pixels for one: the handle fills patches of four pixels, as the body and the table do.
@@ -445,17 +445,17 @@ def test_a_handle_is_asked_for_at_its_patches_and_is_false_at_the_patches_of_the
     assert len({row.tobytes() for row in answers}) > 1, "not the same patches every time"
 
 
-def test_colours_are_not_asked_of_patches_of_crops_without_them():
+def test_colors_are_open_for_patches_of_gray_crops():
     from words import OPEN, TRUE
 
     frames, crop = handle_crop(scale=4, left=192.0, top=104.0, side=24.0)
-    coloured, grey = place_answers(frames, [crop, crop], colourless=[False, True])
-    assert (coloured[:, 2] == TRUE).any()
-    assert (grey[:, 2] == OPEN).all()
-    assert (grey[:, 1] == TRUE).any(), "kinds are asked"
+    colored, gray = place_answers(frames, [crop, crop], colorless=[False, True])
+    assert (colored[:, 2] == TRUE).any()
+    assert (gray[:, 2] == OPEN).all()
+    assert (gray[:, 1] == TRUE).any(), "kinds are asked"
 
 
-def test_a_patch_that_is_blue_is_not_told_to_be_no_bear_either():
+def test_held_out_pairs_are_not_trained_as_negatives_of_patches():
     from train_clip import ClipTraining, place_truth
     from truth import TruthTable
     from words import FALSE, OPEN, Phrase
@@ -495,7 +495,7 @@ def trainer_of(config, start=None):
     return Trainer(CLIPTokenizer.from_pretrained(CLIP), config, start)
 
 
-def test_what_patches_of_a_mirrored_crop_are_asked_stays_on_them():
+def test_labels_of_patches_follow_a_mirrored_crop():
     import torch
     from train_clip import Batch, mirrored
 
@@ -535,7 +535,7 @@ def test_only_the_last_phase_of_the_weights_that_ship_asks_patches():
     assert "dense" not in trainer_of(config).losses(batch)
 
 
-def test_what_patches_are_asked_reaches_the_image_tower_but_not_where_its_last_attention_looks():
+def test_the_dense_loss_trains_the_image_tower_except_its_last_attention_weights():
     config = small_training(dense=1.0)
     trainer = trainer_of(config)
     trainer.losses(batch_of(config))["dense"].backward()
@@ -550,13 +550,13 @@ def test_what_patches_are_asked_reaches_the_image_tower_but_not_where_its_last_a
     assert trainer.patch_heads.weight.grad is None
 
 
-def test_patches_that_are_not_asked_cost_nothing_and_right_answers_cost_less_than_wrong_ones():
+def test_the_dense_loss_ignores_open_patches_and_prefers_correct_answers():
     import torch
     from train_clip import dense_loss
     from words import CANONICAL, FALSE, OPEN, TRUE
 
     axes = torch.eye(8)
-    texts = torch.cat([axes[:2], axes[2].expand(len(CANONICAL), -1)])  # two phrases, all canonical ones alike
+    texts = torch.cat([axes[:2], axes[2].expand(len(CANONICAL), -1)])  # two phrases, all canonical ones equal
     places = torch.full((1, 3, 2), OPEN)
     places[0, 0], places[0, 1] = torch.tensor([TRUE, FALSE]), torch.tensor([FALSE, TRUE])
 
@@ -570,7 +570,7 @@ def test_patches_that_are_not_asked_cost_nothing_and_right_answers_cost_less_tha
     assert right == pytest.approx(np.log1p(np.exp(-10)) + np.log(2), abs=1e-6)
 
 
-def test_what_training_reads_at_patches_is_what_the_encoder_reads_there(tmp_path, monkeypatch):
+def test_training_and_encoder_compute_the_same_patch_embeddings(tmp_path, monkeypatch):
     import torch
     from train_clip import MEAN, STD, save
 

@@ -1,4 +1,4 @@
-"""Each example runs without arguments and prints what it promises."""
+"""Each example runs and prints the expected output."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("built")]
 
 
 def run(name: str, folder: Path, *arguments: object) -> str:
-    """What an example prints when it runs in a folder."""
+    """Standard output of an example, run in a folder."""
     command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
     result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
@@ -23,17 +23,17 @@ def test_01_renders_a_ball(tmp_path):
     assert (tmp_path / "output" / "examples" / "ball.png").stat().st_size > 1000
 
 
-def test_02_draws_a_heatmap_of_each_prompt(tmp_path):
+def test_02_draws_a_heatmap_for_each_prompt(tmp_path):
     output = run("02_search.py", tmp_path)
     assert output.count("of the image above") == 2
     assert (tmp_path / "output" / "examples" / "red_apple.png").exists()
 
 
-def test_02_searches_a_scene_of_ones_own(built, tmp_path):
+def test_02_searches_a_given_scene(built, tmp_path):
     assert run("02_search.py", tmp_path, built, "blue ball").startswith("blue ball: best")
 
 
-def test_03_cuts_out_a_thing(tmp_path):
+def test_03_cuts_out_an_object(tmp_path):
     output = run("03_cut_out.py", tmp_path)
     assert "Gaussians around" in output
     assert (tmp_path / "output" / "examples" / "cut_out.ply").exists()

@@ -1,6 +1,6 @@
-"""The environment of the Makefile: any fitting Python makes it, once, and one that is broken is mended.
+"""The Makefile's environment: created once with any supported Python, and repaired if it is broken.
 
-Pythons are stand-ins of a few lines of shell: nothing is installed, no network is needed.
+Short shell scripts replace Python: nothing is installed, and no network is required.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ import pytest
 MAKEFILE = Path(__file__).parents[2] / "Makefile"
 TOOLS = ("make", "sh", "touch", "rm", "mkdir", "ln", "chmod", "cat", "cp", "dirname")
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not shutil.which("make"), reason="make is not there")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not shutil.which("make"), reason="make is not installed"),
+]
 
-# Says its version, makes environments with itself as their Python, and notes what it was asked to do.
+# Prints its version, creates environments that contain itself as Python, and logs its arguments.
 STAND_IN = """#!/bin/sh
 echo "$*" >> "{log}"
 case "$1 $2 $3" in
@@ -31,7 +34,7 @@ esac
 
 
 class Clone:
-    """A folder with the Makefile, on a machine that has the pythons it is given and no others."""
+    """A folder with the Makefile and a PATH that contains only the given versions of Python."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.programs, self.log = folder / "a clone", folder / "programs", folder / "log"
@@ -59,7 +62,7 @@ class Clone:
         )
 
     def asked(self) -> list[str]:
-        """What pythons were asked to do, without the questions for their version."""
+        """Logged arguments of the Python scripts, without version queries."""
         return [line for line in self.log.read_text().splitlines() if not line.startswith("-c")]
 
 
@@ -72,7 +75,7 @@ INSTALL = "-m pip install --quiet --disable-pip-version-check -c constraints.txt
 DEMO = "demo --output output/demo"
 
 
-def test_what_is_installed_is_not_installed_again(clone):
+def test_an_installed_environment_is_not_installed_again(clone):
     clone.give("python3", "3.11")
     assert clone.make("demo").returncode == 0
     assert clone.asked() == ["-m venv --clear .venv", INSTALL, DEMO]
@@ -81,7 +84,7 @@ def test_what_is_installed_is_not_installed_again(clone):
 
 
 @pytest.mark.parametrize("python3", [None, "3.9", "3.14", "2.7"])
-def test_a_python_that_fits_is_found_under_its_own_name(clone, python3):
+def test_a_supported_python_is_found_by_its_versioned_name(clone, python3):
     if python3:
         clone.give("python3", python3)
     clone.give("python3.12", "3.12")
@@ -90,19 +93,19 @@ def test_a_python_that_fits_is_found_under_its_own_name(clone, python3):
     assert "python3.12 -m venv" in done.stdout
 
 
-def test_no_python_that_fits_is_told_in_one_line_with_what_was_found(clone):
+def test_a_missing_supported_python_is_reported_in_one_line(clone):
     clone.give("python3", "3.9")
     done = clone.make("demo")
     assert done.returncode != 0
-    told = [line for line in done.stderr.splitlines() if not line.startswith("make:")]
-    assert told == [
+    messages = [line for line in done.stderr.splitlines() if not line.startswith("make:")]
+    assert messages == [
         "lexsplat needs Python 3.10 to 3.13, found: python3 is 3.9; run: make PYTHON=/path/to/python3.12 demo"
     ]
     assert not (clone.folder / ".venv").exists()
 
 
-def test_an_environment_without_pip_is_mended_when_make_runs_again(clone):
-    """As on Debian before python3-venv is installed: the environment is left with a Python and no pip."""
+def test_an_environment_without_pip_is_repaired_on_the_next_run(clone):
+    """As on Debian without python3-venv: the environment contains Python but no pip."""
     clone.give("python3", "3.11", ensurepip=False)
     assert clone.make("demo").returncode != 0
     assert (clone.folder / ".venv" / "bin" / "python").exists()
@@ -111,7 +114,7 @@ def test_an_environment_without_pip_is_mended_when_make_runs_again(clone):
     assert clone.asked() == ["-m ensurepip --default-pip", INSTALL, DEMO]
 
 
-def test_an_environment_whose_python_is_gone_is_made_anew(clone):
+def test_an_environment_whose_python_was_removed_is_recreated(clone):
     clone.give("python3", "3.11")
     assert clone.make("demo").returncode == 0
     python = clone.folder / ".venv" / "bin" / "python"
@@ -121,7 +124,7 @@ def test_an_environment_whose_python_is_gone_is_made_anew(clone):
     assert clone.asked() == ["-m venv --clear .venv", INSTALL, DEMO]
 
 
-def test_an_output_folder_may_have_a_space_in_its_name(clone):
+def test_the_name_of_the_output_folder_may_contain_a_space(clone):
     clone.give("python3", "3.11")
     assert clone.make("demo", "OUTPUT=my demo").returncode == 0
     assert clone.asked()[-1] == "demo --output my demo"

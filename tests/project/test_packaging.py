@@ -1,4 +1,4 @@
-"""Package data: every file of the demo that git knows, every template, and no stray files beside them."""
+"""Package data: every file of the demo and every template, and no other files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib  # pytest brings it along
+    import tomli as tomllib  # a dependency of pytest
 
 REPOSITORY = Path(__file__).parents[2]
 DATA = REPOSITORY / "src" / "lexsplat"
@@ -21,13 +21,13 @@ def patterns() -> list[str]:
     return project["tool"]["setuptools"]["package-data"]["lexsplat"]
 
 
-def packed(root: Path) -> set[str]:
+def packaged(root: Path) -> set[str]:
     found = (path for pattern in patterns() for path in root.glob(pattern) if path.is_file())
     return {path.relative_to(root).as_posix() for path in found}
 
 
-def test_every_file_of_the_demo_and_every_template_is_packed():
-    shipped = {
+def test_every_file_of_the_demo_and_every_template_is_packaged():
+    bundled = {
         path.relative_to(DATA).as_posix()
         for path in (DATA / "demo").rglob("*")
         if path.is_file()
@@ -35,13 +35,13 @@ def test_every_file_of_the_demo_and_every_template_is_packed():
         and path.name[0] != "."
         and "ground_truth" not in path.parts
     }
-    assert len(shipped) > 400
+    assert len(bundled) > 400
     templates = {path.relative_to(DATA).as_posix() for path in DATA.rglob("templates/*.*")}
-    assert shipped | templates | {"py.typed"} == packed(DATA)
+    assert bundled | templates | {"py.typed"} == packaged(DATA)
 
 
-def test_the_data_of_a_wheel_stay_under_forty_megabytes():
-    assert sum((DATA / path).stat().st_size for path in packed(DATA)) < 38_000_000
+def test_package_data_take_less_than_38_megabytes():
+    assert sum((DATA / path).stat().st_size for path in packaged(DATA)) < 38_000_000
 
 
 @pytest.mark.parametrize(
@@ -54,8 +54,8 @@ def test_the_data_of_a_wheel_stay_under_forty_megabytes():
         "demo/scene/codes/view_000.png",
     ],
 )
-def test_what_tools_and_runs_leave_beside_the_demo_is_not_packed(tmp_path, stray):
+def test_files_left_by_tools_and_runs_are_not_packaged(tmp_path, stray):
     path = tmp_path / stray
     path.parent.mkdir(parents=True)
     path.touch()
-    assert packed(tmp_path) == set()
+    assert packaged(tmp_path) == set()

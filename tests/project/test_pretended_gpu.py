@@ -1,4 +1,4 @@
-"""The pretended GPU keeps CUDA's rules: a test on it that passes says something."""
+"""The pretended GPU enforces CUDA's rules, so that tests on it are meaningful."""
 
 import threading
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-THERE_IS_ONE = torch.cuda.is_available()
+HAS_GPU = torch.cuda.is_available()
 
 
 @pytest.fixture
@@ -14,16 +14,27 @@ def gpu(pretended_gpu):
     return pretended_gpu
 
 
-def test_tensors_made_or_moved_there_say_so(gpu):
-    made = [
+def test_tensors_created_on_or_moved_to_the_gpu_report_its_device(gpu):
+    created = [
         torch.zeros(3, device="cuda"), torch.tensor([1.0, 2.0], device="cuda"), torch.ones(2).to("cuda"),
         torch.as_tensor(np.ones(2), device="cuda"), torch.ones(2).cuda(), torch.randn(2, device="cuda:0"),
         torch.nn.Linear(2, 2).to("cuda").weight, torch.ones(2).to(torch.zeros(1, device="cuda")),
     ]  # fmt: skip
-    made += [made[0].new_ones(4), torch.zeros_like(made[0]), made[0] + 1, made[0][:2], made[0].sum()]
-    assert {str(tensor.device) for tensor in made} == {"cuda:0"}
-    assert all(tensor.is_cuda for tensor in made)
-    assert made[0].cpu().device.type == made[0].to("cpu").device.type == torch.zeros(3).device.type == "cpu"
+    created += [
+        created[0].new_ones(4),
+        torch.zeros_like(created[0]),
+        created[0] + 1,
+        created[0][:2],
+        created[0].sum(),
+    ]
+    assert {str(tensor.device) for tensor in created} == {"cuda:0"}
+    assert all(tensor.is_cuda for tensor in created)
+    assert (
+        created[0].cpu().device.type
+        == created[0].to("cpu").device.type
+        == torch.zeros(3).device.type
+        == "cpu"
+    )
 
 
 @pytest.mark.parametrize(
@@ -44,7 +55,7 @@ def test_tensors_of_two_devices_do_not_mix(gpu, mix):
         mix(torch.ones(3), torch.ones(3, device="cuda"))
 
 
-def test_single_numbers_indices_and_asked_for_copies_do(gpu):
+def test_scalars_indices_and_explicit_copies_mix(gpu):
     there = torch.arange(4.0, device="cuda")
     assert (there * torch.tensor(2.0)).tolist() == [0, 2, 4, 6]
     assert there[torch.tensor([True, False, True, False])].tolist() == [0, 2]
@@ -55,13 +66,13 @@ def test_single_numbers_indices_and_asked_for_copies_do(gpu):
 
 
 @pytest.mark.parametrize("read", [lambda t: t.numpy(), np.asarray, lambda t: np.array(t) + 1])
-def test_there_is_no_way_to_numpy_but_through_the_host(gpu, read):
+def test_conversion_to_numpy_requires_a_copy_to_the_host(gpu, read):
     with pytest.raises(TypeError, match="can't convert cuda:0 device type tensor to numpy"):
         read(torch.ones(2, device="cuda"))
     assert torch.ones(2, device="cuda").cpu().numpy().tolist() == [1, 1]
 
 
-def test_random_numbers_come_from_a_generator_of_the_device_and_leave_the_hosts_alone(gpu):
+def test_random_numbers_come_from_the_devices_generator(gpu):
     with pytest.raises(RuntimeError, match="generator"):
         torch.randn(2, device="cuda", generator=torch.Generator())
     with pytest.raises(RuntimeError, match="generator"):
@@ -79,7 +90,7 @@ def test_random_numbers_come_from_a_generator_of_the_device_and_leave_the_hosts_
     assert torch.rand(3, device="cuda").tolist() == drawn
 
 
-def test_views_share_memory_and_changes_in_place_keep_the_object(gpu):
+def test_views_share_memory_and_in_place_operations_return_the_same_object(gpu):
     whole = torch.zeros(2, 3, device="cuda")
     row = whole[1]
     assert row.add_(2) is row
@@ -105,7 +116,7 @@ def test_a_model_trains_as_on_the_cpu(gpu, fused):
         torch.testing.assert_close(here, there)
 
 
-def test_waiting_for_the_device_is_counted(gpu):
+def test_synchronizations_are_counted(gpu):
     there = torch.ones(3, device="cuda")
     gpu.clear()
     there.mul_(2).add_(there)
@@ -119,7 +130,7 @@ def test_waiting_for_the_device_is_counted(gpu):
     assert sum(gpu.values()) == 5
 
 
-def test_half_precision_is_asked_for_and_threads_have_the_gpu_too(gpu):
+def test_autocast_and_threads_work(gpu):
     layer = torch.nn.Linear(2, 2).to("cuda")
     with torch.autocast("cuda", dtype=torch.float16):
         assert layer(torch.ones(1, 2, device="cuda")).dtype == torch.float16
@@ -132,11 +143,11 @@ def test_half_precision_is_asked_for_and_threads_have_the_gpu_too(gpu):
     assert found == [torch.device("cuda:0")]
 
 
-def test_afterwards_all_is_as_before():
-    assert torch.cuda.is_available() == THERE_IS_ONE
+def test_torch_is_restored_afterwards():
+    assert torch.cuda.is_available() == HAS_GPU
     assert torch.Generator.__module__.startswith("torch")
     assert torch.Tensor.to is torch._C.TensorBase.to
-    if THERE_IS_ONE:
+    if HAS_GPU:
         return
     with pytest.raises((RuntimeError, AssertionError, NotImplementedError)):
         torch.zeros(1, device="cuda")

@@ -92,6 +92,6 @@ def test_what_was_understood_can_be_read():
     )
 
 
-def test_an_empty_part_is_told_with_a_phrase_that_would_do():
+def test_an_empty_part_is_refused_with_a_valid_example():
     with pytest.raises(QueryError, match=r"left of the mug.*such as"):
         parse("left of the mug")

@@ -43,7 +43,7 @@ def test_a_click_selects_the_ball_that_is_seen_there(scene, field, number):
     assert np.array_equal(chosen.mask.numpy(), scene.labels == number)
 
 
-def test_two_things_of_one_meaning_are_told_apart_by_where_the_click_was(scene):
+def test_the_clicked_position_selects_among_objects_of_one_meaning(scene):
     codes = torch.from_numpy(np.where(scene.labels == 1, 0, scene.labels).astype(np.uint8))[:, None]
     same = CodeField(scene.codebook, codes, torch.ones(len(codes), 1), torch.zeros(len(codes)))
     chosen = select_hit(click(scene, 1)[0], scene.gaussians, same, scene.cameras)

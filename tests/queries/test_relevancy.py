@@ -54,7 +54,7 @@ def test_averaged_templates_are_mean_directions_whatever_the_lengths():
     torch.testing.assert_close(found, torch.tensor([[0.5**0.5, 0.5**0.5], [0.0, 1.0]]))
 
 
-def test_prompts_are_embedded_by_one_call():
+def test_prompts_are_encoded_in_one_call():
     calls = []
 
     def encode(batch):

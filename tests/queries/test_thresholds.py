@@ -51,8 +51,8 @@ def test_the_threshold_is_half_where_the_classes_lie_on_either_side_of_it():
     assert float(thresholds.automatic_threshold(above)) == pytest.approx(0.75, abs=2e-3)
 
 
-def test_what_is_over_half_is_told_apart_from_what_is_only_a_little_alike():
-    # Asked for a nose: the room says 0.02, the bear 0.3, its nose 0.7. Otsu alone parts bear and room.
+def test_scores_above_one_half_are_separated_from_slightly_similar_ones():
+    # Prompt "nose": the room scores 0.02, the bear 0.3, its nose 0.7. Otsu alone separates bear and room.
     row = torch.tensor([[0.02] * 18_000 + [0.3] * 1_900 + [0.7] * 100])
     assert 0.3 < float(thresholds.automatic_threshold(row)) <= 0.5
     lower = torch.tensor([[0.02] * 18_000 + [0.3] * 1_900 + [0.45] * 100])

@@ -1,4 +1,4 @@
-"""Adam on the CPU against torch's, and its state as tensors."""
+"""Adam on the CPU compared with torch's Adam, and its state as tensors."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ def gradients(shape: tuple[int, ...], count: int, seed: int = 0) -> list[torch.T
 
 
 @pytest.mark.parametrize("shape", [(5,), (7, 3), (100_001,)])
-def test_steps_equal_those_of_torch_in_double_precision(shape):
+def test_steps_equal_torchs_in_double_precision(shape):
     start = torch.linspace(-1, 1, 5).repeat(shape[-1])[: shape[-1]].expand(shape).clone()
     ours = torch.nn.Parameter(start.clone())
     reference = torch.nn.Parameter(start.double())
@@ -31,7 +31,7 @@ def test_steps_equal_those_of_torch_in_double_precision(shape):
         )
 
 
-def test_what_never_had_a_gradient_does_not_move():
+def test_rows_without_any_gradient_do_not_change():
     parameter = torch.nn.Parameter(torch.ones(4))
     optimizer = Adam(parameter, 0.1)
     parameter.grad = torch.tensor([0.0, 1.0, 0.0, -1.0])
@@ -39,8 +39,8 @@ def test_what_never_had_a_gradient_does_not_move():
     torch.testing.assert_close(parameter.detach(), torch.tensor([1.0, 0.9, 1.0, 1.1]))
 
 
-def test_what_is_out_of_sight_for_a_while_moves_on_as_torchs_does():
-    # Of every second row the gradient is zero from the second step on: a Gaussian that the views do not show.
+def test_rows_whose_gradient_becomes_zero_follow_torchs_adam():
+    # The gradient of every second row is zero from the second step on, as that of a Gaussian in none of the views.
     ours, reference = torch.nn.Parameter(torch.ones(40, 3)), torch.nn.Parameter(torch.ones(40, 3).double())
     optimizer, expected = Adam(ours, 1e-2), torch.optim.Adam([reference], lr=1e-2, eps=1e-15)
     before = torch.ones(20, 3)
@@ -63,7 +63,7 @@ def test_no_gradient_means_no_step():
     assert optimizer_tensors(optimizer) == {}
 
 
-def test_the_number_of_threads_changes_no_bit():
+def test_results_are_bit_identical_for_any_number_of_threads():
     results = []
     threads = torch.get_num_threads()
     for count in (1, 3):
@@ -78,7 +78,7 @@ def test_the_number_of_threads_changes_no_bit():
     assert torch.equal(*results)
 
 
-def test_a_loaded_state_goes_on_bit_for_bit():
+def test_a_loaded_state_continues_bit_for_bit():
     straight = torch.nn.Parameter(torch.ones(6))
     optimizer = Adam(straight, 1e-2)
     steps = gradients((6,), 4)

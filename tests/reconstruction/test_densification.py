@@ -1,4 +1,4 @@
-"""Density control against gsplat's own strategies, and against the MCMC paper where they need CUDA."""
+"""Density control compared with gsplat's strategies, or with the MCMC paper where gsplat requires CUDA."""
 
 import math
 
@@ -22,7 +22,7 @@ SCHEDULE = DensitySchedule(start=2, stop=100, every=5, reset_every=20)
 
 
 def some_parameters(count: int = 40, seed: int = 0) -> tuple[dict, dict]:
-    """Parameters under gsplat's names, with optimizers that have a state."""
+    """Parameters under gsplat's names, with optimizers that contain a state."""
     generator = torch.Generator().manual_seed(seed)
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
     parameters = {
@@ -40,7 +40,7 @@ def some_parameters(count: int = 40, seed: int = 0) -> tuple[dict, dict]:
 
 
 def projected(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Projected centers with a gradient, and radii of which some are zero."""
+    """Projected centers with gradients, and radii, some of them zero."""
     generator = torch.Generator().manual_seed(seed)
     means2d = torch.zeros(count, 2, requires_grad=True)
     means2d.grad = 3e-6 * torch.randn(count, 2, generator=generator)
@@ -72,7 +72,7 @@ def assert_same(left: dict, right: dict) -> None:
         assert torch.equal(left[name], right[name]), name
 
 
-def test_default_control_does_exactly_what_gsplats_strategy_does_until_its_missing_reset():
+def test_default_control_equals_gsplats_strategy_up_to_its_missing_reset():
     from gsplat.strategy import DefaultStrategy
 
     ours, our_optimizers = some_parameters()
@@ -107,7 +107,7 @@ def test_the_cap_is_never_exceeded(cap, strategy, seed):
         assert len(parameters["means"]) <= cap
 
 
-def test_what_grows_under_a_cap_has_the_highest_gradients():
+def test_under_a_cap_the_gaussians_of_highest_gradient_grow():
     parameters, optimizers = some_parameters(count=10)
     with torch.no_grad():
         parameters["opacities"].fill_(2.0)
@@ -129,7 +129,7 @@ def test_what_grows_under_a_cap_has_the_highest_gradients():
     assert torch.equal(parameters["means"].detach(), torch.cat([originals, originals[7:]]))
 
 
-def test_opacities_are_reset_when_due_and_only_then():
+def test_opacities_are_reset_on_schedule_only():
     parameters, optimizers = some_parameters()
     control = new_control(min_opacity=0.005)
     run(control, parameters, optimizers, range(20))
@@ -140,7 +140,7 @@ def test_opacities_are_reset_when_due_and_only_then():
 
 
 @pytest.mark.parametrize("resets", [False, True])
-def test_large_gaussians_are_removed_only_where_opacities_are_reset(resets):
+def test_large_gaussians_are_removed_only_if_opacities_are_reset(resets):
     parameters, optimizers = some_parameters()
     with torch.no_grad():
         parameters["opacities"].fill_(3.0)
@@ -171,7 +171,7 @@ def test_a_resumed_run_continues_bit_for_bit(strategy):
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_the_global_generator_is_left_alone_and_has_no_say(strategy):
+def test_the_global_generator_is_neither_used_nor_changed(strategy):
     results = []
     for outside in (0, 1):
         torch.manual_seed(outside)
@@ -183,7 +183,7 @@ def test_the_global_generator_is_left_alone_and_has_no_say(strategy):
     assert_same(*results)
 
 
-def test_mcmc_moves_the_faint_and_grows_by_a_twentieth():
+def test_mcmc_relocates_faint_gaussians_and_grows_by_a_twentieth():
     parameters, optimizers = some_parameters(count=100)
     with torch.no_grad():
         parameters["opacities"][:30] = -8.0
@@ -192,7 +192,7 @@ def test_mcmc_moves_the_faint_and_grows_by_a_twentieth():
     assert float(parameters["opacities"].detach().sigmoid().min()) >= 0.005 * (1 - 1e-5)
 
 
-def test_mcmc_noise_is_shaped_by_the_covariance_and_spares_the_opaque():
+def test_mcmc_noise_follows_the_covariance_and_spares_opaque_gaussians():
     parameters, optimizers = some_parameters(count=4000)
     with torch.no_grad():
         parameters["quats"].copy_(torch.tensor([1.0, 0, 0, 0]).expand(4000, 4))
@@ -211,7 +211,7 @@ def test_mcmc_noise_is_shaped_by_the_covariance_and_spares_the_opaque():
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 20, 51])
 @pytest.mark.parametrize("opacity", [0.02, 0.4, 0.95])
 def test_copies_blend_to_the_gaussian_they_replace(copies, opacity):
-    """The definition: the same opacity in the middle, and the same integral along a line."""
+    """By definition, copies have the same opacity at the center and the same integral along a line."""
     new_opacity, new_scale = relocate(
         torch.tensor([opacity]), torch.tensor([[0.7, 1.0, 2.0]]), torch.tensor([copies]), torch.empty(0)
     )
@@ -241,7 +241,7 @@ def test_relocation_equals_the_double_sum_of_the_paper():
     np.testing.assert_allclose(new_scales, scales * np.array([e[1] for e in expected])[:, None], rtol=1e-9)
 
 
-def test_more_copies_than_the_table_holds_are_treated_as_its_last():
+def test_copy_counts_beyond_the_table_use_its_last_entry():
     tensors = torch.tensor([0.5]), torch.ones(1, 3)
     most = relocate(*tensors, torch.tensor([51]), torch.empty(0))
     beyond = relocate(*tensors, torch.tensor([1000]), torch.empty(0))
@@ -259,7 +259,7 @@ def test_covariances_equal_gsplats_torch_function():
     torch.testing.assert_close(covariances(quats, scales), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_gsplats_own_operators_are_back_afterwards():
+def test_gsplats_own_operators_are_restored():
     from gsplat.strategy import ops
 
     before = ops.compute_relocation, ops.quat_scale_to_covar_preci
@@ -268,13 +268,13 @@ def test_gsplats_own_operators_are_back_afterwards():
     assert (ops.compute_relocation, ops.quat_scale_to_covar_preci) == before
 
 
-def test_the_schedule_of_the_full_length_is_that_of_3dgs():
+def test_the_full_length_schedule_equals_that_of_3dgs():
     assert density_schedule("default", 30_000) == DensitySchedule(500, 15_000, 100, 3_000)
     assert density_schedule("mcmc", 30_000).stop == 25_000
 
 
-def test_a_short_training_has_as_many_rounds_of_mcmc_as_a_long_one():
-    """Each adds a twentieth: with a tenth of the rounds it would grow by 3 where a long one grows by 150,000."""
+def test_short_and_long_trainings_have_the_same_number_of_mcmc_rounds():
+    """Each round adds a twentieth; a tenth of the rounds would mean growth by 3 instead of 150,000."""
     short, full = density_schedule("mcmc", 3_000, minimum_every=100), density_schedule("mcmc", 30_000)
     rounds = [(schedule.stop - schedule.start) // schedule.every for schedule in (short, full)]
     assert rounds == [245, 245]

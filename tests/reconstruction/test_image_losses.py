@@ -1,4 +1,4 @@
-"""Image losses against torchmetrics and scikit-image in float64, and their gradients against autograd."""
+"""Image losses compared with torchmetrics and scikit-image in float64, and their gradients with autograd."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from lexsplat.reconstruction.image_losses import l1_loss, photometric_loss, ssim
 
 
 def two_images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """A smooth photo with texture, and a noisy rendering of it."""
+    """A smooth textured photo and a noisy rendering of it."""
     generator = torch.Generator().manual_seed(seed)
     ramp = torch.linspace(0, 0.6, width)[None, :, None] * torch.tensor([1.0, 0.5, 0.2])
     photo = (ramp + 0.4 * torch.rand(height, width, 3, generator=generator)).clamp(0, 1)
@@ -35,8 +35,8 @@ def test_ssim_equals_torchmetrics(height, width):
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0, 1.1])
 @pytest.mark.parametrize("noise", [1e-3, 1e-2, 0.1])
-def test_bright_flat_and_gray_surfaces_are_as_exact(level, noise):
-    # Squares near 1 whose difference is a variance of 1e-6: in float32 that is rounding (SSIM once was off by 1e-4).
+def test_ssim_is_exact_on_bright_flat_and_gray_surfaces(level, noise):
+    # A variance of 1e-6 as the difference of squares near 1 is lost to float32 rounding, an SSIM error of 1e-4.
     generator = torch.Generator().manual_seed(0)
     photo = min(level, 1.0) + noise * torch.randn(31, 43, 1, generator=generator).expand(31, 43, 3)
     image = (level + noise * torch.randn(31, 43, 1, generator=generator).expand(31, 43, 3)).contiguous()
@@ -50,7 +50,7 @@ def test_bright_flat_and_gray_surfaces_are_as_exact(level, noise):
         assert float((gradient - exact).abs().max()) <= 2e-5 * float(exact.abs().max())
 
 
-def test_an_image_that_equals_its_photo_has_no_gradient_at_all():
+def test_an_image_equal_to_its_photo_has_zero_gradient():
     photo = torch.full((20, 30, 3), 0.9)
     image = photo.clone().requires_grad_()
     loss = photometric_loss(image, ssim_target(photo))
@@ -65,7 +65,7 @@ def test_the_torch_path_equals_torchmetrics():
     assert float(value) == pytest.approx(float(torchmetrics_ssim(image, photo)), abs=1e-12)
 
 
-def test_double_images_take_the_torch_path_and_agree_with_the_kernel():
+def test_float64_images_use_torch_and_agree_with_the_kernel():
     image, photo = two_images(20, 30)
     single = photometric_loss(image, ssim_target(photo))
     double = photometric_loss(image.double(), ssim_target(photo.double()))
@@ -100,7 +100,7 @@ def test_a_slice_of_more_channels_gives_the_same_loss_and_gradient():
     assert not channels.grad[..., 3:].any()
 
 
-def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
+def test_losses_are_bit_identical_for_any_number_of_threads(monkeypatch):
     image, photo = two_images(40, 50)
     target = ssim_target(photo)
     monkeypatch.setattr(image_loss_kernels, "PIXELS_PER_PIECE", 300)
@@ -123,7 +123,7 @@ def test_l1_of_a_constant_difference_is_that_difference():
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(6, 30), st.integers(6, 30), st.integers(0, 1000))
-def test_ssim_is_one_for_equal_images_and_never_above(height, width, seed):
+def test_ssim_is_one_for_equal_images_and_at_most_one_otherwise(height, width, seed):
     image, photo = two_images(height, width, seed)
     assert float(ssim(photo, ssim_target(photo))) == pytest.approx(1.0, abs=1e-5)
     assert float(ssim(image, ssim_target(photo))) < 1.0
@@ -131,7 +131,7 @@ def test_ssim_is_one_for_equal_images_and_never_above(height, width, seed):
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(6, 24), st.integers(6, 24), st.integers(0, 1000))
-def test_ssim_is_deaf_to_mirroring(height, width, seed):
+def test_ssim_is_invariant_to_mirroring(height, width, seed):
     image, photo = two_images(height, width, seed)
     plain = float(ssim(image, ssim_target(photo)))
     mirrored = float(ssim(image.flip(0, 1), ssim_target(photo.flip(0, 1))))
@@ -158,7 +158,7 @@ def test_transposed_taps_are_the_transpose_of_the_reflected_blur(length):
 
 
 @pytest.mark.parametrize("shape", [(5, 20, 3), (20, 5, 3), (20, 20, 4), (20, 20)])
-def test_photos_that_cannot_be_used_are_refused(shape):
+def test_invalid_photos_are_refused(shape):
     with pytest.raises(ValueError, match="image must be"):
         ssim_target(torch.zeros(shape))
 

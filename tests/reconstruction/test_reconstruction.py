@@ -1,4 +1,4 @@
-"""Reconstruction on a ray-traced capture: it learns, resumes bit for bit, and fails with words."""
+"""Reconstruction of a ray-traced capture: quality, bit-identical resumption and error messages."""
 
 import dataclasses
 import shutil
@@ -20,17 +20,17 @@ SHORT = ReconstructionConfig(
 
 
 @pytest.fixture(scope="module")
-def scene(tiny_capture):
+def capture(tiny_capture):
     return load_capture(tiny_capture)
 
 
 @pytest.fixture(scope="module")
-def points(scene):
-    return initial_points(scene)
+def points(capture):
+    return initial_points(capture)
 
 
 @pytest.fixture(scope="module")
-def trained(scene, points):
+def trained(capture, points):
     config = ReconstructionConfig(
         iterations=150,
         sh_degree=1,
@@ -40,39 +40,39 @@ def trained(scene, points):
         scales_rate=2e-2,
         sh0_rate=2e-2,
     )
-    trainer = Reconstructor(scene, config, points)
-    before = held_out_psnr(trainer, scene)
+    trainer = Reconstructor(capture, config, points)
+    before = held_out_psnr(trainer, capture)
     trainer.run()
     return trainer, before
 
 
-def test_held_out_views_become_sharp(scene, trained):
+def test_held_out_views_become_sharp(capture, trained):
     trainer, before = trained
-    assert held_out_psnr(trainer, scene) > max(18.0, before + 6.0)
+    assert held_out_psnr(trainer, capture) > max(18.0, before + 6.0)
 
 
 def test_density_control_adds_gaussians_within_the_cap(points, trained):
     assert len(points.points) < len(trained[0].gaussians()) <= 2_000
 
 
-def test_result_is_detached_and_remembers_the_mip_filter(trained):
+def test_the_result_is_detached_and_records_the_mip_filter(trained):
     gaussians = trained[0].gaussians()
     assert gaussians.antialiased
     assert not any(tensor.requires_grad for tensor in gaussians.tensors().values())
 
 
 @pytest.mark.parametrize("change", [{}, {"strategy": "mcmc"}, {"exposure": True}])
-def test_a_resumed_training_equals_an_uninterrupted_one_bit_for_bit(scene, points, change):
+def test_a_resumed_training_equals_an_uninterrupted_one_bit_for_bit(capture, points, change):
     config = dataclasses.replace(SHORT, **change)
-    straight = Reconstructor(scene, config, points, seed=5)
+    straight = Reconstructor(capture, config, points, seed=5)
     straight.run()
 
-    first = Reconstructor(scene, config, points, seed=5)
+    first = Reconstructor(capture, config, points, seed=5)
     for _ in range(13):
         first.step()
     saved = {name: value.clone() for name, value in first.state_dict().items()}
-    first.step()  # what is saved must not follow the training
-    second = Reconstructor(scene, config, points, seed=6)
+    first.step()  # the saved state must not change with the training
+    second = Reconstructor(capture, config, points, seed=6)
     second.load_state_dict(saved)
     second.run()
 
@@ -82,24 +82,24 @@ def test_a_resumed_training_equals_an_uninterrupted_one_bit_for_bit(scene, point
         assert torch.equal(left[name], right[name]), name
 
 
-def test_state_survives_safetensors(scene, points, tmp_path):
+def test_state_survives_safetensors(capture, points, tmp_path):
     from safetensors.torch import load_file, save_file
 
-    trainer = Reconstructor(scene, SHORT, points)
+    trainer = Reconstructor(capture, SHORT, points)
     for _ in range(12):
         trainer.step()
     save_file(trainer.state_dict(), tmp_path / "state.safetensors")
-    other = Reconstructor(scene, SHORT, points, seed=1)
+    other = Reconstructor(capture, SHORT, points, seed=1)
     other.load_state_dict(load_file(tmp_path / "state.safetensors"))
     assert trainer.step() == other.step()
 
 
-def test_seeds_decide_and_neither_the_global_generator_nor_the_threads(scene, points):
+def test_results_depend_on_the_seed_but_not_on_the_global_generator_or_threads(capture, points):
     def means(seed: int, outside: int) -> torch.Tensor:
         threads = torch.get_num_threads()
         torch.manual_seed(outside)
         torch.set_num_threads(1 + 2 * outside)
-        trainer = Reconstructor(scene, SHORT, points, seed=seed)
+        trainer = Reconstructor(capture, SHORT, points, seed=seed)
         for _ in range(8):
             trainer.step()
         torch.set_num_threads(threads)
@@ -109,21 +109,21 @@ def test_seeds_decide_and_neither_the_global_generator_nor_the_threads(scene, po
     assert not torch.equal(means(0, 0), means(1, 0))
 
 
-def test_every_view_is_visited_once_per_round(scene, points):
-    trainer = Reconstructor(scene, SHORT, points)
+def test_every_view_is_visited_once_per_round(capture, points):
+    trainer = Reconstructor(capture, SHORT, points)
     visited = []
-    for _ in range(2 * len(scene.train_names)):
+    for _ in range(2 * len(capture.train_names)):
         visited.append(trainer._next_view())
         trainer.steps_done += 1
     rounds = np.array(visited).reshape(2, -1)
-    assert (np.sort(rounds, axis=1) == np.arange(len(scene.train_names))).all()
+    assert (np.sort(rounds, axis=1) == np.arange(len(capture.train_names))).all()
     assert (rounds[0] != rounds[1]).any()
 
 
-def test_events_count_up_to_the_end(scene):
+def test_events_count_up_to_the_end(capture):
     events = []
     reconstruct(
-        scene, dataclasses.replace(SHORT, iterations=25, reset_opacities=False), listener=events.append
+        capture, dataclasses.replace(SHORT, iterations=25, reset_opacities=False), listener=events.append
     )
     assert [event.done for event in events] == [10, 20, 25]
     assert {event.stage for event in events} == {"reconstruct"}
@@ -131,17 +131,17 @@ def test_events_count_up_to_the_end(scene):
     assert all(5 < event.metrics["psnr"] < 50 for event in events)
 
 
-def test_a_memory_budget_of_nothing_changes_nothing(scene, points):
+def test_a_memory_budget_of_zero_does_not_change_results(capture, points):
     results = []
     for memory in (0, 4 << 30):
-        trainer = Reconstructor(scene, SHORT, points, memory=memory)
+        trainer = Reconstructor(capture, SHORT, points, memory=memory)
         for _ in range(15):
             trainer.step()
         results.append(trainer.gaussians().means)
     assert torch.equal(*results)
 
 
-def test_masked_pixels_have_no_say(tiny_capture, tmp_path, points):
+def test_masked_pixels_do_not_affect_the_result(tiny_capture, tmp_path, points):
     captures = []
     for name, paint in (("plain", False), ("painted", True)):
         folder = shutil.copytree(tiny_capture, tmp_path / name)
@@ -165,9 +165,9 @@ def test_masked_pixels_have_no_say(tiny_capture, tmp_path, points):
     assert torch.equal(*colors)
 
 
-def test_exposure_follows_a_photo_that_is_darker_than_the_others(scene, points, tiny_capture, tmp_path):
+def test_the_exposure_model_fits_a_darker_photo(capture, points, tiny_capture, tmp_path):
     folder = shutil.copytree(tiny_capture, tmp_path / "dark")
-    dark = scene.train_names[2]
+    dark = capture.train_names[2]
     image = np.array(Image.open(folder / "images" / dark)) * 0.6
     Image.fromarray(image.astype(np.uint8)).save(folder / "images" / dark)
     config = dataclasses.replace(
@@ -180,32 +180,32 @@ def test_exposure_follows_a_photo_that_is_darker_than_the_others(scene, points, 
     assert float(gains.mean()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_divergence_is_noticed(scene, points):
-    trainer = Reconstructor(scene, SHORT, points)
+def test_divergence_is_detected(capture, points):
+    trainer = Reconstructor(capture, SHORT, points)
     with torch.no_grad():
         trainer._parameters["sh0"].fill_(float("nan"))
     with pytest.raises(TrainingError, match="nan at iteration 1"):
         trainer.step()
 
 
-def test_a_scene_without_points_or_training_views_is_refused(scene):
+def test_a_capture_without_points_or_training_views_is_refused(capture):
     nothing = InitialPoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), "capture", "")
     with pytest.raises(TrainingError, match="initial points"):
-        Reconstructor(scene, SHORT, nothing)
+        Reconstructor(capture, SHORT, nothing)
     with pytest.raises(TrainingError, match="training view"):
-        Reconstructor(dataclasses.replace(scene, train_names=()), SHORT, nothing)
+        Reconstructor(dataclasses.replace(capture, train_names=()), SHORT, nothing)
 
 
-def test_points_beyond_the_cap_are_thinned(scene, points):
-    trainer = Reconstructor(scene, dataclasses.replace(SHORT, max_gaussians=100), points)
+def test_points_beyond_the_cap_are_thinned(capture, points):
+    trainer = Reconstructor(capture, dataclasses.replace(SHORT, max_gaussians=100), points)
     means = trainer.gaussians().means
     assert len(means) == 100
     known = {tuple(point) for point in points.points.tolist()}
     assert len({tuple(mean) for mean in means.tolist()} & known) == 100
 
 
-def test_a_checkpoint_that_lacks_something_is_refused(scene, points):
-    trainer = Reconstructor(scene, SHORT, points)
+def test_an_incomplete_checkpoint_is_refused(capture, points):
+    trainer = Reconstructor(capture, SHORT, points)
     state = trainer.state_dict()
     del state["parameters/means"]
     with pytest.raises(ValueError, match="parameters/means"):
@@ -222,7 +222,7 @@ def test_settings_out_of_range_are_named(change):
         ReconstructionConfig(**change)
 
 
-def test_the_full_length_has_the_rates_and_the_schedule_of_3dgs():
+def test_the_full_length_uses_the_rates_and_schedule_of_3dgs():
     config = ReconstructionConfig()
     expected = {"means": 3.2e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3}
     assert config.rates(extent=2.0) == pytest.approx({**expected, "shN": 2.5e-3 / 20})
@@ -230,7 +230,7 @@ def test_the_full_length_has_the_rates_and_the_schedule_of_3dgs():
     assert config.is_long
 
 
-def test_short_trainings_take_longer_strides_and_start_small():
+def test_short_trainings_use_higher_rates_and_start_at_low_resolution():
     config = ReconstructionConfig(iterations=3_750)
     assert config.rates(1.0)["means"] == pytest.approx(2 * 1.6e-4)
     assert config.rates(1.0)["opacity_logits"] == 5e-2
@@ -238,15 +238,15 @@ def test_short_trainings_take_longer_strides_and_start_small():
     assert not config.is_long
 
 
-def test_what_is_set_is_not_overruled():
+def test_explicit_settings_take_precedence():
     config = ReconstructionConfig(iterations=100, warm_up=0.0, rate_scale=1.0, max_gaussians=7)
     assert config.warm_up_iterations == 0
     assert config.rates(1.0)["means"] == pytest.approx(1.6e-4)
     assert config.cap(torch.device("cuda")) == config.cap(torch.device("cpu")) == 7
 
 
-def test_the_learning_rate_of_the_means_decays_to_a_hundredth(scene, points):
-    trainer = Reconstructor(scene, SHORT, points)
+def test_the_learning_rate_of_the_means_decays_to_a_hundredth(capture, points):
+    trainer = Reconstructor(capture, SHORT, points)
     first = trainer._means_rate()
     trainer.steps_done = SHORT.iterations
     assert trainer._means_rate() == pytest.approx(first / 100)

@@ -1,4 +1,4 @@
-"""Photos for training: from the file or from the cache the same, and never more cache than allowed."""
+"""Training photos: file and cache give the same values, and the cache never exceeds its size."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def views(tiny_capture):
 
 
 @pytest.mark.parametrize("memory", [0, 2 * PHOTO_BYTES, 10 * PHOTO_BYTES + MOMENT_BYTES, 1 << 30])
-def test_targets_do_not_depend_on_the_cache_and_stay_within_it(views, memory):
+def test_targets_do_not_depend_on_the_cache_size_which_is_never_exceeded(views, memory):
     images = TrainingImages(views, memory=memory)
     for _ in range(2):
         for view in views:
@@ -44,7 +44,7 @@ def test_a_photo_that_fits_is_read_once(views, monkeypatch):
     assert [reads.count(view.name) for view in views[:4]] == [1, 1, 3, 3]
 
 
-def test_shrunken_images_and_cameras_agree(views):
+def test_downscaled_images_and_cameras_agree(views):
     images = TrainingImages(views, memory=1 << 20, shrink=2.0)
     camera = images.camera(views[0].name)
     assert (camera.width, camera.height) == (48, 36)

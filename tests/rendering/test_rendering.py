@@ -64,8 +64,8 @@ def test_image_and_gradients_equal_the_float64_reference(antialiased, seed, degr
     assert relative_error(found.means2d.grad, expected["means2d"].grad) < 1e-5
 
 
-def test_every_gaussian_gets_an_exact_gradient_not_only_the_mean():
-    # A norm over all Gaussians hides errors in the faint ones.
+def test_the_gradient_of_every_single_gaussian_is_exact():
+    # A norm over all Gaussians would hide errors of faint ones.
     gaussians = with_gradients(random_gaussians(40, 7, antialiased=True))
     camera = front_camera()
     leaves = reference.to_float64(gaussians)
@@ -84,7 +84,7 @@ def test_every_gaussian_gets_an_exact_gradient_not_only_the_mean():
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_where_alpha_is_clamped_the_gradients_equal_the_float64_reference(antialiased):
+def test_gradients_of_clamped_alpha_equal_the_float64_reference(antialiased):
     gaussians, camera = random_gaussians(20, 3, antialiased=antialiased, scale=0.3), front_camera()
     gaussians.means[0] = 0.5 * torch.from_numpy(camera.position).float()
     gaussians.opacity_logits[0] = 10.0
@@ -128,7 +128,7 @@ def test_gradients_equal_finite_differences_of_the_reference():
 
 
 def rigid(twist: torch.Tensor) -> torch.Tensor:
-    """Rigid motion [4, 4] of (rotation vector, translation) [6], by the matrix exponential."""
+    """Rigid transform [4, 4] of (rotation vector, translation) [6], by the matrix exponential."""
     zero = torch.zeros((), dtype=twist.dtype)
     x, y, z, a, b, c = twist.unbind()
     rows = [zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero]
@@ -142,7 +142,7 @@ def rigid(twist: torch.Tensor) -> torch.Tensor:
 def test_the_gradient_of_the_pose_equals_the_float64_reference(turned, antialiased):
     gaussians = with_gradients(random_gaussians(40, 21, antialiased=antialiased))
     camera = front_camera()
-    # The world is also turned half around each axis: a quaternion is found in four ways, by its largest number.
+    # The rotations by 180 degrees about each axis cover all four branches of the conversion to a quaternion.
     world = rigid(torch.tensor([*turned, 0.0, 0.0, 0.0], dtype=torch.float64))
     start = torch.from_numpy(camera.viewmat) @ world
     twist = torch.zeros(6, requires_grad=True)
@@ -165,7 +165,7 @@ def test_the_gradient_of_the_pose_equals_the_float64_reference(turned, antialias
         assert relative_error(getattr(gaussians, name).grad, leaves[name].grad) < 1e-4, name
 
 
-def test_a_pose_that_is_off_finds_back_by_its_gradient():
+def test_gradient_descent_recovers_a_perturbed_pose():
     gaussians, camera = random_gaussians(60, 4), front_camera()
     photo = render(gaussians, camera).image
     true = torch.from_numpy(camera.viewmat).float()
@@ -202,7 +202,7 @@ def test_features_and_their_gradients_equal_the_float64_reference():
             assert relative_error(features.grad, features64.grad) < 1e-5
 
 
-def test_depth_is_the_weighted_mean_of_the_depths():
+def test_depth_is_the_weighted_mean_of_the_depths_of_the_gaussians():
     gaussians, camera = random_gaussians(40, 3), front_camera()
     leaves = {k: v.detach() for k, v in reference.to_float64(gaussians).items()}
     projected = reference.project(leaves, camera, antialiased=False)
@@ -215,10 +215,10 @@ def test_depth_is_the_weighted_mean_of_the_depths():
     assert found.features.shape[-1] == 0
 
 
-# ------------------------------------------------------------------------------------- geometry is deaf to language
+# --------------------------------------------------------------------------- geometry is detached from language
 
 
-def test_features_do_not_move_geometry_gradients_by_a_single_bit():
+def test_features_leave_the_gradients_of_the_geometry_bit_identical():
     camera = front_camera(70, 50)
     gradients = []
     for features in (None, torch.randn(200, 9, requires_grad=True)):
@@ -235,7 +235,7 @@ def test_features_do_not_move_geometry_gradients_by_a_single_bit():
         assert torch.equal(alone, beside)
 
 
-def test_a_loss_on_features_alone_gives_geometry_no_gradient():
+def test_a_loss_on_features_alone_yields_no_gradient_of_the_geometry():
     for color in (False, True):
         gaussians = with_gradients(random_gaussians(50, 1))
         features = torch.randn(50, 5, requires_grad=True)
@@ -246,7 +246,7 @@ def test_a_loss_on_features_alone_gives_geometry_no_gradient():
             assert gradient is None or not gradient.any(), name
 
 
-def test_alpha_moves_geometry_even_without_color():
+def test_alpha_contributes_to_the_gradients_of_the_geometry_without_color():
     gaussians = with_gradients(random_gaussians(30, 1))
     rendering = render(gaussians, front_camera(), color=False)
     rendering.alpha.sum().backward()
@@ -254,7 +254,9 @@ def test_alpha_moves_geometry_even_without_color():
     leaves = reference.to_float64(gaussians)
     expected = reference.render(leaves, front_camera(), antialiased=False, degree=3)
     expected["alpha"].sum().backward()
-    assert relative_error(gaussians.means.grad, leaves["means"].grad) < 1e-2  # unclear pixels count here
+    assert (
+        relative_error(gaussians.means.grad, leaves["means"].grad) < 1e-2
+    )  # includes pixels close to a threshold
     assert gaussians.sh0.grad is None
 
 
@@ -276,8 +278,8 @@ def test_the_order_of_the_gaussians_does_not_matter(seed, count, width, height):
 @example(50, 1, 24)
 def test_a_crop_of_the_image_is_the_image_of_a_cropped_camera(seed, x, y):
     gaussians, camera = random_gaussians(80, seed, scale=0.02), front_camera(200, 140)
-    # Of a Gaussian far outside, the derivative of the projection is taken at 1.15 times the field of view (gsplat
-    # and 3DGS do so too), which is another place in the narrower one: such Gaussians are left out.
+    # The Jacobian of a Gaussian far outside is evaluated at 1.15 times the field of view, as in gsplat and 3DGS, so
+    # that it differs in a narrower field of view. Such Gaussians are excluded.
     seen = gaussians.means.double() @ torch.from_numpy(camera.viewmat[:3, :3]).T + camera.viewmat[:3, 3]
     pixels = (seen @ torch.from_numpy(camera.K).T)[:, :2] / seen[:, 2:]
     beside = (pixels - torch.tensor([x + 50.0, y + 35.0])).abs() > torch.tensor([65.0, 45.5])
@@ -291,7 +293,7 @@ def test_a_crop_of_the_image_is_the_image_of_a_cropped_camera(seed, x, y):
     assert (difference < 1e-4).float().mean() > 0.999
 
 
-def test_an_opaque_gaussian_hides_what_is_behind_it():
+def test_an_opaque_gaussian_occludes_the_gaussians_behind_it():
     eye = torch.tensor(front_camera().position, dtype=torch.float32)
     wall = Gaussians(
         means=torch.stack([eye * 0.5, torch.zeros(3)]),
@@ -320,7 +322,7 @@ def test_an_empty_scene_is_the_background_and_has_empty_gradients():
     assert gaussians.means.grad.shape == (0, 3)
 
 
-def test_gaussians_behind_the_camera_or_nearer_than_near_are_not_drawn():
+def test_gaussians_behind_the_camera_or_the_near_plane_are_not_drawn():
     gaussians, camera = random_gaussians(20, 0, scale=0.05), front_camera()
     behind = replace(gaussians, means=gaussians.means * 0.1 + 2 * torch.tensor(camera.position).float())
     rendering = render(behind, camera)
@@ -330,7 +332,7 @@ def test_gaussians_behind_the_camera_or_nearer_than_near_are_not_drawn():
     assert not render(gaussians, camera, near=100.0).alpha.any()
 
 
-def test_the_near_plane_is_where_it_is_said_to_be():
+def test_the_near_plane_is_at_the_given_depth():
     camera = Camera(16, 16, np.array([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), np.eye(4))
     gaussians = random_gaussians(4, 0, scale=0.05)
     gaussians.opacity_logits[:] = 2.0
@@ -339,7 +341,7 @@ def test_the_near_plane_is_where_it_is_said_to_be():
     assert (render(gaussians, camera, near=0.25).radii > 0).tolist() == [False, True, True, False]
 
 
-def test_of_gaussians_at_one_depth_the_first_is_in_front():
+def test_gaussians_at_equal_depth_are_drawn_in_index_order():
     gaussians, camera = random_gaussians(2, 0), front_camera()
     gaussians.means[:] = 0.0
     gaussians.opacity_logits[:] = 8.0
@@ -352,7 +354,7 @@ def test_of_gaussians_at_one_depth_the_first_is_in_front():
     assert swapped[1] > swapped[0]
 
 
-def test_a_gaussian_across_the_edge_of_the_image_is_cut_not_lost():
+def test_a_gaussian_across_the_image_border_is_clipped():
     camera = front_camera()
     at_edge = torch.linalg.inv(torch.tensor(camera.viewmat)) @ torch.tensor(
         [-camera.K[0, 2] / camera.K[0, 0] * 3.0, 0.0, 3.0, 1.0], dtype=torch.float64
@@ -367,7 +369,7 @@ def test_a_gaussian_across_the_edge_of_the_image_is_cut_not_lost():
 
 @pytest.mark.parametrize("log_scale", [-40.0, -12.0, 6.0, 14.0, 30.0, 80.0])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_degenerate_scales_leave_everything_finite(log_scale, antialiased):
+def test_degenerate_scales_yield_finite_results(log_scale, antialiased):
     gaussians = random_gaussians(30, 2, antialiased=antialiased)
     gaussians.log_scales[::3, 0] = log_scale
     gaussians.log_scales[1::3] = log_scale
@@ -381,7 +383,7 @@ def test_degenerate_scales_leave_everything_finite(log_scale, antialiased):
         assert getattr(gaussians, name).grad.isfinite().all(), name
 
 
-def test_a_gaussian_with_a_number_that_is_not_finite_is_left_out():
+def test_gaussians_with_nan_or_infinity_are_not_drawn():
     gaussians, camera = random_gaussians(30, 2), front_camera()
     expected = render(gaussians.select(torch.arange(30) >= 5), camera)
     gaussians.means[0, 1] = float("nan")
@@ -397,7 +399,7 @@ def test_a_gaussian_with_a_number_that_is_not_finite_is_left_out():
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), float("-inf")])
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits"])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_no_number_makes_what_other_gaussians_show_or_learn_not_finite(name, wrong, antialiased):
+def test_invalid_values_of_one_gaussian_keep_the_results_of_others_finite(name, wrong, antialiased):
     gaussians = random_gaussians(30, 2, antialiased=antialiased)
     getattr(gaussians, name)[7].reshape(-1)[0] = wrong
     gaussians = with_gradients(gaussians)
@@ -411,7 +413,7 @@ def test_no_number_makes_what_other_gaussians_show_or_learn_not_finite(name, wro
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 17), (17, 1), (15, 33)])
 @pytest.mark.parametrize("channels", [0, 1, 2, 300])
-def test_any_size_and_any_number_of_channels_equal_the_float64_reference(width, height, channels):
+def test_images_of_any_size_and_channel_count_equal_the_float64_reference(width, height, channels):
     gaussians, camera = random_gaussians(25, 6), front_camera(width, height)
     features = torch.randn(25, channels, generator=torch.Generator().manual_seed(0), requires_grad=True)
     leaves = {k: v.detach() for k, v in reference.to_float64(gaussians).items()}
@@ -429,7 +431,7 @@ def test_any_size_and_any_number_of_channels_equal_the_float64_reference(width, 
 
 
 def test_a_hundred_thousand_gaussians_in_one_tile():
-    # All equal and wide: alpha is a = 0.005 everywhere, and pixels end with T = (1 - a)^n > 1e-4 >= (1 - a)^(n + 1).
+    # All are equal and wide: alpha is a = 0.005, and pixels finish with T = (1 - a)^n > 1e-4 >= (1 - a)^(n + 1).
     count, a = 100_000, 0.005
     camera = front_camera(16, 16)
     gaussians = with_gradients(
@@ -452,7 +454,7 @@ def test_a_hundred_thousand_gaussians_in_one_tile():
     assert np.sort(per_gaussian.numpy())[::-1][: n - 1] == pytest.approx(expected[: n - 1], rel=2e-3)
 
 
-# ------------------------------------------------------------------------------------------------ same bits always
+# ------------------------------------------------------------------------------------------------ reproducibility
 
 
 def all_results(gaussians: Gaussians, camera: Camera) -> list[torch.Tensor]:
@@ -470,7 +472,7 @@ def all_results(gaussians: Gaussians, camera: Camera) -> list[torch.Tensor]:
     return [rendering.channels, rendering.alpha, weights, *gradients]
 
 
-def test_one_two_and_four_threads_and_two_runs_give_the_same_bits():
+def test_results_are_bit_identical_across_thread_counts_and_runs():
     gaussians, camera = random_gaussians(3000, 5, antialiased=True, scale=0.05), front_camera(165, 120)
     before = torch.get_num_threads()
     try:
@@ -485,7 +487,7 @@ def test_one_two_and_four_threads_and_two_runs_give_the_same_bits():
             assert torch.equal(one, two)
 
 
-def test_a_prepared_view_renders_the_same_bits_and_keeps_geometry_still():
+def test_a_prepared_view_renders_bit_identically_without_gradients_of_the_geometry():
     gaussians, camera = random_gaussians(300, 5, antialiased=True), front_camera(100, 70)
     features = torch.randn(300, 9, requires_grad=True)
     prepared = prepare(gaussians, camera)
@@ -518,7 +520,7 @@ def test_a_prepared_view_of_another_camera_or_scene_is_refused():
         render(random_gaussians(31, 5), camera, prepared=prepared)
 
 
-def test_without_gradients_the_image_is_the_same():
+def test_the_image_is_the_same_without_gradients():
     gaussians, camera = random_gaussians(100, 5), front_camera()
     with torch.no_grad():
         alone = render(with_gradients(gaussians), camera)
@@ -556,7 +558,7 @@ def test_code_weights_are_the_gradient_of_rendered_one_hot_codes():
     assert torch.allclose(found.sum(1), accumulate_weights(gaussians, camera), rtol=1e-4, atol=1e-3)
 
 
-def test_code_weights_are_added_to_what_is_given():
+def test_code_weights_are_added_to_the_given_tensor():
     gaussians, camera = random_gaussians(50, 9), front_camera()
     codes = np.arange(37 * 50).reshape(37, 50) % 5
     once = accumulate_codes(gaussians, camera, codes, 5)
@@ -564,14 +566,14 @@ def test_code_weights_are_added_to_what_is_given():
     assert torch.allclose(twice, 2 * once, rtol=1e-6)
 
 
-def test_code_255_means_no_code_unless_there_are_that_many():
+def test_code_255_means_no_code_unless_there_are_256_codes():
     gaussians, camera = random_gaussians(50, 9), front_camera()
     codes = np.full((37, 50), 255, np.uint8)
     assert not accumulate_codes(gaussians, camera, codes, 255).any()
     assert accumulate_codes(gaussians, camera, codes, 256)[:, 255].sum() > 1
 
 
-def test_many_batches_of_tiles_give_the_same_weights(monkeypatch):
+def test_the_number_of_tile_batches_does_not_change_the_weights(monkeypatch):
     from lexsplat.rendering import cpu_backend
 
     gaussians, camera = random_gaussians(300, 9), front_camera(100, 70)
@@ -584,7 +586,7 @@ def test_many_batches_of_tiles_give_the_same_weights(monkeypatch):
 # ------------------------------------------------------------------------------------------------------- arguments
 
 
-def test_wrong_arguments_are_told():
+def test_invalid_arguments_are_refused():
     gaussians, camera = random_gaussians(5, 0), front_camera()
     with pytest.raises(ValueError, match="features must be"):
         render(gaussians, camera, features=torch.zeros(4, 3))
@@ -609,7 +611,7 @@ def test_wrong_arguments_are_told():
         render(gaussians.to("meta"), camera)
 
 
-def test_sh_degree_limits_what_is_used():
+def test_sh_degree_limits_the_coefficients_used():
     gaussians, camera = random_gaussians(30, 0, degree=2), front_camera()
     constant = replace(gaussians, shN=torch.zeros(30, 0, 3))
     assert torch.equal(render(gaussians, camera, sh_degree=0).image, render(constant, camera).image)

@@ -42,7 +42,7 @@ def results(device: str, antialiased: bool, degree: int) -> dict[str, torch.Tens
 def test_cuda_agrees_with_the_cpu(antialiased, degree):
     cpu, cuda = results("cpu", antialiased, degree), results("cuda", antialiased, degree)
     for name in ("image", "features", "alpha"):
-        # Where alpha is within rounding of its threshold, one of them draws 1/255 that the other does not.
+        # Where alpha is within rounding of its threshold, only one of them may draw the contribution of 1/255.
         assert ((cpu[name] - cuda[name]).abs() < 1e-4).float().mean() > 0.999, name
         assert (cpu[name] - cuda[name]).abs().max() < 0.05, name
     for name in cpu.keys() - {"image", "features", "alpha"}:
@@ -50,7 +50,7 @@ def test_cuda_agrees_with_the_cpu(antialiased, degree):
         assert error < 5e-3, (name, float(error))
 
 
-def test_the_gradient_of_the_pose_on_cuda_is_that_on_the_cpu():
+def test_the_pose_gradient_on_cuda_agrees_with_the_cpu():
     camera, gradients = front_camera(165, 123), []
     for device in ("cpu", "cuda"):
         gaussians = random_gaussians(2000, 3, antialiased=True, scale=0.06).to(device)
@@ -62,7 +62,7 @@ def test_the_gradient_of_the_pose_on_cuda_is_that_on_the_cpu():
     assert (gradients[0] - gradients[1]).norm() < 5e-3 * gradients[0].norm()
 
 
-def test_features_do_not_move_geometry_gradients_on_cuda():
+def test_features_leave_the_gradients_of_the_geometry_unchanged_on_cuda():
     gaussians = random_gaussians(500, 3).to("cuda").map(lambda t: t.detach().clone().requires_grad_())
     features = torch.randn(500, 9, device="cuda", requires_grad=True)
     rendering = render(gaussians, front_camera(), features=features)

@@ -1,7 +1,7 @@
-"""The gsplat backend without a GPU: gsplat's own Python, over a stand-in for its CUDA extension (`gsplat_kernels`).
+"""The gsplat backend without a GPU: gsplat's own Python with a replacement of its CUDA extension (`gsplat_kernels`).
 
-This shows that our calls are what gsplat wants, that shapes and orders are understood, and that gradients go where
-they should; what CUDA itself computes is for `test_rendering_gpu.py`.
+These tests check the arguments passed to gsplat, shapes and orders of its results, and the flow of gradients.
+`test_rendering_gpu.py` checks the results of CUDA itself.
 """
 
 import importlib.abc
@@ -24,7 +24,7 @@ COUNT, WIDTH, HEIGHT = 60, 50, 37
 
 @pytest.fixture
 def on_gsplat(monkeypatch):
-    """Makes rendering take the gsplat backend for tensors on the CPU."""
+    """Selects the gsplat backend for tensors on the CPU."""
     gsplat_kernels.install(monkeypatch)
 
     def switch():
@@ -64,13 +64,13 @@ def results(antialiased, degree, viewmat=None):
 @pytest.mark.parametrize(
     ("antialiased", "degree", "viewmat"), [(False, 0, False), (True, 3, False), (True, 2, True)]
 )
-def test_the_gsplat_backend_renders_what_the_cpu_renders(on_gsplat, antialiased, degree, viewmat):
+def test_the_gsplat_backend_agrees_with_the_cpu(on_gsplat, antialiased, degree, viewmat):
     cpu = results(antialiased, degree, viewmat)
     on_gsplat()
     twin = results(antialiased, degree, viewmat)
     assert cpu.keys() == twin.keys()
     for name in ("image", "features", "alpha", "depth"):
-        # Where alpha is within rounding of its threshold, one of them draws 1/255 that the other does not.
+        # Where alpha is within rounding of its threshold, only one of them may draw the contribution of 1/255.
         assert ((cpu[name] - twin[name]).abs() < 1e-4).float().mean() > 0.995, name
         assert (cpu[name] - twin[name]).abs().max() < 0.05, name
     for name in cpu.keys() - {"image", "features", "alpha", "depth"}:
@@ -78,7 +78,7 @@ def test_the_gsplat_backend_renders_what_the_cpu_renders(on_gsplat, antialiased,
         assert error < 5e-3, (name, float(error))
 
 
-def test_on_the_gsplat_backend_too_features_leave_geometry_alone(on_gsplat):
+def test_features_yield_no_gradient_of_the_geometry_on_the_gsplat_backend(on_gsplat):
     on_gsplat()
     gaussians = random_gaussians(COUNT, 3).map(lambda t: t.detach().clone().requires_grad_())
     features = torch.randn(COUNT, 3, requires_grad=True)
@@ -99,7 +99,7 @@ def test_a_view_prepared_by_gsplat_renders_the_same(on_gsplat):
     )
 
 
-def test_on_the_gsplat_backend_no_gaussian_at_all_is_an_empty_picture(on_gsplat):
+def test_the_gsplat_backend_renders_zero_gaussians_as_an_empty_image(on_gsplat):
     on_gsplat()
     nothing = random_gaussians(COUNT, 3).select(torch.zeros(COUNT, dtype=torch.bool))
     nothing = nothing.map(lambda t: t.detach().clone().requires_grad_())
@@ -112,7 +112,7 @@ def test_on_the_gsplat_backend_no_gaussian_at_all_is_an_empty_picture(on_gsplat)
     assert accumulate_codes(nothing, camera, np.zeros((HEIGHT, WIDTH), int), 3).shape == (0, 3)
 
 
-def test_the_gsplat_backend_renders_more_channels_than_gsplat_has_kernels_or_memory_for(on_gsplat):
+def test_the_gsplat_backend_renders_any_number_of_channels(on_gsplat):
     on_gsplat()
     gaussians, camera = random_gaussians(COUNT, 3), front_camera(WIDTH, HEIGHT)
     features = torch.randn(COUNT, 600).requires_grad_()
@@ -127,7 +127,7 @@ def test_the_gsplat_backend_renders_more_channels_than_gsplat_has_kernels_or_mem
 
 
 @pytest.mark.parametrize("kind", [ImportError, RuntimeError])
-def test_an_extension_that_cannot_be_built_ends_in_one_line(monkeypatch, kind):
+def test_an_extension_that_fails_to_compile_is_reported_in_one_line(monkeypatch, kind):
     class Backend(types.ModuleType):
         @property
         def _C(self):
@@ -140,7 +140,7 @@ def test_an_extension_that_cannot_be_built_ends_in_one_line(monkeypatch, kind):
         gsplat_backend._require_gsplat()
 
 
-def test_what_gsplat_says_while_it_compiles_is_no_part_of_our_output(monkeypatch, capsys):
+def test_gsplats_compiler_messages_are_not_printed(monkeypatch, capsys):
     class Talkative(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         def find_spec(self, name, path=None, target=None):
             return importlib.machinery.ModuleSpec(name, self) if name == "gsplat.cuda._backend" else None
@@ -160,7 +160,7 @@ def test_what_gsplat_says_while_it_compiles_is_no_part_of_our_output(monkeypatch
     assert "set up successfully" in said.err
 
 
-def test_an_installation_without_the_extension_ends_in_one_line(monkeypatch):
+def test_an_installation_without_the_extension_is_reported_in_one_line(monkeypatch):
     backend = types.ModuleType("gsplat.cuda._backend")
     backend._C = None
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
@@ -168,7 +168,7 @@ def test_an_installation_without_the_extension_ends_in_one_line(monkeypatch):
         gsplat_backend._require_gsplat()
 
 
-def test_a_missing_gsplat_ends_in_one_line(monkeypatch):
+def test_a_missing_gsplat_is_reported_in_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(BackendError, match=r"gsplat: found .*; pip install gsplat==1\.5\.3"):
         gsplat_backend._require_gsplat()

@@ -1,4 +1,4 @@
-"""The parts of the CPU rasterizer on their own: projection, harmonics, pairs, vectors, the kernel cache."""
+"""Unit tests of the CPU rasterizer: projection, spherical harmonics, pairs, vectors, and the kernel cache."""
 
 import logging
 import math
@@ -24,11 +24,11 @@ from lexsplat.rendering.kernels.jit import parallel
 
 pytestmark = pytest.mark.slow
 
-# ------------------------------------------------------------------------------------------ against gsplat's twins
+# --------------------------------------------------------------------------- gsplat's torch functions
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_projection_equals_gsplats_torch_twin(antialiased):
+def test_projection_equals_gsplats_torch_function(antialiased):
     from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 
     gaussians, camera = random_gaussians(500, 3, antialiased=antialiased), front_camera(160, 120)
@@ -47,7 +47,8 @@ def test_projection_equals_gsplats_torch_twin(antialiased):
     ours = gaussians.map(lambda t: t.clone().requires_grad_())
     found = cpu_backend.project(ours, camera, 0.01)
     drawn = found.radii > 0
-    # Their box is for opacity 1, ours for the opacity there is: what we draw they draw, and hardly less.
+    # gsplat's box assumes opacity 1, ours uses the actual opacity: all that we draw is drawn by gsplat, which draws
+    # little more.
     assert (radii[0].amin(-1) > 0)[drawn].all()
     assert drawn.float().mean() > 0.5
     for mine, theirs in zip(
@@ -66,8 +67,8 @@ def test_projection_equals_gsplats_torch_twin(antialiased):
         assert torch.allclose(mine, theirs, rtol=2e-4, atol=2e-5 * float(theirs.abs().max())), name
 
 
-def test_what_is_not_drawn_could_not_be_seen():
-    # Radius 0 promises that no pixel gets alpha >= 1/255 (checked in float64 without any box).
+def test_gaussians_of_radius_zero_are_invisible():
+    # Radius 0 means that no pixel receives alpha >= 1/255 (computed in float64 without boxes).
     from support import rendering_reference as reference
 
     gaussians, camera = random_gaussians(400, 8, antialiased=True), front_camera(40, 30)
@@ -83,14 +84,14 @@ def test_what_is_not_drawn_could_not_be_seen():
     power = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", offset, projected["conic"], offset)
     alpha = projected["opacity"][:, None, None] * torch.exp(-power)
     assert (alpha[hidden] < 1 / 255).all()
-    # And no alpha >= 1/255 lies outside the box.
+    # No pixel outside the box receives alpha >= 1/255.
     outside = (offset.abs() > extents[:, None, None] + 1e-3).any(-1)
     drawn = radii > 0
     assert (alpha[drawn][outside[drawn]] < 1 / 255 * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_colors_equal_gsplats_torch_twin(degree):
+def test_colors_equal_gsplats_torch_function(degree):
     from gsplat.cuda._torch_impl import _spherical_harmonics
 
     gaussians, camera = random_gaussians(300, degree, degree=4), front_camera()
@@ -99,7 +100,7 @@ def test_colors_equal_gsplats_torch_twin(degree):
     direction = leaves["means"] - torch.from_numpy(camera.position)
     expected = (_spherical_harmonics(degree, direction, coefficients) + 0.5).clamp_min(0)
     ours = gaussians.map(lambda t: t.clone().requires_grad_())
-    everything = torch.ones(300, dtype=torch.int32)  # colors of all, drawn or not
+    everything = torch.ones(300, dtype=torch.int32)  # colors of all Gaussians, drawn or not
     projection = replace(cpu_backend.project(ours, camera, 0.01), radii=everything, means=ours.means)
     found = cpu_backend.shade(ours, camera, projection, degree)
     assert torch.allclose(found.double(), expected, atol=1e-5)
@@ -134,7 +135,7 @@ def random_ellipses(count: int, width: int, height: int, rng: np.random.Generato
 
 @pytest.fixture
 def poisoned_memory(monkeypatch):
-    """Memory of np.empty full of what must never be read: NaN, or an index far outside."""
+    """Fills the memory of np.empty with values that must never be read: NaN, or an index far out of range."""
     empty = np.empty
 
     def poisoned(shape, dtype=float, *args, **options):
@@ -145,25 +146,25 @@ def poisoned_memory(monkeypatch):
     monkeypatch.setattr(np, "empty", poisoned)
 
 
-def test_pairs_of_a_thousand_random_scenes_are_complete_permutations(poisoned_memory):
+def test_pair_lists_are_complete_permutations(poisoned_memory):
     rng = np.random.default_rng(0)
     for _ in range(1000):
         count, width, height = int(rng.integers(1, 120)), int(rng.integers(1, 90)), int(rng.integers(1, 90))
         means, conics, opacities, reach, depths, radii = random_ellipses(count, width, height, rng)
         found = pairs.find_pairs(means, conics, opacities, reach, depths, radii, width, height)
         total = int(found.tile_offsets[-1])
-        # Sorted by depth, ties by index, visible ones only.
+        # Sorted by depth, ties by index, visible Gaussians only.
         visible = np.flatnonzero(radii)
         assert np.array_equal(found.order, visible[np.argsort(depths[visible], kind="stable")])
         # Every slot of both lists was written exactly once.
         assert np.array_equal(np.sort(found.pairs), np.arange(total))
         assert found.pair_offsets[-1] == total == len(found.members)
-        # Both lists name the same Gaussian, and tiles keep the depth order.
+        # Both lists contain the same Gaussian, and tiles preserve depth order.
         owner = np.repeat(np.arange(len(visible)), np.diff(found.pair_offsets))
         assert np.array_equal(owner[found.pairs], found.members)
         tile = np.repeat(np.arange(found.tiles), np.diff(found.tile_offsets))
         assert (np.diff(tile.astype(np.int64) * count + found.members) > 0).all()
-        # Exactly the tiles that the box of the ellipse overlaps at a pixel center.
+        # Exactly the tiles with a pixel center inside the box of the ellipse.
         n = found.order
         columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
         in_x = np.abs(columns - means[n, :1].astype(float)) <= reach[n, :1] + binning.SLACK
@@ -175,7 +176,7 @@ def test_pairs_of_a_thousand_random_scenes_are_complete_permutations(poisoned_me
         assert np.array_equal(listed[np.lexsort((tile, found.members))], expected)
 
 
-def test_every_number_that_is_read_was_written_before(poisoned_memory):
+def test_no_uninitialized_memory_is_read(poisoned_memory):
     rng = np.random.default_rng(1)
     for _ in range(20):
         count, width, height, channels = (
@@ -202,7 +203,7 @@ def test_every_number_that_is_read_was_written_before(poisoned_memory):
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(2**-20, 2**30, width=32), min_size=0, max_size=200), st.integers(0, 2**32 - 1))
-def test_the_radix_sort_is_numpys_stable_sort(depths, seed):
+def test_the_radix_sort_equals_numpys_stable_sort(depths, seed):
     keys = np.array(depths, np.float32)
     radii = np.random.default_rng(seed).integers(0, 2, len(keys)).astype(np.int32)
     order, scratch = np.zeros(len(keys), np.int32), np.zeros(len(keys), np.int32)
@@ -228,7 +229,7 @@ def _with_lanes(a, b, out):
     out[86] = lanes.any_positive(lanes.select_greater(x, np.float32(0), np.float32(-1), x))
 
 
-def test_lanes_compute_what_numpy_computes():
+def test_lane_operations_equal_numpy():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 16)).astype(np.float32)
     out = np.zeros(87, np.float32)
@@ -247,7 +248,7 @@ def _alpha_at(s, opacity):
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0, 5.6), st.floats(0.004, 1.0))
-def test_alpha_is_the_exponential_to_three_millionths(exponent, opacity):
+def test_alpha_equals_the_exponential_within_3e_6(exponent, opacity):
     exact = min(opacity * math.exp(-exponent), 0.999)
     assume(abs(exact * 255 - 1) > 1e-4)
     found = _alpha_at(np.float32(-exponent / 8), np.float32(opacity))
@@ -265,7 +266,7 @@ def test_a_tile_is_finished_when_its_last_pixel_is():
 # ----------------------------------------------------------------------------------------------- threads and cache
 
 
-def test_parallel_hands_out_every_item_once_and_passes_errors_on():
+def test_parallel_processes_every_item_once_and_propagates_errors():
     before = torch.get_num_threads()
     try:
         for threads in (1, 3):
@@ -309,7 +310,7 @@ def run_probe(**environment: str) -> str:
     return done.stdout
 
 
-def test_compiled_kernels_are_found_again_where_numba_cache_dir_says(tmp_path):
+def test_compiled_kernels_are_reused_from_numba_cache_dir(tmp_path):
     first, second = run_probe(NUMBA_CACHE_DIR=str(tmp_path)), run_probe(NUMBA_CACHE_DIR=str(tmp_path))
     assert "compiling CPU kernels, once" in first
     assert "hits 0" in first
@@ -317,8 +318,8 @@ def test_compiled_kernels_are_found_again_where_numba_cache_dir_says(tmp_path):
     assert str(tmp_path) in second
 
 
-def test_kernels_of_another_processor_do_no_harm_and_those_of_this_one_are_announced(tmp_path):
-    # A home on a network, a disk that moves to another machine: once they were compiled anew without a word.
+def test_kernels_cached_for_another_processor_are_recompiled(tmp_path):
+    # As with a home folder on a network, or a disk moved to another machine.
     here = {"NUMBA_CACHE_DIR": str(tmp_path)}
     run_probe(**here)
     other = run_probe(**here, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
@@ -327,13 +328,13 @@ def test_kernels_of_another_processor_do_no_harm_and_those_of_this_one_are_annou
     assert "hits 1" in run_probe(**here)
 
 
-def test_what_is_never_compiled_is_not_announced(tmp_path):
-    # Whoever only looks compiles no gradients, and was told "compiling, once" at every start.
+def test_kernels_that_are_not_compiled_are_not_announced(tmp_path):
+    # A viewer never compiles the kernels of gradients.
     assert "compiling" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
     assert "compiling" not in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
 
 
-def test_every_compilation_of_ours_is_announced_once_and_nobody_elses(monkeypatch, caplog):
+def test_only_compilation_of_this_packages_kernels_is_announced_once(monkeypatch, caplog):
     from lexsplat.reconstruction import adam_kernel as optimizer_kernels
     from lexsplat.rendering.kernels import jit
 
@@ -350,7 +351,7 @@ def test_every_compilation_of_ours_is_announced_once_and_nobody_elses(monkeypatc
     assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
 
 
-def test_two_processes_that_compile_at_once_do_each_other_no_harm(tmp_path):
+def test_two_processes_can_compile_at_the_same_time(tmp_path):
     command = [sys.executable, "-c", PROBE]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     both = [
@@ -362,7 +363,7 @@ def test_two_processes_that_compile_at_once_do_each_other_no_harm(tmp_path):
     assert "hits 1" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
 
 
-def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tmp_path, monkeypatch):
+def test_a_read_only_installation_caches_kernels_in_the_home_folder(tmp_path, monkeypatch):
     from lexsplat.rendering.kernels import jit
 
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
@@ -380,8 +381,8 @@ def test_an_installation_that_cannot_be_written_keeps_its_kernels_in_the_home(tm
 
 
 @pytest.mark.parametrize("homeless", [False, True])
-def test_where_nothing_can_be_written_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch, homeless):
-    # Homeless: a container whose user has no entry in /etc/passwd, and no HOME.
+def test_without_a_writable_folder_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch, homeless):
+    # Homeless: a container whose user has neither an entry in /etc/passwd nor HOME.
     from lexsplat.rendering.kernels import jit
 
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
@@ -401,7 +402,7 @@ def test_where_nothing_can_be_written_kernels_go_to_a_temporary_folder(tmp_path,
     assert folder == str(tmp_path / "lexsplat-kernels-")
 
 
-def test_a_far_turned_camera_keeps_depths_positive():
+def test_a_strongly_rotated_camera_keeps_depths_positive():
     camera = look_at(np.array([0.0, 0, 0]), np.array([1.0, 0, 0]), np.array([0.0, 0, 1]), 64, 48, 1.2)
     gaussians = random_gaussians(300, 4, scale=0.05)
     found = cpu_backend.project(gaussians, camera, 0.2)

@@ -191,7 +191,7 @@ def test_a_stage_takes_as_many_threads_as_fit_and_no_setting_that_decides_a_resu
 def one_line(error: MemoryBudgetError, *words: str) -> None:
     text = str(error)
     assert "\n" not in text
-    for word in ("expected at least", "found --memory", "give --memory", *words):
+    for word in ("expected at least", "found --memory", "use --memory", *words):
         assert word in text, text
 
 
@@ -201,7 +201,7 @@ def test_photos_whose_features_do_not_fit_are_refused_with_a_size_that_does():
     one_line(caught.value, "photos of 1600x1200 pixels", "a max-side of ")
     side = int(str(caught.value).rsplit(" ", 1)[1])
     assert feature_budget.extraction_threads((1600, 1200), side, 2000, 200 * MEGABYTE) == 1
-    needed = int(str(caught.value).split("give --memory ")[1].split("MB")[0])
+    needed = int(str(caught.value).split("use --memory ")[1].split("MB")[0])
     assert feature_budget.extraction_threads((1600, 1200), 1600, 2000, needed * MEGABYTE) == 1
 
 

@@ -14,12 +14,12 @@ pytestmark = pytest.mark.xdist_group("built")
 
 
 def without_times(result: dict) -> dict:
-    """``metrics.json`` without what a clock or the machine's memory says."""
+    """``metrics.json`` without times and memory."""
     size = {key: value for key, value in result["size"].items() if not key.startswith("peak_")}
     return {**result, "speed": None, "size": size}
 
 
-def test_the_same_seed_gives_the_same_metrics_times_aside(built, tiny_capture, tmp_path):
+def test_the_same_seed_gives_the_same_metrics_except_for_times(built, tiny_capture, tmp_path):
     again = tmp_path / "again"
     # Features are the slow part and have no seed: they are shared, the rest is made anew.
     shutil.copytree(built / "checkpoints" / "features", again / "checkpoints" / "features")
@@ -32,7 +32,7 @@ def test_the_same_seed_gives_the_same_metrics_times_aside(built, tiny_capture, t
     assert set(results[0]["language"]) >= {"strict", "official", "lerf_2d", "lerf_3d"}
 
 
-def test_a_trained_field_is_the_same_to_the_last_bit_too(built, tiny_capture, tmp_path):
+def test_trained_fields_are_bit_identical_for_the_same_seed(built, tiny_capture, tmp_path):
     results, fields = [], []
     for name in ("one", "two"):
         scene = tmp_path / name
@@ -62,7 +62,7 @@ def test_evaluate_writes_rows_for_tables(built, tmp_path):
     assert r"\begin{tabular}" in (copy / "metrics.tex").read_text()
 
 
-def test_prompt_lists_are_for_the_scenes_of_the_paper(built, tiny_capture, tmp_path, capsys):
+def test_prompt_lists_apply_only_to_the_scenes_of_the_paper(built, tiny_capture, tmp_path, capsys):
     copy = tmp_path / "copy"
     shutil.copytree(built, copy)
     assert cli.main(["evaluate", str(copy), "--prompt-list", "paper"]) == 1

@@ -26,22 +26,22 @@ def snapshot() -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")}
 
 
-def test_it_takes_at_most_six_megabytes():
+def test_it_takes_at_most_six_megabytes_on_disk():
     assert sum(path.stat().st_size for path in BUNDLED_SCENE.rglob("*")) <= 6_000_000
 
 
-def test_it_says_nothing_of_the_machine_that_built_it():
+def test_it_contains_no_information_about_the_build_machine():
     text = (BUNDLED_SCENE / "scene.json").read_text()
     assert not re.search(r'"/[a-z]', text)
     assert json.loads(text)["capture"] is None
 
 
-def test_its_language_is_of_the_encoder_that_ships(scene):
+def test_its_language_uses_the_bundled_encoder(scene):
     assert scene.folder.record["stages"]["features"]["clip_hash"] == load_clip("bundled").content_hash
 
 
 @pytest.mark.parametrize("prompt", ["red apple", "blue mug", "rubber duck", "pumpkin"])
-def test_what_is_asked_for_is_where_the_exact_mask_says(scene, prompt):
+def test_relevancy_agrees_with_the_exact_mask(scene, prompt):
     found = []
     for folder in sorted((demo_capture() / "segmentations").iterdir())[::4]:
         mask = read_mask(folder / f"{prompt.replace(' ', '_')}.png")
@@ -54,7 +54,7 @@ def test_what_is_asked_for_is_where_the_exact_mask_says(scene, prompt):
 
 
 @pytest.mark.slow
-def test_the_command_line_answers_beside_the_user_and_leaves_the_package_alone(tmp_path, monkeypatch, capsys):
+def test_the_command_line_writes_to_the_working_folder_and_not_to_the_package(tmp_path, monkeypatch, capsys):
     before = snapshot()
     monkeypatch.chdir(tmp_path)
     assert cli.main(["query", "demo", "red apple", "red mug"]) == 0
@@ -70,7 +70,7 @@ def test_the_command_line_answers_beside_the_user_and_leaves_the_package_alone(t
     assert snapshot() == before
 
 
-def test_a_folder_called_demo_comes_first(tmp_path, monkeypatch, capsys):
+def test_a_folder_named_demo_takes_precedence(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     os.mkdir("demo")
     assert cli.main(["info", "demo"]) == 1

@@ -33,7 +33,7 @@ def base():
 
 
 def choose(editor: Editor, *balls: int) -> Selection:
-    """The balls of some codes, as they are now: language says which."""
+    """Gaussians of the balls with the given codes, identified by language."""
     mask = torch.isin(editor.scene.field.codes[:, 0], torch.tensor(balls, dtype=torch.uint8))
     return Selection(
         editor.scene.gaussians, editor.scene.cameras, mask, mask.float(), phrase=f"balls {balls}"
@@ -45,7 +45,7 @@ def same(a: Scene, b: Scene) -> bool:
     return all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[0])
 
 
-def test_delete_and_keep_take_language_along(base):
+def test_delete_and_keep_also_select_the_language(base):
     scene, labels = base
     editor = Editor(scene)
     editor.delete(choose(editor, 0, 1))
@@ -57,7 +57,7 @@ def test_delete_and_keep_take_language_along(base):
     assert len(scene.gaussians) == 150, "the scene itself stays"
 
 
-def test_move_moves_only_what_was_chosen(base):
+def test_move_changes_only_the_selected_gaussians(base):
     scene, labels = base
     editor = Editor(scene)
     turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
@@ -75,7 +75,7 @@ def test_move_moves_only_what_was_chosen(base):
     assert not torch.allclose(after.shN[labels == 2][:, 0], before.shN[labels == 2][:, 0], atol=1e-3)
 
 
-def test_a_duplicate_says_what_the_original_says(base):
+def test_a_duplicate_has_the_language_of_the_original(base):
     scene, labels = base
     editor = Editor(scene)
     editor.duplicate(choose(editor, 4), Motion(translation=(0, 0, 1.5)))
@@ -106,7 +106,7 @@ def test_recoloring_changes_hue_and_keeps_shading(base):
 
 @given(st.lists(st.sampled_from(["delete", "recolor", "move", "duplicate", "undo", "redo"]), max_size=9))
 @settings(max_examples=25, deadline=None)
-def test_a_journal_read_again_gives_the_same_scene(base, tmp_path_factory, actions):
+def test_replaying_a_journal_gives_the_same_scene(base, tmp_path_factory, actions):
     scene, _ = base
     journal = tmp_path_factory.mktemp("edit") / "edits.jsonl"
     editor = Editor(scene, journal)
@@ -129,7 +129,7 @@ def test_a_journal_read_again_gives_the_same_scene(base, tmp_path_factory, actio
     assert len(again.undone) == len(editor.undone)
 
 
-def test_undo_and_redo_lead_back_and_forth_exactly(base):
+def test_undo_and_redo_are_exact_inverses(base):
     scene, _ = base
     editor = Editor(scene)
     states = [editor.scene]
@@ -149,7 +149,7 @@ def test_undo_and_redo_lead_back_and_forth_exactly(base):
     assert not editor.redo(), "a new step forgets what was undone"
 
 
-def test_discarding_leaves_nothing(base, tmp_path):
+def test_discarding_removes_all_edits(base, tmp_path):
     scene, _ = base
     editor = Editor(scene, tmp_path / "edits.jsonl")
     editor.delete(choose(editor, 0))
@@ -159,7 +159,7 @@ def test_discarding_leaves_nothing(base, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_torn_last_line_is_left_out(base, tmp_path, caplog):
+def test_an_incomplete_last_line_is_ignored(base, tmp_path, caplog):
     scene, _ = base
     journal = tmp_path / "edits.jsonl"
     editor = Editor(scene, journal)
@@ -177,7 +177,7 @@ def test_a_torn_last_line_is_left_out(base, tmp_path, caplog):
 @pytest.mark.parametrize(
     "damage", ["{}\n", '{"step": "delete"}\n', "not json\n", '{"undo": true}\n{"undo": true}\n']
 )
-def test_damaged_journals_are_told(base, tmp_path, damage):
+def test_damaged_journals_are_refused(base, tmp_path, damage):
     scene, _ = base
     journal = tmp_path / "edits.jsonl"
     editor = Editor(scene, journal)
@@ -196,7 +196,7 @@ def test_a_journal_of_another_scene_is_refused(base, tmp_path):
         Editor(editor.scene, journal)
 
 
-def test_what_cannot_be_done_leaves_no_trace(base, tmp_path):
+def test_a_refused_edit_leaves_the_scene_unchanged(base, tmp_path):
     scene, _ = base
     editor = Editor(scene, tmp_path / "edits.jsonl")
     old = choose(editor, 1)

@@ -36,7 +36,7 @@ def test_a_scene_is_written_in_every_format(built, tmp_path, ending, capsys):
     assert f"all{ending}" in capsys.readouterr().out
 
 
-def test_a_selection_alone_holds_the_gaussians_that_were_found(built, tmp_path):
+def test_exporting_a_selection_writes_only_the_gaussians_found(built, tmp_path):
     limit = float(open_scene(built).scores(["red apple"]).quantile(0.8))
     arguments = ["--select", "red apple", "--language", "--threshold", limit]
     assert export(built, tmp_path / "apple.ply", *arguments) == 0
@@ -49,7 +49,7 @@ def test_a_selection_alone_holds_the_gaussians_that_were_found(built, tmp_path):
     assert (tmp_path / "apple.codebook.safetensors").exists()
 
 
-def test_selections_are_those_of_find_and_are_told(built, tmp_path, monkeypatch, capsys):
+def test_exported_selections_equal_those_of_find_and_are_reported(built, tmp_path, monkeypatch, capsys):
     """Relations, a viewer, what was found of each phrase: as find and edit have it, not the bare words."""
     asked = []
     limit = float(open_scene(built).scores(["red apple"]).quantile(0.8))
@@ -71,7 +71,7 @@ def test_selections_are_those_of_find_and_are_told(built, tmp_path, monkeypatch,
     assert second == "giraffe: 0 Gaussians; probably not in this scene"
 
 
-def test_labels_say_which_phrase_claims_which_gaussian(built, tmp_path):
+def test_labels_assign_gaussians_to_phrases(built, tmp_path):
     phrases = ["red apple", "blue ball"]
     for name in ("l.csv", "l.json"):
         assert export(built, tmp_path / name, "--select", *phrases) == 0
@@ -89,7 +89,7 @@ def test_labels_say_which_phrase_claims_which_gaussian(built, tmp_path):
         assert (row["label"] in claims) if claims else row["label"] == ""
 
 
-def test_of_two_phrases_the_one_further_above_its_threshold_labels(built):
+def test_the_phrase_furthest_above_its_threshold_determines_the_label(built):
     gaussians = open_scene(built).gaussians.select(torch.arange(3))
 
     def make(scores, limit):
@@ -113,7 +113,7 @@ def test_of_two_phrases_the_one_further_above_its_threshold_labels(built):
          "red apple, blue ball: expected something to write, found nothing"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_written_is_told_in_one_line(built, tmp_path, arguments, words, capsys):
+def test_impossible_exports_are_refused_in_one_line(built, tmp_path, arguments, words, capsys):
     assert export(built, tmp_path / arguments[0], *arguments[1:]) == 1
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -138,7 +138,7 @@ def written_by_others(ending: str, gaussians: Gaussians, path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", [".ply", ".splat", ".spz"])
-def test_splats_of_another_program_get_language_and_keep_their_geometry(
+def test_splats_of_another_program_receive_language_and_keep_their_geometry(
     built, tiny_capture, tmp_path, ending
 ):
     original = read_ply(built / "gaussians.ply")

@@ -45,7 +45,7 @@ class Settings:
     folder: Path = Path("x")
 
 
-def test_fingerprints_change_with_any_field_and_only_then():
+def test_fingerprints_change_with_any_field_and_with_nothing_else():
     same = fingerprint(Settings(), {"b": 1, "a": 2})
     assert same == fingerprint(Settings(), {"a": 2, "b": 1})
     assert same != fingerprint(Settings(rate=0.2), {"b": 1, "a": 2})
@@ -62,7 +62,7 @@ def test_tensors_and_metadata_survive(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x80\x04pickle", b"\xff" * 64])
-def test_what_is_not_safetensors_is_refused(tmp_path, content):
+def test_files_other_than_safetensors_are_refused(tmp_path, content):
     (tmp_path / "t.safetensors").write_bytes(content)
     with pytest.raises(FileFormatError, match="safetensors"):
         read_tensors(tmp_path / "t.safetensors")
@@ -78,7 +78,7 @@ def test_a_truncated_safetensors_is_refused(tmp_path):
             read_tensors(path)
 
 
-def test_a_stage_is_finished_only_for_what_it_was_made_from(tmp_path):
+def test_a_stage_is_finished_only_for_the_same_inputs(tmp_path):
     folder = SceneFolder(tmp_path)
     folder.finish("reconstruct", "abc", 1.5, gaussians=10)
     again = SceneFolder.open(tmp_path)
@@ -101,7 +101,7 @@ def test_cameras_and_code_maps_survive(tmp_path):
     np.testing.assert_array_equal(folder.read_code_map("a/b.jpg"), codes)
 
 
-def test_a_folder_that_is_no_scene_says_how_to_make_one(tmp_path):
+def test_the_error_for_a_folder_without_a_scene_names_the_build_command(tmp_path):
     with pytest.raises(SceneFolderError, match=r"lexsplat build CAPTURE --output SCENE"):
         SceneFolder.open(tmp_path / "nowhere")
 
@@ -119,7 +119,7 @@ def _hold(root: str, ready, release) -> None:
 
 
 @pytest.mark.slow
-def test_the_second_builder_is_told_who_is_at_work(tmp_path):
+def test_a_second_build_is_refused_with_the_process_of_the_first(tmp_path):
     context = multiprocessing.get_context("spawn")
     ready, release = context.Event(), context.Event()
     process = context.Process(target=_hold, args=(str(tmp_path), ready, release))
@@ -135,7 +135,7 @@ def test_the_second_builder_is_told_who_is_at_work(tmp_path):
         pass
 
 
-def test_a_builder_clears_what_dead_processes_left_and_nothing_that_is_being_written(tmp_path):
+def test_a_build_removes_only_temporary_files_of_dead_processes(tmp_path):
     dead = multiprocessing.get_context("spawn").Process(target=int)
     dead.start()
     dead.join()

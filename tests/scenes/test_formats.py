@@ -40,7 +40,7 @@ def language(count: int, codes_each: int = 3, num_codes: int = 6):
 
 
 def tame(count: int, degree: int = 0) -> Gaussians:
-    """Gaussians whose colors and sizes lie in the range that 8 bits can say."""
+    """Gaussians whose colors and sizes are in the range of 8-bit formats."""
     g = make(count, degree)
     return Gaussians(g.means, g.quats, g.log_scales * 0.3 - 3, g.opacity_logits, g.sh0 * 0.4, g.shN * 0.1)
 
@@ -53,7 +53,7 @@ def distances_of_rotations(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 # .splat
 
 
-def test_a_splat_file_has_the_bytes_worked_out_by_hand(tmp_path):
+def test_a_splat_file_has_the_bytes_computed_by_hand(tmp_path):
     one = Gaussians(
         torch.tensor([[1.0, -2.0, 3.0]]), torch.tensor([[2.0, 0.0, 0.0, -2.0]]),
         torch.log(torch.tensor([[0.5, 1, 2]])),
@@ -66,7 +66,7 @@ def test_a_splat_file_has_the_bytes_worked_out_by_hand(tmp_path):
     assert found[10:] == (219, 128, 128, 37)  # 128 + 128 / sqrt(2) = 218.5, rounded; 128 - 90.5
 
 
-def test_gsplat_writes_the_same_splats_in_another_order(tmp_path):
+def test_gsplat_writes_the_same_splats_in_a_different_order(tmp_path):
     exporter = pytest.importorskip("gsplat.exporter")
     g = tame(300)
     write_splat(g, tmp_path / "ours.splat")
@@ -100,7 +100,7 @@ def test_a_splat_file_of_gsplat_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 33, np.full(8, np.nan, "<f4").tobytes()])
-def test_what_is_no_splat_file_is_refused(tmp_path, content):
+def test_files_other_than_splats_are_refused(tmp_path, content):
     (tmp_path / "g.splat").write_bytes(content)
     with pytest.raises(FileFormatError):
         read_splat(tmp_path / "g.splat")
@@ -110,7 +110,7 @@ def test_what_is_no_splat_file_is_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("ending", list(COMPRESSED))
-def test_compressed_files_keep_what_their_bits_can_say(tmp_path, ending):
+def test_compressed_files_preserve_values_within_their_precision(tmp_path, ending):
     pytest.importorskip("gaussforge")
     g = tame(500, 2)
     path = tmp_path / f"g{ending}"
@@ -127,7 +127,7 @@ def test_compressed_files_keep_what_their_bits_can_say(tmp_path, ending):
     assert (back.sh0 - g.sh0).abs().median() < 0.02
 
 
-def test_a_compressed_ply_is_known_by_its_content(tmp_path):
+def test_a_compressed_ply_is_recognized_by_its_content(tmp_path):
     pytest.importorskip("gaussforge")
     write_compressed(tame(50), tmp_path / "plain_name.ply", "compressed.ply")
     assert len(read_splats(tmp_path / "plain_name.ply")) == 50
@@ -160,13 +160,13 @@ def test_damaged_compressed_files_are_refused(tmp_path, ending):
         read_splats(tmp_path / f"absent{ending}")
 
 
-def test_a_missing_library_is_told_with_its_remedy(tmp_path, monkeypatch):
+def test_a_missing_library_is_reported_with_its_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "gaussforge", None)
     with pytest.raises(BackendError, match="pip install"):
         read_compressed(tmp_path / "g.spz", "spz")
 
 
-def test_infinite_opacities_of_other_programs_become_certain_ones(tmp_path):
+def test_infinite_opacity_logits_of_other_programs_become_opacities_0_and_1(tmp_path):
     g = make(4, 0)
     write_ply(g, tmp_path / "g.ply")
     content = bytearray((tmp_path / "g.ply").read_bytes())
@@ -178,7 +178,7 @@ def test_infinite_opacities_of_other_programs_become_certain_ones(tmp_path):
         read_ply(tmp_path / "g.ply")
 
 
-def test_other_endings_are_refused(tmp_path):
+def test_other_suffixes_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match="ends in"):
         read_splats(tmp_path / "g.obj")
 
@@ -186,7 +186,7 @@ def test_other_endings_are_refused(tmp_path):
 # Language
 
 
-def test_stored_language_holds_the_likeliest_codes(tmp_path):
+def test_stored_language_contains_the_most_probable_codes(tmp_path):
     field, stored = language(40)
     dense = field.code_probabilities()
     for row, codes, weights in zip(dense, stored.codes, stored.weights):
@@ -200,7 +200,7 @@ def test_stored_language_holds_the_likeliest_codes(tmp_path):
         assert file.metadata() == {"encoder": "some/clip", "encoder_hash": "abc"}
 
 
-def test_plyfile_finds_the_language_and_we_read_the_rest(tmp_path):
+def test_plyfile_reads_the_language_and_read_ply_the_rest(tmp_path):
     plyfile = pytest.importorskip("plyfile")
     g, (_, stored) = make(30, 1), language(30)
     write_ply(g, tmp_path / "g.ply", further=ply_columns(stored))
@@ -214,7 +214,7 @@ def test_plyfile_finds_the_language_and_we_read_the_rest(tmp_path):
     assert all(torch.equal(getattr(back, name), value) for name, value in g.tensors().items())
 
 
-def test_the_codebook_lies_beside_the_file(tmp_path):
+def test_the_codebook_is_written_next_to_the_file(tmp_path):
     assert codebook_path(tmp_path / "mug.ply").name == "mug.codebook.safetensors"
 
 
@@ -277,13 +277,13 @@ def test_every_chunk_of_a_glb_is_aligned(tmp_path):
     assert (binary % 4, kind, 28 + length + binary) == (0, b"BIN\0", len(content))
 
 
-def test_writers_refuse_what_is_not_finite(tmp_path):
+def test_writers_refuse_nan_and_infinity(tmp_path):
     g = make(3, 0)
     g.means[1, 0] = float("nan")
     for write in (write_splat, write_glb):
-        with pytest.raises(ValueError, match="not finite"):
+        with pytest.raises(ValueError, match="NaN or infinity"):
             write(g, tmp_path / "x")
-    with pytest.raises(ValueError, match="does not fit"):
+    with pytest.raises(ValueError, match="expected, got"):
         write_glb(make(4, 0), tmp_path / "x", language=language(5)[1])
 
 
@@ -301,7 +301,7 @@ def test_labels_in_csv_are_read_by_the_standard_library(tmp_path):
     assert [float(row["score"]) for row in rows] == [0, 0.25, 0.5, 0.75, 1]
 
 
-def test_plyfile_reads_the_point_cloud_without_what_does_not_show(tmp_path):
+def test_plyfile_reads_the_point_cloud_without_transparent_gaussians(tmp_path):
     plyfile = pytest.importorskip("plyfile")
     g = tame(50)
     count = write_points_ply(g, tmp_path / "p.ply")

@@ -19,7 +19,7 @@ METHODS = ("averaged", "lifted", "trained")
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_old_folder_opens_under_the_present_names(method):
+def test_an_old_folder_opens_with_the_current_names(method):
     scene = open_scene(OLD / method, device="cpu")
     record = scene.folder.record
     assert scene.field.method == method
@@ -60,7 +60,7 @@ def test_reading_an_old_folder_does_not_write_it(tmp_path):
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_saved_record_has_the_present_names(tmp_path):
+def test_a_saved_record_has_the_current_names(tmp_path):
     folder = SceneFolder(Path(shutil.copytree(OLD / "trained", tmp_path / "scene")))
     folder.save()
     written = (folder.root / "scene.json").read_text()

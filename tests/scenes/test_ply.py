@@ -15,7 +15,7 @@ from lexsplat.scenes.formats.ply import read_ply, write_ply
 
 @settings(max_examples=25, deadline=None)
 @given(count=st.integers(0, 20), degree=st.integers(0, 4), antialiased=st.booleans())
-def test_what_is_written_is_read_back_exactly(tmp_path_factory, count, degree, antialiased):
+def test_gaussians_survive_a_round_trip_exactly(tmp_path_factory, count, degree, antialiased):
     path = tmp_path_factory.mktemp("ply") / "g.ply"
     gaussians = make(count, degree, antialiased=antialiased)
     write_ply(gaussians, path)
@@ -67,7 +67,7 @@ def test_columns_in_another_order_and_extra_columns_are_read_by_name(tmp_path):
     assert torch.equal(back.quats, gaussians.quats)
 
 
-def test_a_value_that_is_not_finite_is_not_written(tmp_path):
+def test_nan_is_not_written(tmp_path):
     gaussians = make(3, 0)
     gaussians.means[1, 0] = float("nan")
     with pytest.raises(ValueError, match="1 of 3"):
@@ -93,7 +93,7 @@ def test_an_absurd_count_is_refused_without_allocating(tmp_path):
 
 @settings(max_examples=200, deadline=None)
 @given(data=st.data())
-def test_flipped_bytes_never_end_in_another_error(tmp_path_factory, data):
+def test_flipped_bytes_cause_only_typed_errors(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("flip")
     write_ply(make(2, 1), folder / "g.ply")
     content = bytearray((folder / "g.ply").read_bytes())
@@ -107,7 +107,7 @@ def test_flipped_bytes_never_end_in_another_error(tmp_path_factory, data):
     assert all(torch.isfinite(value).all() for value in back.tensors().values())
 
 
-def test_nothing_but_a_ply_is_a_ply(tmp_path):
+def test_files_other_than_ply_are_refused(tmp_path):
     (tmp_path / "x.ply").write_bytes(io.BytesIO(b"PK\x03\x04 pickle").getvalue())
     with pytest.raises(FileFormatError, match="PLY header"):
         read_ply(tmp_path / "x.ply")

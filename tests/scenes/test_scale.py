@@ -1,4 +1,4 @@
-"""One known distance gives a scene its scale; up can be told; both are kept and used."""
+"""Scale from one known distance and the up direction: setting, storage and use."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ def stored(scene) -> dict:
     return json.loads((scene / "scene.json").read_text())["world"]
 
 
-def test_up_comes_from_the_cameras_and_the_scale_from_nowhere(scene, capsys):
+def test_up_is_estimated_from_the_cameras_and_the_scale_is_unknown(scene, capsys):
     assert run("scale", scene) == 0
     assert "scale: not known" in capsys.readouterr().out
     assert run("info", scene, "--json") == 0
@@ -40,7 +40,7 @@ def test_up_comes_from_the_cameras_and_the_scale_from_nowhere(scene, capsys):
 
 
 @pytest.mark.slow
-def test_one_distance_makes_sizes_metres(scene, capsys):
+def test_one_known_distance_gives_sizes_in_meters(scene, capsys):
     pygltflib = pytest.importorskip("pygltflib")
     assert run("scale", scene, "--distance", 0.35, "--points", "0,0,0", "0,-0.7,0") == 0
     assert stored(scene)["meters_per_unit"] == pytest.approx(0.5)
@@ -60,7 +60,7 @@ def test_one_distance_makes_sizes_metres(scene, capsys):
 
 
 @pytest.mark.slow
-def test_phrases_name_what_the_distance_is_between(scene, capsys):
+def test_a_distance_can_be_given_between_two_phrases(scene, capsys):
     assert run("scale", scene, "--distance", 0.3, "--between", "red apple", "banana", "--json") == 0
     world = json.loads(capsys.readouterr().out)
     found = [open_scene(scene).find(phrase).largest() for phrase in ("red apple", "banana")]
@@ -71,7 +71,7 @@ def test_phrases_name_what_the_distance_is_between(scene, capsys):
 
 
 @pytest.mark.slow
-def test_up_can_be_told_and_is_used_everywhere(scene, capsys):
+def test_up_can_be_set_and_is_used_everywhere(scene, capsys):
     pygltflib = pytest.importorskip("pygltflib")
     assert run("scale", scene, "--up=-1,0,0") == 0
     assert "from the user" in capsys.readouterr().out
@@ -84,7 +84,7 @@ def test_up_can_be_told_and_is_used_everywhere(scene, capsys):
     assert turned == pytest.approx([0, 1, 0], abs=1e-6), "glTF has y up"
 
 
-def test_building_again_keeps_what_was_told_as_long_as_the_cameras_stay(tiny_capture, tmp_path, caplog):
+def test_a_rebuild_keeps_up_and_scale_while_the_cameras_are_unchanged(tiny_capture, tmp_path, caplog):
     build = ["reconstruct", tiny_capture, "--output", tmp_path, "--device", "cpu", "--iterations", 3]
     assert run(*build) == 0
     assert stored(tmp_path)["up"]["direction"] == pytest.approx([0, 0, 1], abs=1e-3)
@@ -103,7 +103,7 @@ def test_building_again_keeps_what_was_told_as_long_as_the_cameras_stay(tiny_cap
     assert "the scale no longer holds" in caplog.text
 
 
-def test_what_makes_no_sense_is_refused(scene, capsys):
+def test_invalid_up_and_scale_are_refused(scene, capsys):
     for arguments in (
         ["--distance", "1"],
         ["--between", "a", "b"],

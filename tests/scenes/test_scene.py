@@ -31,7 +31,7 @@ def scene(made):
     return made[0]
 
 
-def test_an_answer_is_made_of_scores_thresholds_and_presences(scene):
+def test_answers_contain_scores_thresholds_and_presences(scene):
     answers = scene.ask(BALLS)
     question = Question(scene.embed(BALLS), scene.embed(list(scene.query.negatives)), scene.query)
     assert torch.equal(answers.scores, gaussian_relevancy(scene.field, question))
@@ -47,7 +47,7 @@ def test_an_answer_is_made_of_scores_thresholds_and_presences(scene):
     assert len(answers) == 3
 
 
-def test_one_question_gives_one_threshold_and_one_presence_everywhere(scene):
+def test_threshold_and_presence_are_the_same_everywhere(scene):
     answers = scene.ask(BALLS)
     for index, prompt in enumerate(BALLS):
         limit = pytest.approx(float(answers.thresholds[index]))
@@ -60,7 +60,7 @@ def test_one_question_gives_one_threshold_and_one_presence_everywhere(scene):
         assert entry["present"] == answers.presences[index]
 
 
-def test_the_ball_that_is_asked_for_is_selected(made):
+def test_the_requested_ball_is_selected(made):
     scene, ground_truth = made
     found = scene.find("ball 2")
     assert (found.count, len(found), found.num_gaussians) == (1, 80, 80)
@@ -92,7 +92,7 @@ def test_a_known_prompt_renders_no_views_again(scene, monkeypatch):
     assert len(rendered) == 3 * training, "other settings, other thresholds"
 
 
-def test_a_given_threshold_is_taken_as_it_is(scene):
+def test_a_given_threshold_is_used_unchanged(scene):
     answers = scene.ask(BALLS, 0.25)
     assert answers.thresholds.tolist() == [0.25] * 3
     assert not answers.automatic
@@ -135,20 +135,20 @@ def test_a_threshold_outside_the_unit_interval_is_refused(scene, wrong):
 
 
 @pytest.mark.parametrize("wrong", [["ball 0"], 7, None, ""])
-def test_a_selection_is_of_one_phrase(scene, wrong):
+def test_a_selection_has_one_phrase(scene, wrong):
     for ask in (scene.select, scene.find):
         with pytest.raises(QueryError):
             ask(wrong)
 
 
 @pytest.mark.parametrize("wrong", [[], "", ["ball 0", " "], [None], 5])
-def test_what_is_no_prompt_is_refused(scene, wrong):
+def test_invalid_prompts_are_refused(scene, wrong):
     for ask in (scene.ask, scene.scores, scene.embed):
         with pytest.raises(QueryError):
             ask(wrong)
 
 
-def test_what_the_scene_does_not_hold_has_no_instances_in_json(scene):
+def test_an_absent_object_has_no_instances_in_json(scene):
     scene.presence_classifier.classify = lambda scores: "no"
     (entry,) = find_phrases(scene, "ball 0")["phrases"]
     assert (entry["present"], entry["count"], entry["instances"]) == ("no", 0, [])
@@ -162,17 +162,17 @@ def test_representations_are_short(scene):
     assert len(repr(scene.find("ball 0"))) < 100
 
 
-def test_default_views_are_spread_over_the_held_out_ones(scene):
+def test_default_views_are_evenly_spaced_held_out_views(scene):
     camera = scene.views["view0"].camera
     scene.views = {f"v{n:02}": StoredView(f"v{n:02}", camera, "test") for n in range(11)}
     assert _default_views(scene) == ["v00", "v02", "v04", "v06", "v08", "v10"]
 
 
-def test_an_export_replaces_a_file_only_when_told(scene, tmp_path):
+def test_an_export_replaces_a_file_only_with_overwrite(scene, tmp_path):
     file = tmp_path / "all.ply"
     file.write_bytes(b"of another program")
-    for write in (lambda **told: export_scene(scene, file, **told),
-                  lambda **told: export_gaussians(scene.gaussians, file, **told)):  # fmt: skip
+    for write in (lambda **options: export_scene(scene, file, **options),
+                  lambda **options: export_gaussians(scene.gaussians, file, **options)):  # fmt: skip
         with pytest.raises(SceneFolderError, match="expected a new file, found one that exists"):
             write()
     assert file.read_bytes() == b"of another program"
@@ -190,7 +190,7 @@ def test_an_export_never_replaces_a_file_of_the_scene(tmp_path):
         export_scene(opened, BUNDLED_SCENE / "gaussians.ply", overwrite=True)
 
 
-def test_what_is_no_scene_folder_is_refused_with_what_it_is(tmp_path):
+def test_a_folder_of_another_kind_is_refused_with_its_kind(tmp_path):
     with pytest.raises(SceneFolderError, match="found a file"):
         open_scene(BUNDLED_SCENE / "gaussians.ply")
     with pytest.raises(SceneFolderError, match="no such folder"):
@@ -205,7 +205,7 @@ def test_an_unknown_device_is_refused():
             open_scene("demo", device=device)
 
 
-def test_the_front_door_shows_the_public_names():
+def test_the_package_exports_the_public_names():
     names = {"open_scene", "build", "Scene", "Selection"}
     assert names <= set(dir(lexsplat))
     assert names <= set(lexsplat.__all__)

@@ -23,7 +23,7 @@ def cloud(degree: int = 3, count: int = 80) -> Gaussians:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_a_camera_that_moves_along_sees_the_same_picture(degree):
+def test_a_camera_transformed_with_the_scene_renders_the_same_image(degree):
     g = cloud(degree)
     rotation = Rotation.random(random_state=degree).as_matrix()
     scale, shift, center = 1.7, np.array([0.3, -2.0, 1.0]), np.array([0.1, 0.2, -0.3])
@@ -42,7 +42,7 @@ def test_a_camera_that_moves_along_sees_the_same_picture(degree):
 
 @given(st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
-def test_turning_twice_is_turning_by_the_product(seed):
+def test_two_rotations_equal_their_product(seed):
     first, second = (Rotation.random(random_state=seed + k).as_matrix() for k in (0, 5000))
     shN = make(3, 3).shN
     twice = rotated_harmonics(rotated_harmonics(shN, first), second)
@@ -52,14 +52,14 @@ def test_turning_twice_is_turning_by_the_product(seed):
 
 @given(st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
-def test_quaternions_multiply_as_scipy_says(seed):
+def test_quaternion_products_equal_scipys(seed):
     a, b = (Rotation.random(random_state=seed + k) for k in (0, 5000))
     product = multiply_quaternions(*(torch.from_numpy(quaternion_from_matrix(r.as_matrix())) for r in (a, b)))
     expected = (a * b).as_quat()[[3, 0, 1, 2]]
     assert abs(float(product @ torch.from_numpy(expected))) == pytest.approx(1)
 
 
-def test_only_proper_motions_are_taken():
+def test_only_similarity_transforms_are_accepted():
     with pytest.raises(ValueError, match="proper rotation"):
         transformed(cloud(0), rotation=np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match="scale"):

@@ -1,4 +1,4 @@
-"""Captures, scenes, references and pretended devices that the tests share."""
+"""Captures, scenes, reference implementations and pretended devices shared by the tests."""
 
 import os
 from pathlib import Path
@@ -8,4 +8,4 @@ TESTS_ON_PATH = {
         filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")])
     )
 }
-"""Environment of a script in this folder that a test runs in a process of its own."""
+"""Environment of a script of this folder that a test runs in a separate process."""

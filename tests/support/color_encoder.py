@@ -9,7 +9,7 @@ WORDS = {"red apple": 0, "blue ball": 1}
 
 
 class ColorClip:
-    """Embeds redness, blueness and the rest of an image's mean color; knows two prompts."""
+    """Encodes redness, blueness and the remainder of an image's mean color; supports two prompts."""
 
     name, content_hash, image_size, dim = "color", "color-clip", 4, 6
     device = torch.device("cpu")
@@ -25,7 +25,7 @@ class ColorClip:
 
 
 class ColorDino:
-    """Color of every fourth pixel."""
+    """Returns the color of every fourth pixel."""
 
     name, content_hash, dim = "color", "color-dino", 4
     device = torch.device("cpu")
@@ -36,7 +36,7 @@ class ColorDino:
 
 
 def install(patch):
-    """Replace the loaded encoders with both, by `pytest.MonkeyPatch`."""
+    """Replace the functions that load encoders by these encoders."""
     patch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColorClip())
     patch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColorDino())
     patch.setattr("lexsplat.pipeline.encoding.model_folder", lambda *_: None)

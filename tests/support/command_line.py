@@ -9,19 +9,19 @@ from lexsplat import cli
 
 
 class Terminal(io.StringIO):
-    """Standard input that claims to be a terminal."""
+    """Standard input that reports to be a terminal."""
 
     def isatty(self) -> bool:
         return True
 
 
 def modified(folder: Path) -> dict[str, int]:
-    """Time of modification of each file of a folder."""
+    """Modification time of each file in a folder."""
     return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
 
 
 def fails_in_one_line(capsys, arguments: list[str], *words: str) -> None:
-    """A command ends with status 1 and one line that has these words."""
+    """Assert that a command ends with status 1 and one line that contains the given words."""
     assert cli.main(arguments) == 1
     captured = capsys.readouterr()
     lines = [line for line in captured.err.replace("[y/N] ", "\n").splitlines() if line.startswith("error:")]

@@ -15,7 +15,7 @@ MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
 def seeded(build):
     torch.manual_seed(0)
     model = build()
-    with torch.no_grad():  # the usual initialization is so small that every image would look the same
+    with torch.no_grad():  # with the default initialization, all images would have nearly the same embedding
         for parameter in model.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.15)
     return model.eval()

@@ -1,4 +1,4 @@
-"""Settings of a build small enough to be repeated in tests."""
+"""Settings of a small build that tests can repeat."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What gsplat 1.5.3's CUDA extension does, written out for the CPU, to stand in its place below gsplat's own Python.
+"""A CPU replacement of gsplat 1.5.3's CUDA extension, used by gsplat's own Python code.
 
-Written after its sources (gsplat/cuda/csrc): the same thresholds, the same checks of inputs, and what is left
-uninitialized there is NaN here. Gradients come from torch's autograd over gsplat's torch twins where it has them,
-over the forward pass written here where it has none (blending). Tensors may be plain, or pretended ones
-(`pretended_gpu`); mixed ones are refused, as by ``CHECK_CUDA``.
+It follows the sources (gsplat/cuda/csrc): thresholds and checks of inputs are the same, and memory that is
+uninitialized there is NaN here. Gradients are computed by torch's autograd through gsplat's torch functions or, for
+blending, through the forward pass in this file. Tensors are either all on the CPU or all pretended
+(`pretended_gpu`); a mixture is refused, as by ``CHECK_CUDA``.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from torch import Tensor
 from support.pretended_gpu import PretendedTensor, inner, wrapped
 
 TILE_CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
-"""Numbers of channels that kernels are compiled for."""
+"""Channel counts that the kernels are compiled for."""
 SHARED_MEMORY = 64 << 10
-"""Bytes a block may share on the smallest cards that torch still supports (compute capability 7.5)."""
+"""Shared memory per block in bytes on the smallest supported devices (compute capability 7.5)."""
 ALPHA_THRESHOLD, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
 
 def install(monkeypatch: Any) -> None:
-    """Put the stand-in where gsplat looks for its extension."""
-    backend = ModuleType("gsplat.cuda._backend")  # not the true one: it would try to compile the extension
+    """Install the replacement where gsplat looks for its extension."""
+    backend = ModuleType("gsplat.cuda._backend")  # the real module would try to compile the extension
     backend._C = Extension()
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
 
 
 def taken(*tensors: Tensor | None, names: str = "") -> tuple[Any, ...]:
-    """The plain tensors behind inputs, after the checks that the extension makes."""
+    """Unwrap the inputs to CPU tensors, after the same checks as in the extension."""
     given = [tensor for tensor in tensors if tensor is not None]
     if len({isinstance(tensor, PretendedTensor) for tensor in given}) > 1:
         raise RuntimeError("an input must be a CUDA tensor")
@@ -44,10 +44,10 @@ def taken(*tensors: Tensor | None, names: str = "") -> tuple[Any, ...]:
 
 
 class Extension:
-    """The functions of the extension that are called on the way of rendering and density control."""
+    """The functions of the extension that rendering and density control call."""
 
     CameraModelType = None
-    PINHOLE = "pinhole"  # where gsplat looks, whatever it says
+    PINHOLE = "pinhole"  # the attribute that gsplat reads; its value is not used
 
     def projection_ewa_3dgs_fused_fwd(
         self, means, covars, quats, scales, opacities, viewmats, Ks,
@@ -75,7 +75,7 @@ class Extension:
         size = torch.tensor([width, height])
         seen &= (reach > 0).any(-1) & (means2d + reach > 0).all(-1) & (means2d - reach < size).all(-1)
         radii[seen] = reach[seen].int()
-        for values in (means2d, depths, conics):  # from at::empty, and never written
+        for values in (means2d, depths, conics):  # from at::empty, never written
             values[~seen] = torch.nan
         compensations[~seen] = 0.0  # from at::zeros
         return dress(radii, means2d, depths, conics, compensations if calc_compensations else None)
@@ -144,7 +144,7 @@ class Extension:
         dirs, coeffs, masks = taken(dirs, coeffs, masks)
         colors = harmonics(degree, dirs, coeffs)
         if masks is not None:
-            colors[~masks] = torch.nan  # from at::empty_like, and never written
+            colors[~masks] = torch.nan  # from at::empty_like, never written
         return dress(colors)[0]
 
     def spherical_harmonics_bwd(self, bases, degree, dirs, coeffs, masks, v_colors, compute_v_dirs):
@@ -192,7 +192,7 @@ class Extension:
         leaves = [t.clone().requires_grad_() for t in (means2d, conics, colors, opacities)]
         with torch.enable_grad():
             found = blend(*leaves, background, width, height, tile, offsets, members)
-            # Without a member nothing asks for gradients.
+            # If the tile is empty, no input requires gradients.
             found = tuple(part + 0 * sum(leaf.flatten()[:0].sum() for leaf in leaves) for part in found)
         gradients = torch.autograd.grad(found, leaves, (v_colors, v_alphas))
         return dress(None, *gradients)
@@ -217,19 +217,19 @@ class Extension:
 
 
 def type_of(example: Tensor) -> Any:
-    """What makes results tensors of the same device as an input."""
+    """Function that moves results to the device of an input."""
     on_gpu = isinstance(example, PretendedTensor)
     return lambda *results: tuple(wrapped(result) if on_gpu else result for result in results)
 
 
 def _not_empty(means: Tensor) -> None:
-    """``B = means.numel() / (N * 3)`` of integers: no Gaussian at all ends the process."""
+    """``B = means.numel() / (N * 3)`` in integers: zero Gaussians would terminate the process."""
     if not len(means):
         raise SystemError("SIGFPE: gsplat divides by the number of Gaussians")
 
 
 def project(means, quats, scales, viewmats, Ks, width, height, eps2d):
-    """gsplat's twin: radii, means2d, depths, conics and compensations, of a leading dimension of 1."""
+    """gsplat's torch function: radii, means2d, depths, conics and compensations, with a leading dimension of 1."""
     from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 
     covariances, _ = _quat_scale_to_covar_preci(quats, scales, True, False, False)
@@ -239,14 +239,14 @@ def project(means, quats, scales, viewmats, Ks, width, height, eps2d):
 
 
 def harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
-    """gsplat's twin of spherical harmonics."""
+    """gsplat's torch function for spherical harmonics."""
     from gsplat.cuda._torch_impl import _spherical_harmonics
 
     return _spherical_harmonics(degree, dirs, coeffs)
 
 
 def blend(means2d, conics, colors, opacities, background, width, height, tile, offsets, members):
-    """Front-to-back blending of one image, tile by tile: ``[1, H, W, C]`` and alpha ``[1, H, W, 1]``."""
+    """Front-to-back blending of one image by tiles: ``[1, H, W, C]`` and alpha ``[1, H, W, 1]``."""
     rows, columns = offsets.shape[1:]
     starts = [*offsets.flatten().tolist(), len(members)]
     ys, xs = torch.meshgrid(torch.arange(tile) + 0.5, torch.arange(tile) + 0.5, indexing="ij")

@@ -1,4 +1,4 @@
-"""How well Gaussians show the held-out views of a capture."""
+"""Image quality on the held-out views of a capture."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Builds a scene in processes that are killed at random moments, again and again, until it is finished.
+"""Repeats a build in processes that are killed at random moments, until the scene is finished.
 
-Run by test_killed_builds.py in a process of its own: everything is imported once, then every attempt is a fork,
-so that fifty kills take a minute. No work with threads is done before the forks.
+test_killed_builds.py runs this module in a separate process. It imports everything once, and every attempt is a fork,
+so that fifty kills take a minute. No threads are started before the forks.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 
 KILLS_A_SCENE = 7
 SHORTEST_STAGE = 0.2
-"""Seconds of the codebook on a quick machine: a kill within them, after the stage before, is in it."""
+"""Duration in seconds of the shortest stage, the codebook, on a fast machine: earlier kills hit the stage."""
 LONGEST_SECONDS = 1.2
-"""Until any other kill."""
+"""Maximum delay in seconds of the other kills."""
 
 
 def attempt(arguments: list[str], output: Path, seconds: float | None, after_stages: int = 0) -> str:
-    """Runs the command line in a fork: "finished", "failed", or "killed" so many seconds after so many stages."""
+    """Run the command line in a fork: "finished", "failed", or "killed" after stages and a delay."""
     child = os.fork()
     if child == 0:
         status = 1
@@ -49,7 +49,7 @@ def attempt(arguments: list[str], output: Path, seconds: float | None, after_sta
 
 
 def stages_done(output: Path) -> int:
-    """Finished stages, as scene.json says it."""
+    """Number of finished stages according to scene.json."""
     try:
         return len(json.loads((output / "scene.json").read_text())["stages"])
     except FileNotFoundError:
@@ -60,7 +60,7 @@ def main() -> None:
     folder, kills, seed, stages, *arguments = sys.argv[1:]
     import transformers.models.auto.tokenization_auto
     import transformers.models.clip.modeling_clip
-    import transformers.models.vit.modeling_vit  # noqa: F401  (seconds of imports, once, before the first fork)
+    import transformers.models.vit.modeling_vit  # noqa: F401  (imported once, before the first fork)
 
     rng = np.random.default_rng(int(seed))
     killed: list[int] = []

@@ -1,6 +1,6 @@
-"""A small scene whose language is known: balls of one code each, seen by a ring of cameras.
+"""A small scene of known language: balls with one code each, and a ring of cameras.
 
-Index maps are ray-traced, so they do not depend on the renderer.
+Index maps are ray-traced and therefore independent of the renderer.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class LanguageScene:
     gaussians: Gaussians
     labels: np.ndarray  # [N] code of each Gaussian
     cameras: dict[str, Camera]
-    code_maps: dict[str, np.ndarray]  # [H, W] uint8, 255 off the balls
+    code_maps: dict[str, np.ndarray]  # [H, W] uint8, 255 outside the balls
     codebook: Codebook
 
 
@@ -45,7 +45,7 @@ def make_scene(
     points = (CENTERS[:, None] + RADIUS * 0.95 * directions).reshape(-1, 3)
     labels = np.repeat(np.arange(len(CENTERS)), per_ball)
     gaussians = gaussians_from_points(points, np.full_like(points, 0.5), sh_degree=0, opacity=0.9)
-    gaussians.log_scales -= 0.7  # round Gaussians as wide as their spacing would stand out of the balls
+    gaussians.log_scales -= 0.7  # Gaussians as wide as their spacing would extend beyond the balls
     cameras, code_maps = {}, {}
     for view in range(views):
         angle = 2 * np.pi * view / views
@@ -57,7 +57,7 @@ def make_scene(
 
 
 def trace(camera: Camera) -> np.ndarray:
-    """The ball each pixel's ray meets first, 255 for none."""
+    """Index of the first ball on each pixel's ray, 255 if there is none."""
     ys, xs = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([xs, ys, np.ones_like(xs)], -1) @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -74,7 +74,7 @@ def trace(camera: Camera) -> np.ndarray:
 
 
 def label_accuracy(field, scene: LanguageScene, names=None) -> float:
-    """Share of pixels on the balls, away from silhouettes, whose likeliest code is right."""
+    """Fraction of ball pixels, excluding silhouettes, whose most probable code is correct."""
     right = total = 0
     for name in names or scene.cameras:
         ground_truth = scene.code_maps[name]

@@ -1,7 +1,7 @@
-"""Runs stages under a hard limit of memory, each in a fork of one process that has imported everything.
+"""Runs stages under a hard memory limit, each in a fork of one process that has imported everything.
 
-Called by test_memory_budget.py with a folder made by `write_photos`; prints one line of JSON: what came of each
-stage, the bytes it was granted, and the bytes that were resident at most.
+test_memory_budget.py runs this module with a folder written by `write_photos`. It prints one line of JSON with the
+outcome of each stage, its limit in bytes, and its peak resident memory in bytes.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ SAMPLE, DIMENSIONS, CODES = 40_000, 512, 8
 
 
 def write_photos(folder: Path) -> None:
-    """The room in large photos, with and without cameras, and a giant one that is masked and was taken upright."""
+    """Large photos of the room, with and without cameras, and a giant portrait photo with a mask."""
     textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     (folder / "images").mkdir(parents=True)
     frames = []
     for index, camera in enumerate(room_cameras()):
         small = Image.fromarray((room_photo(camera, textures) * 255).round().astype(np.uint8))
         small.resize(LARGE, Image.Resampling.BILINEAR).save(folder / "images" / f"{index}.jpg", quality=90)
-        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's axes to OpenGL's
+        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV to OpenGL axes
         frames.append({"file_path": f"images/{index}.jpg", "transform_matrix": pose.tolist()})
     scale = LARGE[0] / SIZE[0]
     intrinsics = {name: float(value) * scale for name, value in zip(("fl_x", "fl_y"), np.diag(camera.K))}
@@ -50,7 +50,7 @@ def write_photos(folder: Path) -> None:
 
 
 def place_photos(folder: Path, memory: int) -> str:
-    """Structure from motion, by the command line."""
+    """Structure from motion through the command line."""
     from lexsplat import cli
 
     out = io.StringIO()
@@ -62,7 +62,7 @@ def place_photos(folder: Path, memory: int) -> str:
 
 
 def triangulate_points(folder: Path, memory: int) -> str:
-    """Points under known poses, at the size of features of the small photos."""
+    """Triangulation with known poses, with the feature size of the small photos."""
     from lexsplat.captures import load_capture
     from lexsplat.captures.sfm import triangulation
 
@@ -72,7 +72,7 @@ def triangulate_points(folder: Path, memory: int) -> str:
 
 
 def undistort_giant(folder: Path, memory: int) -> str:
-    """A giant photo with a mask, through its lens, smaller and with its valid pixels."""
+    """Undistorting and downscaling a giant photo with a mask, and its valid pixels."""
     from lexsplat.captures.capture import View
     from lexsplat.captures.images.undistortion import Lens, pinhole_of
     from lexsplat.geometry.cameras import Camera
@@ -88,7 +88,7 @@ def undistort_giant(folder: Path, memory: int) -> str:
 
 
 def turn_giant(folder: Path, memory: int) -> str:
-    """The upright copy of a giant photo that is stored turned."""
+    """The upright copy of a giant photo that is stored rotated."""
     from lexsplat.captures.sfm.preparation import _look_at, _write_upright
 
     target = folder / "upright.jpg"
@@ -98,7 +98,7 @@ def turn_giant(folder: Path, memory: int) -> str:
 
 
 class Maps(dict):
-    """Features of twenty views, made when asked for."""
+    """Features of twenty views, generated on access."""
 
     def __missing__(self, name: str):
         import torch
@@ -111,7 +111,7 @@ class Maps(dict):
 
 
 def fit_codes(folder: Path, memory: int) -> str:
-    """A codebook from a large sample."""
+    """A codebook fitted to a large sample."""
     from lexsplat.codebook import CodebookConfig, fit_codebook
 
     config = CodebookConfig(
@@ -122,7 +122,7 @@ def fit_codes(folder: Path, memory: int) -> str:
 
 
 def budgets() -> dict[str, tuple[Callable[[Path, int], str], int]]:
-    """Each stage with the least memory that it asks for, by the functions that the stages use."""
+    """Each stage with its minimum memory, computed by the functions that the stages use."""
     from lexsplat.runtime import memory as budget
 
     searching = budget.extraction_bytes(LARGE, SIDE, FEATURES, 1)
@@ -139,20 +139,20 @@ def budgets() -> dict[str, tuple[Callable[[Path, int], str], int]]:
 
 
 def status_bytes(name: str) -> int:
-    """What the system says of this process: "VmData" is limited, "VmRSS" is resident, "VmHWM" its peak."""
+    """A memory value of this process: "VmData" is the limited one, "VmRSS" resident memory, "VmHWM" its peak."""
     with open("/proc/self/status") as file:
         return next(int(line.split()[1]) * 1024 for line in file if line.startswith(name))
 
 
 def run_limited(work: Callable[[Path, int], str], folder: Path, memory: int, beside: int) -> dict:
-    """What a stage says for itself in a fork that may take so many bytes more, or how it ended."""
+    """The outcome of a stage in a fork with a limit of additional memory in bytes: its result, or how it ended."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         limit = status_bytes("VmData") + memory + beside
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         try:
-            Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+            Path("/proc/self/clear_refs").write_text("5")  # resets the peak
             before = status_bytes("VmRSS")
             said = work(folder, memory)
             resident = status_bytes("VmHWM") - before
@@ -169,7 +169,7 @@ def run_limited(work: Callable[[Path, int], str], folder: Path, memory: int, bes
 
 def main() -> None:
     folder, beside = Path(sys.argv[1]), int(sys.argv[2])
-    if hasattr(os, "sched_setaffinity"):  # as many threads on any machine
+    if hasattr(os, "sched_setaffinity"):  # the same number of threads on any machine
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
     import pycolmap  # noqa: F401
     import torch  # noqa: F401

@@ -7,7 +7,7 @@ import pycolmap
 
 
 def move(model, number) -> None:
-    """Rotate and move a photo, as if it were mis-registered."""
+    """Rotate and translate the pose of a photo, as if it were mis-registered."""
     frame = model.frame(model.image(number).frame_id)
     turn = pycolmap.Rotation3d(np.array([0.0, np.sin(0.2), 0.0, np.cos(0.2)]))
     frame.rig_from_world = pycolmap.Rigid3d(turn, np.array([0.7, -0.4, 0.2])) * frame.rig_from_world

@@ -1,17 +1,17 @@
-"""A pretended GPU: tensors that say ``cuda:0`` and behave as such, while their numbers lie in the CPU's memory.
+"""A pretended GPU: tensors that report the device ``cuda:0`` and follow its rules, with their data in CPU memory.
 
-`PretendedTensor` wraps a CPU tensor. Every operation on it is unwrapped, run by the CPU and wrapped again, after it
-was held to the rules of CUDA: all tensors on one device (but single numbers in arithmetic, indices, and copies that
-are asked for), no way to NumPy but through ``.cpu()``, random numbers from a generator of the same device. Inside the
-`PretendedGPU` mode ``device="cuda"`` makes such tensors. The fixture ``pretended_gpu`` (in conftest.py) enters it and
-makes torch.cuda say that there is a GPU; `gsplat_kernels` does what gsplat's CUDA extension does.
+`PretendedTensor` wraps a CPU tensor. Every operation is checked against the rules of CUDA, unwrapped, executed on the
+CPU, and wrapped again. The rules: all tensors are on one device (except scalars in arithmetic, indices and explicit
+copies), conversion to NumPy requires ``.cpu()``, and random numbers come from a generator of the same device. In the
+`PretendedGPU` mode, ``device="cuda"`` creates such tensors. The fixture ``pretended_gpu`` (in conftest.py) enters it
+and makes torch.cuda report a GPU; `gsplat_kernels` replaces gsplat's CUDA extension.
 
-What this shows: that the program keeps its tensors where they belong on the paths a GPU's user takes; how often it
-waits for the device (`waits`: a read of a number, a copy to the host, or one from ordinary host memory); that
-gsplat's own Python is called as it wants to be. What it cannot show: what CUDA's kernels compute, in which order they
-add, how fast they are and what memory they take; that an operation exists on CUDA at all; what runs while the host
-goes on; where gsplat's extension waits by itself (once for each projection); what inference mode forbids; and
-libraries that look at torch's C++ types (torch takes its per-tensor paths for optimizers here, not those over lists).
+Tests on it check that tensors are on the right devices, how often the host waits for the device (`waits`: reading a
+value, copying to the host, or copying from pageable host memory), and the arguments passed to gsplat's Python code.
+They cannot check the results, summation order, speed and memory of CUDA kernels; whether an operation exists on CUDA;
+asynchronous execution; the synchronizations inside gsplat's extension (one per projection); the restrictions of
+inference mode; and libraries that depend on torch's C++ types (torch's optimizers use their per-tensor paths here,
+not the multi-tensor ones).
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ NAME = "Pretended GPU"
 aten = torch.ops.aten
 
 COPIES = {aten._to_copy.default, aten.copy_.default, aten.copy.default, aten._foreach_copy_.default}
-"""Operations that may take tensors of two devices: they are how tensors travel."""
+"""Operations that accept tensors of two devices, because they copy between devices."""
 INDEXING = {
     aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default,
     aten._unsafe_index.Tensor,
 }  # fmt: skip
-"""Tensors on the GPU may be indexed by tensors on the CPU; not the other way round."""
+"""Operations in which CPU tensors can index GPU tensors, but not vice versa."""
 TAKES_NUMBERS = {
     aten.where.self, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default,
     aten.masked_fill.Tensor, aten.masked_fill_.Tensor, aten.fill_.Tensor, aten.index_fill_.int_Tensor,
 }  # fmt: skip
-"""Operations beside arithmetic that take a CPU tensor of no dimension for a number."""
+"""Operations other than arithmetic that accept a zero-dimensional CPU tensor as a scalar."""
 IN_HALF = {
     aten.mm.default, aten.addmm.default, aten.bmm.default, aten.baddbmm.default, aten.convolution.default,
 }  # fmt: skip
@@ -53,14 +53,14 @@ DECIDES_SIZES = {
     aten.nonzero.default, aten.masked_select.default, aten._unique2.default, aten.unique_consecutive.default,
     aten.bincount.default, aten.unique_dim.default, aten.repeat_interleave.Tensor,
 }  # fmt: skip
-"""Operations whose results have a size that only the device knows: the host waits for it."""
+"""Operations whose result size depends on the data, so that the host waits for the device."""
 
 
 class PretendedTensor(torch.Tensor):
-    """A CPU tensor in the clothes of one on the GPU.
+    """A CPU tensor presented as a GPU tensor.
 
-    To torch's C++ it is on the device "meta", where there is no memory to be read by mistake: gradients on "cuda"
-    need a library that a torch without CUDA lacks. Python sees "cuda:0".
+    Python code sees the device "cuda:0". torch's C++ code sees "meta", which has no memory that could be read by
+    mistake; gradients on "cuda" would require CUDA's libraries.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl
@@ -83,7 +83,7 @@ class PretendedTensor(torch.Tensor):
         return 0
 
     def to(self, *args: Any, **kwargs: Any) -> torch.Tensor:
-        """As torch's: the tensor itself where nothing is to be done."""
+        """Like `torch.Tensor.to`; returns the tensor itself if no conversion is required."""
         places = [getattr(a, "device", a) for a in (*args, kwargs.get("device"))]
         places = [a for a in places if isinstance(a, (str, torch.device))]
         dtypes = [
@@ -133,7 +133,7 @@ def _is_cuda(device: Any) -> bool:
 
 
 class PretendedGenerator(torch.Generator):
-    """A random generator for either device; torch's own says it is on the CPU whatever it was asked for."""
+    """A random generator for either device; without CUDA, torch's own generator always reports the CPU."""
 
     def __new__(cls, device: Any = "cpu") -> PretendedGenerator:
         made = super().__new__(cls)
@@ -143,39 +143,39 @@ class PretendedGenerator(torch.Generator):
 
     @property
     def device(self) -> torch.device:
-        """Where its numbers are drawn."""
+        """Device of the generator."""
         return DEVICE if self._cdata in _generators else torch.device("cpu")
 
 
 _generators: dict[int, PretendedGenerator] = {}
-"""Generators of the GPU, by what stays the same when torch passes them on."""
+"""Generators of the GPU, by a key that is unchanged when torch passes them on."""
 
 
 class PretendedGPU(TorchDispatchMode):
-    """Within the mode, tensors can be made on the GPU."""
+    """Mode in which tensors can be created on the pretended GPU."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # torch would import its compiler, which takes seconds, to keep it off this mode
+        return False  # otherwise torch imports its compiler, which takes seconds
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return execute(func, args, kwargs or {})
 
 
 waits: Counter[str] = Counter()
-"""How often the host waited for the device, by operation."""
+"""Number of times the host waited for the device, by operation."""
 _own_random_state = torch.Generator().manual_seed(7).get_state()
 _random_lock = threading.RLock()
 _thread = threading.local()
 
 
 def inner(value: Any) -> Any:
-    """What a pretended tensor wraps; anything else as it is."""
+    """The CPU tensor inside a pretended tensor; other values are returned unchanged."""
     return value._inner if isinstance(value, PretendedTensor) else value
 
 
 def wrapped(value: Any) -> Any:
-    """A plain tensor as one on the GPU; anything else as it is."""
+    """A CPU tensor wrapped as a GPU tensor; other values are returned unchanged."""
     if isinstance(value, torch.Tensor) and not isinstance(value, PretendedTensor):
         return PretendedTensor(value)
     return value
@@ -183,16 +183,18 @@ def wrapped(value: Any) -> Any:
 
 def execute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     """Run one operation under the rules of CUDA."""
-    if torch.is_inference_mode_enabled():  # where torch neither takes operations apart nor knows our views
+    if (
+        torch.is_inference_mode_enabled()
+    ):  # in which torch neither decomposes operations nor tracks views of this class
         with torch.inference_mode(False), torch.no_grad(), PretendedGPU():
             return func(*args, **kwargs)
-    if func._can_decompose():  # on tensors that were made in that mode
+    if func._can_decompose():  # for tensors created in inference mode
         with PretendedGPU():
             return func.decompose(*args, **kwargs)
     flat, shape = tree_flatten((args, kwargs))
     on_gpu = any(isinstance(value, PretendedTensor) for value in flat)
     wanted = kwargs.get("device")
-    # "meta" is what torch's C++ takes for our device, but where transformers makes models before their weights.
+    # torch's C++ code uses "meta" for this device; transformers uses it to create models before loading weights.
     meant = str(torch.utils._device.CURRENT_DEVICE) != "meta"
     to_gpu = wanted is not None and (_is_cuda(wanted) or (meant and wanted.type == "meta"))
     if not on_gpu and not to_gpu:
@@ -202,7 +204,7 @@ def execute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     _check_devices(func, args, flat)
     _count_waits(func, args, kwargs, lands_on_gpu)
     if func is aten._fused_sdp_choice.default:
-        return 0  # plain attention: the fast forms are CUDA's own
+        return 0  # the plain implementation; the fast ones are specific to CUDA
     known = {id(value._inner): value for value in flat if isinstance(value, PretendedTensor)}
     args, kwargs = tree_unflatten([inner(value) for value in flat], shape)
     if wanted is not None:
@@ -212,7 +214,7 @@ def execute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     with _randomness(func, kwargs, lands_on_gpu):
         found = func(*args, **kwargs)
     if torch.Tag.inplace_view in func.tags:
-        with no_dispatch():  # to the shape that torch's C++ knows of the outer tensor the same
+        with no_dispatch():  # so that torch's C++ code sees the same shape of the outer tensor
             func(*tree_unflatten(flat, shape)[0])
     if func is aten._to_copy.default and any(found is arg for arg in args):
         found = found.clone()
@@ -220,13 +222,13 @@ def execute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _halved(value: Any) -> Any:
-    """As autocast does before products and convolutions; torch's own does not know pretended tensors."""
+    """Autocast before products and convolutions; torch's own does not support pretended tensors."""
     is_single = isinstance(value, torch.Tensor) and value.dtype == torch.float32
     return value.half() if is_single else value
 
 
 def _dressed(value: Any, known: dict[int, PretendedTensor], func: Any) -> Any:
-    """A result as the caller must see it: what was changed in place stays the same object."""
+    """Wrap a result; operations in place return the same object."""
     before = known.get(id(value))
     if before is None:
         return wrapped(value)
@@ -262,7 +264,7 @@ def _check_devices(func: Any, args: Any, flat: list[Any]) -> None:
 
 
 def _count_waits(func: Any, args: Any, kwargs: dict[str, Any], lands_on_gpu: bool) -> None:
-    """Note where the host would stand still until the device has done all it was given."""
+    """Count the operations at which the host would wait for the device."""
     if func in READS or func in DECIDES_SIZES:
         waits[str(func)] += 1
     elif func in INDEXING and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
@@ -279,7 +281,7 @@ def _count_waits(func: Any, args: Any, kwargs: dict[str, Any], lands_on_gpu: boo
 
 @contextlib.contextmanager
 def _randomness(func: Any, kwargs: dict[str, Any], lands_on_gpu: bool) -> Iterator[None]:
-    """The GPU has random numbers of its own, and takes no generator of the CPU."""
+    """Check that random numbers on the GPU do not use a generator of the CPU."""
     given = kwargs.get("generator")
     if given is not None and (given._cdata in _generators) != lands_on_gpu:
         raise RuntimeError("Expected a generator of the tensors' own device, but found one of the other")
@@ -323,7 +325,7 @@ _torch_to = torch.Tensor.to
 
 
 def _to(self: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
-    """`torch.Tensor.to`; for "cuda" without a number torch's C++ would ask CUDA's library which one is meant."""
+    """`torch.Tensor.to`; for "cuda" without an index, torch's C++ code would query CUDA for the current device."""
     args = tuple(DEVICE if isinstance(a, (str, torch.device)) and _is_cuda(a) else a for a in args)
     if kwargs.get("device") is not None and _is_cuda(kwargs["device"]):
         kwargs["device"] = DEVICE
@@ -331,14 +333,14 @@ def _to(self: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
 
 
 def _pinned(self: torch.Tensor) -> torch.Tensor:
-    """A copy in memory that a GPU reads by itself; waiting is counted by ``non_blocking`` alone."""
+    """A copy in pinned memory; only ``non_blocking`` determines whether a wait is counted."""
     if isinstance(self, PretendedTensor):
         raise RuntimeError("cannot pin 'torch.cuda.FloatTensor' only dense CPU tensors can be pinned")
     return self.clone()
 
 
 def _made_on_the_host(make: Any) -> Any:
-    """torch's C++ would look for CUDA's library before it copied what it made: the copy is made here."""
+    """Creates the tensor on the CPU and copies it; torch's C++ code would require CUDA for the copy."""
 
     def made(data: Any, *, device: Any = None, requires_grad: bool = False, **options: Any) -> torch.Tensor:
         found = make(data, **options)
@@ -371,7 +373,7 @@ _CUDA = {
 
 @contextlib.contextmanager
 def pretending(monkeypatch: Any) -> Iterator[Counter[str]]:
-    """A GPU for the length of the block, in this thread and in those that start in it; gives `waits`."""
+    """A pretended GPU in this thread and in threads started inside the block; yields `waits`."""
     for name, stand_in in _CUDA.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device=None: waits.update(["synchronize"]))
@@ -389,7 +391,7 @@ def pretending(monkeypatch: Any) -> Iterator[Counter[str]]:
     monkeypatch.setattr(torch.Tensor, "to", _to)
     monkeypatch.setattr(torch.Tensor, "pin_memory", _pinned)
     monkeypatch.setattr(torch.Tensor, "cuda", lambda self, *_, **__: self.to(DEVICE))
-    torch.utils._device._device_constructors()  # remembers them: it must not remember ours
+    torch.utils._device._device_constructors()  # caches the constructors before they are replaced
     for name in ("tensor", "as_tensor"):
         monkeypatch.setattr(torch, name, _made_on_the_host(getattr(torch, name)))
     with PretendedGPU():

@@ -1,4 +1,4 @@
-"""Texts and a small lifted scene for the tests of questions."""
+"""Text embeddings and a small scene for the tests of queries."""
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ def texts(count, dim, seed):
 
 
 def lifted_cloud() -> tuple[CodeField, Gaussians, Camera]:
-    """Gaussians in a cloud with random codes, some with none, and a camera that sees past them."""
+    """Gaussians in a cloud with random codes, some without a code, and a camera whose view extends beyond them."""
     rng = np.random.default_rng(0)
     gaussians = gaussians_from_points(
         rng.uniform(-0.6, 0.6, (150, 3)), rng.random((150, 3)), sh_degree=0, opacity=0.7

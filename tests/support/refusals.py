@@ -9,7 +9,7 @@ from lexsplat.runtime.errors import CaptureError, LexsplatError
 
 
 def assert_tells(error: LexsplatError, *parts: str) -> None:
-    """The message has subject, expected, found and remedy in one line, and contains ``parts``."""
+    """Assert that the message states subject, expected, found and remedy in one line, and contains ``parts``."""
     message = str(error)
     assert error.subject
     assert error.expected

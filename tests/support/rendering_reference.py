@@ -1,6 +1,6 @@
-"""Rendering by definition: float64, one Gaussian after another over all pixels, gradients by torch autograd.
+"""Reference rendering in float64: one Gaussian after another over all pixels, with gradients by torch autograd.
 
-Written from the equations, not from the kernels: no tiles, no boxes, no fused anything.
+It implements the equations independently of the kernels, without tiles, boxes or fused operations.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def project(
 
 
 def shade(p: dict[str, Tensor], camera: Camera, degree: int, viewmat: Tensor | None = None) -> Tensor:
-    """RGB [N, 3]; the polynomials are those of gsplat's torch twin."""
+    """RGB [N, 3]; the polynomials are those of gsplat's torch function."""
     from gsplat.cuda._torch_impl import _spherical_harmonics
 
     view = torch.from_numpy(camera.viewmat) if viewmat is None else viewmat
@@ -69,7 +69,8 @@ def blend(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Channels [H, W, C], alpha [H, W], the weight of each Gaussian at each pixel [N, H, W], and clear [H, W].
 
-    A pixel is clear if no decision there (threshold, clamp, end) is so close that float32 may take the other way.
+    A pixel is clear if none of its comparisons (threshold, clamp, termination) is so close that float32 could decide
+    differently.
     """
     ys, xs = torch.meshgrid(
         torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
@@ -110,7 +111,7 @@ def render(
     background: Tensor | None = None,
     viewmat: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Image over the background, alpha, weights and clear pixels; from ``viewmat`` where it is given."""
+    """Image over the background, alpha, weights and clear pixels; from ``viewmat`` if it is given."""
     projected = project(p, camera, antialiased, viewmat=viewmat)
     image, alpha, weights, clear = blend(projected, shade(p, camera, degree, viewmat), camera)
     if background is not None:
@@ -121,7 +122,7 @@ def render(
 def random_gaussians(
     count: int, seed: int, *, degree: int = 3, antialiased: bool = False, scale: float = 0.15
 ) -> Gaussians:
-    """Around the origin, standard deviations around ``scale``, some nearly opaque."""
+    """Random Gaussians around the origin, of standard deviations around ``scale``, some nearly opaque."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -139,7 +140,7 @@ def random_gaussians(
 
 
 def front_camera(width: int = 50, height: int = 37) -> Camera:
-    """A little above and beside the axis, so that nothing is symmetric."""
+    """A camera slightly off the axis, so that the view is not symmetric."""
     return look_at(
         np.array([0.4, -0.3, -3.0]),
         np.array([0.05, 0.0, 0.0]),

@@ -17,7 +17,7 @@ VOID = {"meta", "img", "link", "br", "input"}
 
 
 class Page(HTMLParser):
-    """Checks that tags are closed in order; collects texts, attributes and table rows."""
+    """Checks that tags are nested correctly; collects texts, attributes and table rows."""
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)

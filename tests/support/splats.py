@@ -1,4 +1,4 @@
-"""Random Gaussians for files."""
+"""Random Gaussians for tests of file formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras of somebody who tilts the camera, around a known up."""
+"""Hand-held cameras, tilted around a known up direction."""
 
 from __future__ import annotations
 

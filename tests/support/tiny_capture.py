@@ -1,6 +1,6 @@
-"""A capture small enough to build in a test: spheres on a checkered floor, ray-traced, in COLMAP's text layout.
+"""A capture small enough to build in tests: ray-traced spheres on a checkered floor, in COLMAP's text layout.
 
-Made without any code of lexsplat, so that it can serve as a reference for cameras, images and masks.
+It uses no code of lexsplat, so that it can serve as a reference for cameras, images and masks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LIGHT = np.array([0.4, -0.5, 0.77])
 
 
 def camera_poses(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """World-to-camera rotations and translations (OpenCV axes) on an arc in front of the things."""
+    """World-to-camera rotations and translations (OpenCV axes) on an arc in front of the objects."""
     poses = []
     for i in range(count):
         angle = np.radians(-35 + 70 * i / max(1, count - 1))
@@ -35,7 +35,7 @@ def camera_poses(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
 def trace(
     rotation: np.ndarray, translation: np.ndarray, focal: float, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Color ``[H, W, 3]``, index of the thing hit (0 floor, 1.. spheres) and hit point ``[H, W, 3]``."""
+    """Color ``[H, W, 3]``, index of the object hit (0 floor, 1.. spheres) and hit point ``[H, W, 3]``."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], -1) @ rotation
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)

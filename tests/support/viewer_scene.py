@@ -1,4 +1,4 @@
-"""A scene with known answers for tests of the viewer: colored balls, "ball 0" to "ball 4", one code each."""
+"""A scene with known query results for tests of the viewer: colored balls, "ball 0" to "ball 4", one code each."""
 
 import colorsys
 
@@ -16,7 +16,7 @@ WORDS = [f"ball {number}" for number in range(5)]
 
 
 class BallScene(Scene):
-    """Embeds text without an encoder: "ball k" is axis k, canonical phrases are axis 31, other text is in between."""
+    """Text embeddings without a model: "ball k" is axis k, canonical phrases are axis 31, other text lies between."""
 
     def encode_text(self, texts: list[str]) -> torch.Tensor:
         rows = torch.zeros(len(texts), 32)

@@ -18,7 +18,7 @@ FOCAL = 60.0
 
 
 def shared_data(name: str) -> Path:
-    """A development data set beside the repository; skips the test where it is absent."""
+    """A development data set next to the repository; skips the test if it is absent."""
     root = os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2].parent / "shared" / "data")
     folder = Path(root) / name
     if not folder.is_dir():
@@ -55,7 +55,7 @@ def write_images(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH,
 def write_transforms(
     root: Path, names: list[str], *, file: str = "transforms.json", images: bool = True, **top: object
 ) -> dict:
-    """A transforms.json with cameras around the origin; returns the document for changes."""
+    """A transforms.json with cameras around the origin; returns the document for modification."""
     frames = []
     for name, camera in zip(names, cameras_around(len(names))):
         pose = np.linalg.inv(camera.viewmat) @ OPENGL_TO_OPENCV
@@ -82,7 +82,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def colmap_bytes(names: list[str], *, model: int = 1, params: tuple = (FOCAL, FOCAL, 32.0, 24.0)) -> dict:
-    """The three binary files of a COLMAP model, written by the format's description, as bytes."""
+    """The three binary files of a COLMAP model as bytes, written from the description of the format."""
     cameras = struct.pack("<QIiQQ", 1, 1, model, WIDTH, HEIGHT) + struct.pack(f"<{len(params)}d", *params)
     images = struct.pack("<Q", len(names))
     for index, (name, camera) in enumerate(zip(names, cameras_around(len(names)))):

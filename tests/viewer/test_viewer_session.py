@@ -342,7 +342,7 @@ def test_the_history_is_stored_with_the_latest_prompt_first(tmp_path):
     assert History.load(tmp_path).prompts == ["the last", *(f"thing {n}" for n in range(MAX_PROMPTS - 1))]
 
 
-def test_files_written_by_earlier_versions_are_read_and_written_again_alike(tmp_path):
+def test_files_of_earlier_versions_are_read_and_rewritten_unchanged(tmp_path):
     content = {"history": ["mug", "red apple"], "vocabulary": ["pear", "plum"]}
     (tmp_path / "viewer.json").write_text(json.dumps(content))
     history = History.load(tmp_path)

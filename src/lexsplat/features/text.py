@@ -42,7 +42,7 @@ class TextCache:
 
         Args:
             content_hash: The model's hash, as recorded with the features.
-            prompts: Texts; repeated ones are embedded once.
+            prompts: Texts; repeated ones are encoded once.
             encoder: Returns the model; called only for new prompts.
 
         Raises:

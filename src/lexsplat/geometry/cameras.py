@@ -1,6 +1,6 @@
-"""Pinhole cameras, and the only place where camera conventions are converted.
+"""Pinhole cameras and conversion between camera conventions.
 
-Convention everywhere else: OpenCV axes (x right, y down, z forward), ``viewmat`` maps world to camera,
+All other modules use one convention: OpenCV axes (x right, y down, z forward), ``viewmat`` maps world to camera,
 ``K`` is in pixels, and the center of the top-left pixel is at (0.5, 0.5).
 """
 
@@ -29,7 +29,7 @@ class Camera:
         viewmat: World to camera ``[4, 4]``, OpenCV axes, float64.
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite, or a size or focal length is not positive.
+        ValueError: If a shape is wrong, a value is NaN or infinite, or a size or focal length is not positive.
     """
 
     width: int
@@ -45,7 +45,7 @@ class Camera:
         if self.viewmat.shape != (4, 4):
             raise ValueError(f"viewmat must be [4, 4], got {list(self.viewmat.shape)}")
         if not (np.isfinite(self.K).all() and np.isfinite(self.viewmat).all()):
-            raise ValueError("camera has a number that is not finite")
+            raise ValueError("camera contains NaN or infinity")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
@@ -62,12 +62,12 @@ class Camera:
         return np.asarray(self.viewmat[2, :3] / np.linalg.norm(self.viewmat[2, :3]), dtype=np.float64)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for an image of another size (the field of view stays)."""
+        """The same camera for another image size; the field of view is unchanged."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(width, height, scale @ self.K, self.viewmat)
 
     def downscaled(self, factor: float) -> Camera:
-        """The same camera for an image ``factor`` times smaller, sizes rounded, at least one pixel."""
+        """The same camera for an image smaller by ``factor``; sizes are rounded and at least one pixel."""
         if not factor > 0:
             raise ValueError(f"downscale must be positive, got {factor:g}")
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
@@ -85,12 +85,12 @@ def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height: int, fov_y: float) -> Camera:
-    """A camera at ``position`` that looks at ``target``.
+    """A camera at ``position`` directed at ``target``.
 
     Args:
         position: Center of projection ``[3]``, world.
-        target: Point in the middle of the image ``[3]``, world.
-        up: World direction that appears upwards ``[3]``; not parallel to the view.
+        target: Point projected to the image center ``[3]``, world.
+        up: World direction that points up in the image ``[3]``; not parallel to the viewing direction.
         width: Image width in pixels.
         height: Image height in pixels.
         fov_y: Vertical field of view in radians.
@@ -105,9 +105,9 @@ def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height:
 
 
 def camera_extent(cameras: Iterable[Camera]) -> float:
-    """Radius of the cameras' positions around their mean times 1.1: the scene scale of 3DGS.
+    """Scene scale of 3DGS: 1.1 times the largest distance of a camera from the mean camera position.
 
-    A single camera, or cameras at one point, have extent 1.
+    The extent of a single camera, or of cameras at one point, is 1.
     """
     positions = np.stack([camera.position for camera in cameras])
     radius = float(np.linalg.norm(positions - positions.mean(0), axis=1).max()) * 1.1

@@ -103,7 +103,7 @@ class PresenceClassifier:
     Args:
         gaussians: The geometry of the scene.
         language: Its language.
-        references: The embedded `REFERENCE_PHRASES`.
+        references: Embeddings of `REFERENCE_PHRASES`.
     """
 
     def __init__(self, gaussians: Gaussians, language: LanguageField, references: Question) -> None:

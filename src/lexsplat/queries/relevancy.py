@@ -207,7 +207,7 @@ def code_relevancy(codewords: Tensor, question: Question) -> Tensor:
 
     Args:
         codewords: CLIP part of the codebook ``[K, D]``, of any length.
-        question: The embedded prompts.
+        question: Embeddings of the prompts.
     """
     positives, negatives = question.units(codewords)
     unit = torch.nn.functional.normalize(codewords.float(), dim=-1)
@@ -252,7 +252,7 @@ def probability_relevancy(probabilities: Tensor, codewords: Tensor, question: Qu
     Args:
         probabilities: ``[..., K]``, non-negative; the sum of a row is its coverage in 0..1.
         codewords: CLIP part of the codebook ``[K, D]``.
-        question: The embedded prompts.
+        question: Embeddings of the prompts.
 
     Returns:
         Relevancy ``[..., P]`` in 0..1; 0 where the distribution is empty.
@@ -278,7 +278,7 @@ def render_relevancy(
         field: The language of the scene.
         gaussians: Its geometry.
         camera: The view.
-        question: The embedded prompts.
+        question: Embeddings of the prompts.
 
     Returns:
         ``[P, H, W]`` in 0..1, on the device of the Gaussians.

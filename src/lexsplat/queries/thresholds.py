@@ -110,7 +110,7 @@ def scene_thresholds(
     Args:
         relevancy: Renders the maps ``[P, H, W]`` of the prompts in a view.
         cameras: All views to choose from, none of which is evaluated: the training views.
-        presences: Whether the scene holds each prompt; None for methods that cannot tell.
+        presences: Whether the scene contains each prompt; None for methods that do not determine it.
         long_side: Longer side of the renderings in pixels, at most.
 
     Raises:

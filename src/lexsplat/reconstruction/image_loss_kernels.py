@@ -171,7 +171,7 @@ def _compare(
             over1, over2 = one / (a1 + square), one / (a2 + spread)
             luminance, structure = a1 * over1, a2 * over2
             scores[y, i] = luminance * structure
-            # 1 - luminance is m^2 over1, and 1 - structure is spread over2.
+            # 1 - luminance is m^2 * over1, and 1 - structure is spread * over2.
             by_product = two * luminance * spread * over2 * over2
             by_square = -luminance * structure * over2
             by_mean = two * structure * over1 * (mt * square * over1 - luminance * m)

@@ -193,7 +193,7 @@ class Session:
 
     def _provisional_threshold(self, scores: NDArray[np.float32]) -> float:
         """A threshold in milliseconds. It is 0.5 for an absent object, as the automatic one will be."""
-        presence = self._presence  # None until `warm_up` has embedded the reference phrases
+        presence = self._presence  # None until `warm_up` has encoded the reference phrases
         if presence is not None and presence.classify(torch.from_numpy(scores)) == "no":
             return BORDER
         return quick_threshold(scores, self._opacities)

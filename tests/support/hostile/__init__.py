@@ -1,4 +1,4 @@
-"""Every reader of lexsplat with a valid input, checks of its result, and the mutations to try on it.
+"""Every reader of lexsplat with a valid input, checks of its result, and mutations of the input.
 
 One module per package of the product; each registers its readers in `READERS`. To add a reader, write a function that
 returns a `Reader` and decorate it with ``@reader``. `running` runs them.

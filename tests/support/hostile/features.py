@@ -1,4 +1,4 @@
-"""Readers of features from elsewhere, of the feature and text caches, and of model folders."""
+"""Readers of external features, of the feature and text caches, and of model folders."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def text_cache() -> Reader:
 
 @reader
 def model_folder() -> Reader:
-    """What decides whether a folder is a model: its configuration and its index of shards."""
+    """The files that determine whether a folder is a model: its configuration and its index of shards."""
     from lexsplat.features.hub import model_folder as find
 
     def make(folder: Path) -> None:

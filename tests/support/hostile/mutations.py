@@ -151,7 +151,7 @@ def structure(document: Any, rng: np.random.Generator, limit: int = 600) -> Iter
     for index in sorted(chosen.tolist()):
         path, change = changes[index]
         data = _changed(copy.deepcopy(document), path, change)
-        # Lone surrogates cannot be written as UTF-8, but as an escape they can stand in a file.
+        # Lone surrogates cannot be encoded as UTF-8, but a file can contain them as escapes.
         yield "structure", json.dumps(data, ensure_ascii=bool(index % 2)).encode("utf-8", "surrogatepass")
 
 

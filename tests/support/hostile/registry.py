@@ -1,4 +1,4 @@
-"""The registry of hostile readers: a reader, a valid input, and the mutations to try on it."""
+"""The registry of hostile readers: a reader, a valid input, and mutations of the input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Reader:
         read: Reads it.
         check: Raises AssertionError if the result is invalid.
         mutations: By file, relative to the folder: its mutations.
-        exact: Files of which no part may be missing: truncated, they fail or yield the same result.
+        exact: Files of which no part may be missing: if truncated, they fail or yield the same result.
         value_errors: Whether ValueError is documented for damaged content.
     """
 

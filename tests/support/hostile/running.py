@@ -1,4 +1,4 @@
-"""Runs hostile readers in a process of its own::
+"""Runs hostile readers in a separate process::
 
     python -m support.hostile.running WORK_FOLDER REPORT.json CLAIMS_FOLDER
 
@@ -30,7 +30,7 @@ from support.hostile import READERS, Reader
 SECONDS = 5.0
 GIGABYTE = 1 << 30
 BASE_BYTES = 3 << 28
-"""Memory of the process before any input: torch, Numba's kernels, the other libraries."""
+"""Memory of the process before any input: torch, Numba's kernels and other libraries."""
 
 
 class Hang(BaseException):

@@ -1,4 +1,4 @@
-"""Reads images of every mode Pillow supports as arrays, with typed errors for what it cannot read."""
+"""Reads images of every mode that Pillow supports into arrays and raises typed errors for unreadable files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lexsplat.captures.images.bands import band_ranges, is_large, reduced
 from lexsplat.runtime.errors import CaptureError
 
 HEIC_SUFFIXES = (".heic", ".heif")
-"""Suffixes of Apple's photos, which need the library pi-heif."""
+"""Suffixes of HEIF photos, as Apple's phones take them; reading them requires the library pi-heif."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIC_SUFFIXES)
-"""Suffixes of images, in the order in which they are tried for names without one."""
+"""Suffixes of image files, in the order in which they are tried for names without a suffix."""
 
 MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-"""Largest image that is opened: 179 million pixels. Headers that claim more are decompression bombs."""
+"""Largest image that is opened: 179 million pixels. Larger headers are treated as decompression bombs."""
 
 
 @contextmanager
@@ -35,8 +35,8 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     nerfstudio and instant-ngp ignore the tag), so rotating the pixels would break the poses.
 
     Raises:
-        CaptureError: If the file is missing, truncated or not an image, exceeds `MAX_PIXELS`, or needs a library that
-            is not installed.
+        CaptureError: If the file is missing, truncated or not an image, exceeds `MAX_PIXELS`, or requires a library
+            that is not installed.
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
@@ -82,26 +82,26 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         ArithmeticError,
         struct.error,
     ) as error:
-        # The types that Pillow's decoders raise on damaged files; callers only decode inside the block.
+        # The types that Pillow's decoders raise on damaged files; the block contains only decoding.
         raise CaptureError(
             path,
-            expected="a whole image",
+            expected="a complete image",
             found=f"damaged data ({error or type(error).__name__})",
             remedy="copy the file again, or remove it from the capture",
         ) from error
 
 
 class _BoundedFile(io.BufferedReader):
-    """A file that never allocates more than its size, whatever length a damaged header states."""
+    """A file that never allocates more than its size, even if a damaged header states a larger length."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
         self._end = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Bytes up to the end of the file, or up to ``size`` of them."""
-        left = max(0, self._end - self.tell())
-        return super().read(left if size is None or size < 0 else min(size, left))
+        """At most ``size`` bytes, or all bytes up to the end of the file."""
+        remaining = max(0, self._end - self.tell())
+        return super().read(remaining if size is None or size < 0 else min(size, remaining))
 
 
 def _register_heic(path: Path) -> None:
@@ -121,7 +121,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the header alone.
 
     Raises:
-        CaptureError: As :func:`open_image`, and for an image without pixels.
+        CaptureError: As :func:`open_image`, or if the image has no pixels.
     """
     with open_image(path) as image:
         width, height = image.size
@@ -143,7 +143,7 @@ def read_image(
     Args:
         path: The file.
         background: Color behind transparent pixels.
-        size: Width and height of the result, as by :func:`resize_image`; a large photo is then reduced in bands
+        size: Width and height of the result, as in :func:`resize_image`; large photos are reduced in bands
             (`lexsplat.captures.images.bands`). None keeps the image's size.
 
     Raises:
@@ -171,7 +171,7 @@ class PhotoRows:
 
 
 def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PhotoRows:
-    """An image as a source of rows, held in memory as decoded: three or four bytes per pixel.
+    """An image as a source of rows; the decoded pixels stay in memory, three or four bytes per pixel.
 
     Raises:
         CaptureError: As :func:`open_image`.
@@ -181,7 +181,7 @@ def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
 
 
 def read_bytes(path: Path) -> NDArray[np.uint8]:
-    """An image as ``[H, W, 3]`` bytes, composited on black: `read_image`, rounded.
+    """An image as ``[H, W, 3]`` uint8, composited on black: the values of `read_image`, rounded.
 
     Raises:
         CaptureError: As :func:`open_image`.
@@ -214,16 +214,16 @@ def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> ND
 
 
 def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
-    """A mask as ``[H, W]`` bool: true where the image is brighter than half.
+    """A mask as ``[H, W]`` bool: true where the image is brighter than half of its range.
 
-    In an image of values 0 and 1, 1 is true. Transparent pixels are false.
+    In an image with values 0 and 1 only, 1 is true. Transparent pixels are false.
 
     Args:
         path: The image.
-        nonzero: Every pixel that is not black is true, which is COLMAP's convention.
+        nonzero: COLMAP's convention: every pixel that is not black is true.
 
     Raises:
-        CaptureError: As :func:`open_image`, and for a mask that is dark but not black, such as an image of labels.
+        CaptureError: As :func:`open_image`, or if the mask is dark but not black, as images of labels are.
     """
     with open_image(path) as image:
         image.load()
@@ -239,13 +239,13 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     if highest <= 1:
         return values > 0.5
     half = 127 if highest <= 255 else 32767
-    # Slightly above black is JPEG noise. More is a mask in colors, such as palette labels.
+    # Values slightly above black are JPEG noise; larger ones indicate colors, such as palette labels.
     if half / 4 < highest <= half:
         raise CaptureError(
             path,
-            expected="a mask in black and white",
+            expected="a black-and-white mask",
             found=f"values up to {highest:g}: neither black nor brighter than half",
-            remedy="save it in black and white",
+            remedy="save it as black and white",
         )
     return values > half
 
@@ -268,14 +268,14 @@ def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[n
 
 
 def resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask ``[H, W]`` at another ``(width, height)``, by nearest pixel."""
+    """Resample a mask ``[H, W]`` to ``(width, height)`` by nearest neighbor."""
     rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
     columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
     return mask[rows[:, None], columns[None, :]]
 
 
 def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
-    """Whether one size is the other scaled uniformly, up to rounding of each side by less than a pixel."""
+    """Whether the sizes differ by a uniform scale, up to rounding of each side by less than one pixel."""
     low, high = 0.0, np.inf
     for a, b in zip(found, expected):
         low, high = max(low, (a - 1) / b), min(high, (a + 1) / b)

@@ -39,7 +39,7 @@ __all__ = [
 def field_from_tensors(
     tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
 ) -> TrainedField | CodeField:
-    """A stored field; the names of its tensors say which form it has.
+    """A stored field; the names of its tensors determine its form.
 
     Raises:
         ValueError: If the tensors are of neither form, do not fit each other, or hold NaN or infinity.

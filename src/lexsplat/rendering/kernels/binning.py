@@ -1,10 +1,10 @@
-"""The Gaussians that overlap each tile, nearest first.
+"""Lists the Gaussians that overlap each tile, nearest first.
 
 A pair is one Gaussian in one tile. Pairs are listed twice: by tile (for blending) and by Gaussian (for the sum of
 gradients); ``pairs`` maps the first list to the second.
 
-Only `find_boxes` rounds bounding boxes to integers, and counting and filling both read these integers: two
-floating-point computations of a span can differ by one pixel, which would write outside the list.
+Bounding boxes are rounded to integers once, in `find_boxes`, and both counting and filling use these integers. Two
+separate floating-point computations of a span could differ by one pixel and write outside the list.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lexsplat.rendering.kernels.jit import kernel
 TILE = 16
 """Width and height of a tile in pixels."""
 SLACK = 1e-3
-"""Pixels added to every side of a box, so that rounding never cuts off a contribution."""
+"""Margin of a box in pixels on each side, so that rounding never removes a contribution."""
 RADIX_BITS = 11
 
 # Columns of the table of ellipses: center, half conic, opacity (padded to 32 bytes).
@@ -31,10 +31,10 @@ TILE_FIRST, TILE_LAST, ROW_FIRST, ROW_LAST, BOX_FIELDS = 0, 1, 2, 3, 4
 
 @kernel
 def sort_visible(keys: NDArray[np.uint32], radii: I32, order: I32, scratch: I32) -> int:
-    """Indices of the visible Gaussians by depth, ties by index; returns how many (stable radix sort).
+    """Sort the indices of the visible Gaussians by depth, ties by index (stable radix sort); returns their number.
 
-    ``keys`` are the bits of the depths: those of positive floats sort like the floats. ``order`` and ``scratch``
-    have room for all Gaussians.
+    ``keys`` are the bit patterns of the depths: positive floats sort like their bits. ``order`` and ``scratch`` have
+    one element for each Gaussian.
     """
     size = 1 << RADIX_BITS
     count = 0
@@ -60,7 +60,7 @@ def sort_visible(keys: NDArray[np.uint32], radii: I32, order: I32, scratch: I32)
             target[histogram[digit, slot]] = n
             histogram[digit, slot] += 1
         source, target = target, source
-    # After three passes the result lies in scratch.
+    # After three passes, an odd number, the result is in scratch.
     order[:count] = scratch[:count]
     return count
 
@@ -80,7 +80,7 @@ def find_boxes(
     boxes: I32,
     counts: I64,
 ) -> None:
-    """Gather the ellipses in depth order and round their boxes, once, to tile columns and pixel rows."""
+    """Gather the ellipses in depth order and round their boxes to tile columns and pixel rows."""
     half = np.float32(0.5)
     for k in range(start, stop):
         n = order[k]
@@ -92,7 +92,7 @@ def find_boxes(
         ellipses[k, HALF_C] = half * conics[n, 2]
         ellipses[k, OPACITY] = opacities[n]
         reach_x, reach_y = extents[n, 0] + SLACK, extents[n, 1] + SLACK
-        # First and last pixel whose center (index + 0.5) is inside; clamped before the cast, so it always fits.
+        # First and last pixel whose center (index + 0.5) is inside; clamped before the cast to avoid overflow.
         left = math.ceil(min(max(x - reach_x - 0.5, 0.0), float(width)))
         right = math.floor(min(max(x + reach_x - 0.5, -1.0), float(width - 1)))
         top = math.ceil(min(max(y - reach_y - 0.5, 0.0), float(height)))
@@ -110,7 +110,7 @@ def find_boxes(
 
 @kernel
 def count_pairs(start: int, stop: int, boxes: I32, tiles_x: int, strips: int, histogram: I64) -> None:
-    """Pairs of every tile, for each strip of Gaussians on its own."""
+    """Count the pairs of every tile, separately for each strip of Gaussians."""
     total = boxes.shape[0]
     for strip in range(start, stop):
         for k in range(strip * total // strips, (strip + 1) * total // strips):
@@ -123,7 +123,7 @@ def count_pairs(start: int, stop: int, boxes: I32, tiles_x: int, strips: int, hi
 
 @kernel
 def offsets_of(histogram: I64, tile_offsets: I64) -> None:
-    """Turn the counts into the place of each tile's, and within it each strip's, first pair."""
+    """Replace the counts by the index of the first pair of each tile and, within it, of each strip."""
     strips, tiles = histogram.shape
     total = 0
     for tile in range(tiles):
@@ -147,7 +147,7 @@ def fill_pairs(
     members: I32,
     pairs: I32,
 ) -> None:
-    """List the pairs by tile; strips follow each other within a tile, so depth order is kept."""
+    """List the pairs by tile; strips are consecutive within a tile, which preserves depth order."""
     total = boxes.shape[0]
     for strip in range(start, stop):
         for k in range(strip * total // strips, (strip + 1) * total // strips):

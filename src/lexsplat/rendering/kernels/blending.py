@@ -1,7 +1,7 @@
-"""Front-to-back blending, tile by tile: the parts shared by the forward pass, its gradient and code weights.
+"""Front-to-back blending by tiles: the forward pass, and the functions shared with its gradient and code weights.
 
-A Gaussian is the outer loop and a row of sixteen pixels the inner step (see `lanes`). Per-tile arrays are flat:
-row j of the tile starts at 16 j, and row j of channel c of C at 16 (j C + c).
+The outer loop is over Gaussians, and the inner loop processes rows of sixteen pixels (see `lanes`). Per-tile arrays
+are flat: row j of the tile starts at 16 j, and row j of channel c of C at 16 (j C + c).
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from lexsplat.rendering.kernels.lanes import LANES, any_positive, load, select_g
 if TILE != LANES:
     raise RuntimeError(f"a row of a tile must be one vector: TILE {TILE}, LANES {LANES}")
 PIXELS = TILE * TILE
-# Literals in kernels are float32: a float64 literal would widen everything it touches.
+# Literals in kernels are float32: a float64 literal would promote every expression it appears in.
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 ALPHA_THRESHOLD = np.float32(1.0 / 255.0)
 ALPHA_MAX = np.float32(0.999)
 TRANSMITTANCE_MIN = np.float32(1e-4)
-"""A pixel is finished before the Gaussian that would reduce its transmittance to this value or below."""
+"""A pixel is finished when the next Gaussian would reduce its transmittance to this value or below."""
 CHECK_EVERY = 16
-"""Gaussians between two checks whether the whole tile is finished."""
+"""Number of Gaussians between two checks whether all pixels of the tile are finished."""
 
-# exp(-s) = P(-s / 8)^8 for 0 <= s <= 6, relative error 1e-6. Beyond s = ln 255 = 5.54 alpha is below its threshold.
+# exp(-s) = P(-s / 8)^8 for 0 <= s <= 6, relative error 1e-6. Beyond s = ln 255 = 5.54, alpha is below its threshold.
 EIGHTH = np.float32(-0.125)
 FARTHEST = np.float32(-6.0 / 8.0)
 E0, E1, E2, E3, E4, E5 = (
@@ -55,9 +55,9 @@ E0, E1, E2, E3, E4, E5 = (
 
 @kernel
 def start_tile(tile: int, tiles_x: int, width: int, height: int, live: F32) -> None:
-    """Transmittance of each pixel: 1 inside the image, 0 outside.
+    """Initialize the transmittance ``live`` of each pixel: 1 inside the image, 0 outside.
 
-    A finished pixel keeps its last transmittance with a minus sign.
+    A finished pixel stores its last transmittance with a minus sign.
     """
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     for j in range(TILE):
@@ -77,7 +77,7 @@ def tile_finished(live: F32) -> bool:
 
 @kernel
 def alpha_of(fixed: Any, slope: Any, dy: np.float32, opacity: np.float32) -> Any:
-    """Alpha along a row, where ``fixed + slope dy`` is -1/8 of the exponent; 0 below the threshold."""
+    """Alpha along a row; ``fixed + slope dy`` is -1/8 of the exponent. Values below the threshold become 0."""
     s = fixed + slope * dy
     s = select_greater(s, ZERO, ZERO, s)
     s = select_greater(s, FARTHEST, s, FARTHEST)
@@ -91,7 +91,7 @@ def alpha_of(fixed: Any, slope: Any, dy: np.float32, opacity: np.float32) -> Any
 
 @kernel
 def finish_pixels(before: Any, after: Any) -> Any:
-    """New ``live`` values: the transmittance after, or minus the one before where the pixel is finished."""
+    """New ``live`` values: the transmittance ``after``, or minus ``before`` where the pixel is finished."""
     minus = select_greater(before, ZERO, ZERO - before, before)
     return select_greater(after, TRANSMITTANCE_MIN, after, minus)
 
@@ -107,7 +107,7 @@ def pass_row(live: F32, j: int, row_alpha: Any) -> Any:
 
 @kernel
 def column_numbers() -> Any:
-    """0 to 15."""
+    """The vector 0 to 15."""
     ramp = np.empty(TILE, np.float32)
     for i in range(TILE):
         ramp[i] = i
@@ -116,11 +116,11 @@ def column_numbers() -> Any:
 
 @kernel
 def seen_from_tile(ellipses: F32, k: int, left: int, top: int, columns: Any) -> Any:
-    """Ellipse ``k`` in the tile whose corner is pixel (left, top), ready for `alpha_of`.
+    """The terms of ellipse ``k`` for `alpha_of` in the tile whose corner is pixel (left, top).
 
     Returns:
-        dx of the columns, vectors ``across`` and ``slope`` and a number ``down``, with which -1/8 of the exponent
-        is ``across + slope dy + down dy^2``; dy of row 0; opacity.
+        dx of the columns; vectors ``across`` and ``slope`` and a scalar ``down`` such that -1/8 of the exponent is
+        ``across + slope dy + down dy^2``; dy of row 0; the opacity.
     """
     dx = columns - (ellipses[k, CENTER_X] - np.float32(left) - HALF)
     dy = np.float32(top) + HALF - ellipses[k, CENTER_Y]
@@ -131,7 +131,7 @@ def seen_from_tile(ellipses: F32, k: int, left: int, top: int, columns: Any) -> 
 
 @kernel
 def rows_in_tile(boxes: I32, k: int, top: int) -> tuple[int, int]:
-    """First and one past the last row of the tile that box ``k`` covers."""
+    """First row of the tile that box ``k`` covers, and one past the last."""
     return max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)
 
 

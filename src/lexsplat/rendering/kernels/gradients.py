@@ -1,7 +1,8 @@
-"""The gradient of blending: one row of numbers per pair, then a sum over the pairs of each Gaussian.
+"""The gradient of blending: one row of values per pair, then a sum over the pairs of each Gaussian.
 
-Blending runs again from front to back. What everything behind a Gaussian contributes to the loss is the total,
-known from the image, less what has been passed; so nothing per pixel needs to be kept from the forward pass.
+Blending is recomputed from front to back. The contribution of everything behind a Gaussian to the loss is the total,
+which follows from the image, minus the contributions already passed. The forward pass therefore stores nothing per
+pixel.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ from lexsplat.rendering.kernels.lanes import (
 )
 
 GEOMETRY_FIELDS = 6
-"""Columns of a row before the channels: gradient by the exponent times 1, dx, dy, dx^2, dx dy, dy^2."""
+"""Columns of a row before the channels: gradient w.r.t. the exponent times 1, dx, dy, dx^2, dx dy, dy^2."""
 
 
 @kernel
 def row_width(channels: int) -> int:
-    """Numbers per pair: the moments and the channels, and always room for two vectors of four."""
+    """Values per pair: the moments and the channels, at least eight so that two vectors of four fit."""
     return max(GEOMETRY_FIELDS + channels, 8)
 
 
@@ -60,7 +61,7 @@ def _load_tile(
     upstream: F32,
     behind: F32,
 ) -> None:
-    """Gradients of the tile's pixels, and what the whole stack of Gaussians contributes to the loss."""
+    """Load the gradients of the tile's pixels, and the contribution of all Gaussians of each pixel to the loss."""
     height, width, channels = image.shape
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     if left + TILE > width or top + TILE > height:
@@ -79,9 +80,9 @@ def _load_tile(
 
 @kernel
 def _exponent_gradient(behind: F32, j: int, weight: Any, row_alpha: Any, dots: Any) -> Any:
-    """Gradient by the exponent along row ``j``; takes what the Gaussian contributes out of ``behind``.
+    """Gradient w.r.t. the exponent along row ``j``; subtracts the Gaussian's contribution from ``behind``.
 
-    ``dots`` is the Gaussian's color times the upstream gradient of each pixel.
+    ``dots`` is the dot product of the Gaussian's color and the upstream gradient of each pixel.
     """
     # d loss / d alpha = T dots - rest / (1 - alpha), and d alpha / d exponent = -alpha.
     share = weight * dots
@@ -98,7 +99,7 @@ def _feature_gradients(
 ) -> None:
     """Sum of weight times upstream gradient for the channels after the colors, four at a time.
 
-    The last group of four overlaps the one before it; fewer than four channels go one by one.
+    The last group of four overlaps the previous one; fewer than four channels are processed one by one.
     """
     channel = colors
     while channel < channels:
@@ -144,9 +145,9 @@ def blend_backward(
     """Gradients of every pair in tiles ``start`` to ``stop``, written to ``rows [M * row_width(C)]``.
 
     Args:
-        colors: 3 or 0. Only these first channels and alpha have a say in the geometry; the other channels give
-            gradients to their values alone.
-        geometry: Whether the geometry wants gradients at all.
+        colors: 3 or 0. Only these first channels and alpha contribute to the gradients of the geometry; the other
+            channels contribute to the gradients of their own values only.
+        geometry: Whether gradients of the geometry are required.
     """
     height, width, channels = image.shape
     live, weights = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
@@ -200,7 +201,7 @@ def blend_backward(
                 g1 += gradient * dy
                 g2 += gradient * (dy * dy)
             if touched:
-                # Without colors the two sums after the moments are zero and features overwrite them.
+                # Without colors, the two sums after the moments are zero and are overwritten by the features.
                 store_totals(rows, row, g0, g0 * dx, g1, g0 * dx * dx)
                 store_totals(rows, row + 4, g1 * dx, g2, r0, r1)
                 if colors == 3:
@@ -228,7 +229,7 @@ def sum_pairs(
     grad_colors: F32,
     grad_features: F32,
 ) -> None:
-    """Sum the rows of each Gaussian in a fixed order and turn moments into gradients."""
+    """Sum the rows of each Gaussian in a fixed order and convert the moments to gradients."""
     fields = row_width(colors + grad_features.shape[1])
     sums = np.empty(fields, np.float32)
     two = np.float32(2)
@@ -254,7 +255,7 @@ def sum_pairs(
 
 @kernel
 def gather(start: int, stop: int, order: I32, source: F32, column: int, values: F32) -> None:
-    """Rows of ``source`` in depth order into columns ``column`` and on of ``values``."""
+    """Copy the rows of ``source`` in depth order to the columns of ``values`` from ``column`` on."""
     for k in range(start, stop):
         n = order[k]
         for channel in range(source.shape[1]):

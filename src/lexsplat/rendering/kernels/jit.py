@@ -1,8 +1,8 @@
-"""How the kernels are compiled, announced and spread over threads.
+"""Compilation and caching of the kernels, the log message about it, and their execution on several threads.
 
-Kernels release the GIL and are driven by our own threads instead of Numba's ``prange``. They compile several
-times faster that way, need no threading layer (whose pitfalls are forked children and two callers at once), and
-several Python threads may render at the same time.
+Kernels release the GIL and run on a thread pool of this module instead of Numba's ``prange``. They compile several
+times faster this way, need no threading layer (which has problems with forked processes and concurrent callers), and
+several Python threads can render at the same time.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _announced = False
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function, without the GIL and with a cache on disk.
+    """Compile a function that releases the GIL, with a cache on disk.
 
-    Fast-math stays off: under its promise that there are no NaN, the outcome of a comparison with one is
-    undefined, and comparisons decide here where memory is written.
+    Fast-math stays off. It assumes that no value is NaN, which makes comparisons with NaN undefined, and comparisons
+    determine here where memory is written.
     """
-    # Numba takes the folder from its global settings when the cache is made; leave those as they were.
+    # Numba reads the folder from its global settings when it creates the cache; the settings are restored afterwards.
     before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     numba.config.CACHE_DIR = _cache_folder()  # type: ignore[attr-defined]
     try:
@@ -47,12 +47,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def _cache_folder() -> str:
-    """Where compiled kernels are kept, for exactly these sources and this compiler.
+    """Folder of the compiled kernels for exactly these sources and this version of Numba.
 
-    Numba looks only at the file of the function it compiles, and would keep kernels whose parts, written in
-    another file, have changed. Two versions of Numba would overwrite each other's; those of several processors and
-    versions of Python it keeps apart. The first folder that can be written is taken: that of the environment
-    variable NUMBA_CACHE_DIR, the package's, the user's, a temporary one.
+    Numba checks only the file of the compiled function, so its cache would keep kernels whose callees in other files
+    have changed. It separates processors and versions of Python, but not its own versions. The first writable folder
+    is used: the environment variable NUMBA_CACHE_DIR, or else the package's cache, then the user's, then a temporary
+    one.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     here = Path(__file__).parent
@@ -63,24 +63,21 @@ def _cache_folder() -> str:
     places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home) / "lexsplat"]
     for place in places:
         try:
-            # A user without a home is a RuntimeError.
+            # expanduser() raises RuntimeError if the user has no home directory.
             folder = place.expanduser() / f"kernels-{digest.hexdigest()[:12]}"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return str(folder)
         except (OSError, RuntimeError):
             continue
-    logger.info(
-        "no folder for compiled kernels can be written; set NUMBA_CACHE_DIR to keep them between runs"
-    )
+    logger.info("no writable folder for compiled kernels; set NUMBA_CACHE_DIR to keep them between runs")
     return tempfile.mkdtemp(prefix="lexsplat-kernels-")
 
 
 class _Announcer(event.Listener):
-    """Says once per process, before the first of our kernels is compiled, what the wait is for.
+    """Logs the reason for the delay once per process, before the first of this package's kernels is compiled.
 
-    Numba tells when it compiles, and does not when it finds a kernel in the cache: no guess at what is cached for
-    this processor and this version, nor at which kernels will be needed.
+    Numba triggers the event only for actual compilation, not for kernels found in the cache.
     """
 
     def on_start(self, event: Any) -> None:
@@ -105,18 +102,18 @@ def _forget_pool() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    # Threads do not survive a fork; a child starts its own.
+    # Threads do not survive a fork; the child process starts its own pool.
     os.register_at_fork(after_in_child=_forget_pool)
 
 
 def parallel(function: Callable[..., Any], count: int, grain: int, *arguments: Any) -> None:
-    """Run ``function(start, stop, *arguments)`` over ``range(count)`` on as many threads as torch uses.
+    """Run ``function(start, stop, *arguments)`` over ``range(count)`` on the number of threads that torch uses.
 
     Args:
         function: A kernel.
         count: Number of work items.
-        grain: Items handed out at a time; threads take the next piece when they are done.
-        *arguments: Passed through.
+        grain: Items per piece; a thread takes the next piece when it has finished one.
+        *arguments: Further arguments of ``function``.
     """
     global _pool
     if count <= 0:

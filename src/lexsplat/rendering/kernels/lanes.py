@@ -1,10 +1,10 @@
-"""Sixteen float32 numbers at once inside kernels: one row of a tile.
+"""Explicit vectors of sixteen float32 values in kernels: one row of a tile.
 
-Whether a compiler vectorises a loop depends on what it can prove about overlapping arrays, and one missed proof
-costs a factor of five. Here the vectors are written down: a kernel loads a row, computes with ``+ - * /`` and
-the functions below, and stores it. LLVM maps sixteen lanes to whatever the machine has (AVX-512, AVX2, NEON).
+A compiler vectorizes a loop only if it can prove that the arrays do not overlap, and one missed proof costs a factor
+of five. The vectors are therefore explicit: a kernel loads a row, computes with ``+ - * /`` and the functions below,
+and stores it. LLVM maps sixteen lanes to the instructions of the machine (AVX-512, AVX2, NEON).
 
-Everything in this file is for use inside kernels only.
+These functions can be called from kernels only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numba.extending import models, overload, register_model
 intrinsic: Any = extending.intrinsic  # its annotations describe the undecorated function
 LANES = 16
 _LLVM = ir.VectorType(ir.FloatType(), LANES)
-# a * b + c may be one fused instruction; nothing else is relaxed.
+# Allows a * b + c to become one fused instruction; no other fast-math flag is set.
 _FLAGS = ("contract",)
 
 
@@ -56,7 +56,7 @@ def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> 
 
 @intrinsic
 def load(typingctx: Any, array: Any, offset: Any) -> Any:
-    """Sixteen numbers of a flat float32 array from ``offset`` on."""
+    """Load sixteen values of a flat float32 array, starting at ``offset``."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         value = builder.load(_pointer(context, builder, signature.args[0], *args))
@@ -68,7 +68,7 @@ def load(typingctx: Any, array: Any, offset: Any) -> Any:
 
 @intrinsic
 def store(typingctx: Any, array: Any, offset: Any, value: Any) -> Any:
-    """Write sixteen numbers to a flat float32 array from ``offset`` on."""
+    """Write sixteen values to a flat float32 array, starting at ``offset``."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         where = _pointer(context, builder, signature.args[0], args[0], args[1])
@@ -125,7 +125,7 @@ for _symbol, _function in (
 
 @intrinsic
 def select_greater(typingctx: Any, left: Any, right: Any, yes: Any, no: Any) -> Any:
-    """In each lane ``yes`` where ``left > right``, else ``no`` (also where a number is NaN)."""
+    """Per lane, ``yes`` where ``left > right``, otherwise ``no`` (also if one of them is NaN)."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         left, right, yes, no = (_operand(builder, k, v) for k, v in zip(signature.args, args))
@@ -137,7 +137,7 @@ def select_greater(typingctx: Any, left: Any, right: Any, yes: Any, no: Any) -> 
 
 @intrinsic
 def any_positive(typingctx: Any, value: Any) -> Any:
-    """Whether a lane is greater than zero."""
+    """Whether any lane is greater than zero."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         mask = builder.fcmp_ordered(">", args[0], ir.Constant(_LLVM, [0.0] * LANES))
@@ -149,7 +149,7 @@ def any_positive(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def total(typingctx: Any, value: Any) -> Any:
-    """Sum of the lanes, always in the same order: halves onto each other."""
+    """Sum of the lanes in a fixed order: the upper half is added to the lower half until one lane remains."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         value, width = args[0], LANES
@@ -167,9 +167,9 @@ def total(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def store_totals(typingctx: Any, array: Any, offset: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Write the sums of the lanes of four vectors to a flat float32 array from ``offset`` on.
+    """Write the sums of the lanes of four vectors to a flat float32 array, starting at ``offset``.
 
-    Together they need half the steps of four times `total`: vectors are folded into each other.
+    Folding the vectors into each other takes half the steps of four calls of `total`.
     """
 
     def indices(*groups: range) -> Any:
@@ -178,7 +178,7 @@ def store_totals(typingctx: Any, array: Any, offset: Any, a: Any, b: Any, c: Any
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array, offset, *vectors = args
-        block = LANES  # lanes that still belong to one of the vectors
+        block = LANES  # lanes that belong to the same vector
         while len(vectors) > 1:
             half = block // 2
             starts = range(0, 2 * LANES, block)

@@ -1,6 +1,6 @@
 """Projection of 3D Gaussians to ellipses on the image (EWA splatting), forward and backward.
 
-Arithmetic is float64, which costs nothing here and preserves the determinant of thin Gaussians.
+Arithmetic is in float64, which preserves the determinant of thin Gaussians at no measurable cost.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from lexsplat.rendering.kernels.jit import kernel
 Triple = tuple[float, float, float]
 
 DILATION = 0.3
-"""Added to both variances of every ellipse, square pixels (gsplat's ``eps2d``)."""
+"""Added to both variances of every ellipse, in square pixels (gsplat's ``eps2d``)."""
 ALPHA_THRESHOLD = 1.0 / 255.0
 """Contributions below this are skipped."""
 CLAMP_MARGIN = 0.3
-"""The Jacobian is taken inside the field of view widened by this share of half its tangent."""
+"""The Jacobian is evaluated inside the field of view, widened on each side by this fraction of half its tangent."""
 
 # Fields of the camera vector after the rotation (0 to 8, row by row) and the translation (9 to 11).
 FX, FY, CX, CY, WIDTH, HEIGHT, NEAR = 12, 13, 14, 15, 16, 17, 18
@@ -27,7 +27,7 @@ FX, FY, CX, CY, WIDTH, HEIGHT, NEAR = 12, 13, 14, 15, 16, 17, 18
 
 @kernel
 def _rotation(quat: F32, index: int, matrix: F64) -> float:
-    """Rotation matrix of a quaternion; returns its length."""
+    """Write the rotation matrix of a quaternion to ``matrix``; returns the length of the quaternion."""
     w, x = np.float64(quat[index, 0]), np.float64(quat[index, 1])
     y, z = np.float64(quat[index, 2]), np.float64(quat[index, 3])
     length = math.sqrt(w * w + x * x + y * y + z * z)
@@ -61,7 +61,7 @@ def _to_camera(camera: F64, means: F32, n: int) -> Triple:
 
 @kernel
 def _find_axes(camera: F64, log_scales: F32, n: int, rotation: F64, scale: F64, axes: F64) -> None:
-    """Principal axes of the Gaussian in camera space: columns of R_camera R_gaussian S; writes S to ``scale``."""
+    """Principal axes of the Gaussian in camera space, the columns of R_camera R_gaussian S; writes S to ``scale``."""
     for j in range(3):
         scale[j] = math.exp(np.float64(log_scales[n, j]))
     for i in range(3):
@@ -80,7 +80,7 @@ def _clamped_slope(slope: float, focal: float, center: float, size: float) -> fl
 
 @kernel
 def _image_axis(row: int, focal: float, slope: float, axes: F64) -> Triple:
-    """A row of the Jacobian (0 is horizontal, 1 vertical; ``focal`` is over depth) times the principal axes."""
+    """A row of the Jacobian (0 horizontal, 1 vertical) times the principal axes; ``focal`` is divided by depth."""
     return (
         focal * (axes[3 * row] - slope * axes[6]),
         focal * (axes[3 * row + 1] - slope * axes[7]),
@@ -98,7 +98,7 @@ def _covariance(u: Triple, v: Triple) -> tuple[float, float, float, float, float
     a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
     b = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
     c = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    # |u x v|^2 is the determinant without the cancellation of ac - b^2.
+    # |u x v|^2 equals the determinant ac - b^2 without its cancellation.
     n0, n1, n2 = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
     sharp = n0 * n0 + n1 * n1 + n2 * n2
     return a, b, c, sharp, sharp + DILATION * (a + c) + DILATION * DILATION
@@ -168,7 +168,7 @@ def project(
 
 @kernel
 def _through_inverse(grad_conics: F32, n: int, a: float, b: float, c: float, det: float) -> Triple:
-    """Gradient by the covariance from that by its inverse: d conic = -conic d cov conic."""
+    """Gradient w.r.t. the covariance from the gradient w.r.t. its inverse: d conic = -conic d cov conic."""
     p, q, r = (c + DILATION) / det, -b / det, (a + DILATION) / det
     gp, gr = np.float64(grad_conics[n, 0]), np.float64(grad_conics[n, 2])
     gq = 0.5 * np.float64(grad_conics[n, 1])
@@ -179,7 +179,7 @@ def _through_inverse(grad_conics: F32, n: int, a: float, b: float, c: float, det
 
 @kernel
 def _along_axis(grad_square: float, grad_product: float, axis: Triple, other: Triple) -> Triple:
-    """Gradient by an image axis from those by its square and by its product with the other axis."""
+    """Gradient w.r.t. an image axis from those w.r.t. its square and its product with the other axis."""
     return (
         2.0 * grad_square * axis[0] + grad_product * other[0],
         2.0 * grad_square * axis[1] + grad_product * other[1],
@@ -191,7 +191,7 @@ def _along_axis(grad_square: float, grad_product: float, axis: Triple, other: Tr
 def _through_axes(
     camera: F64, scale: F64, axes: F64, grad_axes: F64, n: int, grad_log_scales: F32, grad_rotation: F64
 ) -> None:
-    """Gradients by the logarithms of the scales and by the rotation of the Gaussian from that by its axes."""
+    """Gradients w.r.t. the log scales and the rotation of the Gaussian from the gradient w.r.t. its axes."""
     for j in range(3):
         total = axes[j] * grad_axes[j] + axes[3 + j] * grad_axes[3 + j] + axes[6 + j] * grad_axes[6 + j]
         grad_log_scales[n, j] = total
@@ -204,7 +204,7 @@ def _through_axes(
 
 @kernel
 def _quaternion_gradient(quats: F32, n: int, length: float, g: F64, grad_quats: F32) -> None:
-    """Through the rotation matrix and the normalization of the quaternion."""
+    """Gradient w.r.t. the unnormalized quaternion from the gradient ``g`` w.r.t. its rotation matrix."""
     w, x, y, z = quats[n, 0] / length, quats[n, 1] / length, quats[n, 2] / length, quats[n, 3] / length
     gw = 2.0 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     gx = 2.0 * (-2.0 * x * (g[4] + g[8]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]))
@@ -237,9 +237,9 @@ def project_backward(
     grad_log_scales: F32,
     grad_opacity_logits: F32,
 ) -> None:
-    """Gradients of `project`. Gaussians that were not seen get zeros.
+    """Gradients of `project`; those of invisible Gaussians are zero.
 
-    ``grad_shaded [N, 3]`` is what their colors say about the means, and is added.
+    ``grad_shaded [N, 3]`` is the gradient w.r.t. the means through the colors; it is added to ``grad_means``.
     """
     rotation, axes, scale = np.empty(9), np.empty(9), np.empty(3)
     grad_axes, grad_rotation = np.empty(9), np.empty(9)
@@ -252,7 +252,7 @@ def project_backward(
         grad_opacity_logits[n] = np.float32(0)
         if radii[n] == 0:
             continue
-        # The forward pass again: cheaper than keeping its intermediate values.
+        # Recomputing the forward pass is cheaper than storing its intermediate values.
         tx, ty, tz = _to_camera(camera, means, n)
         length = _rotation(quats, n, rotation)
         _find_axes(camera, log_scales, n, rotation, scale, axes)
@@ -276,7 +276,7 @@ def project_backward(
             grad_opacity *= compensation
         grad_opacity_logits[n] = grad_opacity * sigmoid * (1.0 - sigmoid)
 
-        # Rows u, v of Jacobian times axes, then the Jacobian and the axes.
+        # Through rows u and v of Jacobian times axes to the Jacobian and the axes.
         gu0, gu1, gu2 = _along_axis(grad_a, grad_b, u, v)
         gv0, gv1, gv2 = _along_axis(grad_c, grad_b, v, u)
         grad_axes[0], grad_axes[1], grad_axes[2] = px * gu0, px * gu1, px * gu2
@@ -288,7 +288,7 @@ def project_backward(
         grad_slope_y = -py * (axes[6] * gv0 + axes[7] * gv1 + axes[8] * gv2)
         gtz = -(gu0 * u[0] + gu1 * u[1] + gu2 * u[2] + gv0 * v[0] + gv1 * v[1] + gv2 * v[2]) / tz
 
-        # The clamped slope is a constant; the unclamped one and the center are t / tz.
+        # A clamped slope is constant; an unclamped slope and the center depend on t / tz.
         if slope_x != tx / tz:
             grad_slope_x = 0.0
         if slope_y != ty / tz:

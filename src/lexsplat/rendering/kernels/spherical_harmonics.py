@@ -13,7 +13,7 @@ from lexsplat.rendering.kernels.jit import kernel
 
 @kernel
 def _basis(x: float, y: float, z: float, degree: int, b: F64) -> None:
-    """Values of the basis at a unit direction."""
+    """Evaluate the basis at a unit direction."""
     b[0] = 0.28209479177387814
     if degree < 1:
         return
@@ -52,7 +52,7 @@ def _basis(x: float, y: float, z: float, degree: int, b: F64) -> None:
 
 @kernel
 def _basis_gradient(x: float, y: float, z: float, degree: int, d: F64) -> None:
-    """Derivatives ``[25, 3]`` of `_basis` by x, y and z as written there (not yet along the sphere)."""
+    """Derivatives ``[25, 3]`` of `_basis` w.r.t. x, y and z, not projected to the tangent of the sphere."""
     d[:] = 0.0
     if degree < 1:
         return
@@ -137,7 +137,7 @@ def shade_backward(
     grad_sh0: F32,
     grad_shN: F32,
 ) -> None:
-    """Gradients of `shade`; a channel clamped at zero passes none."""
+    """Gradients of `shade`; the gradient of a channel clamped to zero is zero."""
     b = np.empty(25)
     d = np.empty((25, 3))
     count = (degree + 1) * (degree + 1)

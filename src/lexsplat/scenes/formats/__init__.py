@@ -1,1 +1,1 @@
-"""Files other programs read and write."""
+"""Reading and writing the file formats of other programs."""

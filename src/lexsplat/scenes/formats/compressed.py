@@ -1,9 +1,11 @@
-"""Compressed splat files, by the library GaussForge: SPZ, the compressed PLY of SuperSplat, ``.ksplat``.
+"""Compressed splat files: SPZ, the compressed PLY of SuperSplat, and ``.ksplat``, through the library GaussForge.
 
-GaussForge (Apache-2.0) carries Niantic's own SPZ code. It is an extra: ``pip install "lexsplat[formats]"``.
+GaussForge (Apache-2.0) includes Niantic's own SPZ code. It is an optional dependency:
+``pip install "lexsplat[formats]"``.
 
-SPZ has y up and z backwards where PLY has y down and z forwards, half a turn about x. GaussForge 0.6 copies the
-numbers without that turn, so we make it here; splat-transform then agrees (tools/check_exports.py).
+SPZ uses y up and z backward; PLY uses y down and z forward. The two differ by a rotation of 180 degrees about x.
+GaussForge 0.6 omits this rotation, so it is applied here. splat-transform agrees with the result
+(tools/check_exports.py).
 """
 
 from __future__ import annotations
@@ -22,25 +24,25 @@ from lexsplat.scenes.transforms import transformed
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
 COMPRESSED = {".spz": "spz", ".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
-"""Endings of file names and what GaussForge calls the formats."""
+"""GaussForge's name of each format, by file suffix."""
 
 
 def write_compressed(gaussians: Gaussians, path: Path, kind: str) -> None:
-    """Write one of `COMPRESSED`; the order of the Gaussians may change.
+    """Write a file of one of the formats in `COMPRESSED`; the order of the Gaussians may change.
 
     Raises:
         BackendError: If GaussForge is not installed.
-        FileFormatError: If it cannot write the file.
+        FileFormatError: If GaussForge cannot convert the Gaussians.
     """
     path.write_bytes(_converted(gaussians, path, kind))
 
 
 def read_compressed(path: Path, kind: str) -> Gaussians:
-    """Read one of `COMPRESSED`.
+    """Read a file of one of the formats in `COMPRESSED`.
 
     Raises:
         BackendError: If GaussForge is not installed.
-        FileFormatError: If the file is damaged or of another format.
+        FileFormatError: If the file is damaged or has another format.
     """
     library = _library(path)
     try:
@@ -49,7 +51,7 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
         raise FileFormatError(path, expected=f"a readable {kind} file", found=str(error.strerror)) from error
     try:
         answer = library.convert(content, kind, "ply")
-    except Exception as error:  # whatever the C++ side throws, the file is at fault
+    except Exception as error:  # GaussForge documents no exception types; the cause is always the file
         raise FileFormatError(path, expected=f"a {kind} file", found=str(error)) from error
     if "data" not in answer:
         raise FileFormatError(path, expected=f"a {kind} file", found=str(answer.get("error")))
@@ -58,7 +60,7 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
         plain.write_bytes(answer["data"])
         try:
             gaussians = read_ply(plain, certain_opacities=True)
-        except FileFormatError as error:  # what it says of the file in between is of no use to anybody
+        except FileFormatError as error:  # its text concerns the temporary file, not the user's
             raise FileFormatError(path, expected=f"a {kind} file", found="damaged content") from error
     return transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians
 
@@ -81,7 +83,7 @@ def _library(path: Path) -> Any:
         raise BackendError(
             path,
             expected="the library gaussforge",
-            found="it is not installed",
+            found="not installed",
             remedy='pip install "lexsplat[formats]"',
         ) from error
     return gaussforge.GaussForge()

@@ -1,11 +1,11 @@
-"""Binary glTF with ``KHR_gaussian_splatting``, the splats of the Khronos Group.
+"""Binary glTF with ``KHR_gaussian_splatting``, the Khronos Group's extension for Gaussian splats.
 
-Activated values go out, as the extension wants them: scales and opacities, and rotations as xyzw. Language is
-in application attributes (their names begin with an underscore, and viewers pass over them); its codebook is an
-accessor that ``extras.lexsplat`` of the primitive names.
+The extension requires activated values: scales and opacities, and rotations in xyzw order. Language is stored in
+application attributes, whose names begin with an underscore and which viewers ignore. The codebook is an accessor;
+``extras.lexsplat`` of the primitive contains its index.
 
-A glTF viewer has y up and meters. The data keep the scene's axes and units; the node turns them, and scales them
-where the scale is known (``lexsplat scale``).
+glTF defines y as up and the meter as the unit. The vertex data keep the scene's axes and units; the node rotates
+them, and scales them if the scale is known (``lexsplat scale``).
 """
 
 from __future__ import annotations
@@ -38,20 +38,21 @@ def write_glb(
     """Write a ``.glb`` with one splat primitive.
 
     Args:
-        gaussians: What to write; spherical harmonics beyond degree 3 are left out, as the extension ends there.
+        gaussians: Gaussians to write. Spherical harmonics beyond degree 3, the extension's limit, are dropped.
         path: The file.
-        language: Codes and codebook to write along.
-        world: Up and scale of the scene; z is up and a unit a meter when left out.
+        language: Codes and codebook to include.
+        world: Up direction and scale of the scene; by default, z is up and the unit is the meter.
 
     Raises:
-        ValueError: If there is no Gaussian, a value is not finite, or the language does not fit.
+        ValueError: If there are no Gaussians, a value is NaN or infinite, or the language has another number of
+            Gaussians.
     """
     g = gaussians.detach().to("cpu")
     check_language(g, language)
     if len(g) == 0:
-        raise ValueError("a glTF needs at least one Gaussian")
+        raise ValueError("glTF requires at least one Gaussian")
     if not all(bool(torch.isfinite(tensor).all()) for tensor in g.tensors().values()):
-        raise ValueError("a Gaussian has a value that is not finite")
+        raise ValueError("the Gaussians contain NaN or infinity")
     buffer = _Buffer()
     primitive: dict[str, Any] = {
         "attributes": _splat_attributes(g, buffer),
@@ -88,7 +89,7 @@ def write_glb(
 
 
 def _splat_attributes(g: Gaussians, buffer: _Buffer) -> dict[str, int]:
-    """The attributes of ``KHR_gaussian_splatting``: accessors by name, their values put into the buffer."""
+    """The attributes of ``KHR_gaussian_splatting``: accessor indices by name, values in the buffer."""
     color = torch.cat([g.sh0[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], 1).clamp(0, 1)
     attributes = {
         "POSITION": buffer.add(g.means, bounds=True),
@@ -108,7 +109,7 @@ def _splat_attributes(g: Gaussians, buffer: _Buffer) -> dict[str, int]:
 
 
 def _language_attributes(language: StoredLanguage, buffer: _Buffer) -> tuple[dict[str, int], dict[str, Any]]:
-    """The application attributes of the language, and what ``extras.lexsplat`` says of them."""
+    """The application attributes of the language and their description for ``extras.lexsplat``."""
     attributes = {
         "_LANGUAGE_CODES": buffer.add(language.codes),
         "_LANGUAGE_WEIGHTS": buffer.add(language.weights),
@@ -122,7 +123,7 @@ def _language_attributes(language: StoredLanguage, buffer: _Buffer) -> tuple[dic
 
 
 def _node(world: World | None) -> dict[str, Any]:
-    """The node that turns the scene upright, and scales it to meters where they are known."""
+    """The node that rotates the scene upright, and scales it to meters if the scale is known."""
     up = np.array([0.0, 0.0, 1.0]) if world is None else world.up.direction
     node: dict[str, Any] = {"mesh": 0, "rotation": _upright(up)}
     if world is not None and world.meters_per_unit is not None:
@@ -131,7 +132,7 @@ def _node(world: World | None) -> dict[str, Any]:
 
 
 class _Buffer:
-    """The binary part of a glTF and the descriptions of what lies in it."""
+    """The binary chunk of a glTF file with its buffer views and accessors."""
 
     def __init__(self) -> None:
         self.chunks: list[bytes] = []
@@ -142,7 +143,7 @@ class _Buffer:
     def add(
         self, values: torch.Tensor, *, normalized: bool = False, bounds: bool = False, vertices: bool = True
     ) -> int:
-        """Append ``[N, 1 | 3 | 4]`` float32 or ``[N, 4]`` uint8; returns the number of its accessor."""
+        """Append ``[N, 1 | 3 | 4]`` float32 or ``[N, 4]`` uint8; returns the index of its accessor."""
         array = np.ascontiguousarray(values.numpy())
         content = array.astype(np.uint8 if array.dtype == np.uint8 else "<f4").tobytes()
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": len(content)}
@@ -167,7 +168,7 @@ class _Buffer:
 
 
 def _upright(up: NDArray[np.float64]) -> list[float]:
-    """The shortest rotation (xyzw) that turns ``up`` to +y."""
+    """The shortest rotation (xyzw) that maps ``up`` to +y."""
     direction = np.asarray(up, float) / np.linalg.norm(up)
     target = np.array([0.0, 1.0, 0.0])
     if direction @ target < -1 + 1e-9:

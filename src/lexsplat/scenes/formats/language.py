@@ -1,7 +1,7 @@
-"""Language in files of other programs: a few codes for each Gaussian, and the codebook they point into.
+"""Language in exported files: a few codes per Gaussian and the codebook that they index.
 
-Whoever has both can search without lexsplat: with the text's cosines r_k to the codewords, the score of a
-Gaussian is the sum of weight times r_code (docs/formats.md).
+The two suffice to search without lexsplat. Given the cosine similarities r_k of a text to the codewords, the score
+of a Gaussian is the sum of weight times r_code over its codes (docs/formats.md).
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from lexsplat.language.fields import LanguageField
 from lexsplat.runtime.files import save_tensors
 
 CODES = 4
-"""Codes of each Gaussian that go into files."""
+"""Number of codes stored per Gaussian."""
 
 
 @dataclass(frozen=True)
 class StoredLanguage:
-    """What a file says about the language of Gaussians.
+    """The language of Gaussians as stored in a file.
 
     Args:
-        codes: Indices into the codebook ``[N, 4]`` uint8, the likeliest first.
-        weights: Their probabilities ``[N, 4]`` in 0..1; what is missing to 1 belongs to other codes.
+        codes: Indices into the codebook ``[N, 4]`` uint8, the most probable first.
+        weights: Their probabilities ``[N, 4]`` in 0..1; the remainder to 1 belongs to other codes.
         uncertainties: u ``[N]`` in 0..1.
         codewords: CLIP part of the codebook ``[K, D]``.
-        encoder: The encoder of the texts: its name and content hash.
+        encoder: Name and content hash of the text encoder.
     """
 
     codes: Tensor
@@ -40,7 +40,7 @@ class StoredLanguage:
     encoder: Mapping[str, str]
 
     def select(self, index: Tensor) -> StoredLanguage:
-        """The rows of some Gaussians."""
+        """The rows of the given Gaussians; the codebook is shared."""
         return StoredLanguage(
             self.codes[index], self.weights[index], self.uncertainties[index], self.codewords, self.encoder
         )
@@ -48,7 +48,7 @@ class StoredLanguage:
 
 @torch.no_grad()
 def stored_language(field: LanguageField, encoder: Mapping[str, str], rows: int = 1 << 16) -> StoredLanguage:
-    """The likeliest `CODES` codes of every Gaussian, on the CPU."""
+    """The `CODES` most probable codes of every Gaussian, on the CPU, computed in blocks of ``rows`` Gaussians."""
     index = torch.arange(len(field.uncertainties), device=field.uncertainties.device)
     codes, weights = [], []
     for block in index.split(rows):
@@ -69,33 +69,33 @@ def stored_language(field: LanguageField, encoder: Mapping[str, str], rows: int 
 
 
 def ply_columns(language: StoredLanguage) -> dict[str, Tensor]:
-    """Further PLY properties by name, ``[N]`` each: ``lang_code_i`` uchar, ``lang_weight_i`` and ``lang_u`` float."""
+    """Additional PLY properties ``[N]`` by name: ``lang_code_i`` uchar, ``lang_weight_i`` and ``lang_u`` float."""
     columns = {f"lang_code_{i}": language.codes[:, i] for i in range(CODES)}
     columns |= {f"lang_weight_{i}": language.weights[:, i] for i in range(CODES)}
     return columns | {"lang_u": language.uncertainties}
 
 
 def codebook_path(path: Path) -> Path:
-    """Where the codebook of an exported file goes: ``NAME.codebook.safetensors`` beside it."""
+    """Path of the codebook of an exported file: ``NAME.codebook.safetensors`` in the same folder."""
     return path.with_name(path.name.removesuffix(path.suffix) + ".codebook.safetensors")
 
 
 def write_codebook(language: StoredLanguage, path: Path) -> None:
-    """Write ``codewords`` ``[K, D]`` as safetensors, with the encoder's name and hash as metadata."""
+    """Write ``codewords`` ``[K, D]`` as safetensors, with the encoder's name and content hash as metadata."""
     save_tensors({"codewords": language.codewords.contiguous()}, path, language.encoder)
 
 
 def write_field(field: LanguageField, metadata: Mapping[str, str], path: Path) -> None:
-    """Write a whole language field as safetensors, as scene folders hold it, with further metadata."""
+    """Write a complete language field as safetensors, in the layout of scene folders, with additional metadata."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in field.tensors().items()}
     save_tensors(tensors, path, {**field.metadata(), **metadata})
 
 
 def check_language(gaussians: Gaussians, language: StoredLanguage | None) -> None:
-    """Refuse language of another number of Gaussians.
+    """Check that the language belongs to the Gaussians.
 
     Raises:
-        ValueError: If the numbers differ.
+        ValueError: If the numbers of Gaussians differ.
     """
     if language is not None and len(language.codes) != len(gaussians):
-        raise ValueError(f"language of {len(language.codes)} Gaussians does not fit {len(gaussians)}")
+        raise ValueError(f"language for {len(gaussians)} Gaussians expected, got {len(language.codes)}")

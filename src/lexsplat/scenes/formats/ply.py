@@ -1,7 +1,7 @@
-"""The PLY of 3D Gaussian Splatting: binary little endian, one float32 property per number.
+"""The PLY of 3D Gaussian Splatting: binary little endian, one float32 property per value.
 
-One schema (`_properties`) serves writing and reading. Reading goes by property *names*, so files whose
-columns stand in another order, or that carry further properties, are read rightly.
+The writer uses the column order of `_properties`. The reader looks properties up by *name*, so the columns may be in
+any order and additional properties are ignored.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _REQUIRED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
 
 
 def _properties(num_rest: int) -> list[str]:
-    """Names of the columns in the order of the original 3DGS writer; ``num_rest`` counts ``f_rest_*``."""
+    """Names of the columns in the order of the original 3DGS writer; ``num_rest`` is the number of ``f_rest_*``."""
     return [
         *("x", "y", "z", "nx", "ny", "nz"),
         *(f"f_dc_{i}" for i in range(3)),
@@ -41,18 +41,17 @@ def _properties(num_rest: int) -> list[str]:
 def write_ply(gaussians: Gaussians, path: Path, *, further: Mapping[str, torch.Tensor] | None = None) -> None:
     """Write the standard 3DGS PLY, readable by every splat viewer.
 
-    Stored (not activated) values go out: log scales and opacity logits. ``f_rest`` is channel-major as in the
+    Values are written before activation: log scales and opacity logits. ``f_rest`` is channel-major as in the
     original files: all red coefficients, then green, then blue.
 
     Args:
-        gaussians: What to write; on any device.
-        path: The file; overwritten. Writing it whole or not at all is the caller's affair
-            (`lexsplat.runtime.files.atomic_path`).
-        further: Properties of our own by name, ``[N]`` each, uint8 or float, after the standard ones: readers go by
-            name and pass over them.
+        gaussians: Gaussians to write, on any device.
+        path: The file; overwritten. The write is not atomic (see `lexsplat.runtime.files.atomic_path`).
+        further: Additional properties by name, ``[N]`` each, uint8 or float, written after the standard ones. Other
+            readers ignore them.
 
     Raises:
-        ValueError: If a value is not finite: such a file would fail in other programs without a word.
+        ValueError: If a value is NaN or infinite; other programs fail on such files without an error message.
     """
     g = gaussians.detach().to("cpu")
     rest = g.shN.transpose(1, 2).flatten(1)
@@ -63,7 +62,7 @@ def write_ply(gaussians: Gaussians, path: Path, *, further: Mapping[str, torch.T
     table = torch.cat(columns, dim=1).numpy().astype("<f4")
     bad = ~np.isfinite(table).all(axis=1)
     if bad.any():
-        raise ValueError(f"{int(bad.sum())} of {len(g)} Gaussians have a value that is not finite")
+        raise ValueError(f"{int(bad.sum())} of {len(g)} Gaussians contain NaN or infinity")
     names = _properties(rest.shape[1])
     header = ["ply", "format binary_little_endian 1.0"]
     if g.antialiased:
@@ -90,11 +89,10 @@ def read_ply(path: Path, *, certain_opacities: bool = False) -> Gaussians:
 
     Args:
         path: A binary little-endian PLY with the properties of 3DGS.
-        certain_opacities: Take an infinite opacity logit as opacity 0 or 1 instead of refusing it: some programs
-            write that.
+        certain_opacities: Accept infinite opacity logits, which some programs write, as opacities 0 and 1.
 
     Raises:
-        FileFormatError: If it is not such a file, is truncated, or holds numbers that are not finite.
+        FileFormatError: If the file is not a PLY of 3D Gaussians, is truncated, or contains NaN or infinity.
     """
     try:
         with open(path, "rb") as file:
@@ -105,7 +103,7 @@ def read_ply(path: Path, *, certain_opacities: bool = False) -> Gaussians:
                     path,
                     expected=f"{count} Gaussians of {dtype.itemsize} bytes",
                     found=f"{available} bytes of data",
-                    remedy="the file is truncated: copy or make it again",
+                    remedy="the file is truncated: copy it again or regenerate it",
                 )
             table = np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype)
     except OSError as error:
@@ -121,7 +119,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype, bool]:
         consumed += len(raw)
         if not raw.endswith(b"\n") or consumed > _MAX_HEADER_BYTES or (not lines and raw.strip() != b"ply"):
             raise FileFormatError(
-                path, expected="a PLY header", found=repr(raw[:20]), remedy="give a .ply of 3D Gaussians"
+                path, expected="a PLY header", found=repr(raw[:20]), remedy="use a .ply of 3D Gaussians"
             )
         lines.append(raw.decode("ascii", "replace").strip())
     if "format binary_little_endian 1.0" not in lines:
@@ -144,7 +142,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype, bool]:
     names = [name for name, _ in columns]
     missing = [name for name in (*_REQUIRED, "f_dc_0", "f_dc_1", "f_dc_2") if name not in names]
     if missing or len(set(names)) != len(names):
-        found = f"no {', '.join(missing)}" if missing else "a property twice"
+        found = f"no {', '.join(missing)}" if missing else "a duplicate property"
         raise FileFormatError(path, expected="the properties of 3D Gaussians", found=found)
     return int(elements[0][2]), np.dtype(columns), "comment antialiased 1" in lines
 
@@ -161,7 +159,7 @@ def _gaussians_from_table(
     num_rest = sum(1 for name in table.dtype.names or () if name.startswith("f_rest_"))
     complete = all(f"f_rest_{i}" in (table.dtype.names or ()) for i in range(num_rest))
     if num_rest not in (0, 9, 24, 45, 72) or not complete:
-        found = str(num_rest) if complete else "gaps in their numbers"
+        found = str(num_rest) if complete else "gaps in their numbering"
         raise FileFormatError(path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found)
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
     gaussians = Gaussians(
@@ -174,8 +172,8 @@ def _gaussians_from_table(
         antialiased=antialiased,
     )
     if certain_opacities:
-        gaussians.opacity_logits.clamp_(-20.0, 20.0)  # keeps NaN, which the check below finds
+        gaussians.opacity_logits.clamp_(-20.0, 20.0)  # NaN stays NaN and is reported below
     damage = gaussians.find_invalid()
     if damage:
-        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="make it again")
+        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="regenerate the file")
     return gaussians

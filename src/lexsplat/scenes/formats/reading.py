@@ -1,4 +1,4 @@
-"""Splats made by other programs, whatever their format."""
+"""Reading splat files of other programs, in any supported format."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lexsplat.scenes.formats.splat import read_splat
 
 
 def read_splats(path: Path) -> Gaussians:
-    """Read ``.ply``, ``.splat``, ``.spz``, ``.compressed.ply`` or ``.ksplat``, by the ending of the name.
+    """Read ``.ply``, ``.splat``, ``.spz``, ``.compressed.ply`` or ``.ksplat``, chosen by suffix.
 
     Raises:
-        FileFormatError: If the ending is none of these or the content is not what it promises.
-        BackendError: If the format needs a library that is not installed.
+        FileFormatError: If the suffix is unknown or the content does not match it.
+        BackendError: If the format requires a library that is not installed.
     """
     refuse_pickle(path)
     name = path.name.lower()
@@ -38,9 +38,9 @@ def read_splats(path: Path) -> Gaussians:
 
 
 def _is_compressed(path: Path) -> bool:
-    """Whether a PLY is SuperSplat's compressed kind, whatever its name: it has chunks before its vertices."""
+    """Whether a PLY has SuperSplat's compressed layout, which has a chunk element before the vertices."""
     try:
         with open(path, "rb") as file:
             return b"element chunk" in file.read(4096).split(b"end_header")[0]
     except OSError:
-        return False  # the reader says what is wrong
+        return False  # the reader reports the error

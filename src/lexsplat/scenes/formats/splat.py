@@ -1,8 +1,8 @@
-"""The ``.splat`` format of the web viewers: 32 bytes a Gaussian, no header, no spherical harmonics.
+"""The ``.splat`` format of the web viewers: 32 bytes per Gaussian, no header, no spherical harmonics.
 
-Position and standard deviations as float32, color and opacity as bytes, rotation (wxyz) as bytes around 128.
-gsplat has a writer too; it changes the order of the Gaussians and rounds colors down, so labels by index would
-no longer fit the file. The tests hold that both agree in everything else.
+Positions and standard deviations are float32, color and opacity are bytes, and the rotation (wxyz) is stored as bytes
+with offset 128. gsplat's writer is not used because it reorders the Gaussians, which invalidates labels by index, and
+rounds colors down. The tests check that both agree in everything else.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), 
 
 
 def write_splat(gaussians: Gaussians, path: Path) -> None:
-    """Write a ``.splat`` file; the order of the Gaussians stays.
+    """Write a ``.splat`` file; the order of the Gaussians is preserved.
 
     Raises:
-        ValueError: If a value is not finite.
+        ValueError: If a value is NaN or infinite.
     """
     g = gaussians.detach().to("cpu")
     if not all(bool(torch.isfinite(tensor).all()) for tensor in g.tensors().values()):
-        raise ValueError("a Gaussian has a value that is not finite")
+        raise ValueError("the Gaussians contain NaN or infinity")
     colors = torch.cat([g.sh0[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], dim=1)
     quats = torch.nn.functional.normalize(g.quats, dim=1)
     table = np.zeros(len(g), dtype=_LAYOUT)
@@ -39,10 +39,11 @@ def write_splat(gaussians: Gaussians, path: Path) -> None:
 def read_splat(path: Path) -> Gaussians:
     """Read a ``.splat`` file.
 
-    Opacities of 0 and 255 become those of a quarter of a step inside, as a logit has no end.
+    Opacity bytes 0 and 255 are read as 0.25 and 254.75, because the logits of opacities 0 and 1 are infinite.
 
     Raises:
-        FileFormatError: If its size does not fit, or it holds numbers that are not finite or not positive.
+        FileFormatError: If the file size is not a multiple of 32 bytes, a position or size is NaN or infinite, or a
+            size is negative.
     """
     try:
         content = path.read_bytes()
@@ -55,7 +56,9 @@ def read_splat(path: Path) -> Gaussians:
     table = np.frombuffer(content, dtype=_LAYOUT)
     means, scales = (torch.from_numpy(table[name].astype(np.float32)) for name in ("mean", "scale"))
     if not (torch.isfinite(means).all() and torch.isfinite(scales).all() and (scales >= 0).all()):
-        raise FileFormatError(path, expected="finite positions and sizes", found="others: not a .splat file")
+        raise FileFormatError(
+            path, expected="finite positions and sizes", found="other values: not a .splat file"
+        )
     rgba = torch.from_numpy(table["rgba"].astype(np.float32)) / 255
     quats = (torch.from_numpy(table["quat"].astype(np.float32)) - 128) / 128
     quats[quats.norm(dim=1) < 1e-3] = torch.tensor([1.0, 0, 0, 0])
@@ -69,5 +72,5 @@ def read_splat(path: Path) -> Gaussians:
     )
     damage = gaussians.find_invalid()
     if damage:
-        raise FileFormatError(path, expected="positions and sizes of a scene", found=damage)
+        raise FileFormatError(path, expected="valid Gaussians", found=damage)
     return gaussians

@@ -1,4 +1,4 @@
-"""Labels and point clouds: tables that spreadsheets, CloudCompare and scripts read."""
+"""Labels and point clouds as tables for spreadsheets, CloudCompare and scripts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lexsplat.geometry.gaussians import SH_C0, Gaussians
 
 
 def colors_of(gaussians: Gaussians) -> Tensor:
-    """Color of every Gaussian seen from nowhere in particular: ``[N, 3]`` uint8."""
+    """View-independent color of every Gaussian (spherical harmonics of degree 0): ``[N, 3]`` uint8."""
     rgb = gaussians.sh0[:, 0].detach() * SH_C0 + 0.5
     return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
@@ -22,13 +22,13 @@ def colors_of(gaussians: Gaussians) -> Tensor:
 def write_labels_csv(
     gaussians: Gaussians, labels: Tensor, scores: Tensor, names: Sequence[str], path: Path
 ) -> None:
-    """One line for each Gaussian: index, x, y, z, red, green, blue, opacity, label, score.
+    """Write one row per Gaussian: index, x, y, z, red, green, blue, opacity, label, score.
 
     Args:
         gaussians: The scene.
-        labels: Number of its label in ``names``, -1 for none ``[N]``.
-        scores: Score of its best label ``[N]``.
-        names: What the labels are called.
+        labels: Index of each Gaussian's label in ``names``, -1 if it has none ``[N]``.
+        scores: Score of each Gaussian's best label ``[N]``.
+        names: Names of the labels.
         path: The file.
     """
     means = gaussians.means.detach().cpu().numpy()
@@ -46,7 +46,7 @@ def write_labels_csv(
 
 
 def write_points_ply(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.1) -> int:
-    """A plain colored point cloud (x, y, z, red, green, blue): one point for each Gaussian that shows.
+    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of at least ``min_opacity``.
 
     Returns:
         Number of points.
