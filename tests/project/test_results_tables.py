@@ -114,13 +114,12 @@ def test_the_page_has_its_sections_in_order_and_the_conditions_once(comparison):
             "benchmark_render",
         ),
     }  # fmt: skip
-    text = tables.page(records, "Handles are hard.\n")
+    text = tables.tables(records)
     assert [line[3:] for line in lines_of(text, "## ")] == [
-        "Methods", "By kind of prompt", "Ablation (the paper's Table 2)", "Speed and memory", "What falls short",
+        "Methods", "By kind of prompt", "Ablation (the paper's Table 2)", "Speed and memory",
     ]  # fmt: skip
     assert text.count("abc123") == 1
     assert text.count("a chip") == 1
-    assert text.endswith("Handles are hard.\n")
     (head,) = lines_of(text, "|  | demo: mIoU")
     assert head.index("demo: mIoU") < head.index("second scene: mIoU"), "scenes in the order of the page"
     default = lines_of(text, "| averaged (default) |")[0]
@@ -143,12 +142,12 @@ def test_files_of_several_commits_are_refused_unless_allowed(comparison):
         "second_compare": tables.stored_record({**comparison, "commit": "def456"}, "second_compare"),
     }
     with pytest.raises(tables.ResultsError, match="demo_compare of abc123, second_compare of def456"):
-        tables.page(records, "")
-    text = tables.page(records, "", allow_mixed=True)
+        tables.tables(records)
+    text = tables.tables(records, allow_mixed=True)
     assert "several commits" in text
     assert {"abc123", "def456"} <= set(text.split())
     with pytest.raises(tables.ResultsError, match="no result files"):
-        tables.page({}, "")
+        tables.tables({})
 
 
 def test_a_single_evaluation_has_its_prompts_by_kind(tmp_path):
@@ -156,13 +155,13 @@ def test_a_single_evaluation_has_its_prompts_by_kind(tmp_path):
     content = result(0.6)
     content["config"]["ground_truth"] = {"folder": str(tmp_path / "segmentations")}
     record = tables.stored_record(content, "demo_evaluate")
-    text = tables.page({"demo_evaluate": record}, "")
+    text = tables.tables({"demo_evaluate": record})
     assert "| demo: kind (prompts) | averaged (default) |" in text
     assert "| name (1) | 0.600 |" in text
 
 
 def test_the_script_adds_files_and_writes_the_page(comparison, tmp_path, monkeypatch, capsys):
-    source, results, notes = tmp_path / "comparison.json", tmp_path / "results", tmp_path / "notes.md"
+    source, results = tmp_path / "comparison.json", tmp_path / "results"
     source.write_text(json.dumps(comparison))
 
     def run(*arguments):
@@ -171,12 +170,16 @@ def test_the_script_adds_files_and_writes_the_page(comparison, tmp_path, monkeyp
 
     run("--add", source, "--name", "demo_compare")
     output = tmp_path / "results.md"
-    with pytest.raises(SystemExit, match="What falls short"):
-        run("--notes", notes, "--output", output)
+    with pytest.raises(SystemExit, match="expected the line"):
+        run("--output", output)
     assert not output.exists()
-    notes.write_text("Nothing.")
-    run("--notes", notes, "--output", output)
-    assert output.read_text(encoding="utf-8").startswith("# Results\n")
+    output.write_text(f"# Results\n\n{tables.BEGIN}\nold\n{tables.END}\n\nBy hand.\n")
+    for _ in range(2):
+        run("--output", output)
+        text = output.read_text(encoding="utf-8")
+        assert text.startswith(f"# Results\n\n{tables.BEGIN}\n")
+        assert "\nold\n" not in text
+        assert text.endswith(f"{tables.END}\n\nBy hand.\n")
     with pytest.raises(SystemExit):
         run("--add", source)
     assert "--name" in capsys.readouterr().err

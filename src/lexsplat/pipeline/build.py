@@ -45,9 +45,9 @@ STAGES = ("reconstruct", "features", "codebook", "language")
 
 
 def build(
-    source: Path,
-    output: Path,
-    config: BuildConfig,
+    source: str | Path,
+    output: str | Path,
+    config: BuildConfig | None = None,
     *,
     until: str = "language",
     test_names: list[str] | None = None,
@@ -59,7 +59,7 @@ def build(
     Args:
         source: Folder with photos and cameras (COLMAP or ``transforms.json``) or with photos alone, or a video.
         output: Scene folder to make or to resume.
-        config: Settings; open ones are chosen to suit the device.
+        config: Settings; open ones are chosen to suit the device. None takes the defaults.
         until: Last stage to run, one of `STAGES`.
         test_names: Names of the held-out views; None takes those of the capture, or else every n-th view.
         splats: File of Gaussians that replace the reconstruction.
@@ -71,10 +71,11 @@ def build(
     """
     if until not in STAGES:
         raise ValueError(f"until must be one of {', '.join(STAGES)}, got {until!r}")
+    source, config = Path(source), config or BuildConfig()
     if config.joint and splats is not None:
         raise ValueError("joint training makes its own Gaussians: leave --splats out")
     device = choose_device(config.device)
-    folder = SceneFolder(output)
+    folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
     with folder.locked():

@@ -91,6 +91,8 @@ class BuildConfig:
         for encoder in ("clip", "dino"):
             if getattr(self, encoder) == "embedded":  # alias of earlier versions
                 object.__setattr__(self, encoder, "bundled")
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ValueError(f"device must be auto, cpu or cuda, got {self.device!r}")
         parse_bytes(self.memory)
         check_seed(self.seed)
         if self.downscale is not None and not 0 < self.downscale < 1e6:

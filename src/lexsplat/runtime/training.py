@@ -1,8 +1,8 @@
 """The training loop: it reports progress, resumes after a kill, and recovers from divergence.
 
-`run_training` runs every gradient descent in lexsplat. A `Checkpoint` keeps the state on disk, so that a training
-killed at any moment continues bit for bit. A `DivergenceGuard` keeps a good state in memory, to which a training
-returns with smaller learning rates when a loss or a parameter becomes invalid.
+`run_training` runs reconstruction, language and joint training. A `Checkpoint` keeps the state on disk, so that a
+training killed at any moment continues bit for bit. A `DivergenceGuard` keeps a good state in memory, to which a
+training returns with smaller learning rates when a loss or a parameter becomes invalid.
 """
 
 from __future__ import annotations

@@ -113,11 +113,11 @@ def answer_queries(
             "threshold": round(limit, 4),
             "peak": 0.0,
             "best_view": names[0],
-            "gaussians": int((score >= limit).sum()),
+            "gaussians": len(found.selection(number)),
             "present": present,
             "views": {},
         }
-        for prompt, limit, score, present in zip(found.prompts, thresholds, found.scores, found.presences)
+        for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
     ]
     for name in names:
         image = _to_uint8(scene.render(name).image)

@@ -20,7 +20,7 @@ from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.runtime.checkpoints import Checkpoint
+    from lexsplat.runtime.training import Checkpoint
 
 Variant = Mapping[str, Mapping[str, Any]]
 """Changes of settings by part of `lexsplat.pipeline.config.BuildConfig`: ``{"codebook": {"use_dino": False}}``."""
