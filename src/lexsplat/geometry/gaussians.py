@@ -64,6 +64,9 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self):,}, sh_degree={self.sh_degree}, device={str(self.device)!r})"
+
     @property
     def device(self) -> torch.device:
         """Device of the tensors."""

@@ -88,7 +88,7 @@ class Selection:
 
     def __repr__(self) -> str:
         return (
-            f"Selection({self.phrase!r}, present={self.present!r}, gaussians={self.num_gaussians}, "
+            f"Selection({self.phrase[:60]!r}, present={self.present!r}, gaussians={self.num_gaussians}, "
             f"threshold={self.threshold:.3g})"
         )
 
