@@ -60,7 +60,10 @@ def test_kills_over_all_stages_do_not_change_the_result(options, tmp_path, metho
     report = json.loads(run.stdout.splitlines()[-1])
     assert "failed" not in report
     assert len(report["killed_after_stages"]) >= KILLS
-    assert len(set(report["killed_after_stages"])) >= 3, "the kills should hit several stages"
+    hit = len(set(report["killed_after_stages"]))
+    assert hit >= METHODS[method] - 1, (
+        "the kills should hit several stages; the last may be too short to be hit"
+    )
     expected, language = results(tmp_path / "undisturbed"), tensors(tmp_path / "undisturbed")
     for scene in map(Path, report["finished"]):
         assert results(scene) == expected
