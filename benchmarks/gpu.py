@@ -34,8 +34,8 @@ from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField, LanguageField, TrainedField
 from lexsplat.queries.relevancy import Question, code_relevancy, probability_relevancy
-from lexsplat.reconstruction.adam import Adam
 from lexsplat.reconstruction.image_losses import photometric_loss, ssim_target
+from lexsplat.reconstruction.optimizers import adam
 from lexsplat.rendering import render
 
 CODES, DIMENSION = 128, 512
@@ -103,7 +103,7 @@ def iterations_per_second(gaussians: Gaussians, cameras: Sequence[Camera], secon
     with torch.no_grad():
         targets = [ssim_target(0.8 * render(gaussians, camera).image) for camera in cameras]
     leaves = gaussians.map(lambda tensor: torch.nn.Parameter(tensor.detach().clone()))
-    optimizers = [Adam(leaf, 1e-4) for leaf in leaves.tensors().values()]
+    optimizers = [adam(leaf, 1e-4) for leaf in leaves.tensors().values()]
     by_camera = {id(camera): target for camera, target in zip(cameras, targets)}
 
     def iterate(camera: Camera) -> None:

@@ -335,19 +335,19 @@ def test_kernels_that_are_not_compiled_are_not_announced(tmp_path):
 
 
 def test_only_compilation_of_this_packages_kernels_is_announced_once(monkeypatch, caplog):
-    from lexsplat.reconstruction import adam_kernel as optimizer_kernels
+    from lexsplat.reconstruction import image_loss_kernels
     from lexsplat.rendering.kernels import jit
 
     monkeypatch.setattr(jit, "_announced", False)
     monkeypatch.setattr(jit, "_dispatchers", set(jit._dispatchers))
-    numbers = [np.ones(3, np.float32) for _ in range(4)]
+    image, products = np.ones((2, 3), np.float32), np.ones((3, 2, 3), np.float32)
     with caplog.at_level(logging.INFO, logger="lexsplat"):
         numba.njit(lambda x: x + 1)(3)
         assert not caplog.records
         for _ in range(2):
-            fresh = jit.kernel(optimizer_kernels._adam.py_func)
+            fresh = jit.kernel(image_loss_kernels._multiply.py_func)
             fresh._cache = NullCache()
-            fresh(0, 3, *numbers, *[np.float32(0.5)] * 6)
+            fresh(0, 2, image, image, products)
     assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lexsplat.reconstruction.adam import (
-    Adam,
+from lexsplat.reconstruction.optimizers import (
+    adam,
     below_prefix,
     load_optimizer_tensors,
     optimizer_tensors,
@@ -28,7 +28,7 @@ class Exposures:
 
     def __init__(self, count: int, rate: float, device: torch.device | str) -> None:
         self.matrices = torch.nn.Parameter(torch.eye(3, 4, device=device).repeat(count, 1, 1))
-        self._optimizer = Adam(self.matrices, rate)
+        self._optimizer = adam(self.matrices, rate)
 
     def apply(self, image: Tensor, index: int) -> Tensor:
         """A rendered image ``[H, W, 3]`` with the colors of photo ``index``."""

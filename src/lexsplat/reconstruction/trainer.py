@@ -9,13 +9,6 @@ import torch
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
-from lexsplat.reconstruction.adam import (
-    Adam,
-    below_prefix,
-    load_optimizer_tensors,
-    optimizer_tensors,
-    with_prefix,
-)
 from lexsplat.reconstruction.densification import (
     REFERENCE_ITERATIONS,
     DensityConfig,
@@ -23,6 +16,13 @@ from lexsplat.reconstruction.densification import (
     density_schedule,
 )
 from lexsplat.reconstruction.exposures import Exposures
+from lexsplat.reconstruction.optimizers import (
+    adam,
+    below_prefix,
+    load_optimizer_tensors,
+    optimizer_tensors,
+    with_prefix,
+)
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.memory import DEFAULT_MEMORY
@@ -235,7 +235,7 @@ class Reconstructor:
         if tracked:
             indices = torch.arange(len(self._parameters["means"]), dtype=torch.float32, device=self.device)
             self._parameters["origins"] = torch.nn.Parameter(indices, requires_grad=False)
-            self._optimizers["origins"] = Adam(self._parameters["origins"], 0.0)
+            self._optimizers["origins"] = adam(self._parameters["origins"], 0.0)
         self._density.step(
             self._parameters,
             self._optimizers,  # type: ignore[arg-type]
@@ -323,9 +323,9 @@ class Reconstructor:
         tensors = gaussians.tensors()
         return {theirs: torch.nn.Parameter(tensors[ours]) for ours, theirs in GSPLAT_NAMES.items()}
 
-    def _new_optimizers(self) -> dict[str, Adam]:
+    def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
         rates = self._rates()
-        return {theirs: Adam(self._parameters[theirs], rates[ours]) for ours, theirs in GSPLAT_NAMES.items()}
+        return {theirs: adam(self._parameters[theirs], rates[ours]) for ours, theirs in GSPLAT_NAMES.items()}
 
     def _rates(self) -> dict[str, float]:
         return {name: rate * self._rate_factor for name, rate in self.config.rates(self._extent).items()}

@@ -23,7 +23,7 @@ from lexsplat.language.fields import TrainedField
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.reconstruction import EVENT_EVERY, STAGE, Reconstructor
-from lexsplat.reconstruction.adam import below_prefix, with_prefix
+from lexsplat.reconstruction.optimizers import below_prefix, with_prefix
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.training import Checkpoint, run_training
 

@@ -24,7 +24,7 @@ from lexsplat.language.losses import (
     uncertainty_loss,
 )
 from lexsplat.language.methods.trained_settings import TrainedConfig
-from lexsplat.reconstruction.adam import check_moments
+from lexsplat.reconstruction.optimizers import check_moments
 from lexsplat.rendering import PreparedView
 from lexsplat.runtime.errors import TrainingError
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 
-class Adam(torch.optim.Adam):
-    """Adam with the epsilon of 3DGS, in one pass over memory.
-
-    On CUDA this is torch's fused Adam, on a CPU our kernel. torch's fused Adam on a CPU gives results that differ in
-    the last bit.
+def adam(parameter: torch.nn.Parameter, rate: float) -> torch.optim.Adam:
+    """Adam with the epsilon of 3DGS, fused: one pass over memory, the same bits at any number of threads.
 
     Every number is updated, including those of Gaussians that the view does not show: their moments decay and still
     move them, so that skipping them would be a different optimizer.
@@ -23,47 +18,7 @@ class Adam(torch.optim.Adam):
         parameter: The parameter to optimize, float32.
         rate: Learning rate.
     """
-
-    def __init__(self, parameter: torch.nn.Parameter, rate: float) -> None:
-        super().__init__([parameter], lr=rate, eps=1e-15, fused=parameter.device.type == "cuda")
-
-    @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Update the parameter by its gradient, if it has one."""
-        group = self.param_groups[0]
-        (parameter,) = group["params"]
-        if parameter.device.type != "cpu" or closure is not None:
-            return super().step(closure)
-        if parameter.grad is None:
-            return None
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.tensor(0.0)
-            state["exp_avg"] = torch.zeros_like(parameter)
-            state["exp_avg_sq"] = torch.zeros_like(parameter)
-        state["step"] += 1
-        _adam_on_cpu(parameter, parameter.grad, state, group)
-        return None
-
-
-def _adam_on_cpu(
-    parameter: Tensor, gradient: Tensor, state: dict[str, Tensor], group: dict[str, Any]
-) -> None:
-    from lexsplat.reconstruction.adam_kernel import adam_step
-
-    beta1, beta2 = group["betas"]
-    count = float(state["step"])
-    correction = math.sqrt(1.0 - beta2**count)
-    adam_step(
-        parameter.detach().view(-1).numpy(),
-        gradient.contiguous().view(-1).numpy(),
-        state["exp_avg"].view(-1).numpy(),
-        state["exp_avg_sq"].view(-1).numpy(),
-        rate=group["lr"] * correction / (1.0 - beta1**count),
-        epsilon=group["eps"] * correction,
-        beta1=beta1,
-        beta2=beta2,
-    )
+    return torch.optim.Adam([parameter], lr=rate, eps=1e-15, fused=True)
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
