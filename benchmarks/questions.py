@@ -20,6 +20,7 @@ from typing import Any
 from records import argument_parser, write_record
 
 import lexsplat
+from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import find_phrases
 
 FILE = Path(__file__).parents[1] / "tests" / "data" / "questions.json"
@@ -33,13 +34,16 @@ def main() -> None:
     parser.add_argument("--wrong", action="store_true", help="print the questions that are answered wrongly")
     options = parser.parse_args()
     things = json.loads(FILE.read_text())["things"]
-    rows: list[list] = []
+    rows: list[dict[str, Any]] = []
     for name, folder in (item.split("=", 1) for item in options.scene or ["demo=demo"]):
         scene = lexsplat.open_scene(folder)
         asked = [question for question in questions(options.half) if question["scene"] == name]
         right = 0
         for question in asked:
-            answer = find_phrases(scene, question["ask"])["phrases"][0]
+            try:
+                answer = find_phrases(scene, question["ask"])["phrases"][0]
+            except QueryError as error:
+                answer = {"present": "refused", "count": -1, "instances": [], "understood": str(error)}
             held = is_right(question, answer, things[name])
             right += held
             if options.wrong and not held:
@@ -48,8 +52,10 @@ def main() -> None:
                     f"{question['ask']}\n    expected {question.get('names')} {question.get('count', '')}, found "
                     f"{answer['present']} {answer['count']} {found}, understood {answer['understood']}"
                 )
-        rows.append([name, options.half, len(asked), right, right / len(asked)])
-    print(json.dumps([dict(zip(("scene", "half", "questions", "right", "share"), row)) for row in rows], indent=1))
+        rows.append(
+            {"scene": name, "half": options.half, "questions": len(asked), "right": right, "share": right / len(asked)}
+        )
+    print(json.dumps(rows, indent=1))
     write_record(options.json, rows, half=options.half)
 
 
@@ -72,7 +78,7 @@ def is_right(question: Mapping[str, Any], answer: Mapping[str, Any], things: Map
             bool(found) and found <= set(question.get("maybe", []))
         )
     wanted = set(question["names"])
-    return answer["present"] != "no" and wanted <= found <= wanted | set(question.get("maybe", []))
+    return answer["present"] in ("yes", "unsure") and wanted <= found <= wanted | set(question.get("maybe", []))
 
 
 def identified(instances: list[Mapping[str, Any]], things: Mapping[str, Any]) -> set[str]:
