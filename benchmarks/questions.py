@@ -53,7 +53,13 @@ def main() -> None:
                     f"{answer['present']} {answer['count']} {found}, understood {answer['understood']}"
                 )
         rows.append(
-            {"scene": name, "half": options.half, "questions": len(asked), "right": right, "share": right / len(asked)}
+            {
+                "scene": name,
+                "half": options.half,
+                "questions": len(asked),
+                "right": right,
+                "share": right / len(asked),
+            }
         )
     print(json.dumps(rows, indent=1))
     write_record(options.json, rows, half=options.half)
@@ -74,11 +80,15 @@ def is_right(question: Mapping[str, Any], answer: Mapping[str, Any], things: Map
         return bool(answer["count"] == question["count"])
     found = identified(answer["instances"], things)
     if not question["names"]:
-        return answer["present"] == "no" and found <= set(question.get("maybe", [])) or (
-            bool(found) and found <= set(question.get("maybe", []))
+        return (
+            answer["present"] == "no"
+            and found <= set(question.get("maybe", []))
+            or (bool(found) and found <= set(question.get("maybe", [])))
         )
     wanted = set(question["names"])
-    return answer["present"] in ("yes", "unsure") and wanted <= found <= wanted | set(question.get("maybe", []))
+    return answer["present"] in ("yes", "unsure") and wanted <= found <= wanted | set(
+        question.get("maybe", [])
+    )
 
 
 def identified(instances: list[Mapping[str, Any]], things: Mapping[str, Any]) -> set[str]:
@@ -94,7 +104,13 @@ def _name(center: list[float], size: list[float], things: Mapping[str, Any]) -> 
         return "wall"
     if center[2] < -1:
         return "floor"
-    return "cloth" if size[0] * size[1] < 4.5 and size[2] < 0.5 else "table" if size[2] < 0.6 else "several things"
+    return (
+        "cloth"
+        if size[0] * size[1] < 4.5 and size[2] < 0.5
+        else "table"
+        if size[2] < 0.6
+        else "several things"
+    )
 
 
 if __name__ == "__main__":

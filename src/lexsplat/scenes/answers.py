@@ -16,7 +16,6 @@ from torch import Tensor
 from lexsplat.geometry.world import world_of
 from lexsplat.language.methods import METHODS
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.phrases import parse
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.runtime.files import atomic_path
@@ -155,19 +154,21 @@ def find_phrases(
     Raises:
         QueryError: If a phrase is empty, the view is unknown, or the threshold is not in 0..1.
     """
-    answers = [
-        {
-            **scene.find(phrase, view, threshold=threshold).to_dict(),
-            "phrase": phrase,
-            "understood": str(parse(phrase)),
-        }
-        for phrase in check_prompts(phrases)
-    ]
+    answers = [find_phrase(scene, phrase, view, threshold) for phrase in check_prompts(phrases)]
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         **scene.world.to_json(),
         "phrases": answers,
     }
+
+
+def find_phrase(
+    scene: Scene, phrase: str, view: str | None = None, threshold: float | None = None
+) -> dict[str, Any]:
+    """One entry of `find_phrases`."""
+    understood = scene.understand(phrase)
+    found = scene.find_understood(understood, view, threshold=threshold).to_dict()
+    return {**found, "phrase": phrase, "understood": str(understood.phrase), "note": understood.note}
 
 
 def _default_views(scene: Scene) -> list[str]:

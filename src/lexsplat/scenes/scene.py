@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,10 +24,11 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
-from lexsplat.queries.phrases import parse, things_of
+from lexsplat.queries.answering import Searched, answer
+from lexsplat.queries.grammar import understand
+from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
-from lexsplat.queries.relations import answer
 from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,
@@ -35,12 +38,15 @@ from lexsplat.queries.relevancy import (
     render_relevancy,
 )
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.spelling import corrected
 from lexsplat.queries.thresholds import check_threshold, scene_thresholds
+from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError
 from lexsplat.scenes.answers import Answers
 from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.named_objects import named_objects
 from lexsplat.scenes.reading import read_scene
 
 if TYPE_CHECKING:
@@ -78,6 +84,7 @@ class Scene:
         self._cache: TextCache | None = None
         self._texts: dict[str, Tensor] = {}
         self._world: World | None = None
+        self._objects: tuple[Selection, ...] | None = None
 
     def __repr__(self) -> str:
         place = f", folder={str(self.folder.root)!r}" if self.folder else ""
@@ -229,7 +236,7 @@ class Scene:
     ) -> Selection:
         """The Gaussians that match a phrase with relations, such as "mug on the cloth".
 
-        `lexsplat.queries.phrases` describes the grammar.
+        `lexsplat.queries.grammar` describes the grammar.
 
         Args:
             phrase: What to look for.
@@ -239,15 +246,69 @@ class Scene:
         Raises:
             QueryError: If a part of the phrase is empty, the view is unknown, or the threshold is not in 0..1.
         """
-        parsed = parse(_one_phrase(phrase))
+        return self.find_understood(self.understand(phrase), view, threshold=threshold)
+
+    def understand(self, phrase: str) -> Understood:
+        """How `find` understands a phrase; its typing errors are mended where the scene holds what is meant.
+
+        Raises:
+            QueryError: If a part of the phrase is empty.
+        """
+        understood = understand(_one_phrase(phrase))
+        vocabulary = default_vocabulary(self.clip)
+        mended: dict[str, str] = {}
+
+        def mend(thing: Thing) -> Thing:
+            meant = thing.text if thing.exact else corrected(thing.text, [*vocabulary, *QUALITIES])
+            if meant == thing.text or self.ask(meant).presences[0] == "no":
+                return thing
+            mended[thing.text] = meant
+            return Thing(meant)
+
+        found = understood.phrase if understood.note else with_things(understood.phrase, mend)
+        notes = [f'"{meant}" for "{typed}", which no dictionary has' for typed, meant in mended.items()]
+        return Understood(found, "; ".join(filter(None, [understood.note, *notes])))
+
+    def find_understood(
+        self,
+        understood: Understood,
+        view: str | StoredView | Camera | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Selection:
+        """`find` for a phrase that is parsed already."""
         chosen = None if view is None else self.camera(view)
-        things = things_of(parsed)
-        answers = self.ask(things, threshold)
+        things = things_of(understood.phrase)
+        answers = self.ask(things, threshold) if things else None
 
-        def viewer(reference: Selection) -> Camera | None:
-            return chosen or self.cameras.get(reference.best_view)
+        def select(text: str) -> Selection:
+            known = answers is not None and text in things
+            return answers.selection(things.index(text)) if known else self.select(text, threshold)  # type: ignore[union-attr]
 
-        return answer(parsed, lambda text: answers.selection(things.index(text)), viewer)
+        def viewer(reference: Selection | None) -> Camera | None:
+            if chosen is not None or reference is None:
+                return chosen or self.middle_camera
+            return self.cameras.get(reference.best_view)
+
+        found = answer(understood.phrase, Searched(select, viewer, lambda: self.objects))
+        empty = found.present == "no" and threshold is None
+        return replace(found, mask=torch.zeros_like(found.mask), parts=()) if empty else found
+
+    @property
+    def objects(self) -> tuple[Selection, ...]:
+        """The things of the everyday vocabulary that the scene holds, each with its name in ``phrase``."""
+        if self._objects is None:
+            self._objects = named_objects(self)
+        return self._objects
+
+    @property
+    def middle_camera(self) -> Camera | None:
+        """The camera closest to the middle of all: where somebody stands who says "me" and gives no view."""
+        cameras = list(self.cameras.values())
+        if not cameras:
+            return None
+        middle = np.mean([camera.position for camera in cameras], axis=0)
+        return min(cameras, key=lambda camera: float(np.linalg.norm(camera.position - middle)))
 
     def click(
         self, view: str | StoredView | Camera, x: float, y: float, *, similarity: float | None = None

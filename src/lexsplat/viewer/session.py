@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.heatmaps import overlay_mask
-from lexsplat.queries.phrases import Thing, parse
+from lexsplat.queries.grammar import parse
+from lexsplat.queries.phrases import Thing
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
 from lexsplat.queries.relevancy import Question as TextQuestion
