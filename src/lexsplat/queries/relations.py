@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lexsplat.geometry.boxes import upright_frame
 from lexsplat.geometry.cameras import Camera
@@ -35,8 +34,6 @@ _INSIDE = 0.6
 """Inside: at least this share of the object lies in the box of the other."""
 _SAME_SIZE = 0.1
 """Two phrases name one object only if the smaller box has at least this share of the larger one's volume."""
-_SAMPLE = 4000
-"""Number of points per selection that relations are computed from, at most."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
         upper, lower = (target, reference) if relation == "above" else (reference, target)
         return _over(upper, lower, frame)
     if relation == "inside":
-        share = float(reference.box.contains(_points(target)).mean())
+        share = float(reference.box.contains(target.sample).mean())
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
@@ -105,7 +102,7 @@ def related(relation: RelationName, targets: Selection, references: Selection, f
         target
         for target in targets.instances
         if any(
-            holds(relation, target, reference - target, frame)  # shared Gaussians support nothing
+            holds(relation, target, _without(reference, target), frame)
             for reference in references.instances
             if not same(target, reference)
         )
@@ -190,7 +187,7 @@ def distance(first: Selection, second: Selection) -> float:
     """
     if not first or not second:
         raise ValueError("an empty selection has no place")
-    apart, _ = cKDTree(_points(first)).query(_points(second))
+    apart, _ = first.tree.query(second.sample)
     return float(np.quantile(apart, 0.002))  # one stray Gaussian does not close a gap
 
 
@@ -218,7 +215,7 @@ def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
     if not _overlap(target, support):
         return False
     box, height = target.box, float(2 * target.box.half_sizes[2])
-    points = _points(support)
+    points = support.sample
     local = (points - box.center) @ box.axes.T
     below = (np.abs(local[:, :2]) <= 1.5 * box.half_sizes[:2]).all(1) & (local[:, 2] < 0)
     if below.sum() < 5:
@@ -254,7 +251,7 @@ def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
 def _overlap(first: Selection, second: Selection) -> bool:
     """Whether the footprints of two objects overlap, seen from above."""
     small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
-    local = (_points(small) - large.center) @ large.box.axes[:2].T
+    local = (small.sample - large.center) @ large.box.axes[:2].T
     return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
 
 
@@ -262,9 +259,9 @@ def _level(offset: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
     return np.asarray(offset - (offset @ frame.up) * frame.up)
 
 
-def _points(selection: Selection) -> NDArray[np.float64]:
-    points = selection.gaussians.means[selection.mask].detach().cpu().double().numpy()
-    return np.asarray(points[:: max(1, len(points) // _SAMPLE)], dtype=np.float64)
+def _without(reference: Selection, target: Selection) -> Selection:
+    """The reference without the Gaussians of the target: shared Gaussians support nothing."""
+    return reference - target if bool((reference.mask & target.mask).any()) else reference
 
 
 def same(first: Selection, second: Selection) -> bool:

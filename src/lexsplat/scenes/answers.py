@@ -29,6 +29,23 @@ MAX_DEFAULT_VIEWS = 6
 """Number of held-out views that a query without ``--view`` renders, at most."""
 
 
+@dataclass(eq=False)
+class Word:
+    """What a scene keeps of a prompt.
+
+    Args:
+        scores: Relevancy of every Gaussian ``[N]`` in 0..1.
+        presence: Whether the scene holds it.
+        threshold: The automatic threshold; None until it is asked for.
+        selection: The selection of that threshold; None until it is asked for.
+    """
+
+    scores: Tensor
+    presence: Presence
+    threshold: float | None = None
+    selection: Selection | None = None
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Answers:
     """Scores, threshold and presence of every prompt in a scene, from `Scene.ask`.
@@ -40,6 +57,7 @@ class Answers:
         presences: Whether the scene holds what each prompt names.
         scene: The scene that was asked.
         automatic: Whether the thresholds come from the scene; False if they were given.
+        words: What the scene keeps of each prompt; () keeps nothing.
     """
 
     prompts: tuple[str, ...]
@@ -48,6 +66,7 @@ class Answers:
     presences: tuple[Presence, ...]
     scene: Scene
     automatic: bool = True
+    words: tuple[Word, ...] = ()
 
     def __len__(self) -> int:
         return len(self.prompts)
@@ -62,7 +81,15 @@ class Answers:
         With an automatic threshold, instances that score far worse than the best one are left out as well
         (`Selection.convincing`).
         """
-        scores, threshold = self.scores[index], float(self.thresholds[index])
+        if not self.words:
+            return self._selection(index)
+        word = self.words[index]
+        word.selection = word.selection or self._selection(index)
+        return word.selection
+
+    def _selection(self, index: int) -> Selection:
+        scores = self.words[index].scores if self.words else self.scores[index]
+        threshold = float(self.thresholds[index])
         selection = Selection(
             self.scene.gaussians,
             self.scene.cameras,

@@ -10,12 +10,11 @@ apple = scene.find("red apple left of the mug")  # a Selection: instances, boxes
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,9 +23,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
-from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import understand
-from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
+from lexsplat.queries.phrases import Understood
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
 from lexsplat.queries.relevancy import (
@@ -38,19 +35,23 @@ from lexsplat.queries.relevancy import (
     render_relevancy,
 )
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.spelling import corrected
 from lexsplat.queries.thresholds import check_threshold, scene_thresholds
-from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.rendering import Rendering, render
+from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError
-from lexsplat.scenes.answers import Answers
+from lexsplat.scenes.answers import Answers, Word
+from lexsplat.scenes.finding import find_in, named_objects, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
-from lexsplat.scenes.named_objects import named_objects
 from lexsplat.scenes.reading import read_scene
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import ImageTextEncoder
+
+_KEPT_BYTES = 128 << 20
+"""Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
+_KEPT_TEXTS = 4096
+"""Number of text embeddings and of parsed phrases that are kept."""
 
 
 class Scene:
@@ -58,6 +59,8 @@ class Scene:
 
     Wherever a list of prompts is expected, a single text is one prompt. Wherever a view is expected, the name of a
     view (with or without suffix), a `StoredView` or any `Camera` will do.
+
+    A scene keeps what it has computed for a word (bounded), and may be asked by many threads at once.
 
     Args:
         gaussians: Geometry and appearance.
@@ -79,12 +82,13 @@ class Scene:
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.folder = clip, folder
+        self._working = threading.RLock()
+        """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
         self._encoder: ImageTextEncoder | None = None
         self._cache: TextCache | None = None
-        self._texts: dict[str, Tensor] = {}
+        self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
-        self._objects: tuple[Selection, ...] | None = None
 
     def __repr__(self) -> str:
         place = f", folder={str(self.folder.root)!r}" if self.folder else ""
@@ -99,7 +103,11 @@ class Scene:
     def query(self, query: QueryConfig) -> None:
         self._query = query
         self._classifier: PresenceClassifier | None = None
-        self._thresholds: dict[str, float] = {}
+        self._objects: tuple[Selection, ...] | None = None
+        kept = max(32, min(1024, _KEPT_BYTES // (5 * max(1, len(self.gaussians)))))
+        self._words: Bounded[str, Word] = Bounded(kept)
+        self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
+        self._understood: Bounded[str, Understood] = Bounded(_KEPT_TEXTS)
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
@@ -117,10 +125,13 @@ class Scene:
             ModelError: If the text encoder cannot be loaded.
         """
         prompts = check_prompts(prompts)
-        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._texts]
+        found = {prompt: self._texts.get(prompt) for prompt in dict.fromkeys(prompts)}
+        new = [prompt for prompt, vector in found.items() if vector is None]
         if new:  # in one call, so that the cache on disk is written once
-            self._texts.update(zip(new, embed_prompts(new, self.encode_text, self.query.templates)))
-        return torch.stack([self._texts[prompt] for prompt in prompts])
+            with self._working:
+                vectors = embed_prompts(new, self.encode_text, self.query.templates)
+            found.update((prompt, self._texts.put(prompt, vector)) for prompt, vector in zip(new, vectors))
+        return torch.stack([vector for prompt in prompts if (vector := found[prompt]) is not None])
 
     def encode_text(self, texts: list[str]) -> Tensor:
         """Embeddings ``[T, D]`` of whole sentences, from the encoder that belongs to the language.
@@ -188,14 +199,26 @@ class Scene:
         """
         prompts = check_prompts(prompts)
         given = None if threshold is None else check_threshold(threshold)
-        question = self._question(prompts)
-        scores = gaussian_relevancy(self.field, question)
-        presences = tuple(self.presence_classifier.classify(row) for row in scores)
-        if given is None:
-            thresholds = self._automatic_thresholds(prompts, question, presences)
-        else:
-            thresholds = torch.full((len(prompts),), given)
-        return Answers(tuple(prompts), scores, thresholds, presences, self, automatic=given is None)
+        words_of = self._words  # another query replaces it
+        found = {prompt: words_of.get(prompt) for prompt in dict.fromkeys(prompts)}
+        new = [prompt for prompt, word in found.items() if word is None]
+        if new:
+            with self._working:
+                made = zip(new, self._new_words(new))
+                found.update((prompt, words_of.put(prompt, word)) for prompt, word in made)
+        words = [word for prompt in prompts if (word := found[prompt]) is not None]
+        presences = tuple(word.presence for word in words)
+        scores = torch.stack([word.scores for word in words])
+        if given is not None:
+            return Answers(
+                tuple(prompts), scores, torch.full((len(words),), given), presences, self, automatic=False
+            )
+        unknown = {prompt: word for prompt, word in zip(prompts, words) if word.threshold is None}
+        if unknown:
+            with self._working:
+                self._find_thresholds(unknown)
+        limits = torch.tensor([word.threshold for word in words])
+        return Answers(tuple(prompts), scores, limits, presences, self, words=tuple(words))
 
     def relevancy(self, prompts: str | Sequence[str], view: str | StoredView | Camera) -> Tensor:
         """Relevancy maps ``[P, H, W]`` of the prompts in a view, in 0..1.
@@ -246,7 +269,13 @@ class Scene:
         Raises:
             QueryError: If a part of the phrase is empty, the view is unknown, or the threshold is not in 0..1.
         """
-        return self.find_understood(self.understand(phrase), view, threshold=threshold)
+        understood = self.understand(phrase)
+        camera = None if view is None else self.camera(view)
+        if isinstance(view, Camera):
+            return find_in(self, understood, camera, threshold)
+        name = view.name if isinstance(view, StoredView) else view
+        key = (str(understood.phrase), name, threshold)
+        return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
     def understand(self, phrase: str) -> Understood:
         """How `find` understands a phrase; its typing errors are mended where the scene holds what is meant.
@@ -254,61 +283,16 @@ class Scene:
         Raises:
             QueryError: If a part of the phrase is empty.
         """
-        understood = understand(_one_phrase(phrase))
-        vocabulary = default_vocabulary(self.clip)
-        mended: dict[str, str] = {}
-
-        def mend(thing: Thing) -> Thing:
-            meant = thing.text if thing.exact else corrected(thing.text, [*vocabulary, *QUALITIES])
-            if meant == thing.text or self.ask(meant).presences[0] == "no":
-                return thing
-            mended[thing.text] = meant
-            return Thing(meant)
-
-        found = understood.phrase if understood.note else with_things(understood.phrase, mend)
-        notes = [f'"{meant}" for "{typed}", which no dictionary has' for typed, meant in mended.items()]
-        return Understood(found, "; ".join(filter(None, [understood.note, *notes])))
-
-    def find_understood(
-        self,
-        understood: Understood,
-        view: str | StoredView | Camera | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Selection:
-        """`find` for a phrase that is parsed already."""
-        chosen = None if view is None else self.camera(view)
-        things = things_of(understood.phrase)
-        answers = self.ask(things, threshold) if things else None
-
-        def select(text: str) -> Selection:
-            known = answers is not None and text in things
-            return answers.selection(things.index(text)) if known else self.select(text, threshold)  # type: ignore[union-attr]
-
-        def viewer(reference: Selection | None) -> Camera | None:
-            if chosen is not None or reference is None:
-                return chosen or self.middle_camera
-            return self.cameras.get(reference.best_view)
-
-        found = answer(understood.phrase, Searched(select, viewer, lambda: self.objects))
-        empty = found.present == "no" and threshold is None
-        return replace(found, mask=torch.zeros_like(found.mask), parts=()) if empty else found
+        text = _one_phrase(phrase)
+        return self._understood.get_or_make(text, lambda: understood_in(self, text))
 
     @property
     def objects(self) -> tuple[Selection, ...]:
         """The things of the everyday vocabulary that the scene holds, each with its name in ``phrase``."""
         if self._objects is None:
-            self._objects = named_objects(self)
+            with self._working:
+                self._objects = self._objects or named_objects(self)
         return self._objects
-
-    @property
-    def middle_camera(self) -> Camera | None:
-        """The camera closest to the middle of all: where somebody stands who says "me" and gives no view."""
-        cameras = list(self.cameras.values())
-        if not cameras:
-            return None
-        middle = np.mean([camera.position for camera in cameras], axis=0)
-        return min(cameras, key=lambda camera: float(np.linalg.norm(camera.position - middle)))
 
     def click(
         self, view: str | StoredView | Camera, x: float, y: float, *, similarity: float | None = None
@@ -335,22 +319,24 @@ class Scene:
             self._classifier = PresenceClassifier(self.gaussians, self.field, references)
         return self._classifier
 
-    def _automatic_thresholds(
-        self, prompts: Sequence[str], question: Question, presences: Sequence[Presence]
-    ) -> Tensor:
-        """The threshold ``[P]`` of each prompt; known ones are not computed again."""
-        new = [place for place, prompt in enumerate(prompts) if prompt not in self._thresholds]
-        if new:
-            asked = Question(question.positives[new], question.negatives, question.config)
-            views = list(self.views.values())
-            training = [view.camera for view in views if view.split == "train"]
-            found = scene_thresholds(
-                lambda camera: render_relevancy(self.field, self.gaussians, camera, asked),
-                training or [view.camera for view in views],
-                [presences[place] for place in new],
-            )
-            self._thresholds.update(zip((prompts[place] for place in new), found.tolist()))
-        return torch.tensor([self._thresholds[prompt] for prompt in prompts])
+    def _new_words(self, prompts: list[str]) -> list[Word]:
+        """Scores and presence of prompts that were not asked before."""
+        scores = gaussian_relevancy(self.field, self._question(prompts))
+        # Copies: a row would keep the scores of all prompts asked with it.
+        return [Word(row.clone(), self.presence_classifier.classify(row)) for row in scores]
+
+    def _find_thresholds(self, words: Mapping[str, Word]) -> None:
+        """The automatic thresholds of words, from one rendering of the training views."""
+        question = self._question(list(words))
+        views = list(self.views.values())
+        training = [view.camera for view in views if view.split == "train"]
+        found = scene_thresholds(
+            lambda camera: render_relevancy(self.field, self.gaussians, camera, question),
+            training or [view.camera for view in views],
+            [word.presence for word in words.values()],
+        )
+        for word, threshold in zip(words.values(), found.tolist()):
+            word.threshold = threshold
 
     # -- views
 
