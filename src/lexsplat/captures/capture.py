@@ -83,7 +83,7 @@ class View:
         return resized(source, size)
 
     def _valid_pixels(self, path: Path) -> tuple[NDArray[np.bool_], bool]:
-        """Pixels that a mask leaves, at the size of the undistorted photo if it was drawn there; and whether it was."""
+        """Pixels that a mask leaves, at the size of the undistorted photo if it was drawn on it; whether it was."""
         mask = read_mask(path, nonzero=True)
         self._check_aspect(path, (mask.shape[1], mask.shape[0]))
         undistorted = self._is_undistorted(mask)
@@ -192,7 +192,7 @@ def _no_points() -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture: its views, their split, points and ground-truth masks.
+    """A capture: its views, their split, and points.
 
     Args:
         root: The capture folder.
@@ -201,7 +201,6 @@ class Capture:
         test_names: Names of the held-out views, sorted.
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
         point_colors: Their colors ``[P, 3]``, RGB in 0..1.
-        segmentations: Folder with ``STEM/PROMPT.png``, or None.
         warnings: What was skipped and why, one line each.
         source: Format of the camera files: ``"colmap"`` or ``"transforms"``.
         background: Color behind transparent pixels, RGB in 0..1.
@@ -213,7 +212,6 @@ class Capture:
     test_names: tuple[str, ...] = ()
     points: NDArray[np.float32] = field(default_factory=_no_points)
     point_colors: NDArray[np.float32] = field(default_factory=_no_points)
-    segmentations: Path | None = None
     warnings: tuple[str, ...] = ()
     source: str = "colmap"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
