@@ -54,7 +54,7 @@ class Reconstructor:
         TrainingError: If there is no training view or no point.
     """
 
-    parameter_prefixes = ("parameters/", "exposures/")
+    parameter_prefixes: tuple[str, ...] = ("parameters/", "exposures/")
 
     def __init__(
         self,
@@ -150,7 +150,7 @@ class Reconstructor:
         """Run one iteration on one view.
 
         Returns:
-            The loss; 0 where it was not read from the GPU (`_reads_loss`).
+            The loss; 0 where it was not read from the GPU (`reads_loss`).
 
         Raises:
             TrainingError: If the loss is not finite, the images diverge, or no Gaussian is left.
@@ -173,7 +173,7 @@ class Reconstructor:
             image = torch.where(valid[..., None], image, target.image)
         loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularization()
         loss.backward()
-        value = loss.item() if self._reads_loss() else 0.0
+        value = loss.item() if self.reads_loss(self.steps_done + 1) else 0.0
         if not math.isfinite(value):
             raise TrainingError(
                 "reconstruction",
@@ -336,9 +336,8 @@ class Reconstructor:
             total = total + scale_weight * self._parameters["log_scales"].exp().mean() / self._extent
         return total
 
-    def _reads_loss(self) -> bool:
-        """Whether this step reads its loss: always on a CPU, every few steps on CUDA, where reading synchronizes."""
-        done = self.steps_done + 1
+    def reads_loss(self, done: int) -> bool:
+        """Whether step ``done`` reads its loss: always on a CPU, every few steps on CUDA, where reading waits."""
         return self.device.type == "cpu" or done % EVENT_EVERY == 0 or done == self.config.iterations
 
     def _update_errors(self, image: Tensor, target: Tensor) -> None:
@@ -347,7 +346,7 @@ class Reconstructor:
         Raises:
             TrainingError: If the renderings are much worse than the background, which means divergence.
         """
-        if not self._reads_loss():
+        if not self.reads_loss(self.steps_done + 1):
             return
         errors = torch.mean((image.detach() - target) ** 2), torch.mean((self._background - target) ** 2)
         olds = self._recent_error, self._background_error
