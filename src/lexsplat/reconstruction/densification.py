@@ -59,11 +59,12 @@ def density_schedule(
         iterations: Number of iterations of the training.
         every: Steps between two rounds in a training of 30,000.
         minimum_every: Lower limit of the actual steps between two rounds of "default", so that enough views
-            contribute to each decision. It does not apply to "mcmc", which adds a twentieth per round at random and
-            would never reach its cap in few rounds.
+            contribute to each decision. For "mcmc" it is 2: "mcmc" adds a twentieth per round at random and would
+            never reach its cap in few rounds, and rounds after every step leave no step in which the moved
+            Gaussians regain opacity.
     """
     scale = iterations / REFERENCE_ITERATIONS
-    closest = minimum_every if strategy == "default" else 1
+    closest = minimum_every if strategy == "default" else 2
     return DensitySchedule(
         start=round(500 * scale),
         stop=round((15_000 if strategy == "default" else 25_000) * scale),
@@ -175,10 +176,13 @@ class DensityControl:
         """
         with self._own_randomness(), _operators_for(self._device):
             if self._mcmc is not None:
+                # gsplat moves faint Gaussians to others and fails if there are none: such a round is left out.
+                opacities = parameters["opacities"].sigmoid()
+                changes = self.refines_at(step) and bool((opacities > self.config.min_opacity).any())
                 self._mcmc.step_post_backward(
-                    parameters, optimizers, self._state, step, {}, lr=means_learning_rate
+                    parameters, optimizers, self._state, step if changes else 0, {}, lr=means_learning_rate
                 )
-                return self.refines_at(step)
+                return changes
             return self._default_step(parameters, optimizers, step, means2d, radii, image_size)
 
     def _default_step(
