@@ -1,7 +1,7 @@
 """Repeats a build in processes that are killed, until the scene is finished.
 
 test_killed_builds.py runs this module in a separate process. It imports everything once, and every attempt is a fork,
-so that fifty kills take a minute. No threads are started before the forks. The first kill of a scene strikes inside
+so that thirty kills take a minute. No threads are started before the forks. The first kill of a scene strikes inside
 one of the stages, at a progress event; the others strike at random moments.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-KILLS_A_SCENE = 7
+KILLS_A_SCENE = 4
 LONGEST_SECONDS = 1.2
 """Maximum delay in seconds of the kills at random moments."""
 
