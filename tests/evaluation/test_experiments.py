@@ -8,22 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support import color_encoder
 from support.experiments import CONFIG
 
 from lexsplat.evaluation.ablate import language_settings, make_language, paper_evaluation
 from lexsplat.evaluation.experiments import Bench, Results
 from lexsplat.runtime.errors import CaptureError
 
+pytestmark = pytest.mark.usefixtures("color_encoders")
+
 AVERAGED = replace(CONFIG, method="averaged", iterations=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
 
 
 @pytest.fixture

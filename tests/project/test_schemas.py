@@ -11,7 +11,6 @@ from lexsplat import cli
 from lexsplat.scenes.folder import BUNDLED_SCENE
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
-pytestmark = pytest.mark.xdist_group("built")
 
 
 def validated(name: str, document: object) -> None:
