@@ -10,7 +10,7 @@ from lexsplat.captures.capture import Capture
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.evaluation.ground_truth import GroundTruth
-from lexsplat.evaluation.measuring import EvaluationConfig, Subject, evaluate
+from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
 from lexsplat.evaluation.report.page import write_report
@@ -71,8 +71,8 @@ def evaluate_scene(
     gallery = Gallery()
     metrics = evaluate(
         photos,
-        Subject(scene.gaussians, scene.field, scene.encode_text),
-        EvaluationConfig(query=scene.query, protocols=tuple(protocols)),
+        scene,
+        EvaluationConfig(protocols=tuple(protocols)),
         ground_truth=GroundTruth(found.masks, found.boxes, _prompt_kinds(photos.root)),
         observer=gallery.add,
         listener=listener,

@@ -74,7 +74,7 @@ class _Case:
 
 def _worst_first(metrics: Metrics, gallery: Gallery) -> list[_Case]:
     cases = [
-        _Case(view, prompt, pair.counts.at(metrics.thresholds[prompt]["auto"]).iou, pair.average_precision)
+        _Case(view, prompt, pair.auto.iou, pair.average_precision)
         for view, prompts in metrics.pairs.items()
         for prompt, pair in prompts.items()
         if (view, prompt) in gallery.cases
