@@ -11,6 +11,7 @@ from PIL import Image
 from support import color_encoder
 from support.experiments import CONFIG
 from support.report_pages import Page
+from support.schemas import validated
 
 from lexsplat import cli
 from lexsplat.captures import Annotations
@@ -172,6 +173,7 @@ def test_the_tables_have_all_rows_with_mean_and_spread(ablated):
     assert [row["name"] for row in rows] == list(METHODS["trained"].variants)
     assert all(row["runs"] == "2" for row in rows)
     record = json.loads((ablated / "ablation.json").read_text())
+    validated("ablation", record)
     values = [run["auto"]["mIoU"] for run in record["runs"]["full"]]
     assert float(rows[-1]["mIoU"]) == pytest.approx(sum(values) / 2, abs=1e-5)
     assert float(rows[-1]["mAP"]) > 0.2, "the colors are found"

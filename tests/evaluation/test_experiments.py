@@ -10,6 +10,7 @@ import pytest
 import torch
 from support import color_encoder
 from support.experiments import CONFIG
+from support.schemas import validated
 
 from lexsplat.evaluation.ablate import make_language, paper_evaluation
 from lexsplat.evaluation.experiments import Bench, Row
@@ -96,10 +97,12 @@ def test_every_file_is_written_after_every_run_and_both_commands_keep_their_own(
     record = json.loads((bench.output / "comparison.json").read_text())
     assert [row["name"] for row in record["rows"]] == ["one"]
     assert record["ground_truth"]["layout"] == "segmentations"
+    validated("comparison", record)
     before = (bench.output / "comparison.html").read_bytes()
     bench.measure("ablation", [row(bench, [], "one")], [0])
     assert (bench.output / "comparison.html").read_bytes() == before
     assert (bench.output / "ablation.html").is_file()
+    validated("ablation", json.loads((bench.output / "ablation.json").read_text()))
 
 
 def test_crop_sizes_of_features_of_another_program_are_refused(open_bench, tmp_path):

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds, print_json_file
-from lexsplat.language.methods import MethodName
+from lexsplat.language.methods import VARIANTS, MethodName
 from lexsplat.pipeline.config import BuildConfig
+
+if TYPE_CHECKING:
+    VariantName = str
+else:
+    VariantName = Literal[VARIANTS]
 
 
 @dataclasses.dataclass
@@ -39,18 +44,7 @@ class Ablate:
     capture: CaptureArgument
     output: Path
     seeds: tuple[int, ...] = (0, 1, 2)
-    variants: tuple[
-        Literal[
-            "w/o DINO",
-            "w/o L_lb",
-            "w/o u_G",
-            "w/o MLP",
-            "w/o u_G & MLP",
-            "one code",
-            "full",
-        ],
-        ...,
-    ] = ()
+    variants: tuple[VariantName, ...] = ()
     methods: tuple[MethodName, ...] = ()
     wrong_labels: float = 0.0
     masks: Path | None = None

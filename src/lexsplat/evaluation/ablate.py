@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
 from lexsplat.evaluation.experiments import Bench, Row
 from lexsplat.language.fields import LanguageField
-from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
+from lexsplat.language.methods import METHODS, VARIANTS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import QueryForm
 from lexsplat.runtime.progress import Listener, silent
-
-VARIANTS = tuple(dict.fromkeys(variant for method in METHODS.values() for variant in method.variants))
-"""Names of the variants of all methods, among them the rows of the paper's Table 2."""
 
 log = logging.getLogger("lexsplat")
 
@@ -161,13 +158,6 @@ def _variants(
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")
-    for variant in variants:
-        if not any(variant in METHODS[method].variants for method in methods):
-            if len(methods) == 1:
-                changed(replace(config, method=methods[0]), variant)  # raises with the variants of the method
-            raise ValueError(
-                f"{' and '.join(methods)} have no variant {variant!r}; variants are {', '.join(VARIANTS)}"
-            )
     rows: list[tuple[str, MethodName, str]] = []
     for method in methods:
         for variant in variants or METHODS[method].variants:
@@ -175,6 +165,13 @@ def _variants(
                 rows.append((variant if len(methods) == 1 else f"{method}: {variant}", method, variant))
             else:
                 log.warning("%s has no variant %r: the row is left out", method, variant)
+    if missing := set(variants) - {variant for _, _, variant in rows}:
+        known = [
+            variant for variant in VARIANTS if any(variant in METHODS[method].variants for method in methods)
+        ]
+        raise ValueError(
+            f"variants of {' and '.join(methods)} are {', '.join(known)}; got {', '.join(missing)}"
+        )
     return rows
 
 

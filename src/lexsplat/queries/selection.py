@@ -197,7 +197,11 @@ class Selection:
         return replace(self, mask=~self.mask, scores=1 - self.scores, phrase=f"not {self.phrase}".strip())
 
     def grow(self, distance: float | None = None) -> Selection:
-        """The union with the Gaussians within ``distance`` (world units; None derives it from the spacing)."""
+        """The union with the Gaussians within ``distance`` (world units; None derives it from the spacing).
+
+        Raises:
+            QueryError: If the distance is negative or no number.
+        """
         if not self:
             return self
         reach = self._reach(distance)
@@ -315,9 +319,9 @@ class Selection:
 
     def _reach(self, distance: float | None) -> float:
         if distance is not None:
-            if not distance >= 0:
-                raise ValueError(f"distance must not be negative, got {distance}")
-            return float(np.nextafter(distance, np.inf))
+            if isinstance(distance, str) or not hasattr(distance, "__float__") or not float(distance) >= 0:
+                raise QueryError("distance", expected="a number from 0", found=repr(distance)[:40])
+            return float(np.nextafter(float(distance), np.inf))
         return self._spacing() * _LINK
 
     def _spacing(self) -> float:

@@ -39,7 +39,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.device import choose_device
-from lexsplat.runtime.errors import ModelError, QueryError
+from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import Answers
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.reading import read_scene
@@ -387,6 +387,10 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         ValueError: If the device is not one of the three.
     """
     place = choose_device(device)
+    if not isinstance(path, (str, os.PathLike)):
+        raise SceneFolderError(
+            repr(path)[:60], expected="the path of a scene folder", found=type(path).__name__
+        )
     found = read_scene(Path(path), place)
     clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
     return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder)
