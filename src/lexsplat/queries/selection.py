@@ -354,7 +354,7 @@ class Selection:
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 
-def _promising_views(selection: Selection, count: int = 8) -> list[str]:
+def _promising_views(selection: Selection) -> list[str]:
     """The views in which the selection would be largest without occlusion."""
     if not selection or not selection.cameras:
         return []
@@ -373,7 +373,7 @@ def _promising_views(selection: Selection, count: int = 8) -> list[str]:
         scale = camera.K[0, 0] * camera.K[1, 1] / (camera.width * camera.height)
         found.append((float((areas * inside / depth**2).sum() * scale * inside.mean()), name))
     found.sort(key=lambda entry: -entry[0])
-    return [name for size, name in found[:count] if size > 0] or [found[0][1]]
+    return [name for size, name in found[:8] if size > 0] or [found[0][1]]
 
 
 @torch.no_grad()

@@ -108,12 +108,7 @@ def quick_threshold(scores: NDArray[np.float32], opacities: NDArray[np.float32])
 
 
 class Coloring:
-    """Colors of all Gaussians of a scene in every mode.
-
-    Args:
-        gaussians: The scene.
-        language: The language field of the scene.
-    """
+    """Colors of all Gaussians of a scene in every mode."""
 
     def __init__(self, gaussians: Gaussians, language: LanguageField) -> None:
         self.photo = colors_of(gaussians)

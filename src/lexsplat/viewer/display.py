@@ -28,13 +28,7 @@ _FRAME_TIMEOUT = 60.0
 
 
 class Display:
-    """Draws a scene in viser.
-
-    Args:
-        server: viser's server.
-        scene: The scene.
-        budget: Maximum number of Gaussians that are drawn.
-    """
+    """Draws a scene in viser."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene, budget: int) -> None:
         self.server, self.scene = server, scene
@@ -163,14 +157,7 @@ class Display:
     def orbit_frames(
         self, client: viser.ClientHandle, frames: int, height: int, listener: Callable[[int], None]
     ) -> list[NDArray[np.uint8]]:
-        """Images of one orbit around the look-at point of a page, at the height of its camera.
-
-        Args:
-            client: The page, which renders them.
-            frames: Number of images.
-            height: Rows of each image.
-            listener: Receives the number of finished images.
-        """
+        """Images of one orbit around the look-at point of a page, at the height of its camera."""
         camera = client.camera
         images = []
         seen_from = [view.camera.position for view in self.scene.views.values()]

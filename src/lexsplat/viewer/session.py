@@ -271,10 +271,10 @@ class Session:
         shares.sort(key=lambda entry: -entry[1])
         return [entry for entry in shares[:count] if entry[1] > 0]
 
-    def thumbnail(self, name: str, selection: Selection, long_side: int = 280) -> NDArray[np.uint8]:
+    def thumbnail(self, name: str, selection: Selection) -> NDArray[np.uint8]:
         """A view ``[h, w, 3]`` with the selection tinted and the rest dimmed."""
         camera = self.scene.view(name).camera
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
+        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 280))
         with torch.no_grad():
             drawn = render(self.scene.gaussians, small, features=selection.mask.float()[:, None])
         image = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
@@ -284,10 +284,6 @@ class Session:
 
     def export(self, selection: Selection, ending: str = ".ply") -> tuple[str, bytes]:
         """File name and content of an export of the selected Gaussians.
-
-        Args:
-            selection: The Gaussians to export.
-            ending: One of `EXPORT_ENDINGS`.
 
         Raises:
             ValueError: If the ending is not one of them.
@@ -310,12 +306,6 @@ def answer_prompt(
     """The scene's answer to a prompt: scores, threshold, presence and selection.
 
     All final answers of the viewer come from here. Phrases with relations are answered by `Scene.find`.
-
-    Args:
-        scene: The scene.
-        prompt: A thing or a phrase with relations.
-        threshold: See `Scene.select`.
-        viewpoint: See `Session.refine`.
     """
     if is_plain(prompt):
         return scene.select(prompt, threshold)

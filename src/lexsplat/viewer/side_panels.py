@@ -24,12 +24,7 @@ _ORBIT = {"frames": 60, "height": 480, "fps": 20}
 
 
 class SelectionPanel:
-    """Facts, download and best views of the current selection.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Facts, download and best views of the current selection."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._session = panels.session
@@ -68,12 +63,7 @@ class SelectionPanel:
 
 
 class ClickPanel:
-    """ "What is this?": names for the clicked object, and the vocabulary they come from.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """ "What is this?": names for the clicked object, and the vocabulary they come from."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._panels, self._history = panels, panels.session.history
@@ -106,12 +96,7 @@ class ClickPanel:
 
 
 class CamerasPanel:
-    """Jumps to the views of the capture, and their frustums.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Jumps to the views of the capture, and their frustums."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         views = panels.session.scene.views
@@ -127,12 +112,7 @@ class CamerasPanel:
 
 
 class SavePanel:
-    """Screenshot and orbit video.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Screenshot and orbit video."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._display = panels.display

@@ -46,13 +46,13 @@ def write_labels_csv(
             )
 
 
-def write_points_ply(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.1) -> int:
-    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of at least ``min_opacity``.
+def write_points_ply(gaussians: Gaussians, path: Path) -> int:
+    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of opacity 0.1 or more.
 
     Returns:
         Number of points.
     """
-    shown = gaussians.select((gaussians.opacities >= min_opacity).detach())
+    shown = gaussians.select((gaussians.opacities >= 0.1).detach())
     layout = [("place", "<f4", 3), ("color", "u1", 3)]
     table = np.zeros(len(shown), dtype=layout)
     table["place"], table["color"] = shown.means.detach().cpu().numpy(), colors_of(shown)
