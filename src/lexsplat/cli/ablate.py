@@ -13,6 +13,8 @@ from lexsplat.language.methods import VARIANTS, MethodName
 from lexsplat.pipeline.config import BuildConfig
 
 if TYPE_CHECKING:
+    from lexsplat.evaluation.ablate import AblationPlan
+
     VariantName = str
 else:
     VariantName = Literal[VARIANTS]
@@ -37,7 +39,7 @@ class Ablate:
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         forms: How codes and text are compared, measured side by side. The paper's form is "feature".
         as_in_paper: Fit and train as long as the paper (30,000 steps).
-        json: Print ablation.json on standard output.
+        json: Print ablation.json on standard output (docs/schemas/ablation.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
@@ -65,10 +67,12 @@ class Ablate:
     def check(self) -> None:
         """Refuse invalid options."""
         check_seeds(self.seeds)
-        if not self.forms:
-            raise ValueError("--forms needs at least one of feature, code")
-        if not 0 <= self.wrong_labels <= 1:
-            raise ValueError(f"--wrong-labels must be in 0..1, got {self.wrong_labels:g}")
+        self._plan()
+
+    def _plan(self) -> AblationPlan:
+        from lexsplat.evaluation.ablate import AblationPlan
+
+        return AblationPlan(self.seeds, self.variants, self.methods, self.wrong_labels, self.forms)
 
     def run(self) -> None:
         """Measure and print the table."""
@@ -80,13 +84,12 @@ class Ablate:
         capture, settings = capture_and_settings(self.capture, self.settings)
         if self.as_in_paper:
             settings = ablation.as_in_paper(settings)
-        plan = ablation.AblationPlan(self.seeds, self.variants, self.methods, self.wrong_labels, self.forms)
         with ProgressBars() as bars:
             rows = ablation.ablate(
                 capture,
                 self.output,
                 settings,
-                plan,
+                self._plan(),
                 ground_truth=GroundTruthSource(self.masks, self.prompt_list),
                 listener=bars,
             )

@@ -43,7 +43,7 @@ class Compare:
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
         lpips: Measure LPIPS if it is installed; --no-lpips leaves it out.
-        json: Print comparison.json on standard output.
+        json: Print comparison.json on standard output (docs/schemas/comparison.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
@@ -67,6 +67,7 @@ class Compare:
     def check(self) -> None:
         """Refuse invalid options."""
         check_seeds(self.seeds)
+        ComparisonPlan(self.methods, self.seeds)
 
     def run(self) -> None:
         """Measure and print the table."""

@@ -45,7 +45,8 @@ class SelectionPanel:
         selection = current.selection if current else None
         self._facts.content = pages.selection_facts(current)
         self._download.disabled = not selection
-        best = self._session.best_views(selection, _THUMBNAILS) if selection else []
+        shares = selection.view_shares[:_THUMBNAILS] if selection else []
+        best = [(name, share) for name, share in shares if share > 0]
         self._go_to.visible = bool(best)
         self._go_to.options = tuple(name for name, _ in best) or ("",)
         for number, handle in enumerate(self._thumbnails):
