@@ -18,6 +18,7 @@ from lexsplat.language.methods import METHODS
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Presence, Selection
+from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.folder import SceneFolder
@@ -80,7 +81,12 @@ class Answers:
 
         With an automatic threshold, instances that score far worse than the best one are left out as well
         (`Selection.convincing`).
+
+        Raises:
+            QueryError: If there is no prompt of this number.
         """
+        if type(index) is not int or not -len(self) <= index < len(self):
+            raise QueryError("answer", expected=f"a number from 0 to {len(self) - 1}", found=repr(index)[:40])
         if not self.words:
             return self._selection(index)
         word = self.words[index]
@@ -124,8 +130,8 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "best_view", "gaussians",
-        "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
+        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
+        highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
 
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
@@ -138,7 +144,7 @@ def answer_queries(
             "prompt": prompt,
             "threshold": round(limit, 4),
             "peak": 0.0,
-            "best_view": names[0],
+            "peak_view": names[0],
             "gaussians": len(found.selection(number)),
             "present": present,
             "views": {},
@@ -151,7 +157,7 @@ def answer_queries(
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(folder, answer["prompt"], name, image, values, limit)
             if values.max() > answer["peak"]:
-                answer["peak"], answer["best_view"] = float(values.max()), name
+                answer["peak"], answer["peak_view"] = float(values.max()), name
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         "form": scene.query.form,
@@ -194,7 +200,7 @@ def find_phrase(
 ) -> dict[str, Any]:
     """One entry of `find_phrases`."""
     understood = scene.understand(phrase)
-    found = scene.find_understood(understood, view, threshold=threshold).to_dict()
+    found = scene.find(phrase, view, threshold=threshold).to_dict()
     return {**found, "phrase": phrase, "understood": str(understood.phrase), "note": understood.note}
 
 
