@@ -80,10 +80,8 @@ def is_right(question: Mapping[str, Any], answer: Mapping[str, Any], things: Map
         return bool(answer["count"] == question["count"])
     found = identified(answer["instances"], things)
     if not question["names"]:
-        return (
-            answer["present"] == "no"
-            and found <= set(question.get("maybe", []))
-            or (bool(found) and found <= set(question.get("maybe", [])))
+        return (answer["present"] == "no" and found <= set(question.get("maybe", []))) or (
+            bool(found) and found <= set(question.get("maybe", []))
         )
     wanted = set(question["names"])
     return answer["present"] in ("yes", "unsure") and wanted <= found <= wanted | set(

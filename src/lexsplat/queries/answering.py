@@ -33,7 +33,7 @@ from lexsplat.queries.relations import (
     same,
 )
 from lexsplat.queries.selection import PRESENCES, Selection
-from lexsplat.queries.vocabulary import SURFACES
+from lexsplat.queries.vocabulary import NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
 _LARGE = 0.05
@@ -81,10 +81,10 @@ def apart(selection: Selection, searched: Searched) -> Selection:
 
     "Toy" scores high all over a table, so that several objects and the table are one cluster. Where a cluster has
     several known objects, the objects are scored as wholes (by their median) and those close to the best are taken,
-    by the rule of `Selection.convincing`.
+    by the rule of `Selection.convincing`. Phrases with an everyday name, such as "red mug", stay as they are.
     """
     large = len(selection) >= _LARGE * len(selection.mask)
-    if selection.present == "no" or not large or selection.phrase.lower().split()[-1] in SURFACES:
+    if selection.present == "no" or not large or NAMES & set(selection.phrase.lower().split()):
         return selection
     objects = _things(searched)
     inside = [each for each in objects if (each.mask & selection.mask).sum() >= _WHOLE * len(each)]
@@ -202,12 +202,12 @@ def _certain(selection: Selection) -> list[Selection]:
     return [] if selection.present == "no" else selection.instances
 
 
-def _joined(like: Selection, parts: tuple[Selection, ...], present: str | None = None) -> Selection:
+def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | None = None) -> Selection:
     """The union of instances, which stay apart."""
     mask = torch.zeros_like(like.mask)
     for part in parts:
         mask |= part.mask
-    return replace(like, mask=mask, parts=parts, present=present or like.present)  # type: ignore[arg-type]
+    return replace(like, mask=mask, parts=parts, present=present or like.present)
 
 
 def _frame(searched: Searched, targets: Selection) -> Frame:

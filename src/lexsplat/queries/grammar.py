@@ -23,12 +23,12 @@ What does not fit is one thing, asked for in its own words, and `Understood.note
 from __future__ import annotations
 
 import re
+
 from lexsplat.queries.phrases import (
     Anything,
     AtLeast,
     Between,
     Both,
-    CornerName,
     Except,
     InCorner,
     Phrase,

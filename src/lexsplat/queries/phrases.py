@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Union, cast
+from typing import Any, Literal, Union
 
 RelationName = Literal[
-    "left of", "right of", "in front of", "behind", "on", "under", "above", "below", "inside", "next to", "nearest to",
-    "farthest from",
+    "left of", "right of", "in front of", "behind", "on", "under", "above", "below", "inside", "next to",
+    "nearest to", "farthest from",
 ]  # fmt: skip
 PickName = Literal["largest", "smallest", "tallest", "shortest", "leftmost", "rightmost"]
 CornerName = Literal[
@@ -157,5 +157,5 @@ def with_things(phrase: Phrase, change: Callable[[Thing], Phrase]) -> Phrase:
     """The same phrase with each thing replaced."""
     if isinstance(phrase, Thing):
         return change(phrase)
-    changed = {name: with_things(part, change) for name, part in parts_of(phrase).items()}
-    return cast(Phrase, replace(phrase, **changed))
+    changed: dict[str, Any] = {name: with_things(part, change) for name, part in parts_of(phrase).items()}
+    return replace(phrase, **changed)

@@ -30,7 +30,7 @@ _CONTRACTIONS = (
     (r"\bi'm\b", "i am"),
     (r"\b(i|we|you)'ve\b", r"\1 have"),
     (r"\b(i|we|you)'d\b", r"\1 would"),
-    (r"\b(whats|wheres)\b", lambda found: f"{found[1][:-1]} is"),
+    (r"\b(what|where)s\b", r"\1 is"),
 )
 _TAIL = re.compile(
     rf"[\s,;]+(?:please|pls|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
@@ -116,8 +116,8 @@ def as_phrase(words: str) -> str:
     Args:
         words: One sentence with single spaces, without the mark at its end.
     """
-    for pattern, instead in _CONTRACTIONS:
-        words = re.sub(pattern, instead, words, flags=re.IGNORECASE)
+    for contraction, long in _CONTRACTIONS:
+        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
     whole, before = words, ""
     is_asked = False
     while words != before:

@@ -160,8 +160,8 @@ def beside_viewer(relation: RelationName, targets: Selection, camera: Camera, fr
 def in_corner(targets: Selection, everything: Selection, corner: CornerName, frame: Frame) -> Selection:
     """The instances of ``targets`` in the corners of the area that ``everything`` takes.
 
-    The area is a rectangle along the viewer's axes. An instance is in a corner if it lies in the outer quarter of both
-    sides; of several in one corner, the one farthest out is taken.
+    The area is a rectangle along the viewer's axes. An instance is in a corner if it lies in the outer quarter of
+    both sides. Of several in one corner, the one farthest out is taken.
     """
     axes = np.stack([frame.right, frame.ahead])
     places = np.array([axes @ each.center for each in everything.instances or targets.instances])

@@ -23,11 +23,10 @@ _QUALITIES = """
     painted, shiny, soft, fluffy, leafy, tiled, potted, burning, round, square, flat, big, small, large, little, tall,
     open, closed, empty, full, broken, wet, dry, old, new, dark, bright, transparent, colorful, dirty, clean
 """
-SURFACES = frozenset(
-    "table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal, "
-    "plastic, stone, brick, leaves, ground, window, door, curtain, fence, shelf, bed, hand, wheel".split(", ")
-)
-"""Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
+_SURFACES = """
+    table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
+    plastic, stone, brick, leaves, ground, window, door, curtain, fence, shelf, bed, hand, wheel
+"""
 
 
 def words(text: str) -> list[str]:
@@ -35,6 +34,13 @@ def words(text: str) -> list[str]:
     return [" ".join(entry.split()) for entry in text.split(",")]
 
 
+SURFACES = frozenset(words(_SURFACES))
+"""Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
+NAMES = frozenset(entry.split(" of ")[0].split()[-1] for entry in words(_EVERYDAY) + words(_BUNDLED)) - {
+    "wood",
+    "metal",
+}
+"""The nouns of all everyday names."""
 QUALITIES = frozenset(words(_QUALITIES))
 """Adjectives that may follow their noun: "is the mug red", "vase, white"."""
 

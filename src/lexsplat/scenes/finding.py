@@ -30,6 +30,8 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     understood = understand(phrase)
     if understood.note:
         return understood
+    if scene.clip == "bundled" and not phrase.isascii():
+        return Understood(understood.phrase, "the bundled encoder knows English words alone")
     vocabulary = [*default_vocabulary(scene.clip), *QUALITIES]
     mended: dict[str, str] = {}
 

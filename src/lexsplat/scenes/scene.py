@@ -25,7 +25,7 @@ from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.phrases import Understood
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
+from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
 from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
-from lexsplat.queries.heatmaps import overlay_mask
 from lexsplat.queries.grammar import parse
+from lexsplat.queries.heatmaps import overlay_mask
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
