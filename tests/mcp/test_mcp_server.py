@@ -1,3 +1,4 @@
+# ruff: noqa: E501  (one question a line)
 """The MCP server, through the client of the official package."""
 
 import asyncio

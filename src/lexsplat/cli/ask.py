@@ -19,8 +19,8 @@ class Ask:
     """Ask a scene in your own words: "where is the mug?", "what is on the table?", "how many toys are there?".
 
     With --stdin the scene stays open. Each line of standard input is a phrase, or a JSON object with "ask" and
-    optionally "view", "threshold" and "id". Each line of standard output is the answer as one JSON document. Errors are
-    answers as well, and the program goes on.
+    optionally "view", "threshold" and "id". Each line of standard output is the answer as one JSON document. Errors
+    are answers as well, and the program goes on.
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.

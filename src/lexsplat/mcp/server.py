@@ -27,8 +27,8 @@ MAX_BODY = 1 << 20
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 INSTRUCTIONS = (
-    "Places that can be searched with words. Positions are in scene units, in the axes of the scene; meters are given "
-    'where the scale is known. "present": "no" means that the scene does not hold it: say so, and do not guess. '
+    "Places that can be searched with words. Positions are in scene units, in the axes of the scene; meters are "
+    'given where the scale is known. "present": "no" means that the scene does not hold it: say so, and do not guess. '
     '"understood" tells how a phrase was parsed.'
 )
 
@@ -163,8 +163,8 @@ def _add_prompts(server: MCPServer) -> None:
     def inventory(scene: str = "") -> str:
         """List what a place holds, with places and sizes."""
         return (
-            f"Make an inventory of the place {scene}. Call describe_scene and list_objects, then find for things that "
-            "you expect in such a place but do not see in the list. Give a table: name, count, place in words, size. "
+            f"Make an inventory of the place {scene}. Call describe_scene and list_objects, then find for things "
+            "that you expect in such a place but do not see in the list. Give a table: name, count, place in words, size. "
             "Name what is unsure, and leave out what is not present."
         )
 
@@ -172,6 +172,6 @@ def _add_prompts(server: MCPServer) -> None:
     def where_is(thing: str, scene: str = "") -> str:
         """Find a lost thing and tell where it is in words."""
         return (
-            f"Find {thing} in the place {scene} with find. If it is present, describe its place by the things next to "
-            "it (relate, nearest) and show it with render(look_at=...). If it is not, say so and name what is similar."
+            f"Find {thing} in the place {scene} with find. If it is present, describe its place by what is next to it "
+            "(relate, nearest) and show it with render(look_at=...). If it is not, say so and name what is similar."
         )

@@ -32,7 +32,7 @@ from lexsplat.queries.relations import (
     related,
     same,
 )
-from lexsplat.queries.selection import PRESENCES, Selection
+from lexsplat.queries.selection import PRESENCES, Presence, Selection
 from lexsplat.queries.vocabulary import NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
