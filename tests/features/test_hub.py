@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import huggingface_hub
 import pytest
-from huggingface_hub import errors
+from huggingface_hub import constants, errors
 from support.refusals import assert_tells
 
 from lexsplat.features import hub
@@ -41,7 +41,7 @@ class Hub:
         self.fetched: list[dict] = []
         self.folder = tmp_path / "snapshot"
         self.cached: dict[str, Path] = {}
-        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
         monkeypatch.setattr(
             huggingface_hub.HfApi, "model_info", lambda api, name, **given: self.info(**given)
         )
