@@ -18,6 +18,7 @@ from PIL import Image
 
 from lexsplat.captures.capture import Capture, View
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
+from lexsplat.captures.sfm.feature_budget import check_mapping
 from lexsplat.captures.sfm.photos import PoseConfig
 from lexsplat.captures.sfm.preparation import PreparedPhotos
 from lexsplat.runtime import memory as budget
@@ -288,7 +289,7 @@ def _run_pycolmap(
     mapping.match_pairs(database, pairs, memory, seed=None)
     # Drops matches that violate the epipolar geometry of the known poses; estimates nothing.
     pycolmap.guided_geometric_verification(known, database)
-    mapping.check_mapping(database, memory)
+    check_mapping(database, memory)
     listener(Event(STAGE, done + 2, total))
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
     (folder / "model").mkdir()
