@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -21,8 +22,8 @@ from lexsplat.captures.readers.camera_files import MAX_COORDINATE
 from lexsplat.captures.sfm.photos import PoseConfig
 from lexsplat.captures.sfm.preparation import PreparedPhotos
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -123,7 +124,9 @@ def triangulate(
     empty = np.zeros((0, 3), np.float32)
     if len(views) < 2:
         return empty, empty
-    cached = None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.npz"
+    cached = (
+        None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.safetensors"
+    )
     if cached is not None and (known := _read_cache(cached)) is not None:
         return known
     from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
@@ -360,19 +363,13 @@ def _cache_key(views: tuple[View, ...], seed: int) -> str:
 
 
 def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Cached points; None where there are none or the file is damaged."""
+    """Cached points and colors; None where there are none or the file is damaged."""
     try:
-        with np.load(file, allow_pickle=False) as content:
-            points, colors = content["points"], content["colors"]
-    except Exception:  # numpy raises many types on damaged archives; the points are triangulated again
+        tensors, _ = read_tensors(file)
+        return tensors["points"].numpy(), tensors["colors"].numpy()
+    except (FileFormatError, KeyError):  # the points are triangulated again
         return None
-    sound = points.ndim == 2 and points.shape[1:] == (3,) and points.shape == colors.shape
-    if not sound or not (np.isfinite(points).all() and np.isfinite(colors).all()):
-        return None
-    return points.astype(np.float32), colors.astype(np.float32)
 
 
 def _write_cache(file: Path, points: NDArray[np.float32], colors: NDArray[np.float32]) -> None:
-    """Cache points atomically."""
-    with atomic_path(file) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, points=points, colors=colors)
+    write_tensors(file, {"points": torch.from_numpy(points), "colors": torch.from_numpy(colors)}, {})
