@@ -22,7 +22,7 @@ from torch import Tensor
 from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
-from lexsplat.runtime.fingerprints import digest, file_hash
+from lexsplat.runtime.fingerprints import digest
 
 FORMAT_VERSION = "1"
 
@@ -113,11 +113,6 @@ def hash_of(*parts: Any) -> str:
     """Hash of JSON-like values, 32 hex digits: the cache keys. Changing it invalidates every cache."""
     text = json.dumps(parts, sort_keys=True, default=str)
     return digest([text.encode()], 16)
-
-
-def hash_file(path: Path) -> str:
-    """Hash of a file's bytes, 32 hex digits: part of cache keys."""
-    return file_hash(path, digest_size=16)
 
 
 def write_crops(

@@ -92,7 +92,8 @@ def find_pairs(projection: Projection, width: int, height: int) -> TilePairs:
     tiles_x, tiles_y = -(-width // binning.TILE), -(-height // binning.TILE)
     histogram = np.zeros((STRIPS, tiles_x * tiles_y), np.int64)
     tile_offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
-    parallel(binning.count_pairs, STRIPS, 1, boxes, tiles_x, STRIPS, histogram)
+    lists = boxes, tiles_x, histogram, pair_offsets, members, pairs
+    parallel(binning.list_pairs, STRIPS, 1, True, *lists)
     binning.offsets_of(histogram, tile_offsets)
-    parallel(binning.fill_pairs, STRIPS, 1, boxes, tiles_x, STRIPS, histogram, pair_offsets, members, pairs)
+    parallel(binning.list_pairs, STRIPS, 1, False, *lists)
     return TilePairs(width, height, count, order, ellipses, boxes, pair_offsets, tile_offsets, members, pairs)

@@ -198,9 +198,7 @@ def without_misregistered(
     """The model with its mis-registered photos registered again, or removed."""
     with pycolmap.Database.open(database) as opened:
         wrong = misregistered(model, opened)
-    if not wrong:
-        return model
-    return register_again(model, wrong, database, photos.images, _mapper_options(seed))
+    return register_again(model, wrong, database, photos.images, _mapper_options(seed)) if wrong else model
 
 
 def write_model(model: pycolmap.Reconstruction, output: Path) -> None:
