@@ -15,7 +15,6 @@ from support.rooms import (
     room_cameras,
     room_photo,
     save_as_phone,
-    texture,
 )
 from support.written_captures import save
 
@@ -31,9 +30,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     for index, camera in enumerate(room_cameras()):
-        save(folder / f"{index}.png", room_photo(camera, textures))
+        save(folder / f"{index}.png", room_photo(camera))
     save(folder / "unrelated.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     events = []
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), listener=events.append), events
@@ -179,10 +177,9 @@ def test_masks_ground_truth_and_the_output_are_not_photos(tmp_path):
 def phone(tmp_path_factory):
     """The room as photographed by a phone: rotated, with a masked sticker on the lens; uses the global mapper."""
     folder = tmp_path_factory.mktemp("phone")
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     sticker = np.random.default_rng(5).random((90, 70, 3)).repeat(2, 0)[:90].repeat(2, 1)[:, :70]
     for index, camera in enumerate(room_cameras()):
-        photo = room_photo(camera, textures)
+        photo = room_photo(camera)
         if index == 4:  # without the sticker
             save_as_phone(folder / "images" / f"{index}.jpg", photo, 6)
             continue
@@ -229,10 +226,9 @@ def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, 
     """Each photo is matched with the next one only, which has no features: every second photo is blank."""
     monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
     monkeypatch.setattr(mapping, "SEQUENTIAL_OVERLAP", 1)
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     cameras = room_cameras()
     for index, camera in enumerate(cameras):
-        save(tmp_path / "photos" / f"{index}.png", room_photo(camera, textures))
+        save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
         save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     with pytest.raises(CaptureError, match="none of which could be registered"):
         poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
