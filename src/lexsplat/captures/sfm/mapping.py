@@ -232,9 +232,8 @@ def _without_misregistered(
     """The model with its mis-registered photos registered again, or removed."""
     with pycolmap.Database.open(database) as opened:
         wrong = misregistered(model, opened)
-    if not wrong:
-        return model
-    return register_again(model, wrong, database, photos.images, _mapper_options(mapper, seed))
+    options = _mapper_options(mapper, seed)
+    return register_again(model, wrong, database, photos.images, options) if wrong else model
 
 
 def unregistered(names: Iterable[str], attempt: Attempt | None) -> tuple[str, ...]:
