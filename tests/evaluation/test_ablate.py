@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from support import color_encoder
 from support.experiments import CONFIG
 from support.report_pages import Page
 from support.schemas import validated
@@ -27,15 +26,7 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.memory import parse_bytes
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 
 
 @pytest.fixture(scope="module")

@@ -34,21 +34,10 @@ def compared(tiny_capture, tmp_path_factory):
             comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
         )
         methods = ("averaged", "averaged-feature", *comparison.BASELINES)
-        comparison.compare(
-            tiny_capture,
-            folder,
-            CONFIG,
-            ComparisonPlan(methods=methods),
-            evaluation=EvaluationConfig(lpips=False),
-        )
+        settings = {"plan": ComparisonPlan(methods=methods), "evaluation": EvaluationConfig(lpips=False)}
+        comparison.compare(tiny_capture, folder, CONFIG, **settings)
         start = time.perf_counter()
-        comparison.compare(
-            tiny_capture,
-            folder,
-            CONFIG,
-            ComparisonPlan(methods=methods),
-            evaluation=EvaluationConfig(lpips=False),
-        )
+        comparison.compare(tiny_capture, folder, CONFIG, **settings)
         again = time.perf_counter() - start
     return folder, again
 

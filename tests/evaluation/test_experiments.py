@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support import color_encoder
 from support.experiments import CONFIG
 from support.schemas import validated
 
@@ -16,15 +15,9 @@ from lexsplat.evaluation.ablate import make_language, paper_evaluation
 from lexsplat.evaluation.experiments import Bench, Row
 from lexsplat.runtime.errors import CaptureError
 
+pytestmark = pytest.mark.usefixtures("color_encoders")
+
 AVERAGED = replace(CONFIG, method="averaged", iterations=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
 
 
 @pytest.fixture

@@ -10,8 +10,6 @@ from support.schemas import SCHEMAS, validated
 from lexsplat import cli
 from lexsplat.scenes.folder import BUNDLED_SCENE
 
-pytestmark = pytest.mark.xdist_group("built")
-
 
 def answer(capsys, *arguments: str) -> dict:
     capsys.readouterr()

@@ -3,7 +3,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.question_scene import lifted_cloud, texts
+from support.question_scene import coded_cloud, texts
 
 from lexsplat.queries import relevancy as queries
 from lexsplat.queries.relevancy import QueryConfig, Question
@@ -28,8 +28,8 @@ def distributions(shape, seed, sharpness=3.0):
 
 
 @pytest.fixture(scope="module")
-def lifted():
-    return lifted_cloud()
+def cloud():
+    return coded_cloud()
 
 
 # Text
@@ -131,8 +131,8 @@ def test_what_is_not_covered_is_not_relevant(form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(lifted, form):
-    field, gaussians, camera = lifted
+def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(cloud, form):
+    field, gaussians, camera = cloud
     found = queries.render_relevancy(field, gaussians, camera, asked(form))
     probabilities = field.render_code_probabilities(gaussians, camera)
     expected = queries.probability_relevancy(probabilities, field.codebook.clip, asked(form))
@@ -141,10 +141,10 @@ def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(lifted, f
     assert not found[:, 0, 0].any(), "the corner is empty"
 
 
-def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted):
+def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(cloud):
     from lexsplat.rendering import render
 
-    field, gaussians, camera = lifted
+    field, gaussians, camera = cloud
     scores = queries.gaussian_relevancy(field, asked())
     rendered = render(gaussians, camera, features=scores.T.contiguous(), color=False).features
     found = queries.render_relevancy(field, gaussians, camera, asked())
@@ -153,8 +153,8 @@ def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
-    field, _, _ = lifted
+def test_scores_of_gaussians_come_from_their_own_distributions(cloud, form):
+    field, _, _ = cloud
     found = queries.gaussian_relevancy(field, asked(form))
     dense = queries.probability_relevancy(field.code_probabilities(), field.codebook.clip, asked(form))
     torch.testing.assert_close(found, dense.T, rtol=0, atol=1e-6)
@@ -162,9 +162,9 @@ def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, monkeypatch):
+def test_scores_of_gaussians_never_hold_all_distributions(cloud, form, monkeypatch):
     """``[N, K]`` of millions of Gaussians would be gigabytes."""
-    field, _, _ = lifted
+    field, _, _ = cloud
     whole = queries.gaussian_relevancy(field, asked(form))
     most = []
 
@@ -181,8 +181,8 @@ def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, monkeypa
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_prompts_do_not_influence_each_other(lifted, form):
-    field, gaussians, camera = lifted
+def test_prompts_do_not_influence_each_other(cloud, form):
+    field, gaussians, camera = cloud
     question = asked(form)
     together = queries.render_relevancy(field, gaussians, camera, question)
     for index in range(3):
