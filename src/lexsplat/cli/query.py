@@ -65,7 +65,6 @@ class Query:
         "negatives": '"object" "things" "stuff" "texture"',
         "temperature": "10",
         "template": "those of the scene",
-        "clip": "the encoder of the build",
     }
 
     def check(self) -> None:
