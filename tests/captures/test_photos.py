@@ -19,7 +19,7 @@ from support.rooms import (
 from support.written_captures import save
 
 from lexsplat.captures import PoseConfig, load_capture, poses_from_photos
-from lexsplat.captures.sfm import photos
+from lexsplat.captures.sfm import mapping, photos
 from lexsplat.captures.sfm.photos import find_photos
 from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
 from lexsplat.runtime.errors import CaptureError
@@ -59,10 +59,10 @@ def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
 
 def test_a_mis_registered_photo_is_registered_again(room, tmp_path, monkeypatch):
     folder, _, _ = room
-    mapping, moved = pycolmap.incremental_mapping, []
+    original, moved = pycolmap.incremental_mapping, []
 
     def misled_once(*arguments, **options):
-        found = mapping(*arguments, **options)
+        found = original(*arguments, **options)
         if not moved:
             moved.extend(
                 number for number in found[0].reg_image_ids() if found[0].image(number).name == "4.png"
@@ -225,7 +225,7 @@ def test_masked_pixels_yield_no_features(phone):
 def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, monkeypatch):
     """Each photo is matched with the next one only, which has no features: every second photo is blank."""
     monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
-    monkeypatch.setattr(photos, "SEQUENTIAL_OVERLAP", 1)
+    monkeypatch.setattr(mapping, "SEQUENTIAL_OVERLAP", 1)
     cameras = room_cameras()
     for index, camera in enumerate(cameras):
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera))

@@ -14,10 +14,9 @@ from support.language_scene import CENTERS, IGNORED, make_scene
 from lexsplat.evaluation import Method
 from lexsplat.evaluation.baselines import (
     DffConfig,
-    DistilledFeatures,
+    GaussianFeatures,
     LerfConfig,
     Ovs3dConfig,
-    ScaledFeatures,
     TrainingData,
     ViewFeatures,
     distill,
@@ -147,7 +146,7 @@ def test_distilling_moves_from_the_mean_towards_the_least_squares_solution_and_i
     data = TrainingData(balls.gaussians, balls.cameras, noisy)
     average = distill(data, DffConfig(steps=0))
     fitted = distill(data, DffConfig(steps=40, learning_rate=0.05))
-    left = (error(fitted.features) - error(best)) / (error(average.features) - error(best))
+    left = (error(fitted.features[0]) - error(best)) / (error(average.features[0]) - error(best))
     assert 0 <= left < 0.6
     again = distill(data, DffConfig(steps=40, learning_rate=0.05))
     torch.testing.assert_close(fitted.features, again.features)
@@ -184,11 +183,12 @@ def test_each_prompt_takes_the_scale_with_the_highest_relevancy(balls):
     labels = torch.from_numpy(balls.labels)
     first[labels == 0] = WORDS[0]
     second[labels == 1] = WORDS[1]
-    both = ScaledFeatures(torch.stack([first, second]), torch.tensor([0.1, 0.2]))
+    both = GaussianFeatures("both", torch.stack([first, second]), torch.tensor([0.1, 0.2]))
     camera = balls.cameras["view0"]
     found = both.relevancy(balls.gaussians, camera, Question(WORDS[:2], OTHER))
     for index, features in enumerate((first, second)):
-        alone = DistilledFeatures(features).relevancy(balls.gaussians, camera, Question(WORDS[:2], OTHER))
+        alone = GaussianFeatures("one", features[None])
+        alone = alone.relevancy(balls.gaussians, camera, Question(WORDS[:2], OTHER))
         torch.testing.assert_close(found[index], alone[index])
     scores = both.gaussian_scores(Question(WORDS[:2], OTHER))
     assert ((scores[0] > 0.9).numpy() == (balls.labels == 0)).all()

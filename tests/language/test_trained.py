@@ -245,6 +245,18 @@ def test_every_part_has_its_learning_rate_and_its_decay(balls) -> None:
         assert of_parts("lr") == pytest.approx([factor * rate for rate in (0.1, 0.2, 0.3, 0.4)])
 
 
+def test_equations_12_and_15_weight_their_terms(balls) -> None:
+    config = replace(QUICK, lambda_ce=2.0, lambda_u=0.5, lambda_s=3.0, lambda_smo=0.25)
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, config)
+    found = trainer.step(balls.cameras["view0"], balls.code_maps["view0"])
+    assert float(found["semantic"]) == pytest.approx(
+        2.0 * float(found["cross_entropy"]) + 0.5 * float(found["uncertainty"])
+    )
+    assert float(found["loss"]) == pytest.approx(
+        3.0 * float(found["semantic"]) + 0.25 * float(found["smoothing"])
+    )
+
+
 def test_smoothing_runs_every_so_many_steps(balls) -> None:
     trainer = FieldTrainer(balls.gaussians, balls.codebook, replace(QUICK, smoothing_every=3))
     steps = [trainer.step(balls.cameras["view0"], balls.code_maps["view0"]) for _ in range(6)]

@@ -252,15 +252,15 @@ def test_a_scene_is_edited_on_the_gpu(on_gpu):
     scene.embed(WORDS)  # what comes after an edit is no scene that embeds words by itself
     editor = Editor(scene)
     count = len(ground_truth.labels)
-    editor.recolor(editor.select("ball 0"), (1.0, 0.0, 0.0), strength=0.5)
-    editor.move(editor.select("ball 1"), Motion(translation=(0.0, 0.0, 0.3), scale=1.1))
-    editor.duplicate(editor.select("ball 2"), Motion(translation=(0.0, 0.0, 2.0)))
-    editor.delete(editor.select("ball 3"))
+    editor.recolor(editor.scene.select("ball 0"), (1.0, 0.0, 0.0), strength=0.5)
+    editor.move(editor.scene.select("ball 1"), Motion(translation=(0.0, 0.0, 0.3), scale=1.1))
+    editor.duplicate(editor.scene.select("ball 2"), Motion(translation=(0.0, 0.0, 2.0)))
+    editor.delete(editor.scene.select("ball 3"))
     assert len(editor.scene.gaussians) == count
     assert devices(editor.scene.gaussians.tensors().values()) == {"cuda:0"}
     assert editor.undo()
     assert len(editor.scene.gaussians) == count + 20
-    editor.keep(editor.select("ball 4"))
+    editor.keep(editor.scene.select("ball 4"))
     assert len(editor.scene.gaussians) == 20
 
 
@@ -279,7 +279,7 @@ def test_the_viewer_answers_on_the_gpu(on_gpu):
     session.refine(question)
     for session.mode in MODES:
         assert session.colors().shape == (len(ground_truth.labels), 3)
-    view, _ = session.best_views(question.selection)[0]
+    view, _ = question.selection.view_shares[0]
     assert session.thumbnail(view, question.selection).dtype == np.uint8
     assert session.what_is(ground_truth.cameras[view], 48.0, 36.0) is not None
     for ending in (".ply", ".splat"):

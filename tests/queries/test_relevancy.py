@@ -38,32 +38,29 @@ def cloud():
 @pytest.mark.parametrize("prompts", [[], [""], ["apple", "  \n"], ""])
 def test_an_empty_prompt_is_an_error_with_a_remedy(prompts):
     with pytest.raises(QueryError, match="red apple"):
-        queries.expand_templates(prompts)
+        queries.check_prompts(prompts)
 
 
-def test_templates_multiply_prompts_in_order():
-    found = queries.expand_templates(["  red   apple ", "cup {x}"], ["a {}", "the {}."])
-    assert found == ["a red apple", "the red apple.", "a cup {x}", "the cup {x}."]
-    with pytest.raises(ValueError, match="once"):
-        queries.expand_templates(["apple"], ["a photo"])
-
-
-def test_averaged_templates_are_mean_directions_whatever_the_lengths():
-    a, b = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 5.0]])
-    found = queries.average_templates(torch.cat([a, b, b, b]), 2)
-    torch.testing.assert_close(found, torch.tensor([[0.5**0.5, 0.5**0.5], [0.0, 1.0]]))
-
-
-def test_prompts_are_encoded_in_one_call():
+def test_prompts_in_all_templates_are_encoded_in_one_call():
     calls = []
 
     def encode(batch):
         calls.append(batch)
         return torch.tensor([[float(len(text)), 1.0] for text in batch])
 
-    found = queries.embed_prompts(["ab", "abcd"], encode, ("{}", "{}!"))
-    assert calls == [["ab", "ab!", "abcd", "abcd!"]]
+    found = queries.embed_prompts(["  red   apple ", "cup {x}"], encode, ("a {}", "the {}."))
+    assert calls == [["a red apple", "the red apple.", "a cup {x}", "the cup {x}."]]
     assert found.shape == (2, 2)
+    with pytest.raises(ValueError, match="once"):
+        queries.QueryConfig(templates=("a photo",))
+
+
+def test_templates_are_averaged_as_directions_whatever_the_lengths():
+    vectors = {"a": [1.0, 0.0], "a!": [0.0, 5.0], "b": [0.0, 5.0], "b!": [0.0, 5.0]}
+    found = queries.embed_prompts(
+        ["a", "b"], lambda texts: torch.tensor([vectors[t] for t in texts]), ("{}", "{}!")
+    )
+    torch.testing.assert_close(found, torch.tensor([[0.5**0.5, 0.5**0.5], [0.0, 1.0]]))
 
 
 # Relevancy

@@ -10,6 +10,7 @@ from support.language_scene import make_codebook, make_scene
 
 from lexsplat.language.fields import CodeField
 from lexsplat.queries.heatmaps import colorize
+from lexsplat.scenes.formats.tables import colors_of
 from lexsplat.viewer.coloring import (
     MODES,
     PROMPT_COLORS,
@@ -19,7 +20,6 @@ from lexsplat.viewer.coloring import (
     language_colors,
     likeliest_codes,
     peak_of,
-    photo_colors,
 )
 
 
@@ -48,7 +48,7 @@ def test_photo_colors_come_from_the_constant_spherical_harmonic(balls):
     gaussians = balls.gaussians.select(torch.arange(3))
     gaussians.sh0 = torch.tensor([[[0.0, 1.0, -1.0]], [[9.0, -9.0, 0.0]], [[0.0, 0.0, 0.0]]])
     expected = [[128, 200, 56], [255, 0, 128], [128, 128, 128]]  # 255 (0.5 + 0.2820948 c), cut to 0..255
-    assert np.abs(photo_colors(gaussians).astype(int) - expected).max() <= 1
+    assert np.abs(colors_of(gaussians).astype(int) - expected).max() <= 1
 
 
 def test_relevancy_changes_only_marked_gaussians(balls, field):
@@ -88,7 +88,7 @@ def test_where_prompts_overlap_the_more_relevant_one_is_drawn(balls, field):
 def test_a_mask_overrides_the_threshold(balls, field):
     mask = balls.labels == 4
     colors = Coloring(balls.gaussians, field).colors("relevancy", [layer(balls, 2, mask=mask)])
-    assert np.array_equal((colors != photo_colors(balls.gaussians)).any(1), mask)
+    assert np.array_equal((colors != colors_of(balls.gaussians)).any(1), mask)
 
 
 def test_opacity_and_fade_mix_linearly(balls, field):

@@ -120,11 +120,12 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
         source: Folder of the capture if it has been moved since the build.
 
     Raises:
-        SceneFolderError: If the photos are not where the build found them.
+        SceneFolderError: If a photo is not where the build found it.
         CaptureError: If they cannot be used.
     """
     record = folder.record
-    held_out = [name for name, view in folder.read_cameras().items() if view.split == "test"]
+    views = folder.read_cameras()
+    held_out = [name for name, view in views.items() if view.split == "test"]
     downscale = record.get("config", {}).get("downscale") or 1.0
     images = record.get("images")
     recorded = record.get("capture")
@@ -137,13 +138,22 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
             found="no such folder",
             remedy="give their folder with --capture",
         )
-    if images is None or place is None:
-        return load_capture(place or folder.root / "poses", downscale=downscale, test_names=held_out)
     poses = folder.root / "poses"
-    return load_capture(
-        poses,
-        images=photo_folder(source) if source is not None and not owned else folder.root / images,
-        beside=place if place.is_dir() else poses,
-        downscale=downscale,
-        test_names=held_out,
-    )
+    if images is None or place is None:
+        found = load_capture(place or poses, downscale=downscale, test_names=held_out)
+    else:
+        found = load_capture(
+            poses,
+            images=photo_folder(source) if source is not None and not owned else folder.root / images,
+            beside=place if place.is_dir() else poses,
+            downscale=downscale,
+            test_names=held_out,
+        )
+    if missing := set(views) - set(found.views):
+        raise SceneFolderError(
+            found.root,
+            expected=f"the {len(views)} photos of the build",
+            found=f"{len(missing)} missing, such as {min(missing)}",
+            remedy="put them back or build again",
+        )
+    return found
