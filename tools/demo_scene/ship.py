@@ -1,4 +1,4 @@
-"""Makes the finished scene that ships with the package: ``python tools/demo_scene/ship.py``.
+"""Build the bundled finished scene: ``python tools/demo_scene/ship.py``.
 
 Builds the demo scene as ``lexsplat demo`` does, but with spherical harmonics of degree 1 in place of 3, which
 halves the file, and keeps what questions need: cameras, Gaussians, language. ``--record`` builds nothing: it

@@ -29,7 +29,7 @@ _MARGIN = 1.2  # side of a picture, in sides of the box around what it shows
 
 
 def pictures(side: int) -> Tensor:
-    """A square picture of each of `WORDS` ``[W, 3, side, side]`` in 0..1: where it is largest in the bundled photos."""
+    """A square crop for each of `WORDS` ``[W, 3, side, side]`` in 0..1, of the photo that shows it largest."""
     return torch.cat([_picture(word, side) for word in WORDS])
 
 

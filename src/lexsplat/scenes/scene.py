@@ -257,22 +257,19 @@ class Scene:
 
         return answer(parsed, lambda text: answers.selection(things.index(text)), viewer)
 
-    def click(
-        self, view: str | StoredView | Camera, x: float, y: float, *, similarity: float | None = None
-    ) -> Selection:
+    def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
         """The surface at a pixel, and what is connected to it and means the same.
 
         Args:
             view: The view that was clicked.
             x: Pixels from the left; the first pixel's center is 0.5.
             y: Pixels from the top.
-            similarity: Smallest similarity in language, in 0..1; None derives it from the scene.
 
         Raises:
             QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
         hit = surface_at(self.gaussians, self.camera(view), x, y)
-        return select_hit(hit, self.gaussians, self.field, self.cameras, similarity, self.world)
+        return select_hit(hit, self.gaussians, self.field, self.cameras, self.world)
 
     @property
     def presence_classifier(self) -> PresenceClassifier:
