@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,9 +23,10 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
+from lexsplat.queries.everyday import EverydayScale, everyday_words
 from lexsplat.queries.phrases import parse, things_of
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
+from lexsplat.queries.presence import Presence, PresenceClassifier
 from lexsplat.queries.relations import answer
 from lexsplat.queries.relevancy import (
     QueryConfig,
@@ -36,7 +38,7 @@ from lexsplat.queries.relevancy import (
     render_relevancy,
 )
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.thresholds import check_threshold, scene_thresholds
+from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
@@ -96,6 +98,7 @@ class Scene:
     def query(self, query: QueryConfig) -> None:
         self._query = query
         self._classifier: PresenceClassifier | None = None
+        self._scale: EverydayScale | None = None
         self._thresholds: dict[str, float] = {}
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
@@ -132,11 +135,11 @@ class Scene:
         if self._given_encode_text is not None:
             return self._given_encode_text(texts)
         known = self._encoder_hash
-        writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
-        if self.folder is None or known is None or not writable:
+        if self.folder is None or known is None:
             return encode_each(self._load_encoder(known), texts)
         if self._cache is None:
-            self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
+            writable = not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
+            self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     def encoder_identity(self) -> dict[str, str]:
@@ -170,8 +173,17 @@ class Scene:
             )
         return self._encoder
 
-    def _question(self, prompts: str | Sequence[str]) -> Question:
-        return Question(self.embed(prompts), self.embed(self.query.negatives), self.query)
+    def question(self, prompts: str | Sequence[str]) -> Question:
+        """The embedded prompts with what they are compared with."""
+        scale = self.everyday_scale if self.query.everyday else None
+        return Question(self.embed(prompts), self.embed(self.query.compared), self.query, scale)
+
+    @property
+    def everyday_scale(self) -> EverydayScale:
+        """What everyday words reach in the scene; made at first use."""
+        if self._scale is None:
+            self._scale = EverydayScale.of(self.field.codebook.clip, self.embed(everyday_words()))
+        return self._scale
 
     # -- answers
 
@@ -189,9 +201,9 @@ class Scene:
         """
         prompts = check_prompts(prompts)
         given = None if threshold is None else check_threshold(threshold)
-        question = self._question(prompts)
+        question = self.question(prompts)
         scores = gaussian_relevancy(self.field, question)
-        presences = tuple(self.presence_classifier.classify(row) for row in scores)
+        presences = self.presence_classifier.classify(question.positives, scores)
         if given is None:
             thresholds = self._automatic_thresholds(prompts, question, presences)
         else:
@@ -205,11 +217,11 @@ class Scene:
             QueryError: If a prompt is empty or the view is unknown.
         """
         camera = self.camera(view)
-        return render_relevancy(self.field, self.gaussians, camera, self._question(prompts))
+        return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        return gaussian_relevancy(self.field, self._question(prompts))
+        return gaussian_relevancy(self.field, self.question(prompts))
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
@@ -275,17 +287,21 @@ class Scene:
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            references = self._question(REFERENCE_PHRASES)
-            self._classifier = PresenceClassifier(self.gaussians, self.field, references)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale)
         return self._classifier
 
     def _automatic_thresholds(
         self, prompts: Sequence[str], question: Question, presences: Sequence[Presence]
     ) -> Tensor:
-        """The threshold ``[P]`` of each prompt; known ones are not computed again."""
+        """The threshold ``[P]`` of each prompt; known ones are not computed again.
+
+        Relative to everyday words, a relevancy of 0.5 is the border itself.
+        """
+        if question.scale is not None:
+            return torch.full((len(prompts),), BORDER)
         new = [place for place, prompt in enumerate(prompts) if prompt not in self._thresholds]
         if new:
-            asked = Question(question.positives[new], question.negatives, question.config)
+            asked = replace(question, positives=question.positives[new])
             views = list(self.views.values())
             training = [view.camera for view in views if view.split == "train"]
             found = scene_thresholds(
