@@ -148,7 +148,7 @@ class Bench:
                 remedy=remedy,
             )
         self.gaussians: Gaussians = self.folder.read_gaussians().to(self.device)
-        self._encoders = Encoders(config.clip, config.dino, self.device)
+        self._encoders = Encoders(config.clip, config.dino, self.config.encoder_device)
         self._maps: FeatureMaps | None = None
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
