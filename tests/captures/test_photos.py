@@ -15,12 +15,11 @@ from support.rooms import (
     room_cameras,
     room_photo,
     save_as_phone,
-    texture,
 )
 from support.written_captures import save
 
 from lexsplat.captures import PoseConfig, load_capture, poses_from_photos
-from lexsplat.captures.sfm import photos
+from lexsplat.captures.sfm import mapping, photos
 from lexsplat.captures.sfm.photos import find_photos
 from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
 from lexsplat.runtime.errors import CaptureError
@@ -31,9 +30,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     for index, camera in enumerate(room_cameras()):
-        save(folder / f"{index}.png", room_photo(camera, textures))
+        save(folder / f"{index}.png", room_photo(camera))
     save(folder / "unrelated.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     events = []
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), listener=events.append), events
@@ -61,10 +59,10 @@ def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):
 
 def test_a_mis_registered_photo_is_registered_again(room, tmp_path, monkeypatch):
     folder, _, _ = room
-    mapping, moved = pycolmap.incremental_mapping, []
+    original, moved = pycolmap.incremental_mapping, []
 
     def misled_once(*arguments, **options):
-        found = mapping(*arguments, **options)
+        found = original(*arguments, **options)
         if not moved:
             moved.extend(
                 number for number in found[0].reg_image_ids() if found[0].image(number).name == "4.png"
@@ -179,10 +177,9 @@ def test_masks_ground_truth_and_the_output_are_not_photos(tmp_path):
 def phone(tmp_path_factory):
     """The room as photographed by a phone: rotated, with a masked sticker on the lens; uses the global mapper."""
     folder = tmp_path_factory.mktemp("phone")
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     sticker = np.random.default_rng(5).random((90, 70, 3)).repeat(2, 0)[:90].repeat(2, 1)[:, :70]
     for index, camera in enumerate(room_cameras()):
-        photo = room_photo(camera, textures)
+        photo = room_photo(camera)
         if index == 4:  # without the sticker
             save_as_phone(folder / "images" / f"{index}.jpg", photo, 6)
             continue
@@ -228,11 +225,10 @@ def test_masked_pixels_yield_no_features(phone):
 def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, monkeypatch):
     """Each photo is matched with the next one only, which has no features: every second photo is blank."""
     monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
-    monkeypatch.setattr(photos, "SEQUENTIAL_OVERLAP", 1)
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+    monkeypatch.setattr(mapping, "SEQUENTIAL_OVERLAP", 1)
     cameras = room_cameras()
     for index, camera in enumerate(cameras):
-        save(tmp_path / "photos" / f"{index}.png", room_photo(camera, textures))
+        save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
         save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     with pytest.raises(CaptureError, match="none of which could be registered"):
         poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))

@@ -12,8 +12,6 @@ from support.command_line import Terminal, fails_in_one_line, modified
 from lexsplat import cli, open_scene
 from lexsplat.scenes.folder import BUNDLED_SCENE
 
-pytestmark = pytest.mark.xdist_group("built")
-
 
 def without_texts(times):
     """Without the cache of texts, which every question may add to."""

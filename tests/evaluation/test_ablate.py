@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from support import color_encoder
 from support.experiments import CONFIG
 from support.report_pages import Page
+from support.schemas import validated
 
 from lexsplat import cli
+from lexsplat.captures import Annotations
 from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
 from lexsplat.evaluation.ablate import AblationPlan
@@ -25,15 +26,7 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.memory import parse_bytes
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 
 
 @pytest.fixture(scope="module")
@@ -171,23 +164,24 @@ def test_the_tables_have_all_rows_with_mean_and_spread(ablated):
     assert [row["name"] for row in rows] == list(METHODS["trained"].variants)
     assert all(row["runs"] == "2" for row in rows)
     record = json.loads((ablated / "ablation.json").read_text())
+    validated("ablation", record)
     values = [run["auto"]["mIoU"] for run in record["runs"]["full"]]
     assert float(rows[-1]["mIoU"]) == pytest.approx(sum(values) / 2, abs=1e-5)
     assert float(rows[-1]["mAP"]) > 0.2, "the colors are found"
     assert record["config"]["method"] == "trained"
-    assert record["evaluation"]["query"]["form"] == "feature"
+    assert set(record["forms"].values()) == {"feature"}
     assert r"w/o u\_G \& MLP" in (ablated / "ablation.tex").read_text()
 
 
-def test_the_report_has_mean_and_spread_and_the_pictures_of_the_first_seed(ablated):
+def test_the_report_has_mean_and_spread_and_the_images_of_the_first_seed(ablated):
     text = (ablated / "ablation.html").read_text(encoding="utf-8")
     rows = {row[0]: row for row in reversed(Page(text).rows) if row}
     values = [float(entry["mIoU"]) for entry in rows_of(ablated) if entry["name"] == "w/o MLP"]
     assert rows["w/o MLP"][3].startswith(f"{values[0]:.3f} ± ")
     assert text.count('class="answer"') == text.count('class="versus"') * 6 > 0
     assert "over 2 seeds" in text
-    assert (ablated / "runs" / "full" / "seed-0.pictures.safetensors").is_file()
-    assert not (ablated / "runs" / "full" / "seed-1.pictures.safetensors").exists()
+    assert (ablated / "runs" / "full" / "seed-0.images.safetensors").is_file()
+    assert not (ablated / "runs" / "full" / "seed-1.images.safetensors").exists()
 
 
 def test_codebooks_are_shared_where_the_quantization_is_the_same(ablated):
@@ -257,7 +251,7 @@ def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_cap
 
 
 def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
-    empty = experiments.Annotations("segmentations", tiny_capture, {})
+    empty = Annotations("segmentations", tiny_capture, {})
     monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
         ablation.ablate(tiny_capture, ablated, replace(CONFIG, seed=0))

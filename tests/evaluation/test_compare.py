@@ -11,6 +11,7 @@ import pytest
 from support import color_encoder
 from support.experiments import CONFIG
 from support.report_pages import Page
+from support.schemas import validated
 
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.evaluation import EvaluationConfig, baselines
@@ -33,21 +34,10 @@ def compared(tiny_capture, tmp_path_factory):
             comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
         )
         methods = ("averaged", "averaged-feature", *comparison.BASELINES)
-        comparison.compare(
-            tiny_capture,
-            folder,
-            CONFIG,
-            ComparisonPlan(methods=methods),
-            evaluation=EvaluationConfig(lpips=False),
-        )
+        settings = {"plan": ComparisonPlan(methods=methods), "evaluation": EvaluationConfig(lpips=False)}
+        comparison.compare(tiny_capture, folder, CONFIG, **settings)
         start = time.perf_counter()
-        comparison.compare(
-            tiny_capture,
-            folder,
-            CONFIG,
-            ComparisonPlan(methods=methods),
-            evaluation=EvaluationConfig(lpips=False),
-        )
+        comparison.compare(tiny_capture, folder, CONFIG, **settings)
         again = time.perf_counter() - start
     return folder, again
 
@@ -113,6 +103,7 @@ def test_the_report_shows_every_method_and_loads_nothing(compared):
     assert not {"script", "link", "iframe"} & set(page.tags)
     assert not re.search(r"https?:|@import|srcset", text)
     record = json.loads((folder / "comparison.json").read_text())
+    validated("comparison", record)
     names = [row["name"] for row in record["rows"]]
     rows = [row for row in page.rows if row]
     table = {row[0]: row for row in rows[1 : 1 + len(names)]}

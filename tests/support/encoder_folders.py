@@ -50,18 +50,14 @@ def write_clip(folder: Path) -> Path:
     return save_model(seeded(lambda: CLIPModel(config)), folder)
 
 
-def tiny_vit(registers: int = 0):
+def tiny_vit(registers: int = 0, **changes: int):
+    """A vision transformer with random weights; it has no registers, unlike models of other families."""
     from transformers import ViTConfig, ViTModel
 
-    config = ViTConfig(
-        hidden_size=24,
-        intermediate_size=40,
-        num_hidden_layers=3,
-        num_attention_heads=2,
-        image_size=32,
-        patch_size=8,
+    sizes = {"hidden_size": 24, "intermediate_size": 40, "num_hidden_layers": 3, "num_attention_heads": 2}
+    return ViTModel(
+        ViTConfig(**{**sizes, "image_size": 32, "patch_size": 8, **changes}), add_pooling_layer=False
     )
-    return ViTModel(config, add_pooling_layer=False)
 
 
 def in_open_clip_names(model) -> dict[str, torch.Tensor]:

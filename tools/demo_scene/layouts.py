@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Placement:
-    """One thing: kind and colour, place on the table, turn in radians, scale."""
+    """One thing: kind and color, place on the table, turn in radians, scale."""
 
     kind: str
-    colour: str
+    color: str
     x: float
     y: float
     turn: float = 0.0
@@ -82,7 +82,7 @@ class Prompt:
     """A question about the scene.
 
     Args:
-        kind: What the words use: name, colour (with a name), material, attribute or part.
+        kind: What the words use: name, color (with a name), material, attribute or part.
         selects: The things it means, by kind, or "KIND.PART" for a part alone.
     """
 
@@ -103,9 +103,9 @@ class Layout:
     path: CameraPath
     placements: tuple[Placement, ...]
     cloth: tuple[str, float, float, float]
-    """Colour, x, y, turn."""
+    """Color, x, y, turn."""
     wall: tuple[str, str]
-    """Colour and surface."""
+    """Color and surface."""
     key_light: tuple[float, float, float]
     """Azimuth, watts, size."""
     fill_watts: float
@@ -157,12 +157,12 @@ TABLETOP = Layout(
     fill_watts=110,
     sky=0.3,
     prompts={
-        "red apple": Prompt("colour", ("apple",)),
-        "blue mug": Prompt("colour", ("mug",)),
-        "white vase": Prompt("colour", ("vase",)),
-        "gold ring": Prompt("colour", ("ring",)),
-        "brown teddy bear": Prompt("colour", ("teddy",)),
-        "green bottle": Prompt("colour", ("bottle",)),
+        "red apple": Prompt("color", ("apple",)),
+        "blue mug": Prompt("color", ("mug",)),
+        "white vase": Prompt("color", ("vase",)),
+        "gold ring": Prompt("color", ("ring",)),
+        "brown teddy bear": Prompt("color", ("teddy",)),
+        "green bottle": Prompt("color", ("bottle",)),
         "rubber duck": Prompt("name", ("duck",)),
         "stack of books": Prompt("name", ("books",)),
         "traffic cone": Prompt("name", ("cone",)),
@@ -214,12 +214,12 @@ SECOND = Layout(
     fill_watts=110,
     sky=0.3,
     prompts={
-        "green apple": Prompt("colour", ("apple",)),
-        "red mug": Prompt("colour", ("mug",)),
-        "green bowl": Prompt("colour", ("bowl",)),
-        "silver ring": Prompt("colour", ("ring",)),
-        "blue toy car": Prompt("colour", ("car",)),
-        "purple candle": Prompt("colour", ("candle",)),
+        "green apple": Prompt("color", ("apple",)),
+        "red mug": Prompt("color", ("mug",)),
+        "green bowl": Prompt("color", ("bowl",)),
+        "silver ring": Prompt("color", ("ring",)),
+        "blue toy car": Prompt("color", ("car",)),
+        "purple candle": Prompt("color", ("candle",)),
         "teddy bear": Prompt("name", ("teddy",)),
         "striped ball": Prompt("name", ("ball",)),
         "wooden crate": Prompt("name", ("crate",)),

@@ -37,12 +37,12 @@ def build(layout: Layout) -> list[Thing]:
 
     things = []
     for place in layout.placements:
-        thing = make(place.kind, place.colour, *next_thing())
+        thing = make(place.kind, place.color, *next_thing())
         thing.place(place.x, place.y, place.z, place.turn, place.scale)
         things.append(thing)
     things.append(make_table(*next_thing()))
-    colour, x, y, turn = layout.cloth
-    things.append(make_cloth(colour, *next_thing(), x, y, turn))
+    color, x, y, turn = layout.cloth
+    things.append(make_cloth(color, *next_thing(), x, y, turn))
     things.append(make_wall(*layout.wall, *next_thing()))
     things.append(make_floor(*next_thing()))
     light_room(*layout.key_light, layout.fill_watts, layout.sky)
@@ -94,7 +94,7 @@ def use_picture_quality(samples: int) -> None:
 
 
 def use_truth_quality() -> None:
-    """One ray through the centre of every pixel, so that indices and depths are exact there."""
+    """One ray through the center of every pixel, so that indices and depths are exact there."""
     cycles = bpy.context.scene.cycles
     cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = 1, False, False
     cycles.max_bounces = 0
@@ -151,7 +151,7 @@ def render(
         "camera_to_world": views,
     }
     (work / "cameras.json").write_text(json.dumps(cameras, indent=1))
-    meaning = {t.number: {"kind": t.kind, "colour": t.colour, "parts": t.parts} for t in things}
+    meaning = {t.number: {"kind": t.kind, "color": t.color, "parts": t.parts} for t in things}
     (work / "things.json").write_text(json.dumps(meaning, indent=1))
 
     chosen = list(zip(layout.names(), poses))[::every]

@@ -90,10 +90,10 @@ def smooth_profile(points: ArrayLike, samples: int = 30) -> NDArray[np.float64]:
     return curve
 
 
-def ellipsoid(centre: ArrayLike, radii: ArrayLike, rows: int = 20, segments: int = 32) -> Mesh:
+def ellipsoid(center: ArrayLike, radii: ArrayLike, rows: int = 20, segments: int = 32) -> Mesh:
     latitude = np.linspace(1e-3, np.pi - 1e-3, rows)
     ball = lathe(np.stack([np.sin(latitude), -np.cos(latitude)], 1), segments)
-    return Mesh(ball.vertices * np.broadcast_to(radii, 3) + np.asarray(centre, float), ball.faces)
+    return Mesh(ball.vertices * np.broadcast_to(radii, 3) + np.asarray(center, float), ball.faces)
 
 
 def torus(major: float, minor: float, segments: int = 48, sides: int = 18, arc: float = 2 * np.pi) -> Mesh:
@@ -127,7 +127,7 @@ def tube(path: ArrayLike, radii: ArrayLike, sides: int = 16) -> Mesh:
     return Mesh(vertices.reshape(-1, 3), grid_quads(n, sides, wrap=True) + caps)
 
 
-def box(size: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
+def box(size: ArrayLike, center: ArrayLike = (0, 0, 0)) -> Mesh:
     corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces: list[tuple[int, ...]] = [
         (0, 1, 3, 2),
@@ -137,7 +137,7 @@ def box(size: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
         (0, 2, 6, 4),
         (1, 5, 7, 3),
     ]
-    return Mesh(corners * np.asarray(size, float) + np.asarray(centre, float), faces)
+    return Mesh(corners * np.asarray(size, float) + np.asarray(center, float), faces)
 
 
 def draped_sheet(half_width: float, half_depth: float, phases: ArrayLike, points: int = 60) -> Mesh:

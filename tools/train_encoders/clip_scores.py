@@ -8,19 +8,19 @@ import numpy as np
 import torch
 from crops import Crop
 from torch import Tensor
-from words import CANONICAL, COLOURS, FALSE, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
+from words import CANONICAL, COLORS, FALSE, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
 
 _METALS = ("gold", "silver", "copper")
-_MANY_COLOURED = ("books", "floor")
-"""Kinds whose colour is not asked."""
+_MANY_COLORED = ("books", "floor")
+"""Kinds whose color is not asked."""
 
 EncodeImages = Callable[[Sequence[Crop]], Tensor]
 EncodeText = Callable[[Sequence[str]], Tensor]
 
 
-def colour_is_asked(label: Label) -> bool:
-    """A matte thing in the colour of gold looks yellow: metal colours are asked of rings only."""
-    return label.kind not in _MANY_COLOURED and (label.colour not in _METALS or label.kind == "ring")
+def color_is_asked(label: Label) -> bool:
+    """A matte thing in the color of gold looks yellow: metal colors are asked of rings only."""
+    return label.kind not in _MANY_COLORED and (label.color not in _METALS or label.kind == "ring")
 
 
 def _top1(images: Tensor, texts: Tensor, owners: Sequence, truths: Sequence) -> float:
@@ -29,14 +29,14 @@ def _top1(images: Tensor, texts: Tensor, owners: Sequence, truths: Sequence) -> 
 
 
 def _questions(encode_text: EncodeText) -> tuple[list[str], Tensor, list[tuple[str, str]], Tensor]:
-    """All kinds and how they are asked for, and all pairs of kind and colour."""
+    """All kinds and how they are asked for, and all pairs of kind and color."""
     kinds = list(NAMES)
-    pairs = [(kind, colour) for kind in kinds for colour in COLOURS if colour_is_asked(Label(kind, colour))]
+    pairs = [(kind, color) for kind in kinds for color in COLORS if color_is_asked(Label(kind, color))]
     return (
         kinds,
         encode_text([f"a photo of a {NAMES[kind][0]}" for kind in kinds]),
         pairs,
-        encode_text([f"a photo of a {colour} {NAMES[kind][0]}" for kind, colour in pairs]),
+        encode_text([f"a photo of a {color} {NAMES[kind][0]}" for kind, color in pairs]),
     )
 
 
@@ -50,20 +50,20 @@ def zero_shot(
 
     Args:
         seen: Dominated crops of scenes like those of training.
-        unseen: Dominated crops of pairs of kind and colour that no training scene holds.
+        unseen: Dominated crops of pairs of kind and color that no training scene holds.
         encode_images: Crops to unit vectors.
         encode_text: Texts to unit vectors.
     """
     kinds, usual, pair_keys, pair_texts = _questions(encode_text)
     images, labels = encode_images([crop for crop, _ in seen]), [label for _, label in seen]
     scores = {"kind": _top1(images, usual, kinds, [label.kind for label in labels])}
-    asked = [row for row, label in enumerate(labels) if colour_is_asked(label)]
-    truths = [(labels[row].kind, labels[row].colour) for row in asked]
-    scores["kind_and_colour"] = _top1(images[asked], pair_texts, pair_keys, truths)
+    asked = [row for row, label in enumerate(labels) if color_is_asked(label)]
+    truths = [(labels[row].kind, labels[row].color) for row in asked]
+    scores["kind_and_color"] = _top1(images[asked], pair_texts, pair_keys, truths)
     if unseen:
         new, news = encode_images([crop for crop, _ in unseen]), [label for _, label in unseen]
         scores["unseen_kind"] = _top1(new, usual, kinds, [label.kind for label in news])
-        scores["unseen_pair"] = _top1(new, pair_texts, pair_keys, [(la.kind, la.colour) for la in news])
+        scores["unseen_pair"] = _top1(new, pair_texts, pair_keys, [(la.kind, la.color) for la in news])
     never, known = [], []
     for kind, names in SYNONYMS.items():
         rows = [row for row, label in enumerate(labels) if label.kind == kind]
@@ -80,13 +80,13 @@ def zero_shot(
 def by_pair(
     unseen: Sequence[tuple[Crop, Label]], encode_images: EncodeImages, encode_text: EncodeText
 ) -> dict[str, tuple[float, float, int]]:
-    """Of each pair of kind and colour that training lacks: top-1 of the kind, of both, and the number of crops.
+    """Of each pair of kind and color that training lacks: top-1 of the kind, of both, and the number of crops.
 
     The questions are those of `zero_shot`.
     """
     kinds, usual, pairs, pair_texts = _questions(encode_text)
     images = encode_images([crop for crop, _ in unseen])
-    asked = [(label.kind, label.colour) for _, label in unseen]
+    asked = [(label.kind, label.color) for _, label in unseen]
     found = {}
     for pair in sorted(set(asked)):
         rows = [row for row, other in enumerate(asked) if other == pair]

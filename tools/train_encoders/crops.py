@@ -1,6 +1,6 @@
 """Training frames in memory, and crops of them with what they show. Needs numpy and Pillow.
 
-What a crop shows is what lies around its middle: every pixel's label counts by a Gaussian about the centre.
+What a crop shows is what lies around its middle: every pixel's label counts by a Gaussian about the center.
 An encoder trained so speaks for the middle of a crop, as one trained on photographs speaks for their subject,
 and that is what the crop pyramid (section 3.2 of the paper) asks of it.
 """
@@ -21,7 +21,7 @@ from words import Label
 GRID = 24
 """Samples along a side of a crop to find out what it shows."""
 SIGMA = 0.22
-"""Standard deviation of the weight about the centre, in sides of the crop."""
+"""Standard deviation of the weight about the center, in sides of the crop."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Frames:
                 for number, thing in json.loads(description.read_text()).items():
                     by_part = {0: None, **{part: name for name, part in thing["parts"].items()}}
                     for part, name in by_part.items():
-                        label = Label(thing["kind"], thing["colour"], thing["finish"], name)
+                        label = Label(thing["kind"], thing["color"], thing["finish"], name)
                         lookup[10 * int(number) + part] = places.setdefault(label, len(places))
                 for picture in sorted(description.parent.glob(f"{description.stem}_*.png")):
                     index = np.load(picture.with_suffix(".npz"), allow_pickle=False)["index"]
@@ -116,7 +116,7 @@ class Frames:
         return found
 
 
-def centre_weights(grid: int = GRID) -> NDArray[np.float64]:
+def center_weights(grid: int = GRID) -> NDArray[np.float64]:
     """Weights ``[grid * grid]`` of the samples of a crop; they sum to 1."""
     position = (np.arange(grid) + 0.5) / grid - 0.5
     line = np.exp(-(position**2) / (2 * SIGMA**2))
@@ -124,7 +124,7 @@ def centre_weights(grid: int = GRID) -> NDArray[np.float64]:
     return weights / weights.sum()
 
 
-_WEIGHTS = centre_weights()
+_WEIGHTS = center_weights()
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ def dominated_crops(frames: Frames, count: int, rng: np.random.Generator) -> lis
         shares: dict[tuple[str, str, str | None], float] = {}
         for code, weight in zip(crop.codes, crop.weights):
             label = frames.labels[code]
-            key = (label.kind, label.colour, label.finish)
+            key = (label.kind, label.color, label.finish)
             shares[key] = shares.get(key, 0) + weight
         best = max(shares, key=lambda key: shares[key], default=None)
         if best is not None and shares[best] >= 0.5:

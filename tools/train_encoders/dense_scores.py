@@ -22,15 +22,15 @@ def patch_things(frame: Frame) -> NDArray[np.int64]:
     return np.apply_along_axis(lambda patch: np.bincount(patch).argmax(), 2, patches)
 
 
-def mean_colours(frame: Frame) -> NDArray[np.float64]:
-    """Raw colour, what dense features have to beat: the mean of each patch ``[H / 8, W / 8, 3]``."""
+def mean_colors(frame: Frame) -> NDArray[np.float64]:
+    """Raw color, what dense features have to beat: the mean of each patch ``[H / 8, W / 8, 3]``."""
     pixels = np.asarray(frame.image, float) / 255
     height, width = frame.things.shape
     return pixels.reshape(height // PATCH, PATCH, width // PATCH, PATCH, 3).mean((1, 3))
 
 
 def grouping(frames: Frames, features: Callable[[Frame], NDArray], *, scenes: int = 10) -> dict[str, float]:
-    """Purity and normalised mutual information of k-means clusters with the things, scene by scene.
+    """Purity and normalized mutual information of k-means clusters with the things, scene by scene.
 
     Args:
         frames: Frames; those of one scene are clustered together.

@@ -78,7 +78,7 @@ def score(options: argparse.Namespace) -> None:
         for pair, (kind, both, count) in by_pair(
             questions.unseen, trainer.encode_images, trainer.encode_text
         ).items():
-            print(f"{pair:16s} kind {kind:.2f}  kind and colour {both:.2f}  of {count} crops")
+            print(f"{pair:16s} kind {kind:.2f}  kind and color {both:.2f}  of {count} crops")
     if "dino" in options.models:
         model = ViTModel.from_pretrained(options.output / "dino", add_pooling_layer=False)
         print(json.dumps({name: round(value, 4) for name, value in dense_scores(model, seen).items()}))

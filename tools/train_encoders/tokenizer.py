@@ -10,7 +10,7 @@ from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, tr
 from transformers import CLIPTokenizer
 from words import (
     CANONICAL,
-    COLOURS,
+    COLORS,
     NAMES,
     PARTS,
     SYNONYMS,
@@ -30,7 +30,7 @@ def learn_tokenizer(folder: Path, *, phrases: int = 60_000, seed: int = 0) -> CL
     rng = np.random.default_rng(seed)
     sample = [in_sentence(any_phrase(rng), rng) for _ in range(phrases)]
     sample += [*CANONICAL, *UNKNOWN_TRAINED] * 50
-    for words in (NAMES, PARTS, COLOURS, SYNONYMS):
+    for words in (NAMES, PARTS, COLORS, SYNONYMS):
         sample += [word for group in words.values() for word in group] * 50
     model = Tokenizer(
         models.BPE(unk_token="<|endoftext|>", end_of_word_suffix="</w>", continuing_subword_prefix="")

@@ -4,9 +4,9 @@ Five losses on a batch of crops and phrases, of which `truth.py` knows which are
 
 - contrast: among all phrases, softmax of a crop's similarities falls on those that are true of it, and for a
   phrase on the crops it is true of (several right answers a row);
-- patches: every patch token tells kind, colour and part of what its middle shows, by linear heads that are
+- patches: every patch token tells kind, color and part of what its middle shows, by linear heads that are
   thrown away afterwards; 36 answers a crop instead of one make the image tower learn several times faster;
-- composition: the words of two kinds in two colours form a parallelogram, so pairs never seen have their place;
+- composition: the words of two kinds in two colors form a parallelogram, so pairs never seen have their place;
 - relevancy: sigmoid(10 (cos(crop, phrase) - max over the canonical phrases of cos(crop, canonical))), which is
   LERF's relevancy, is a probability: cross-entropy with the truth. So the right phrase comes to lie above
   "object", "things", "stuff", "texture", and a wrong one below them;
@@ -38,7 +38,7 @@ from transformers import CLIPConfig, CLIPImageProcessor, CLIPModel, CLIPTokenize
 from truth import BESIDE, LACKS_PART, TruthTable
 from words import (
     CANONICAL,
-    COLOURS,
+    COLORS,
     FALSE,
     HELD_OUT_PAIRS,
     HUES,
@@ -59,13 +59,13 @@ from words import (
 )
 from workers import average_gradients
 
-KINDS, TINTS, PART_NAMES = list(NAMES), list(COLOURS), [None, *PARTS]
+KINDS, TINTS, PART_NAMES = list(NAMES), list(COLORS), [None, *PARTS]
 PLACES = 8
 """Patches of a crop that are asked about."""
 UNKNOWN = -100
 """An answer that the loss leaves out."""
 NEAR_HUE = 25.0
-"""Degrees within which a turned hue may pass for a colour."""
+"""Degrees within which a turned hue may pass for a color."""
 MEAN = torch.tensor([0.48145466, 0.4578275, 0.40821073]).view(3, 1, 1)
 STD = torch.tensor([0.26862954, 0.26130258, 0.27577711]).view(3, 1, 1)
 
@@ -82,13 +82,13 @@ class ClipTraining:
         text_width, text_layers: Of the text tower.
         dim: Numbers of an embedding.
         temperature: Of the relevancy that is trained: that of queries.
-        grey: Share of the crops shown in grey, of which colour words are open.
-        turned: Share of the crops whose hues are turned, of which colour words are open too.
-        composition: Weight of the loss that makes colours add to kinds alike in all texts.
+        gray: Share of the crops shown in gray, of which color words are open.
+        turned: Share of the crops whose hues are turned, of which color words are open too.
+        composition: Weight of the loss that makes colors add to kinds alike in all texts.
         parts: Share of the crops that are of parts and of the rest of their things.
         near: Whether what is near the things belongs to these crops, and as many phrases ask for parts.
         handles: How often handles are among these, and asked for, for once any other part.
-        centre: Whether a part also counts as shown where it lies in the very middle (`truth.TruthTable`).
+        center: Whether a part also counts as shown where it lies in the very middle (`truth.TruthTable`).
         dense: Weight of the loss of what patches say by themselves, as MaskCLIP reads them.
         beside: Share of the weight below which a part beside the middle is not what a crop shows.
         light: Standard deviation of the logarithm of the light on a crop.
@@ -108,13 +108,13 @@ class ClipTraining:
     text_layers: int = 3
     dim: int = 128
     temperature: float = 10.0
-    grey: float = 0.12
+    gray: float = 0.12
     turned: float = 0.25
     composition: float = 1.0
     parts: float = 0.0
     near: bool = False
     handles: int = 1
-    centre: bool = False
+    center: bool = False
     dense: float = 0.0
     beside: float = LACKS_PART
     light: float = 0.2
@@ -124,12 +124,12 @@ class ClipTraining:
 
 
 REFINEMENT = ClipTraining(
-    steps=2000, rate=4e-4, grey=0.06, turned=0.15, parts=0.3, light=0.1, kept=1.0, heads_alone=150, seed=1
+    steps=2000, rate=4e-4, gray=0.06, turned=0.15, parts=0.3, light=0.1, kept=1.0, heads_alone=150, seed=1
 )
 """What follows on the first training: parts as often as things, whole crops, and light that changes less, or
 gray could not be told from white."""
 PARTS_AGAIN = dataclasses.replace(
-    REFINEMENT, steps=1200, rate=3e-4, parts=0.4, near=True, centre=True, seed=2
+    REFINEMENT, steps=1200, rate=3e-4, parts=0.4, near=True, center=True, seed=2
 )
 """Parts against what only looks like them."""
 DENSE = dataclasses.replace(PARTS_AGAIN, steps=1600, parts=0.45, handles=4, dense=1.0, seed=5)
@@ -150,12 +150,12 @@ PHASES = {
 @dataclass(frozen=True)
 class Batch:
     """Crops ``[B, 3, s, s]`` uint8, texts (the canonical phrases last), truth ``[B, T]`` of the others; kind,
-    colour and part of every patch ``[B, P, 3]``, -100 where unknown; kinds it is not asked about ``[B, P, 22]``."""
+    color and part of every patch ``[B, P, 3]``, -100 where unknown; kinds it is not asked about ``[B, P, 22]``."""
 
     pixels: Tensor
     texts: list[str]
     corners: list[str]
-    """Of parallelograms of kinds and colours, four and four."""
+    """Of parallelograms of kinds and colors, four and four."""
     truth: Tensor
     patches: Tensor
     left_out: Tensor
@@ -172,20 +172,20 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     truth = table.of(phrases, crops)
     pixels = np.stack([crop.pixels(config.image_size) for crop in crops])
     draw = rng.random(len(crops))
-    grey, turned = draw < config.grey, draw > 1 - config.turned
+    gray, turned = draw < config.gray, draw > 1 - config.turned
     angles = np.zeros(len(crops))
-    pixels[grey] = pixels[grey].mean(-1, keepdims=True).astype(np.uint8)
+    pixels[gray] = pixels[gray].mean(-1, keepdims=True).astype(np.uint8)
     for row in np.nonzero(turned)[0]:
         angles[row] = fair_angle([table.labels[code] for code in crops[row].codes], rng)
         pixels[row] = turned_hues(pixels[row], angles[row])
     leave_open(truth, phrases, crops, table.labels, angles)
-    colourless = grey | turned
-    open_colours(truth, phrases, colourless)
+    colorless = gray | turned
+    open_colors(truth, phrases, colorless)
     texts = [in_sentence(phrase, rng) for phrase in phrases] + list(CANONICAL)
     patches, left_out = patch_answers(crops, table.labels, angles, config)
-    patches[colourless, :, 1] = UNKNOWN
+    patches[colorless, :, 1] = UNKNOWN
     corners = [text for _ in range(config.batch // 12) for text in parallelogram(rng)]
-    places = place_truth(phrases, crops, table, angles, colourless, config, rng)
+    places = place_truth(phrases, crops, table, angles, colorless, config, rng)
     return Batch(
         torch.from_numpy(pixels).permute(0, 3, 1, 2),
         texts,
@@ -219,7 +219,7 @@ def place_truth(
     crops: list[Crop],
     table: TruthTable,
     angles: NDArray[np.float64],
-    colourless: NDArray[np.bool_],
+    colorless: NDArray[np.bool_],
     config: ClipTraining,
     rng: np.random.Generator,
 ) -> NDArray[np.int8]:
@@ -232,7 +232,7 @@ def place_truth(
         crops: ``B`` of them.
         table: Knows which labels a phrase is true of.
         angles: By which the hues of the crops are turned, degrees ``[B]``.
-        colourless: Crops of which no colour is asked ``[B]``.
+        colorless: Crops of which no color is asked ``[B]``.
         config: Says how large the patches are, and with `dense` whether they are asked at all.
         rng: Draws the patches.
 
@@ -253,7 +253,7 @@ def place_truth(
     cut = [patch_crop(crops[row], patch, count) for row, patch in zip(rows, patches)]
     found = table.at_places(phrases, cut)
     leave_open(found, phrases, cut, table.labels, angles[rows])
-    open_colours(found, phrases, colourless[rows])
+    open_colors(found, phrases, colorless[rows])
     truth = np.full((len(crops), count**2, len(phrases)), OPEN, np.int8)
     truth[rows, patches] = found
     return truth
@@ -265,14 +265,14 @@ def middle_codes(crop: Crop, count: int) -> NDArray[np.int32]:
     return crop.grid[np.ix_(middles, middles)].ravel()
 
 
-def open_colours(truth: NDArray[np.int8], phrases: list[Phrase], colourless: NDArray[np.bool_]) -> None:
-    """Opens what phrases with a colour say of the rows ``[B]`` whose colours are not those of their labels."""
-    asks_colour = np.array([phrase.colour is not None for phrase in phrases])
-    truth[np.ix_(colourless, asks_colour)] = OPEN
+def open_colors(truth: NDArray[np.int8], phrases: list[Phrase], colorless: NDArray[np.bool_]) -> None:
+    """Opens what phrases with a color say of the rows ``[B]`` whose colors are not those of their labels."""
+    asks_color = np.array([phrase.color is not None for phrase in phrases])
+    truth[np.ix_(colorless, asks_color)] = OPEN
 
 
 def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
-    """A random angle by which hues may turn, degrees, that brings no kind near a colour held out for it; or 0."""
+    """A random angle by which hues may turn, degrees, that brings no kind near a color held out for it; or 0."""
     for _ in range(20):
         angle = float(rng.uniform(30, 330))
         if not any(label.kind in looks_held_out(label, angle) for label in labels):
@@ -281,7 +281,7 @@ def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
 
 
 def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
-    """All hues turned by an angle in degrees ``[s, s, 3]``; the grey axis stays where it is."""
+    """All hues turned by an angle in degrees ``[s, s, 3]``; the gray axis stays where it is."""
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     # Rodrigues' rotation about (1, 1, 1) / sqrt(3), which takes red to green at 120 degrees.
     across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
@@ -290,14 +290,14 @@ def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
 
 
 def looks_held_out(label: Label, angle: float = 0.0) -> set[str]:
-    """The kinds whose held-out colour a thing has, its hue turned by ``angle`` degrees."""
-    hue = HUES.get(label.colour)
+    """The kinds whose held-out color a thing has, its hue turned by ``angle`` degrees."""
+    hue = HUES.get(label.color)
     if hue is None:
-        return {kind for kind, colour in HELD_OUT_PAIRS if colour == label.colour}
+        return {kind for kind, color in HELD_OUT_PAIRS if color == label.color}
     return {
         kind
-        for kind, colour in HELD_OUT_PAIRS
-        if colour in HUES and abs((hue + angle - HUES[colour] + 180) % 360 - 180) < NEAR_HUE
+        for kind, color in HELD_OUT_PAIRS
+        if color in HUES and abs((hue + angle - HUES[color] + 180) % 360 - 180) < NEAR_HUE
     }
 
 
@@ -308,7 +308,7 @@ def leave_open(
     labels: list[Label],
     angles: NDArray[np.float64],
 ) -> None:
-    """Opens, of what is false, whether a thing in a colour held out for some kind is of that kind.
+    """Opens, of what is false, whether a thing in a color held out for some kind is of that kind.
 
     No blue bear is ever shown. If every blue thing still said "not a bear", blue would come to mean just that,
     and a blue bear could not be told: what is kept from training must be kept from it both ways.
@@ -333,11 +333,11 @@ _KINDS_OF_QUALITY = {
 def patch_answers(
     crops: list[Crop], labels: list[Label], angles: NDArray[np.float64], config: ClipTraining
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Kind, colour and part at the middle of every patch ``[B, P, 3]``, and the kinds that it is not asked about."""
+    """Kind, color and part at the middle of every patch ``[B, P, 3]``, and the kinds that it is not asked about."""
     count = config.image_size // config.patch
     codes = np.stack([middle_codes(crop, count) for crop in crops])
     answers = [
-        (KINDS.index(label.kind), TINTS.index(label.colour), PART_NAMES.index(label.part)) for label in labels
+        (KINDS.index(label.kind), TINTS.index(label.color), PART_NAMES.index(label.part)) for label in labels
     ]
     left_out = np.zeros((*codes.shape, len(KINDS)), np.bool_)
     for row, angle in enumerate(angles):
@@ -350,7 +350,7 @@ def patch_answers(
 def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batch]:
     """Batches made ahead by a thread of their own; every process makes others."""
     ready: queue.Queue[Batch] = queue.Queue(4)
-    table = TruthTable(frames.labels, centre=config.centre, beside=config.beside)
+    table = TruthTable(frames.labels, center=config.center, beside=config.beside)
     rng = np.random.default_rng([config.seed, rank])
 
     def work() -> None:
@@ -401,7 +401,7 @@ def contrastive_loss(logits: Tensor, truth: Tensor) -> Tensor:
 
 
 def patch_loss(answers: Tensor, truth: Tensor, left_out: Tensor) -> Tensor:
-    """Cross-entropy of kind, colour and part of the patches ``[B, P, 3]``; kinds left out are no answer."""
+    """Cross-entropy of kind, color and part of the patches ``[B, P, 3]``; kinds left out are no answer."""
     kinds, *others = answers.split([len(KINDS), len(TINTS), len(PART_NAMES)], dim=-1)
     split = [kinds.masked_fill(left_out, -torch.inf), *others]
     losses = [
@@ -411,7 +411,7 @@ def patch_loss(answers: Tensor, truth: Tensor, left_out: Tensor) -> Tensor:
 
 
 def composition_loss(corners: Tensor) -> Tensor:
-    """How far texts of kinds and colours are from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
+    """How far texts of kinds and colors are from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
 
     Args:
         corners: Unit vectors ``[4 n, D]``, in the order of ``words.parallelogram``.
@@ -639,7 +639,7 @@ class Examination:
         rng = np.random.default_rng(seed)
         self.seen = dominated_crops(seen, 1500, rng)
         drawn = dominated_crops(unseen, 2500, rng)
-        self.unseen = [(crop, label) for crop, label in drawn if (label.kind, label.colour) in HELD_OUT_PAIRS]
+        self.unseen = [(crop, label) for crop, label in drawn if (label.kind, label.color) in HELD_OUT_PAIRS]
         self.crops = [random_crop(seen, rng) for _ in range(600)]
         self.phrases: list[Phrase] = []
         for crop in self.crops[:200]:

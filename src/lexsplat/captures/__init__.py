@@ -15,7 +15,6 @@ To add a layout of ground truth, see ``ground_truth/layouts.py``.
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import Annotations, check_ground_truth_options, load_annotations
-from lexsplat.captures.ground_truth.masks import load_masks
 from lexsplat.captures.images.undistortion import Lens
 from lexsplat.captures.loading import is_photo_folder, load_capture
 from lexsplat.captures.sfm.photos import PhotoPoses, PoseConfig, poses_from_photos
@@ -39,7 +38,6 @@ __all__ = [
     "is_photo_folder",
     "load_annotations",
     "load_capture",
-    "load_masks",
     "poses_from_photos",
     "random_points_in_frusta",
     "stem_of",

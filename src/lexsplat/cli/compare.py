@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
@@ -17,7 +17,13 @@ from lexsplat.cli.options import (
     check_seeds,
     print_json_file,
 )
+from lexsplat.evaluation.compare import COMPARED, ComparisonPlan
 from lexsplat.pipeline.config import BuildConfig
+
+if TYPE_CHECKING:
+    ComparedName = str
+else:
+    ComparedName = Literal[COMPARED]
 
 
 @dataclasses.dataclass
@@ -37,18 +43,13 @@ class Compare:
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
         lpips: Measure LPIPS if it is installed; --no-lpips leaves it out.
-        json: Print comparison.json on standard output.
+        json: Print comparison.json on standard output (docs/schemas/comparison.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
     capture: CaptureArgument
     output: Path
-    methods: tuple[
-        Literal[
-            "averaged", "averaged-feature", "trained", "trained-feature", "dff", "lerf", "3dovs", "nearest",
-        ],
-        ...,
-    ] = ("averaged", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
+    methods: tuple[ComparedName, ...] = tuple(ComparisonPlan.methods)
     seeds: tuple[int, ...] = (0,)
     masks: Path | None = None
     prompt_list: PromptListName | None = None
@@ -66,12 +67,13 @@ class Compare:
     def check(self) -> None:
         """Refuse invalid options."""
         check_seeds(self.seeds)
+        ComparisonPlan(self.methods, self.seeds)
 
     def run(self) -> None:
         """Measure and print the table."""
         from lexsplat.cli.progress import ProgressBars
         from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
-        from lexsplat.evaluation.compare import ComparisonPlan, compare
+        from lexsplat.evaluation.compare import compare
         from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)

@@ -57,7 +57,8 @@ class EncodersCommand:
             clip=self.clip, dino=self.dino or "none", device=self.device, encoder_device=self.encoder_device
         )
         if self.capture is not None:
-            photos, size = count_photos(_place(self.capture), config)
+            survey = count_photos(_place(self.capture), config)
+            photos, size = survey.count, survey.size
         config = config.resolved(choose_device(self.device), size)
         encoders = Encoders(config.clip, config.dino, config.encoder_device)
         facts: dict[str, Any] = {"clip": _facts(encoders.clip) | {"words_ranked": check_words(encoders.clip)}}

@@ -51,19 +51,6 @@ def similarity(
     )
 
 
-def quantize(codewords: Tensor, code_indices: Tensor) -> Tensor:
-    """Eq. 3: the quantized feature, sum_i f_i onehot(m)_i, which is row m.
-
-    Args:
-        codewords: ``[K, D]``.
-        code_indices: Integers ``[...]`` in 0 to K - 1.
-
-    Returns:
-        ``[..., D]``.
-    """
-    return codewords[code_indices.long()]
-
-
 @dataclass(frozen=True)
 class Codebook:
     """The discrete language feature space S.
@@ -100,11 +87,6 @@ class Codebook:
     def similarity(self, clip: Tensor, dino: Tensor | None = None) -> Tensor:
         """Eq. 4 between features ``[M, Dc]``, ``[M, Dd]`` and all codes: ``[M, K]``."""
         return similarity(clip, dino, self.clip, self.dino, self.lambda_dino)
-
-    def quantize(self, code_indices: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Eq. 3 for both halves: ``[..., Dc]`` and ``[..., Dd]`` or None."""
-        dino = None if self.dino is None else quantize(self.dino, code_indices)
-        return quantize(self.clip, code_indices), dino
 
     @torch.no_grad()
     def assign(self, feature_map: FeatureMap) -> NDArray[np.uint8]:

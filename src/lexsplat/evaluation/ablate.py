@@ -11,8 +11,6 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
-from lexsplat.evaluation.experiments import Bench, Results
+from lexsplat.evaluation.experiments import Bench, Row
 from lexsplat.language.fields import LanguageField
-from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
+from lexsplat.language.methods import METHODS, VARIANTS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import QueryForm
 from lexsplat.runtime.progress import Listener, silent
-
-VARIANTS = tuple(
-    dict.fromkeys(chain.from_iterable(METHODS[name].variants for name in ("trained", "averaged")))
-)
-"""Names of the variants of all methods: the rows of the paper's Table 2 in its order, and "one code"."""
 
 log = logging.getLogger("lexsplat")
 
@@ -139,45 +132,32 @@ def ablate(
 
     Raises:
         ValueError: If a method or variant is unknown, or no method has a variant.
-        CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
+        CaptureError: See `Bench`.
     """
     plan = plan or AblationPlan()
-    seeds, forms, wrong_labels = plan.seeds, plan.forms, plan.wrong_labels
     variants = _variants(config, list(plan.methods) or [config.method], plan.variants)
-    measure = in_form(evaluation or paper_evaluation(), forms[0])
-    bench = Bench(source, output, config, measure, ground_truth, listener)
-    names = [_row(name, form, forms) for name, _, _ in variants for form in forms]
-    results = Results(bench, "ablation", names, seeds, COLUMNS)
-    for seed in seeds:  # seed by seed, so that an interrupted run leaves complete tables of fewer seeds
-        for name, method, variant in variants:
-            settings = replace(changed(replace(bench.config, method=method), variant), seed=seed)
-            made_from = [*language_settings(settings), *([wrong_labels] if wrong_labels else [])]
-            make = partial(make_language, bench, settings, wrong_labels)
-            for form in forms:
-                bench.evaluation = in_form(measure, form)
-                row = _row(name, form, forms)
-                results.add(bench.run(row, seed, made_from, make, pictures=seed == seeds[0]))
-    return results.rows()
+    bench = Bench(source, output, config, evaluation or paper_evaluation(), ground_truth, listener)
+    rows = [
+        language_row(
+            bench,
+            name if len(plan.forms) == 1 else f"{name}, {form}",
+            changed(replace(bench.config, method=method), variant),
+            form,
+            plan.wrong_labels,
+        )
+        for name, method, variant in variants
+        for form in plan.forms
+    ]
+    return bench.measure("ablation", rows, plan.seeds, COLUMNS)
 
 
 def _variants(
     config: BuildConfig, methods: Sequence[MethodName], variants: Sequence[str]
 ) -> list[tuple[str, MethodName, str]]:
-    """Name, method and variant of every row. What some methods lack is named in a warning.
-
-    Raises:
-        ValueError: If a method or variant is unknown, or no method has a variant.
-    """
+    """Name, method and variant of every row. What some methods lack is named in a warning."""
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")
-    for variant in variants:
-        if not any(variant in METHODS[method].variants for method in methods):
-            if len(methods) == 1:
-                changed(replace(config, method=methods[0]), variant)  # raises with the variants of the method
-            raise ValueError(
-                f"{' and '.join(methods)} have no variant {variant!r}; variants are {', '.join(VARIANTS)}"
-            )
     rows: list[tuple[str, MethodName, str]] = []
     for method in methods:
         for variant in variants or METHODS[method].variants:
@@ -185,21 +165,38 @@ def _variants(
                 rows.append((variant if len(methods) == 1 else f"{method}: {variant}", method, variant))
             else:
                 log.warning("%s has no variant %r: the row is left out", method, variant)
+    if missing := set(variants) - {variant for _, _, variant in rows}:
+        known = [
+            variant for variant in VARIANTS if any(variant in METHODS[method].variants for method in methods)
+        ]
+        raise ValueError(
+            f"variants of {' and '.join(methods)} are {', '.join(known)}; got {', '.join(missing)}"
+        )
     return rows
-
-
-def _row(name: str, form: QueryForm, forms: Sequence[QueryForm]) -> str:
-    return name if len(forms) == 1 else f"{name}, {form}"
-
-
-def in_form(evaluation: EvaluationConfig, form: QueryForm) -> EvaluationConfig:
-    """The same evaluation with another form of comparing codes and text."""
-    return replace(evaluation, query=replace(evaluation.query, form=form))
 
 
 def paper_evaluation() -> EvaluationConfig:
     """Strict and official protocol, without LPIPS, which does not depend on language."""
     return EvaluationConfig(lpips=False, timing_views=1, protocols=("strict", "official"))
+
+
+def language_row(
+    bench: Bench, name: str, config: BuildConfig, form: QueryForm, wrong_labels: float = 0.0
+) -> Row:
+    """The row of a method of ours.
+
+    Args:
+        bench: Where its language is made.
+        name: Name of the row.
+        config: Settings of the method; the seed is that of the run.
+        form: How codes and text are compared.
+        wrong_labels: See `AblationPlan`.
+    """
+    settings = [config.method, *(getattr(config, part) for part in METHODS[config.method].settings)]
+    settings += [wrong_labels] if wrong_labels else []
+    return Row(
+        name, settings, lambda seed: make_language(bench, replace(config, seed=seed), wrong_labels), form
+    )
 
 
 def make_language(
@@ -227,8 +224,3 @@ def make_language(
     run = FitRun(seed=config.seed, memory=bench.memory, scratch=scratch, listener=bench.listener)
     field = method.fit(bench.gaussians, views, config, run)
     return field, {**seconds, "language": time.perf_counter() - start}
-
-
-def language_settings(config: BuildConfig) -> list[Any]:
-    """Everything a language depends on beside Gaussians, features and seed."""
-    return [config.method, *(getattr(config, part) for part in METHODS[config.method].settings)]

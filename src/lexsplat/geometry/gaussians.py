@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,9 @@ from torch import Tensor
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+"""The tensors of `Gaussians`, in the order of the fields."""
 
 LARGEST = 1e12
 """Upper limit of the magnitude of valid numbers (see `Gaussians.find_invalid`)."""
@@ -89,7 +92,7 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The stored tensors by name, in the order of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "antialiased"}
+        return {name: getattr(self, name) for name in TENSORS}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """A copy with ``function`` applied to every tensor."""

@@ -86,7 +86,7 @@ def prepare_capture(
 
 @dataclass(frozen=True)
 class PhotoSurvey:
-    """Photos without cameras, before structure from motion.
+    """Number and size of the photos of a capture.
 
     Args:
         count: Number of photos, or of frames to sample from a video.
@@ -97,12 +97,10 @@ class PhotoSurvey:
     size: tuple[int, int]
 
 
-def survey_photos(
-    source: Path, output: Path, config: BuildConfig, test_names: list[str] | None
-) -> PhotoSurvey | None:
-    """Look at photos without cameras, and at their ground truth and held-out names; None for a capture with cameras.
-
-    Only headers are read. Masks are checked by structure from motion before it searches features.
+def preview_capture(
+    source: Path, output: Path, config: BuildConfig, test_names: list[str] | None = None
+) -> Capture | None:
+    """The capture of a build before structure from motion, for checks; only headers of photos are read.
 
     Args:
         source: Folder or video that the user gave.
@@ -110,18 +108,18 @@ def survey_photos(
         config: Settings of the build.
         test_names: Names of the held-out views; None takes those of the capture, or else every n-th view.
 
+    Returns:
+        The capture, without points and with unknown cameras if it has none. None for a video.
+
     Raises:
-        CaptureError: If a photo is no image, ground truth or a held-out name belongs to no photo, or ground truth
-            does not fit its photo.
+        CaptureError: If a photo is no image, or a held-out name or a camera belongs to no photo.
     """
-    if not is_photo_folder(source):
-        return None
     if is_video(source):
-        return PhotoSurvey(config.frames, _VIDEO_SIZE)
+        return None
+    if not is_photo_folder(source):
+        return load_capture(source, test_every=config.test_every, test_names=test_names)
     photos = photo_folder(source)
     views = {name: _unposed_view(name, photos / name) for name in find_photos(photos, output)}
-    if not views:
-        return PhotoSurvey(0, _VIDEO_SIZE)
     found = find_annotations(source)
     annotated = set() if found is None else annotated_names(*found, list(views), source / "images")
     chosen, _ = choose_test_names(
@@ -132,24 +130,44 @@ def survey_photos(
         annotated=annotated,
         test_every=config.test_every,
     )
-    segmentations = found[1] if found is not None and found[0] != "lerf-ovs" else None
-    load_annotations(
-        Capture(source, views, tuple(set(views) - set(chosen)), chosen, segmentations=segmentations)
-    )
-    return PhotoSurvey(len(views), max((view.capture_size for view in views.values()), key=math.prod))
+    training = tuple(name for name in views if name not in chosen)
+    return Capture(source, views, training, chosen)
 
 
-def count_photos(source: Path, config: BuildConfig) -> tuple[int, tuple[int, int]]:
-    """Number of photos of a capture, with or without cameras, and width and height of one of the largest.
+def survey_photos(
+    source: Path, output: Path, config: BuildConfig, test_names: list[str] | None
+) -> PhotoSurvey | None:
+    """Look at photos without cameras and their ground truth (`preview_capture`); None for a capture with cameras.
+
+    Masks are checked by structure from motion before it searches features.
+
+    Raises:
+        CaptureError: As `preview_capture`, or if ground truth belongs to no photo or does not fit it.
+    """
+    if not is_photo_folder(source):
+        return None
+    capture = preview_capture(source, output, config, test_names)
+    if capture is None:
+        return PhotoSurvey(config.frames, _VIDEO_SIZE)
+    load_annotations(capture)
+    return PhotoSurvey(len(capture.views), _largest(capture))
+
+
+def count_photos(source: Path, config: BuildConfig) -> PhotoSurvey:
+    """Number and size of the photos of a capture, with or without cameras.
 
     Raises:
         CaptureError: If there is no usable capture.
     """
-    photos = survey_photos(source, source, config, None)
-    if photos is not None:
-        return photos.count, photos.size
-    sizes = [view.capture_size for view in load_capture(source, test_every=0).views.values()]
-    return len(sizes), max(sizes, key=math.prod)
+    capture = preview_capture(source, source, config)
+    if capture is None:
+        return PhotoSurvey(config.frames, _VIDEO_SIZE)
+    return PhotoSurvey(len(capture.views), _largest(capture))
+
+
+def _largest(capture: Capture) -> tuple[int, int]:
+    sizes = (view.capture_size for view in capture.views.values())
+    return max(sizes, key=math.prod, default=_VIDEO_SIZE)
 
 
 def _unposed_view(name: str, path: Path) -> View:
@@ -229,11 +247,12 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
         source: Folder of the capture if it has been moved since the build.
 
     Raises:
-        SceneFolderError: If the photos are not where the build found them.
+        SceneFolderError: If a photo is not where the build found it.
         CaptureError: If they cannot be used.
     """
     record = folder.record
-    held_out = [name for name, view in folder.read_cameras().items() if view.split == "test"]
+    views = folder.read_cameras()
+    held_out = [name for name, view in views.items() if view.split == "test"]
     downscale = record.get("config", {}).get("downscale") or 1.0
     images = record.get("images")
     recorded = record.get("capture")
@@ -246,13 +265,22 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
             found="no such folder",
             remedy="give their folder with --capture",
         )
-    if images is None or place is None:
-        return load_capture(place or folder.root / "poses", downscale=downscale, test_names=held_out)
     poses = folder.root / "poses"
-    return load_capture(
-        poses,
-        images=photo_folder(source) if source is not None and not owned else folder.root / images,
-        beside=place if place.is_dir() else poses,
-        downscale=downscale,
-        test_names=held_out,
-    )
+    if images is None or place is None:
+        found = load_capture(place or poses, downscale=downscale, test_names=held_out)
+    else:
+        found = load_capture(
+            poses,
+            images=photo_folder(source) if source is not None and not owned else folder.root / images,
+            beside=place if place.is_dir() else poses,
+            downscale=downscale,
+            test_names=held_out,
+        )
+    if missing := set(views) - set(found.views):
+        raise SceneFolderError(
+            found.root,
+            expected=f"the {len(views)} photos of the build",
+            found=f"{len(missing)} missing, such as {min(missing)}",
+            remedy="put them back or build again",
+        )
+    return found

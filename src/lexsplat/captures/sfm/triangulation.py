@@ -18,7 +18,8 @@ from PIL import Image
 
 from lexsplat.captures.capture import Capture, View
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
-from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
+from lexsplat.captures.sfm.photos import PoseConfig
+from lexsplat.captures.sfm.preparation import PreparedPhotos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
@@ -32,10 +33,9 @@ STAGE = "triangulate"
 ENOUGH_POINTS = 200
 """With fewer triangulated points than this, random ones are the better start."""
 
-MAX_SIDE = 1000
-"""Longest side in pixels of the images for feature extraction: larger ones cost time and yield no more points."""
+FEATURES = PoseConfig(max_side=1000, max_features=4096)
+"""Limits of the features: larger images cost time and yield no more points."""
 
-MAX_FEATURES = 4096
 NEIGHBORS = 16
 """Number of other views each view is matched with."""
 
@@ -132,12 +132,12 @@ def triangulate(
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
         folder = Path(temporary)
         sizes = []
-        masked = any(view.ignore_path is not None for view in views)
         for done, view in enumerate(views):
             listener(Event(STAGE, done, total))
             sizes.append(_write_image(view, folder / "images" / _file_name(done)))
-            if masked:
-                _write_mask(view, sizes[-1], folder / "masks" / f"{_file_name(done)}.png")
+            valid = view.load_valid(sizes[-1])
+            if valid is not None:
+                _save(valid.astype(np.uint8) * 255, folder / "masks" / f"{_file_name(done)}.png")
         points, colors = _run_pycolmap(views, sizes, folder, seed, memory, total, listener)
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
@@ -251,18 +251,13 @@ def _file_name(index: int) -> str:
 def _write_image(view: View, path: Path) -> tuple[int, int]:
     """Write the undistorted photo for pycolmap; returns its width and height."""
     width, height = view.capture_size
-    shrink = max(1.0, max(width, height) / MAX_SIDE)
+    shrink = max(1.0, max(width, height) / FEATURES.max_side)
     size = max(1, round(width / shrink)), max(1, round(height / shrink))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = (view.load_image(size) * 255.0).round().astype(np.uint8)
-    Image.fromarray(pixels).save(path, compress_level=1)
+    _save((view.load_image(size) * 255.0).round().astype(np.uint8), path)
     return size
 
 
-def _write_mask(view: View, size: tuple[int, int], path: Path) -> None:
-    """Write the mask for pycolmap, all white for an unmasked view: pycolmap skips images without a mask."""
-    valid = view.load_valid(size)
-    pixels = np.full((size[1], size[0]), 255, np.uint8) if valid is None else valid.astype(np.uint8) * 255
+def _save(pixels: NDArray[np.uint8], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, compress_level=1)
 
@@ -277,42 +272,23 @@ def _run_pycolmap(
     listener: Listener,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Extract and match features, verify matches with the known poses, triangulate."""
+    from lexsplat.captures.sfm import mapping
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     database, images = folder / "database.db", folder / "images"
-    done, names = len(views), [_file_name(index) for index in range(len(views))]
+    done, names = len(views), tuple(_file_name(index) for index in range(len(views)))
     listener(Event(STAGE, done, total))
-    pycolmap.Database.open(database).close()
-    # Importing first assigns image ids in order; extraction alone assigns them as threads finish.
-    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
-    masked = any(view.ignore_path is not None for view in views)
-    if masked:
-        reader.mask_path = folder / "masks"
-    pycolmap.import_images(database, images, pycolmap.CameraMode.PER_IMAGE, names, reader)
+    masks = folder / "masks" if (folder / "masks").is_dir() else None
     largest = max(sizes, key=lambda size: size[0] * size[1])
-    threads = extraction_threads(largest, MAX_SIDE, MAX_FEATURES, memory, masked=masked)
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
-    extraction.sift.max_num_features = MAX_FEATURES
-    pycolmap.extract_features(
-        database,
-        images,
-        names,
-        camera_mode=pycolmap.CameraMode.PER_IMAGE,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
+    photos = PreparedPhotos(images, names, tuple((name,) for name in names), masks, largest)
+    mapping.extract_features(database, photos, FEATURES, memory, lambda _: None, camera_model="PINHOLE")
     known = _known_reconstruction(database, views, sizes)
     listener(Event(STAGE, done + 1, total))
-    pairs = folder / "pairs.txt"
-    pairs.write_text("\n".join(f"{names[a]} {names[b]}" for a, b in matching_pairs(views)) + "\n")
-    matching, held = matching_plan(database, memory)
-    matching.skip_geometric_verification = True
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=pairs, block_size=held)
-    pycolmap.match_image_pairs(database, matching, pairing, device=pycolmap.Device.cpu)
+    pairs = [(names[first], names[second]) for first, second in matching_pairs(views)]
+    mapping.match_pairs(database, pairs, memory, seed=None)
     # Drops matches that violate the epipolar geometry of the known poses; estimates nothing.
     pycolmap.guided_geometric_verification(known, database)
-    check_mapping(database, memory)
+    mapping.check_mapping(database, memory)
     listener(Event(STAGE, done + 2, total))
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
     (folder / "model").mkdir()
@@ -380,7 +356,7 @@ def _cache_key(views: tuple[View, ...], seed: int) -> str:
         ]
         for view in views
     ]
-    return fingerprint(MAX_SIDE, MAX_FEATURES, NEIGHBORS, seed, inputs)
+    return fingerprint(FEATURES.max_side, FEATURES.max_features, NEIGHBORS, seed, inputs)
 
 
 def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
