@@ -279,7 +279,23 @@ def test_siglip_loads_with_its_tokenizer_of_sentencepiece(tmp_path):
     from transformers import SiglipConfig, SiglipModel
 
     words, model = (
-        "an apple a wooden table blue sky a car red mug the books green bottle".split(),
+        [
+            "an",
+            "apple",
+            "a",
+            "wooden",
+            "table",
+            "blue",
+            "sky",
+            "a",
+            "car",
+            "red",
+            "mug",
+            "the",
+            "books",
+            "green",
+            "bottle",
+        ],
         io.BytesIO(),
     )
     lines, options = iter([" ".join(words)] * 50), {"hard_vocab_limit": False, "minloglevel": 5}

@@ -72,7 +72,9 @@ class EverydayScale:
         heights = _heights(codewords, words, mean)
         peaks = _peaks(heights)
         count = min(_BEST_WORDS, len(peaks))
-        return cls(mean, heights.amax(1).clamp_min(_LEAST), max(float(peaks.topk(count).values.mean()), _LEAST))
+        return cls(
+            mean, heights.amax(1).clamp_min(_LEAST), max(float(peaks.topk(count).values.mean()), _LEAST)
+        )
 
     def heights(self, codewords: Tensor, texts: Tensor) -> Tensor:
         """Heights of texts ``[P, D]`` at the codes ``[K, D]``: ``[K, P]``."""
