@@ -59,6 +59,7 @@ class Find:
             return
         for answer in answers["phrases"]:
             _print_answer(answer)
+        print(f"relative to {answers['rests_on']}")
 
 
 def _print_answer(answer: dict[str, Any]) -> None:
