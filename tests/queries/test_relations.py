@@ -78,6 +78,7 @@ FALSE = [
     ("far ball", "left of", "bowl"), ("lamp", "next to", "table"), ("left ball", "next to", "right ball"),
     ("far ball", "next to", "right ball"),
     ("beside", "on", "table"), ("table", "under", "beside"), ("pole", "next to", "other pole"),
+    ("bowl", "inside", "bowl"), ("left ball", "next to", "table"),
 ]  # fmt: skip
 
 

@@ -43,6 +43,9 @@ COMMANDS = {
     "edit": CommandEntry("edit", "Edit", "delete, recolor, move or duplicate things by words"),
     "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
     "view": CommandEntry("view", "View", "show and search a scene in the browser"),
+    "encoders": CommandEntry(
+        "encoders", "EncodersCommand", "fetch, check and time encoders before a long build"
+    ),
     "mcp": CommandEntry("mcp", "Mcp", "tools for language models"),
     "info": CommandEntry("info", "Info", "show what a scene folder contains"),
 }

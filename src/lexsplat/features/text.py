@@ -58,10 +58,11 @@ class TextCache:
 
     Args:
         folder: Folder of the files; created on the first write.
+        writable: Whether new embeddings are stored.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = Path(folder)
+    def __init__(self, folder: Path, *, writable: bool = True) -> None:
+        self._folder, self._writable = Path(folder), writable
         self._known: dict[str, dict[str, Tensor]] = {}
 
     def encode(self, content_hash: str, prompts: Sequence[str], encoder: Callable[[], TextTower]) -> Tensor:
@@ -90,7 +91,8 @@ class TextCache:
                     del known[prompt]
                 return found
             try:
-                self._write(content_hash, known)
+                if self._writable:
+                    self._write(content_hash, known)
             except OSError as error:  # the cache is optional
                 log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
         return torch.stack([known[prompt] for prompt in prompts])

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lexsplat.geometry.world import world_of
 from lexsplat.language.methods import METHODS
+from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Presence, Selection
@@ -130,7 +131,7 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
+        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
         highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
 
     Raises:
@@ -161,8 +162,17 @@ def answer_queries(
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         "form": scene.query.form,
+        "rests_on": rests_on(scene),
         "prompts": answers,
     }
+
+
+def rests_on(scene: Scene) -> str:
+    """What relevancy and presence in a scene are relative to, for people."""
+    words = f"{len(everyday_words()):,} everyday words in this scene"
+    return (
+        words if scene.query.everyday else f"relevancy: {', '.join(scene.query.compared)}; presence: {words}"
+    )
 
 
 def find_phrases(
@@ -180,7 +190,7 @@ def find_phrases(
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
-        ``{"scene", "up", "meters_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
+        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
         "count", "gaussians", "threshold", "best_view" and "instances" with center, size and axes in world units,
         and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and "instances" is empty.
 
@@ -190,6 +200,7 @@ def find_phrases(
     answers = [find_phrase(scene, phrase, view, threshold) for phrase in check_prompts(phrases)]
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
+        "rests_on": rests_on(scene),
         **scene.world.to_json(),
         "phrases": answers,
     }

@@ -22,9 +22,10 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
+from lexsplat.queries.everyday import EverydayScale, everyday_words
 from lexsplat.queries.phrases import Understood
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
+from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,
@@ -35,7 +36,7 @@ from lexsplat.queries.relevancy import (
     render_relevancy,
 )
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.thresholds import check_threshold, scene_thresholds
+from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
@@ -103,6 +104,7 @@ class Scene:
     def query(self, query: QueryConfig) -> None:
         self._query = query
         self._classifier: PresenceClassifier | None = None
+        self._scale: EverydayScale | None = None
         self._objects: tuple[Selection, ...] | None = None
         kept = max(32, min(1024, _KEPT_BYTES // (5 * max(1, len(self.gaussians)))))
         self._words: Bounded[str, Word] = Bounded(kept)
@@ -146,11 +148,11 @@ class Scene:
         if self._given_encode_text is not None:
             return self._given_encode_text(texts)
         known = self._encoder_hash
-        writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
-        if self.folder is None or known is None or not writable:
+        if self.folder is None or known is None:
             return encode_each(self._load_encoder(known), texts)
         if self._cache is None:
-            self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
+            writable = not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
+            self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     def encoder_identity(self) -> dict[str, str]:
@@ -182,8 +184,17 @@ class Scene:
             )
         return self._encoder
 
-    def _question(self, prompts: str | Sequence[str]) -> Question:
-        return Question(self.embed(prompts), self.embed(self.query.negatives), self.query)
+    def question(self, prompts: str | Sequence[str]) -> Question:
+        """The embedded prompts with what they are compared with."""
+        scale = self.everyday_scale if self.query.everyday else None
+        return Question(self.embed(prompts), self.embed(self.query.compared), self.query, scale)
+
+    @property
+    def everyday_scale(self) -> EverydayScale:
+        """What everyday words reach in the scene; made at first use."""
+        if self._scale is None:
+            self._scale = EverydayScale.of(self.field.codebook.clip, self.embed(everyday_words()))
+        return self._scale
 
     # -- answers
 
@@ -229,11 +240,11 @@ class Scene:
             QueryError: If a prompt is empty or the view is unknown.
         """
         camera = self.camera(view)
-        return render_relevancy(self.field, self.gaussians, camera, self._question(prompts))
+        return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        return gaussian_relevancy(self.field, self._question(prompts))
+        return gaussian_relevancy(self.field, self.question(prompts))
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
@@ -314,27 +325,34 @@ class Scene:
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            references = self._question(REFERENCE_PHRASES)
-            self._classifier = PresenceClassifier(self.gaussians, self.field, references)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale)
         return self._classifier
 
     def _new_words(self, prompts: list[str]) -> list[Word]:
         """Scores and presence of prompts that were not asked before."""
-        scores = gaussian_relevancy(self.field, self._question(prompts))
+        question = self.question(prompts)
+        scores = gaussian_relevancy(self.field, question)
+        presences = self.presence_classifier.classify(question.positives, scores)
         # Copies: a row would keep the scores of all prompts asked with it.
-        return [Word(row.clone(), self.presence_classifier.classify(row)) for row in scores]
+        return [Word(row.clone(), presence) for row, presence in zip(scores, presences)]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
-        """The automatic thresholds of words, from one rendering of the training views."""
-        question = self._question(list(words))
-        views = list(self.views.values())
-        training = [view.camera for view in views if view.split == "train"]
-        found = scene_thresholds(
-            lambda camera: render_relevancy(self.field, self.gaussians, camera, question),
-            training or [view.camera for view in views],
-            [word.presence for word in words.values()],
-        )
-        for word, threshold in zip(words.values(), found.tolist()):
+        """The automatic thresholds of words, from one rendering of the training views.
+
+        Relative to everyday words, a relevancy of 0.5 is the border itself.
+        """
+        question = self.question(list(words))
+        if question.scale is not None:
+            found = [BORDER] * len(words)
+        else:
+            views = list(self.views.values())
+            training = [view.camera for view in views if view.split == "train"]
+            found = scene_thresholds(
+                lambda camera: render_relevancy(self.field, self.gaussians, camera, question),
+                training or [view.camera for view in views],
+                [word.presence for word in words.values()],
+            ).tolist()
+        for word, threshold in zip(words.values(), found):
             word.threshold = threshold
 
     # -- views
