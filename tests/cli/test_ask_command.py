@@ -1,0 +1,48 @@
+"""The commands ``ask`` and ``mcp``."""
+
+import importlib.util
+import io
+import json
+import sys
+
+import pytest
+
+from lexsplat import cli
+
+
+def test_each_line_of_the_input_is_answered_with_a_line(monkeypatch, capsys):
+    lines = 'where is the mug?\n\n{"ask": "unicorn", "id": 5}\n{"ask": 1}\n\xff\n'.encode("latin-1")
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines), encoding="latin-1"))
+    assert cli.main(["ask", "demo", "--stdin", "--device", "cpu"]) == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [answer.get("present", "error") for answer in answers] == ["yes", "no", "error", "no"]
+    assert answers[1]["id"] == 5
+
+
+def test_a_question_on_the_command_line_is_answered_with_a_sentence(capsys):
+    assert cli.main(["ask", "demo", "how many apples are there?", "--device", "cpu"]) == 0
+    assert capsys.readouterr().out.startswith('1 found for "apple": apple at (-0.5')
+
+
+@pytest.mark.parametrize("arguments", [["ask", "demo"], ["ask", "demo", "mug", "--stdin"], ["mcp"]])
+def test_wrong_usage_is_told(arguments):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2
+
+
+@pytest.mark.parametrize(
+    "options", [["--http", "--host", "0.0.0.0"], ["--token", "short"], ["--port", "0"], ["--port", "70000"]]
+)
+def test_an_open_door_is_refused(options, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["mcp", "demo", *options])
+    assert stop.value.code == 2
+
+
+def test_without_the_extra_mcp_names_it_in_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["mcp", "demo"]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert 'pip install "lexsplat[mcp]"' in error
