@@ -6,7 +6,7 @@ import torch
 from web_like import Facts, make_web_like, measure
 
 from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, everyday_words
-from lexsplat.queries.relevancy import Question, QueryConfig, code_relevancy
+from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy
 
 unit = torch.nn.functional.normalize
 
@@ -79,7 +79,11 @@ def test_a_question_with_a_scale_does_not_read_its_negatives():
 
 @pytest.mark.parametrize(
     ("config", "everyday"),
-    [(QueryConfig(), True), (QueryConfig(form="feature"), False), (QueryConfig(negatives=("object",)), False)],
+    [
+        (QueryConfig(), True),
+        (QueryConfig(form="feature"), False),
+        (QueryConfig(negatives=("object",)), False),
+    ],
 )
 def test_everyday_words_replace_canonical_phrases_unless_asked_otherwise(config, everyday):
     assert config.everyday is everyday

@@ -105,8 +105,9 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
-        highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
+        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak",
+        "peak_view" (the view with the highest relevancy), "gaussians", "present" (whether the scene holds it: "yes",
+        "no" or "unsure") and "views".
 
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
@@ -144,7 +145,9 @@ def answer_queries(
 def rests_on(scene: Scene) -> str:
     """What relevancy and presence in a scene are relative to, for people."""
     words = f"{len(everyday_words()):,} everyday words in this scene"
-    return words if scene.query.everyday else f"relevancy: {', '.join(scene.query.compared)}; presence: {words}"
+    return (
+        words if scene.query.everyday else f"relevancy: {', '.join(scene.query.compared)}; presence: {words}"
+    )
 
 
 def find_phrases(
@@ -162,9 +165,10 @@ def find_phrases(
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
-        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
-        "count", "gaussians", "threshold", "best_view" and "instances" with center, size and axes in world units,
-        and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and "instances" is empty.
+        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase",
+        "understood", "present", "count", "gaussians", "threshold", "best_view" and "instances" with center, size and
+        axes in world units, and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and
+        "instances" is empty.
 
     Raises:
         QueryError: If a phrase is empty, the view is unknown, or the threshold is not in 0..1.
