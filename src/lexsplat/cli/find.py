@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 from lexsplat.cli.options import (
     Device,
@@ -42,12 +42,6 @@ class Find:
     clip: str | None = None
     device: Device = "auto"
     json: bool = False
-
-    defaults: ClassVar[dict[str, str]] = {
-        "view": "the view that shows the other thing best",
-        "threshold": "chosen for each phrase",
-        "clip": "the encoder of the build",
-    }
 
     def check(self) -> None:
         """Refuse invalid options."""

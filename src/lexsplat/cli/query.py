@@ -65,7 +65,6 @@ class Query:
         "negatives": 'everyday words; "object" "things" "stuff" "texture" for --form feature',
         "temperature": "10",
         "template": "those of the scene",
-        "clip": "the encoder of the build",
     }
 
     def check(self) -> None:

@@ -22,7 +22,7 @@ BORDER = 0.5
 """Relevancy at which a prompt and a canonical phrase are equally near; the paper's threshold."""
 THRESHOLD_VIEWS = 8
 """Number of training views that the threshold of a scene comes from, at most."""
-_LONG_SIDE = 320
+_LONG_SIDE = 80
 """Longer side of their renderings in pixels, at most."""
 _TOP_SHARE = 5e-4
 """The peak of the samples is the mean of their best 0.05 percent."""

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.grammar import parse
 from lexsplat.queries.heatmaps import overlay_mask
-from lexsplat.queries.phrases import Thing, parse
+from lexsplat.queries.phrases import Thing
 from lexsplat.queries.picking import select_hit, surface_at
 from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import check_prompts, probability_relevancy
