@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.experiments import CONFIG
+from support.experiments import ablated as measure_variants
 from support.report_pages import Page
 from support.schemas import validated
 
@@ -18,7 +19,7 @@ from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
 from lexsplat.evaluation.ablate import AblationPlan
 from lexsplat.evaluation.ground_truth import GroundTruthSource
-from lexsplat.language.methods import METHODS
+from lexsplat.language.methods import METHODS, VARIANTS
 from lexsplat.language.methods.averaged import Averaged
 from lexsplat.language.methods.trained import Trained
 from lexsplat.pipeline.config import BuildConfig
@@ -33,7 +34,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 def ablated(tiny_capture, tmp_path_factory):
     """All variants with two seeds."""
     folder = tmp_path_factory.mktemp("ablation")
-    ablation.ablate(tiny_capture, folder, CONFIG, AblationPlan(seeds=(0, 1)))
+    measure_variants(tiny_capture, folder, CONFIG, AblationPlan(seeds=(0, 1)))
     return folder
 
 
@@ -75,7 +76,7 @@ def test_each_method_has_the_variants_that_change_it():
     table_2 = ("w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full")
     assert tuple(METHODS["trained"].variants) == table_2
     assert tuple(METHODS["averaged"].variants) == ("one code", "full")
-    assert set(ablation.VARIANTS) == {*table_2, "one code"}
+    assert set(VARIANTS) == {*table_2, "one code"}
     assert ablation.changed(BuildConfig(), "one code").averaged.top == 1
     with pytest.raises(ValueError, match="averaged"):
         ablation.changed(BuildConfig(), "w/o MLP")
@@ -84,18 +85,18 @@ def test_each_method_has_the_variants_that_change_it():
 def test_a_variant_that_no_method_has_is_refused_before_any_work(tiny_capture, tmp_path):
     for methods in (("averaged",), ("trained", "averaged")):
         with pytest.raises(ValueError, match="with neighbors"):
-            ablation.ablate(
+            measure_variants(
                 tiny_capture,
                 tmp_path / "a",
                 CONFIG,
                 AblationPlan(methods=methods, variants=("with neighbors",)),
             )
     with pytest.raises(ValueError, match="averaged"):
-        ablation.ablate(
+        measure_variants(
             tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("averaged",), variants=("w/o MLP",))
         )
     with pytest.raises(ValueError, match="lifted"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
+        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -104,7 +105,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
 ):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     methods = ("trained", "averaged")
-    rows = ablation.ablate(
+    rows = measure_variants(
         tiny_capture,
         tmp_path,
         CONFIG,
@@ -113,7 +114,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
     assert [row["name"] for row in rows] == ["trained: full", "averaged: full", "averaged: one code"]
     assert "trained has no variant 'one code': the row is left out" in caplog.text
     assert all(row["language_seconds"][0] > 0 and row["storage_bytes"][0] > 0 for row in rows)
-    clean = ablation.ablate(
+    clean = measure_variants(
         tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), methods=methods, variants=("full",))
     )
     assert len(fits) == 5, "other labels are other runs"
@@ -125,7 +126,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
 
 def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
-    rows = ablation.ablate(
+    rows = measure_variants(
         tiny_capture,
         tmp_path,
         CONFIG,
@@ -143,7 +144,7 @@ def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_captur
     ]
     assert again["strict"] == known["strict"], "as if it stood alone"
     with pytest.raises(ValueError, match="form"):
-        ablation.ablate(tiny_capture, tmp_path, CONFIG, AblationPlan(forms=()))
+        measure_variants(tiny_capture, tmp_path, CONFIG, AblationPlan(forms=()))
 
 
 def test_wrong_labels_differ_in_every_view_and_keep_their_share():
@@ -197,7 +198,7 @@ def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_captur
         peaks = json.loads(facts["peaks"])
         assert peaks["peak_rss_bytes"] is None or peaks["peak_rss_bytes"] > 1e7
         write_tensors(path, tensors, {**facts, "peaks": json.dumps({"peak_rss_bytes": 10**15})})
-    rows = ablation.ablate(tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
+    rows = measure_variants(tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
     assert rows[0]["host_bytes"][0] in (None, 10**15)
 
 
@@ -208,7 +209,7 @@ def test_codebook_and_language_receive_the_memory_budget(ablated, tiny_capture, 
         experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
     )
     config = replace(CONFIG, memory="800MB")
-    ablation.ablate(tiny_capture, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
+    measure_variants(tiny_capture, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
     assert [*granted, fits[0][2].memory] == [parse_bytes("800MB")] * 2
 
 
@@ -225,7 +226,7 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
     missing.unlink()
     (ablated / "runs" / "full" / "seed-0.json").write_text("{")  # damaged
     next((ablated / "codebooks").glob("*.safetensors")).write_bytes(b"damaged")
-    ablation.ablate(tiny_capture, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
+    measure_variants(tiny_capture, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
     assert [run.seed for _, _, run in fits] == [0, 1]
     again = json.loads(missing.read_text())["metrics"]["language"]
     assert again == language, "the same seed gives the same numbers"
@@ -238,15 +239,15 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
 def test_another_version_of_the_code_measures_again(ablated, tiny_capture, tmp_path, monkeypatch, fits):
     output = shutil.copytree(ablated, tmp_path / "ablated")
     monkeypatch.setattr(experiments, "code_identity", lambda: "another")
-    ablation.ablate(tiny_capture, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
+    measure_variants(tiny_capture, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
     assert [run.seed for _, _, run in fits] == [0]
 
 
 def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="seed"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
+        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
     with pytest.raises(ValueError, match="variants"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
+        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -254,7 +255,7 @@ def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkey
     empty = Annotations("segmentations", tiny_capture, {})
     monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
-        ablation.ablate(tiny_capture, ablated, replace(CONFIG, seed=0))
+        measure_variants(tiny_capture, ablated, replace(CONFIG, seed=0))
 
 
 def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp_path, fits):
@@ -270,7 +271,7 @@ def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp
 
     def measure(source=None):
         before = len(fits)
-        rows = ablation.ablate(
+        rows = measure_variants(
             capture,
             tmp_path / "out",
             CONFIG,

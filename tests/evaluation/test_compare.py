@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 from support import color_encoder
 from support.experiments import CONFIG
+from support.experiments import compared as measure_methods
 from support.report_pages import Page
 from support.schemas import validated
 
@@ -35,9 +36,9 @@ def compared(tiny_capture, tmp_path_factory):
         )
         methods = ("averaged", "averaged-feature", *comparison.BASELINES)
         settings = {"plan": ComparisonPlan(methods=methods), "evaluation": EvaluationConfig(lpips=False)}
-        comparison.compare(tiny_capture, folder, CONFIG, **settings)
+        measure_methods(tiny_capture, folder, CONFIG, **settings)
         start = time.perf_counter()
-        comparison.compare(tiny_capture, folder, CONFIG, **settings)
+        measure_methods(tiny_capture, folder, CONFIG, **settings)
         again = time.perf_counter() - start
     return folder, again
 
@@ -126,7 +127,7 @@ def test_the_report_shows_every_method_and_loads_nothing(compared):
 
 def test_unknown_methods_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="nerf"):
-        comparison.compare(tiny_capture, tmp_path / "a", CONFIG, ComparisonPlan(methods=("nerf",)))
+        measure_methods(tiny_capture, tmp_path / "a", CONFIG, ComparisonPlan(methods=("nerf",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -136,7 +137,7 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
     for part in ("scene", "runs"):
         shutil.copytree(folder / part, tmp_path / part)
     before = rows_of(folder)["averaged"]
-    comparison.compare(
+    measure_methods(
         tiny_capture,
         tmp_path,
         CONFIG,
@@ -149,7 +150,7 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
     assert not {"official", "lerf_3d"} & set(language)
     assert row["mIoU"] == before["mIoU"], "strict is always measured, with the same result"
     with pytest.raises(ValueError, match="lerf-4d"):
-        comparison.compare(
+        measure_methods(
             tiny_capture, tmp_path / "a", CONFIG, evaluation=EvaluationConfig(protocols=("lerf-4d",))
         )
     assert not (tmp_path / "a").exists()
@@ -168,7 +169,7 @@ def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_p
 
     monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)
     config = replace(CONFIG, memory="800MB")
-    comparison.compare(
+    measure_methods(
         tiny_capture,
         tmp_path,
         config,

@@ -59,7 +59,7 @@ def test_language_does_not_change_geometry(capture, points, strategy):
 def test_language_follows_density_control(capture, points, strategy):
     joint = trainer(capture, points, strategy)
     changes = 0
-    while not joint.done:
+    while not joint.reconstructor.done:
         before = joint.language.field.semantics.detach().clone()
         colors = joint.reconstructor.gaussians().sh0.clone()
         joint.reconstructor.step()

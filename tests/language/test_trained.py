@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from support.language_scene import IGNORED, label_accuracy, make_scene
 
 from lexsplat.language.code_maps import codes_at_pixels
-from lexsplat.language.methods.trained import train_field
+from lexsplat.language.methods.trained import _prepare_views, train_field
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.runtime.errors import TrainingError
@@ -168,6 +168,16 @@ def test_views_without_a_camera_are_not_looked_at(balls) -> None:
     cameras = {name: camera for name, camera in balls.cameras.items() if name != "view7"}
     code_maps = Explosive(balls.code_maps)
     train_field(balls.gaussians, cameras, code_maps, balls.codebook, replace(QUICK, iterations=20))
+
+
+def test_projections_are_kept_as_long_as_the_memory_lasts(balls) -> None:
+    views = _prepare_views(balls.gaussians, balls.cameras, QUICK, 1 << 30)
+    assert all(prepared is not None for _, prepared in views.values())
+    first = next(iter(views.values()))[1].nbytes
+    few = _prepare_views(
+        balls.gaussians, balls.cameras, QUICK, 4 * (first + 1)
+    )  # a quarter is for projections
+    assert [prepared is not None for _, prepared in few.values()] == [True, True] + [False] * (len(views) - 2)
 
 
 @pytest.mark.parametrize(

@@ -313,9 +313,9 @@ def test_every_command_runs_with_device_cuda(pretended_gpu, built, tiny_capture,
 
 
 def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypatch):
-    from support.experiments import CONFIG
+    from support.experiments import CONFIG, compared
 
-    from lexsplat.evaluation import baselines
+    from lexsplat.evaluation import EvaluationConfig, baselines
     from lexsplat.evaluation import compare as comparison
 
     color_encoder.install(monkeypatch)
@@ -329,7 +329,7 @@ def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypa
     )  # fmt: skip
     capture = write_capture(tmp_path / "capture", views=5, width=40, height=30)
     plan = comparison.ComparisonPlan(methods=comparison.BASELINES)
-    evaluation = comparison.EvaluationConfig(lpips=False)
-    comparison.compare(capture, tmp_path / "out", config, plan, evaluation=evaluation)
+    evaluation = EvaluationConfig(lpips=False)
+    compared(capture, tmp_path / "out", config, plan, evaluation=evaluation)
     rows = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert set(comparison.BASELINES) <= set(json.dumps(rows).replace('"', " ").replace(",", " ").split())

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[2] / "src" / "lexsplat"
 # The packages in the order in which data flow. A module may import only its own package and those before it.
 ORDER = (
     "runtime", "geometry", "captures", "rendering", "reconstruction", "features", "codebook", "language", "queries",
-    "scenes", "pipeline", "evaluation", "viewer", "cli", "demo",
+    "scenes", "pipeline", "evaluation", "viewer", "mcp", "cli",
 )  # fmt: skip
 
 
@@ -36,9 +36,9 @@ def imported_packages(tree: ast.AST) -> set[str]:
     return found
 
 
-def test_the_top_folder_shows_the_fifteen_packages_and_the_front_door():
+def test_the_top_folder_shows_the_fifteen_packages_the_data_and_the_front_door():
     there = {path.name for path in PACKAGE.iterdir() if path.name != "__pycache__"}
-    assert there == {*ORDER, "__init__.py", "__main__.py", "py.typed"}
+    assert there == {*ORDER, "demo", "__init__.py", "__main__.py", "py.typed"}
     assert len(ORDER) <= 15
 
 

@@ -62,10 +62,10 @@ def place_photos(folder: Path, memory: int) -> str:
 
 def triangulate_points(folder: Path, memory: int) -> str:
     """Triangulation with known poses, with the feature size of the small photos."""
-    from lexsplat.captures import load_capture
+    from lexsplat.captures import PoseConfig, load_capture
     from lexsplat.captures.sfm import triangulation
 
-    triangulation.MAX_SIDE, triangulation.MAX_FEATURES = SIDE, FEATURES
+    triangulation.FEATURES = PoseConfig(max_side=SIDE, max_features=FEATURES)
     points, _ = triangulation.triangulate(load_capture(folder, test_every=0), memory=memory)
     return f"{len(points)} points"
 

@@ -1,4 +1,4 @@
-"""The two scenes that ship with lexsplat: what stands where, who looks from where, what is asked."""
+"""The layouts of the two demo scenes: objects, camera paths and prompts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Placement:
-    """One thing: kind and color, place on the table, turn in radians, scale."""
+    """One object: kind, color, position on the table, rotation in radians, scale."""
 
     kind: str
     color: str
@@ -24,7 +24,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Sweeps to and fro before the table, each at a height of its own, without a jump between them.
+    """A continuous camera path: sweeps from side to side in front of the table, each at its own height.
 
     Args:
         sweeps: Elevation in degrees at the (start, end) of each sweep.
@@ -79,11 +79,11 @@ def look_from(position: NDArray, target: NDArray) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Prompt:
-    """A question about the scene.
+    """A prompt of the scene.
 
     Args:
-        kind: What the words use: name, color (with a name), material, attribute or part.
-        selects: The things it means, by kind, or "KIND.PART" for a part alone.
+        kind: What the words name: name, color (with a name), material, attribute or part.
+        selects: The objects that match, by kind; "KIND.PART" for a part alone.
     """
 
     kind: str
@@ -116,7 +116,7 @@ class Layout:
         return [f"view_{number:03d}" for number in range(self.views)]
 
     def test_names(self) -> list[str]:
-        """Every so many views, never the first or the last: each lies between training views of the path."""
+        """Every ``test_every``-th view, never the first or last: each lies between training views of the path."""
         return self.names()[self.test_every // 2 :: self.test_every]
 
 

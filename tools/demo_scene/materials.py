@@ -40,18 +40,18 @@ def color_of(name: str) -> Color:
 
 
 def scaled(color: Color, factor: float) -> Color:
-    """Darker or lighter, kept in 0..1."""
+    """A color times a factor, clipped to 0..1."""
     return tuple(min(1.0, factor * channel) for channel in color)  # type: ignore[return-value]
 
 
 def varied(color: Color, rng: np.random.Generator, amount: float = 0.12) -> Color:
-    """A neighbour of the color: every channel times 1 +- ``amount``."""
+    """A color close to ``color``: each channel times a random factor in 1 +- ``amount``."""
     factors = 1 + rng.uniform(-amount, amount, 3)
     return tuple(float(np.clip(channel * factor, 0, 1)) for channel, factor in zip(color, factors))  # type: ignore[return-value]
 
 
 class _Nodes:
-    """A material's node tree, and short ways to add to it."""
+    """The node tree of a material, with methods that add nodes."""
 
     def __init__(self, name: str) -> None:
         self.material = bpy.data.materials.new(name)
@@ -134,7 +134,7 @@ def _noise(nodes: _Nodes, mapping: Any, color: Color, second: Color, scale: floa
 
 
 def _plaster(nodes: _Nodes, mapping: Any, color: Color, second: Color, scale: float) -> tuple[Any, Any]:
-    """Fine sharp-edged blotches: a plain wall that structure from motion can still hold on to."""
+    """Fine blotches with sharp edges: features for structure from motion on a plain wall."""
     noise = nodes.add("ShaderNodeTexNoise", mapping.outputs["Vector"], Scale=scale, Detail=2, Roughness=0.7)
     return nodes.ramp(noise.outputs["Fac"], [(0.42, second), (0.46, color), (1.0, color)]), noise.outputs[
         "Fac"

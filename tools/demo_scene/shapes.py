@@ -1,6 +1,6 @@
 """Meshes from formulas: vertices ``[V, 3]`` and faces as tuples of vertex numbers. Needs numpy only.
 
-Lengths are in scene units (about 20 cm each), z is up, and a thing stands on z = 0 around the z axis.
+Lengths are in scene units (about 20 cm each), z is up, and an object stands on z = 0 around the z axis.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Mesh(NamedTuple):
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """One mesh out of several."""
+    """Several meshes joined to one."""
     faces: list[tuple[int, ...]] = []
     start = 0
     for mesh in meshes:
@@ -57,7 +57,7 @@ def grid_quads(rows: int, columns: int, *, wrap: bool) -> list[tuple[int, ...]]:
 
 
 def lathe(profile: ArrayLike, segments: int = 48, *, ribs: int = 0, rib_depth: float = 0.0) -> Mesh:
-    """A profile of (radius, height) turned about the z axis; ``ribs`` grooves, as of a pumpkin."""
+    """A surface of revolution: a profile of (radius, height) about the z axis, with ``ribs`` grooves (pumpkin)."""
     radius, height = np.asarray(profile, float).T
     angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     groove = 1 - rib_depth * np.abs(np.cos(angle * ribs / 2)) ** 6
@@ -141,7 +141,7 @@ def box(size: ArrayLike, center: ArrayLike = (0, 0, 0)) -> Mesh:
 
 
 def draped_sheet(half_width: float, half_depth: float, phases: ArrayLike, points: int = 60) -> Mesh:
-    """A cloth with low waves, lying on z = 0."""
+    """A cloth with low waves on z = 0."""
     a, b, c = np.asarray(phases, float)
     x, y = np.meshgrid(
         np.linspace(-half_width, half_width, points), np.linspace(-half_depth, half_depth, points)
@@ -151,7 +151,7 @@ def draped_sheet(half_width: float, half_depth: float, phases: ArrayLike, points
 
 
 def leaf(base: ArrayLike, azimuth: float, elevation: float, length: float, width: float) -> Mesh:
-    """A folded blade that starts at ``base`` and bends down under its weight (angles in radians)."""
+    """A folded leaf that starts at ``base`` and bends down (angles in radians)."""
     steps = 8
     outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])

@@ -1,4 +1,4 @@
-"""Makes the finished scene that ships with the package: ``python tools/demo_scene/ship.py``.
+"""Build the bundled finished scene: ``python tools/demo_scene/ship.py``.
 
 Builds the demo scene as ``lexsplat demo`` does, but with spherical harmonics of degree 1 in place of 3, which
 halves the file, and keeps what questions need: cameras, Gaussians, language. ``--record`` builds nothing: it
@@ -47,6 +47,8 @@ def main() -> None:
             folder = build(demo_capture(), work, config, listener=bars)
             quality = evaluate_scene(open_scene(work, device="cpu"), listener=bars)
         BUNDLED_SCENE.mkdir(parents=True, exist_ok=True)
+        texts = Path("checkpoints") / "texts"  # embeddings of everyday words: a question needs no other encoding
+        shutil.copytree(work / texts, BUNDLED_SCENE / texts, dirs_exist_ok=True)
         for name in KEPT:
             shutil.copyfile(work / name, BUNDLED_SCENE / name)
         write_record(folder.record)

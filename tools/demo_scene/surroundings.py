@@ -1,4 +1,4 @@
-"""What the things stand on and before, and the light. Needs Blender."""
+"""Table, cloth, wall, floor and light. Needs Blender."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The nameable things: 18 kinds, each a function that builds one from meshes and materials. Needs Blender.
+"""The 18 kinds of objects: each is a function that builds one from meshes and materials. Needs Blender.
 
-Every mesh carries an object index, which the renderer writes per pixel: ``10 * number`` for the body of
-thing ``number`` and ``10 * number + part`` for its named parts, so that a thing is ``index // 10``.
+Every mesh has an object index, which the renderer writes per pixel: ``10 * number`` for the body of object
+``number`` and ``10 * number + part`` for its named parts. The object of a pixel is ``index // 10``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_PARTS = 9
 
 @dataclass
 class Thing:
-    """Something with a name: its meshes, and the numbers of its named parts."""
+    """An object: its meshes, and the numbers of its named parts."""
 
     kind: str
     color: str
@@ -44,7 +44,7 @@ class Thing:
     objects: list[Any] = field(default_factory=list)
 
     def paint(self, color: Color | None = None, *, vary: float = 0.07, **finish: Any) -> Any:
-        """A material in the thing's own color, or in ``color`` exactly."""
+        """A material in the color of the object, or in ``color`` exactly."""
         if color is None:
             color = varied(color_of(self.color), self.rng, vary)
         return material(color, self.rng, **finish)
@@ -58,7 +58,7 @@ class Thing:
         smooth: bool = True,
         bevel: float = 0.0,
     ) -> None:
-        """Adds a mesh; ``part`` names it as a part with an index of its own, ``bevel`` rounds its edges."""
+        """Add a mesh; ``part`` gives it its own index under this name, ``bevel`` rounds its edges."""
         if part is not None and part not in self.parts:
             if len(self.parts) == MAX_PARTS:
                 raise ValueError(f"{self.kind} has more than {MAX_PARTS} parts")
@@ -77,14 +77,14 @@ class Thing:
         self.objects.append(blender_object)
 
     def place(self, x: float, y: float, z: float = 0.0, rotation: float = 0.0, scale: float = 1.0) -> None:
-        """Stands the thing at (x, y, z), turned about the vertical by ``rotation`` radians."""
+        """Move the object to (x, y, z), rotated about the vertical by ``rotation`` radians."""
         pose = Matrix.Translation((x, y, z)) @ Matrix.Rotation(rotation, 4, "Z") @ Matrix.Scale(scale, 4)
         for blender_object in self.objects:
             blender_object.matrix_world = pose
 
 
 def open_vessel(outside: ArrayLike, thickness: float, lift: float) -> NDArray[np.float64]:
-    """The profile ``[n, 2]`` of a vessel, continued down its inside."""
+    """The profile ``[n, 2]`` of a vessel, outside and inside."""
     outside = np.asarray(outside, float)
     inside = np.maximum(outside - [thickness, 0], [TINY, -np.inf]) + np.array([0, lift])
     return np.concatenate([outside, inside[::-1]])
@@ -331,7 +331,7 @@ def crate(thing: Thing) -> None:
 
 @dataclass(frozen=True)
 class Kind:
-    """A builder, the colors natural to the kind, and the radius of its footprint."""
+    """A builder, the natural colors of the kind, and the radius of its footprint."""
 
     build: Callable[[Thing], None]
     colors: tuple[str, ...]
@@ -361,7 +361,7 @@ KINDS: dict[str, Kind] = {
 
 
 def make(kind: str, color: str, number: int, rng: np.random.Generator) -> Thing:
-    """A thing of ``kind``, standing at the origin.
+    """An object of ``kind`` at the origin.
 
     Args:
         kind: Key of ``KINDS``.

@@ -1,4 +1,4 @@
-"""What the image-text encoder can do, measured on scenes that training did not see."""
+"""Scores of the image-text encoder on scenes outside the training set."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EncodeText = Callable[[Sequence[str]], Tensor]
 
 
 def color_is_asked(label: Label) -> bool:
-    """A matte thing in the color of gold looks yellow: metal colors are asked of rings only."""
+    """Whether a color is tested for a kind: metal colors are, for rings only. Matte gold looks yellow."""
     return label.kind not in _MANY_COLORED and (label.color not in _METALS or label.kind == "ring")
 
 
@@ -29,7 +29,7 @@ def _top1(images: Tensor, texts: Tensor, owners: Sequence, truths: Sequence) -> 
 
 
 def _questions(encode_text: EncodeText) -> tuple[list[str], Tensor, list[tuple[str, str]], Tensor]:
-    """All kinds and how they are asked for, and all pairs of kind and color."""
+    """All kinds with their phrases, and all pairs of kind and color."""
     kinds = list(NAMES)
     pairs = [(kind, color) for kind in kinds for color in COLORS if color_is_asked(Label(kind, color))]
     return (
@@ -46,7 +46,7 @@ def zero_shot(
     encode_images: EncodeImages,
     encode_text: EncodeText,
 ) -> dict[str, float]:
-    """Top-1 accuracies; every question is "which of these does the crop show?".
+    """Top-1 accuracies of classifying crops.
 
     Args:
         seen: Dominated crops of scenes like those of training.
@@ -80,9 +80,9 @@ def zero_shot(
 def by_pair(
     unseen: Sequence[tuple[Crop, Label]], encode_images: EncodeImages, encode_text: EncodeText
 ) -> dict[str, tuple[float, float, int]]:
-    """Of each pair of kind and color that training lacks: top-1 of the kind, of both, and the number of crops.
+    """For each held-out pair of kind and color: top-1 accuracy of the kind and of the pair, and the number of crops.
 
-    The questions are those of `zero_shot`.
+    The classes are those of `zero_shot`.
     """
     kinds, usual, pairs, pair_texts = _questions(encode_text)
     images = encode_images([crop for crop, _ in unseen])
@@ -105,7 +105,7 @@ def calibration(
     *,
     temperature: float = 10.0,
 ) -> dict[str, float]:
-    """Whether right phrase > canonical phrases > wrong phrase, which relevancy at 0.5 rests on.
+    """How often right phrase > canonical phrases > wrong phrase, the assumption behind the relevancy threshold 0.5.
 
     Args:
         crops: Any crops.
@@ -137,7 +137,7 @@ def parts_found(
     encode_images: EncodeImages,
     encode_text: EncodeText,
 ) -> dict[str, float]:
-    """How often the name of a part beats the canonical phrases where it is true, and does not where it is false.
+    """How often the name of a part scores above the canonical phrases where it is true, and below where it is false.
 
     Args:
         crops: Of parts, and of the same things beside them.

@@ -1,4 +1,4 @@
-"""Renders random scenes to training frames. Needs Blender.
+"""Render random scenes to training frames. Needs Blender.
 
 Written to a folder, for scene S and view V, every file whole or not at all:
 
@@ -30,7 +30,7 @@ WIDTH, HEIGHT = 320, 240
 def render_frames(
     folder: Path, scenes: list[int], *, views: int, samples: int, threads: int, say: Callable[[str], None]
 ) -> None:
-    """Renders the scenes with these seeds; those in the folder already are kept.
+    """Render the scenes with these seeds; existing ones are kept.
 
     Args:
         folder: Made if needed. The name "unseen" asks for pairs of kind and color that training leaves out.

@@ -22,7 +22,7 @@ TOP = (1.75, 1.3)
 
 @dataclass
 class RandomScene:
-    """What stands in a random scene, and its views."""
+    """The objects of a random scene, and its views."""
 
     things: list[Thing]
     poses: list[NDArray[np.float64]]
@@ -33,7 +33,7 @@ class RandomScene:
 
 
 def random_scene(rng: np.random.Generator, views: int, *, held_out: bool) -> RandomScene:
-    """Fills the empty Blender file.
+    """Fill the empty Blender file.
 
     Args:
         rng: Decides everything.
@@ -76,7 +76,7 @@ def random_scene(rng: np.random.Generator, views: int, *, held_out: bool) -> Ran
 
 
 def _pair(rng: np.random.Generator, held_out: bool) -> tuple[str, str]:
-    """A kind, and a color: natural to the kind half the time, else any."""
+    """A kind and a color: in half of the cases a natural color of the kind, else any."""
     if held_out and rng.random() < 0.5:
         return sorted(HELD_OUT_PAIRS)[int(rng.integers(len(HELD_OUT_PAIRS)))]
     while True:
@@ -90,7 +90,7 @@ def _pair(rng: np.random.Generator, held_out: bool) -> tuple[str, str]:
 def _free_spot(
     taken: list[tuple[float, float, float]], radius: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """A place on the table that overlaps little with what stands there."""
+    """A position on the table with little overlap with other objects."""
     for _ in range(40):
         x, y = (float(rng.uniform(-half, half)) for half in TOP)
         if all(math.hypot(x - a, y - b) > 0.85 * (radius + other) for a, b, other in taken):
@@ -99,7 +99,7 @@ def _free_spot(
 
 
 def _camera(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -> NDArray[np.float64]:
-    """A level camera before the table that looks near one of the things."""
+    """A level camera in front of the table that looks close to one of the objects."""
     x, y, _ = spots[int(rng.integers(len(spots)))]
     pull = rng.uniform(0.3, 1.0)
     target = np.array([x * pull, y * pull, rng.uniform(0.1, 0.45)])

@@ -1,6 +1,6 @@
-"""Trains the image-text encoder: contrast between crops and phrases, and relevancy as LERF asks it.
+"""Train the image-text encoder: contrast between crops and phrases, and LERF's relevancy.
 
-Five losses on a batch of crops and phrases, of which `truth.py` knows which are true of which:
+Five losses on a batch of crops and phrases; `truth.py` states which phrase is true of which crop:
 
 - contrast: among all phrases, softmax of a crop's similarities falls on those that are true of it, and for a
   phrase on the crops it is true of (several right answers a row);
@@ -164,7 +164,7 @@ class Batch:
 
 
 def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.random.Generator) -> Batch:
-    """A phrase for every crop, a near miss for every second, and some about anything."""
+    """A true phrase for every crop, a near miss for every second one, and some arbitrary phrases."""
     of_parts = round(config.parts * config.batch)
     crops = [random_crop(frames, rng) for _ in range(config.batch - of_parts)]
     crops += part_crops(frames, of_parts, rng, near=config.near, handles=config.handles)
@@ -225,7 +225,7 @@ def place_truth(
 ) -> NDArray[np.int8]:
     """Truth of the phrases at up to ``PLACES`` patches of every crop, ``OPEN`` at the others.
 
-    Half of the patches are drawn anywhere, half so that everything a crop shows is asked about as often.
+    Half of the patches are drawn uniformly, half such that every label of a crop is covered equally often.
 
     Args:
         phrases: ``T`` of them.
@@ -260,19 +260,19 @@ def place_truth(
 
 
 def middle_codes(crop: Crop, count: int) -> NDArray[np.int32]:
-    """What the middle of each of ``count`` x ``count`` patches shows ``[count * count]``, -1 where nothing is."""
+    """The label at the center of each of ``count`` x ``count`` patches ``[count * count]``; -1 for none."""
     middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
     return crop.grid[np.ix_(middles, middles)].ravel()
 
 
 def open_colors(truth: NDArray[np.int8], phrases: list[Phrase], colorless: NDArray[np.bool_]) -> None:
-    """Opens what phrases with a color say of the rows ``[B]`` whose colors are not those of their labels."""
+    """Set phrases with a color to open for the rows ``[B]`` whose colors differ from their labels."""
     asks_color = np.array([phrase.color is not None for phrase in phrases])
     truth[np.ix_(colorless, asks_color)] = OPEN
 
 
 def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
-    """A random angle by which hues may turn, degrees, that brings no kind near a color held out for it; or 0."""
+    """A random rotation of hues in degrees that brings no kind close to a held-out color of it; 0 if none does."""
     for _ in range(20):
         angle = float(rng.uniform(30, 330))
         if not any(label.kind in looks_held_out(label, angle) for label in labels):
@@ -281,7 +281,7 @@ def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
 
 
 def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
-    """All hues turned by an angle in degrees ``[s, s, 3]``; the gray axis stays where it is."""
+    """All hues rotated by an angle in degrees ``[s, s, 3]``; the gray axis stays fixed."""
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     # Rodrigues' rotation about (1, 1, 1) / sqrt(3), which takes red to green at 120 degrees.
     across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
@@ -290,7 +290,7 @@ def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
 
 
 def looks_held_out(label: Label, angle: float = 0.0) -> set[str]:
-    """The kinds whose held-out color a thing has, its hue turned by ``angle`` degrees."""
+    """The kinds whose held-out color an object has after its hue is rotated by ``angle`` degrees."""
     hue = HUES.get(label.color)
     if hue is None:
         return {kind for kind, color in HELD_OUT_PAIRS if color == label.color}
@@ -310,8 +310,8 @@ def leave_open(
 ) -> None:
     """Opens, of what is false, whether a thing in a color held out for some kind is of that kind.
 
-    No blue bear is ever shown. If every blue thing still said "not a bear", blue would come to mean just that,
-    and a blue bear could not be told: what is kept from training must be kept from it both ways.
+    Training shows no blue bear. If every blue object were a negative of "bear", blue would imply "not a bear", and a
+    blue bear could not be recognized. Held-out pairs are therefore excluded in both directions.
     """
     means = [
         {phrase.kind} if phrase.kind else _KINDS_OF_QUALITY[phrase.quality] if phrase.quality else set()
@@ -348,7 +348,7 @@ def patch_answers(
 
 
 def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batch]:
-    """Batches made ahead by a thread of their own; every process makes others."""
+    """Batches, prepared in a background thread; each process makes different ones."""
     ready: queue.Queue[Batch] = queue.Queue(4)
     table = TruthTable(frames.labels, center=config.center, beside=config.beside)
     rng = np.random.default_rng([config.seed, rank])
@@ -364,7 +364,7 @@ def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batc
 def mirrored(
     batch: Batch, config: ClipTraining, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Half of the crops mirrored, with what their patches show: pixels, patches, left out, places."""
+    """Half of the crops mirrored, together with the labels of their patches: pixels, patches, left out, places."""
     count = config.image_size // config.patch
     chosen = torch.rand(len(batch.pixels), generator=generator) < 0.5
     pixels = torch.where(chosen[:, None, None, None], batch.pixels.flip(-1), batch.pixels)
@@ -377,7 +377,7 @@ def mirrored(
 
 
 def jittered(pixels: Tensor, generator: torch.Generator, light: float) -> Tensor:
-    """Crops as the encoder takes them, in other light, with a little noise."""
+    """Crops as the encoder takes them, with changed light and a little noise."""
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator)
@@ -411,7 +411,7 @@ def patch_loss(answers: Tensor, truth: Tensor, left_out: Tensor) -> Tensor:
 
 
 def composition_loss(corners: Tensor) -> Tensor:
-    """How far texts of kinds and colors are from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
+    """Deviation of texts of kinds and colors from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
 
     Args:
         corners: Unit vectors ``[4 n, D]``, in the order of ``words.parallelogram``.
@@ -458,7 +458,7 @@ def asking_losses(
 
 
 def dense_loss(values: Tensor, texts: Tensor, places: Tensor, scale: Tensor, temperature: float) -> Tensor:
-    """What patches say by themselves: contrast and relevancy as of crops, of the patches that are asked.
+    """Contrast and relevancy of single patches, as for crops.
 
     Args:
         values: What the patches say ``[B, P, D]`` (`Trainer.see`), of any length.
@@ -474,7 +474,7 @@ def dense_loss(values: Tensor, texts: Tensor, places: Tensor, scale: Tensor, tem
 
 
 class Trainer:
-    """The model, its average over the steps, and what encodes with them."""
+    """The model, its average over the steps, and encoding with either."""
 
     def __init__(self, tokenizer: CLIPTokenizer, config: ClipTraining, start: Path | None = None) -> None:
         torch.manual_seed(config.seed)
@@ -501,7 +501,7 @@ class Trainer:
         return self.config.rate * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * along)))
 
     def step(self, batch: Batch) -> dict[str, float]:
-        """One step of the optimizer and of the average; what each loss was before it, by name."""
+        """One step of the optimizer and of the average; returns each loss before the step, by name."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate()
         losses = self.losses(batch)
@@ -520,7 +520,7 @@ class Trainer:
         return {name: round(value.item(), 3) for name, value in losses.items()}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """The losses by name, before they are weighed; ``dense`` only where it has a weight."""
+        """The losses by name, unweighted; ``dense`` only if its weight is not 0."""
         words = self.tokens([*batch.texts, *batch.corners])
         with torch.autocast("cpu", dtype=torch.bfloat16):
             pixels, patches, left_out, places = mirrored(batch, self.config, self.generator)
@@ -549,10 +549,10 @@ class Trainer:
         return losses
 
     def kept_patches(self, count: int) -> Tensor:
-        """Which patches the image tower sees ``[count, P]``: half of them at first, all at the end.
+        """The patches that the image tower receives ``[count, P]``: half of them at first, all at the end.
 
-        A crop seen in half takes little more than half of the time and still says what it shows; the last
-        quarter of the steps gets the tower used to whole crops.
+        Half of the patches take little more than half of the time and still show the object; the last quarter of
+        the steps uses whole crops.
         """
         patches = (self.config.image_size // self.config.patch) ** 2
         share = self.config.kept if self.done < 0.75 * self.config.steps else 1.0
@@ -633,7 +633,7 @@ def pooled(output: object) -> Tensor:
 
 
 class Examination:
-    """The crops and questions of the scores, drawn once."""
+    """The crops and phrases of the scores, drawn once."""
 
     def __init__(self, seen: Frames, unseen: Frames, *, seed: int = 7) -> None:
         rng = np.random.default_rng(seed)
@@ -665,7 +665,7 @@ class Examination:
 
 
 def save(trainer: Trainer, folder: Path) -> None:
-    """An ordinary Hugging Face folder."""
+    """Save an ordinary Hugging Face folder."""
     size = trainer.config.image_size
     model = copy.deepcopy(trainer.average)
     model.config._attn_implementation = "sdpa"

@@ -1,8 +1,8 @@
-"""Trains the dense encoder: patches of one thing attract each other across views, patches of others repel.
+"""Train the dense encoder: patches of one object attract each other across views, patches of others repel.
 
-DINO finds by itself that the parts of a thing belong together, from a hundred million images. From a few
-thousand renders a small model does not: self-distillation alone grouped by color (the prototype's purity was
-below that of raw color). So positives are taken from what renders know: patches that show the same thing of
+DINO learns from a hundred million images that the parts of an object belong together. A small model does not learn
+it from a few thousand renderings: self-distillation alone grouped by color (the prototype's purity was
+below that of raw color). Positives are therefore taken from the renderings: patches that show the same thing of
 the same scene, in two views of it, seen in different light, cut and size. No words and no names of kinds are
 used, save that things of the same kind in different scenes neither attract nor repel.
 """
@@ -73,7 +73,7 @@ class Batch:
 
 
 class Source:
-    """Batches, made ahead by a thread of their own."""
+    """Batches, prepared in a background thread."""
 
     def __init__(self, frames: Frames, config: DinoTraining, rank: int) -> None:
         self.config, self.frames = config, frames
@@ -229,7 +229,7 @@ def model_config(config: DinoTraining) -> ViTConfig:
 
 
 def save(model: ViTModel, folder: Path, config: DinoTraining) -> None:
-    """An ordinary Hugging Face folder."""
+    """Save an ordinary Hugging Face folder."""
     model.save_pretrained(folder)
     size = {"height": config.side, "width": config.side}
     mean, std = MEAN.flatten().tolist(), STD.flatten().tolist()

@@ -1,4 +1,4 @@
-"""Which phrases are true of which crops: labels around the middle, weighed. Needs numpy only."""
+"""Which phrases are true of which crops, from the weighted labels of the crops. Needs numpy only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BESIDE = 0.15
 
 
 class TruthTable:
-    """Truth of phrases over the labels of some frames; equal meanings are worked out once.
+    """Truth of phrases for the labels of some frames; equal meanings are computed once.
 
     Args:
         labels: All labels that occur.
@@ -38,7 +38,7 @@ class TruthTable:
         self._known: dict[tuple, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
 
     def _columns(self, phrase: Phrase) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of which labels the phrase is true, of which it is not false."""
+        """The labels for which the phrase is true, and those for which it is not false."""
         meaning = (phrase.kind, phrase.color, phrase.quality, phrase.part, phrase.unknown)
         if meaning not in self._known:
             answers = np.array([phrase.of(label) for label in self.labels])

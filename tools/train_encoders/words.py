@@ -1,4 +1,4 @@
-"""The language of the embedded encoder: phrases, and of what each is true. Needs numpy only.
+"""The language of the bundled encoder: phrases, and the labels for which each is true. Needs numpy only.
 
 A phrase is true, false, or open (neither: training skips it) of a `Label`, which is what a pixel shows: a
 thing's kind, color and finish, and which part of it. Whether a phrase names what a crop shows follows from
@@ -128,7 +128,7 @@ _NO_ONE_COLOR = {"books", "floor"}
 
 @dataclass(frozen=True)
 class Label:
-    """What a pixel shows."""
+    """The label of a pixel."""
 
     kind: str
     color: str
@@ -278,7 +278,7 @@ _KNOWN_WORDS = frozenset(
 
 @dataclass(frozen=True)
 class Phrase:
-    """Words and what they ask for; what is None is not asked for.
+    """Words and their meaning; None means anything.
 
     Args:
         words: As a user would type them.
@@ -365,7 +365,7 @@ def phrase_for(label: Label, rng: np.random.Generator) -> Phrase:
 
 
 def near_miss(label: Label, rng: np.random.Generator) -> Phrase:
-    """A phrase about something like the label, but not it: other color, other kind, or another part."""
+    """A phrase that is close to the label but false: another color, kind or part."""
     draw = rng.random()
     kind, color, part = label.kind, label.color, label.part
     if draw < 0.4:
@@ -382,7 +382,7 @@ def near_miss(label: Label, rng: np.random.Generator) -> Phrase:
 
 
 def any_phrase(rng: np.random.Generator) -> Phrase:
-    """Any phrase, of something that may be in no picture."""
+    """Any phrase, also of objects that no image shows."""
     if rng.random() < 0.3:
         word = _pick(UNKNOWN_TRAINED, rng) if rng.random() < 0.6 else _made_up_word(rng)
         color = f"{_pick(tuple(COLORS), rng)} " if rng.random() < 0.4 else ""
@@ -399,7 +399,7 @@ def colored(kind: str, color: str, rng: np.random.Generator) -> Phrase:
 def parallelogram(rng: np.random.Generator) -> list[str]:
     """Two kinds in two colors, as texts (k c, k d, l c, l d): what sets colors apart should not hang on the kind.
 
-    Pairs that training pictures lack are among them: their words may be read, what they look like may not be seen.
+    Pairs that training images lack are among them: their words may be read, what they look like may not be seen.
     """
     kind, other = rng.choice([name for name in NAMES if name not in _NO_ONE_COLOR], 2, replace=False)
     color, tint = rng.choice(list(COLORS), 2, replace=False)
@@ -426,7 +426,7 @@ _VOWELS, _CODAS = (*"aeiou", "ea", "oo", "ai"), tuple("nrltkms")
 
 
 def _made_up_word(rng: np.random.Generator) -> str:
-    """Syllables that are most likely no word: what was never read should match nothing."""
+    """A made-up word: unknown words should match nothing."""
     while True:
         count = int(rng.integers(1, 4))
         word = "".join(_pick(_ONSETS, rng) + _pick(_VOWELS, rng) for _ in range(count)) + _pick(_CODAS, rng)

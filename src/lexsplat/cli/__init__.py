@@ -35,6 +35,7 @@ COMMANDS = {
     "language": CommandEntry("build", "Language", "the later stages of build: language on the Gaussians"),
     "query": CommandEntry("query", "Query", "heatmaps, masks and scores for free text"),
     "find": CommandEntry("find", "Find", "where things are in 3D, how many and how large"),
+    "ask": CommandEntry("ask", "Ask", "questions in your own words, many a second with --stdin"),
     "scale": CommandEntry("scale", "Scale", "set the length of a meter and the up direction of a scene"),
     "evaluate": CommandEntry("evaluate", "Evaluate", "measure a scene on its held-out views"),
     "ablate": CommandEntry("ablate", "Ablate", "measure the method without its parts"),
@@ -45,6 +46,7 @@ COMMANDS = {
     "encoders": CommandEntry(
         "encoders", "EncodersCommand", "fetch, check and time encoders before a long build"
     ),
+    "mcp": CommandEntry("mcp", "Mcp", "tools for language models"),
     "info": CommandEntry("info", "Info", "show what a scene folder contains"),
 }
 """Commands by name, in the order of the help page."""

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds, print_json_file
+from lexsplat.cli.experiments import open_bench, print_table
+from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds
 from lexsplat.language.methods import VARIANTS, MethodName
 from lexsplat.pipeline.config import BuildConfig
 
@@ -60,8 +61,6 @@ class Ablate:
     defaults: ClassVar[dict[str, str]] = {
         "variants": "all that differ for the method",
         "methods": "the method of the settings",
-        "masks": "the ground truth in the capture or beside it",
-        "prompt_list": "the prompts of the ground truth",
     }
 
     def check(self) -> None:
@@ -72,29 +71,17 @@ class Ablate:
     def _plan(self) -> AblationPlan:
         from lexsplat.evaluation.ablate import AblationPlan
 
-        return AblationPlan(self.seeds, self.variants, self.methods, self.wrong_labels, self.forms)
+        methods = self.methods or (self.settings.method,)
+        return AblationPlan(self.seeds, self.variants, methods, self.wrong_labels, self.forms)
 
     def run(self) -> None:
         """Measure and print the table."""
-        from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation import GroundTruthSource
         from lexsplat.evaluation import ablate as ablation
-        from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
         if self.as_in_paper:
             settings = ablation.as_in_paper(settings)
-        with ProgressBars() as bars:
-            rows = ablation.ablate(
-                capture,
-                self.output,
-                settings,
-                self._plan(),
-                ground_truth=GroundTruthSource(self.masks, self.prompt_list),
-                listener=bars,
-            )
-        if self.json:
-            print_json_file(self.output / "ablation.json")
-            return
-        print(format_rows(rows, ablation.COLUMNS))
-        print(f"{self.output}: ablation.json, ablation.csv, ablation.tex, ablation.html")
+        evaluation = ablation.paper_evaluation()
+        with open_bench(capture, settings, evaluation, self) as bench:
+            rows = ablation.ablate(bench, self._plan())
+        print_table(self, "ablation", rows, ablation.COLUMNS)

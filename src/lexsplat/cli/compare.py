@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
+from lexsplat.cli.experiments import open_bench, print_table
 from lexsplat.cli.options import (
     ALL_PROTOCOLS,
     CaptureArgument,
@@ -15,7 +16,6 @@ from lexsplat.cli.options import (
     ProtocolName,
     Settings,
     check_seeds,
-    print_json_file,
 )
 from lexsplat.evaluation.compare import COMPARED, ComparisonPlan
 from lexsplat.pipeline.config import BuildConfig
@@ -59,10 +59,6 @@ class Compare:
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
-    defaults: ClassVar[dict[str, str]] = {
-        "masks": "the ground truth in the capture or beside it",
-        "prompt_list": "the prompts of the ground truth",
-    }
 
     def check(self) -> None:
         """Refuse invalid options."""
@@ -71,24 +67,11 @@ class Compare:
 
     def run(self) -> None:
         """Measure and print the table."""
-        from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
+        from lexsplat.evaluation import EvaluationConfig
         from lexsplat.evaluation.compare import compare
-        from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
-        with ProgressBars() as bars:
-            rows = compare(
-                capture,
-                self.output,
-                settings,
-                ComparisonPlan(self.methods, self.seeds),
-                evaluation=EvaluationConfig(lpips=self.lpips, protocols=self.protocols),
-                ground_truth=GroundTruthSource(self.masks, self.prompt_list),
-                listener=bars,
-            )
-        if self.json:
-            print_json_file(self.output / "comparison.json")
-            return
-        print(format_rows(rows))
-        print(f"{self.output}: comparison.json, comparison.csv, comparison.tex, comparison.html")
+        evaluation = EvaluationConfig(lpips=self.lpips, protocols=self.protocols)
+        with open_bench(capture, settings, evaluation, self) as bench:
+            rows = compare(bench, ComparisonPlan(self.methods, self.seeds))
+        print_table(self, "comparison", rows)

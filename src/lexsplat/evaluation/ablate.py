@@ -11,20 +11,18 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
+from lexsplat.evaluation import EvaluationConfig
 from lexsplat.evaluation.experiments import Bench, Row
 from lexsplat.language.fields import LanguageField
-from lexsplat.language.methods import METHODS, VARIANTS, FitRun, MethodName, TrainingViews
+from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import QueryForm
-from lexsplat.runtime.progress import Listener, silent
 
 log = logging.getLogger("lexsplat")
 
@@ -82,97 +80,59 @@ class AblationPlan:
 
     Args:
         seeds: Seeds of codebook and language.
-        variants: Names out of `VARIANTS`; empty takes all of each method.
-        methods: Names of methods; empty takes that of the settings. Rows of several are named "METHOD: VARIANT".
+        variants: Names out of `lexsplat.language.methods.VARIANTS`; empty takes all of each method.
+        methods: Names of methods. Rows of several are named "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
         forms: How codes and text are compared: "feature" as in the paper, "code". Names of rows end in the form if
             there are several.
 
     Raises:
-        ValueError: If there is no seed or form, or the share is not within 0..1.
+        ValueError: If there is no seed, form or method, the share is not within 0..1, a method is unknown, or no
+            method has a variant.
     """
 
     seeds: Sequence[int] = (0, 1, 2)
     variants: Sequence[str] = ()
-    methods: Sequence[MethodName] = ()
+    methods: Sequence[MethodName] = ("trained",)
     wrong_labels: float = 0.0
     forms: Sequence[QueryForm] = ("feature",)
 
     def __post_init__(self) -> None:
-        if not self.seeds or not self.forms:
-            raise ValueError("an ablation needs at least one seed and one form")
-        with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share before any work
+        if not self.seeds or not self.forms or not self.methods:
+            raise ValueError("an ablation needs at least one seed, one form and one method")
+        with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share
+        unknown = [name for name in self.methods if name not in METHODS]
+        if unknown:
+            raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")
+        known = {variant: None for method in self.methods for variant in METHODS[method].variants}
+        missing = [variant for variant in self.variants if variant not in known]
+        if missing:
+            methods = " and ".join(self.methods)
+            raise ValueError(f"variants of {methods} are {', '.join(known)}; got {', '.join(missing)}")
 
 
-def ablate(
-    source: Path,
-    output: Path,
-    config: BuildConfig,
-    plan: AblationPlan | None = None,
-    *,
-    evaluation: EvaluationConfig | None = None,
-    ground_truth: GroundTruthSource | None = None,
-    listener: Listener = silent,
-) -> list[dict[str, Any]]:
-    """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
-
-    An interrupted command resumes where it stopped; the tables are rewritten after every run.
+def ablate(bench: Bench, plan: AblationPlan | None = None) -> list[dict[str, Any]]:
+    """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).
 
     Args:
-        source: Folder with photos, cameras and masks.
-        output: Folder for everything that is written.
-        config: Settings of the full method; ``config.seed`` is the seed of the Gaussians.
-        plan: The rows and seeds; None takes all variants of the method of the settings.
-        evaluation: How to measure; None takes `paper_evaluation`.
-        ground_truth: Where the ground truth is read from; None takes the capture's.
-        listener: Receives progress events.
+        bench: Where they are made and measured; its settings are those of the full methods.
+        plan: The rows and seeds; None takes all variants of the paper's method.
 
     Returns:
         Rows as `report.table_rows` makes them.
-
-    Raises:
-        ValueError: If a method or variant is unknown, or no method has a variant.
-        CaptureError: See `Bench`.
     """
-    plan = plan or AblationPlan()
-    variants = _variants(config, list(plan.methods) or [config.method], plan.variants)
-    bench = Bench(source, output, config, evaluation or paper_evaluation(), ground_truth, listener)
-    rows = [
-        language_row(
-            bench,
-            name if len(plan.forms) == 1 else f"{name}, {form}",
-            changed(replace(bench.config, method=method), variant),
-            form,
-            plan.wrong_labels,
-        )
-        for name, method, variant in variants
-        for form in plan.forms
-    ]
-    return bench.measure("ablation", rows, plan.seeds, COLUMNS)
-
-
-def _variants(
-    config: BuildConfig, methods: Sequence[MethodName], variants: Sequence[str]
-) -> list[tuple[str, MethodName, str]]:
-    """Name, method and variant of every row. What some methods lack is named in a warning."""
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown:
-        raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")
-    rows: list[tuple[str, MethodName, str]] = []
-    for method in methods:
-        for variant in variants or METHODS[method].variants:
-            if variant in METHODS[method].variants:
-                rows.append((variant if len(methods) == 1 else f"{method}: {variant}", method, variant))
-            else:
+    plan, rows = plan or AblationPlan(), []
+    for method in plan.methods:
+        for variant in plan.variants or METHODS[method].variants:
+            if variant not in METHODS[method].variants:
                 log.warning("%s has no variant %r: the row is left out", method, variant)
-    if missing := set(variants) - {variant for _, _, variant in rows}:
-        known = [
-            variant for variant in VARIANTS if any(variant in METHODS[method].variants for method in methods)
-        ]
-        raise ValueError(
-            f"variants of {' and '.join(methods)} are {', '.join(known)}; got {', '.join(missing)}"
-        )
-    return rows
+                continue
+            config = changed(replace(bench.config, method=method), variant)
+            name = variant if len(plan.methods) == 1 else f"{method}: {variant}"
+            for form in plan.forms:
+                row = name if len(plan.forms) == 1 else f"{name}, {form}"
+                rows.append(language_row(bench, row, config, form, plan.wrong_labels))
+    return bench.measure("ablation", rows, plan.seeds, COLUMNS)
 
 
 def paper_evaluation() -> EvaluationConfig:

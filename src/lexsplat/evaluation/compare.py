@@ -5,17 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
-from lexsplat.evaluation import EvaluationConfig, GroundTruthSource, baselines
+from lexsplat.evaluation import baselines
 from lexsplat.evaluation.ablate import language_row
 from lexsplat.evaluation.experiments import Bench, Made, Row
 from lexsplat.evaluation.methods import Method
 from lexsplat.language.methods import METHODS, MethodName
-from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import embed_prompts
-from lexsplat.runtime.progress import Listener, silent
 
 BASELINES = ("dff", "lerf", "3dovs", "nearest")
 """The methods that the paper compares with, and "nearest", a lower bound without 3D."""
@@ -45,39 +42,20 @@ class ComparisonPlan:
             raise ValueError(f"methods are {', '.join(COMPARED)}; got {', '.join(unknown) or 'too few'}")
 
 
-def compare(
-    source: Path,
-    output: Path,
-    config: BuildConfig,
-    plan: ComparisonPlan | None = None,
-    *,
-    evaluation: EvaluationConfig | None = None,
-    ground_truth: GroundTruthSource | None = None,
-    listener: Listener = silent,
-) -> list[dict[str, Any]]:
-    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
+def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, Any]]:
+    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).
 
-    An interrupted command resumes where it stopped; the tables are rewritten after every run. Memory is the peak of
-    the process while a method's language is made (Linux only); storage is what a scene must keep to answer;
-    training time is reconstruction, features and language.
+    Memory is the peak of the process while a method's language is made (Linux only); storage is what a scene must
+    keep to answer; training time is reconstruction, features and language.
 
     Args:
-        source: Folder with photos, cameras and masks.
-        output: Folder for everything that is written.
-        config: Settings; ``config.seed`` is the seed of the Gaussians.
+        bench: Where they are made and measured.
         plan: The rows and seeds; None takes the defaults.
-        evaluation: How to measure; None takes the defaults: all protocols.
-        ground_truth: Where the ground truth is read from; None takes the capture's.
-        listener: Receives progress events.
 
     Returns:
         Rows as `report.table_rows` makes them.
-
-    Raises:
-        CaptureError: See `Bench`.
     """
     plan = plan or ComparisonPlan()
-    bench = Bench(source, output, config, evaluation or EvaluationConfig(), ground_truth, listener)
     return bench.measure("comparison", [_row(bench, name) for name in plan.methods], plan.seeds)
 
 

@@ -199,10 +199,10 @@ def _registered_images(
 ) -> str:
     """Run structure from motion unless its result is up to date; returns the folder of the images that have poses."""
     poses, memory = folder.root / "poses", parse_bytes(config.memory)
-    made_from = _photos_fingerprint(source, photos, folder.root, config)
+    key = _photos_fingerprint(source, photos, folder.root, config)
     images = folder.record["stages"].get("poses", {}).get("images")
     kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()
-    if kept and folder.is_finished("poses", made_from):
+    if kept and folder.is_finished("poses", key):
         return str(images)
     start = time.perf_counter()
     folder.reopen("poses")
@@ -219,7 +219,7 @@ def _registered_images(
         "unregistered": list(found.unregistered),
         "images": images,
     }
-    folder.finish("poses", made_from, time.perf_counter() - start, **facts)
+    folder.finish("poses", key, time.perf_counter() - start, **facts)
     return images
 
 

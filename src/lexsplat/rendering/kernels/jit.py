@@ -8,7 +8,6 @@ Several Python threads can render at once.
 from __future__ import annotations
 
 import functools
-import hashlib
 import itertools
 import logging
 import os
@@ -21,6 +20,8 @@ from typing import Any
 import numba
 import torch
 from numba.core import event
+
+from lexsplat.runtime.fingerprints import digest
 
 logger = logging.getLogger("lexsplat")
 
@@ -53,17 +54,17 @@ def _cache_folder() -> str:
     is used: the environment variable NUMBA_CACHE_DIR, or else the package's cache, then the user's, then a temporary
     one.
     """
-    digest = hashlib.sha256(numba.__version__.encode())
     here = Path(__file__).parent
-    for source in sorted(here.glob("*.py")):
-        digest.update(source.read_bytes())
+    key = digest(
+        [numba.__version__.encode(), *(source.read_bytes() for source in sorted(here.glob("*.py")))], 6
+    )
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
     places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home) / "lexsplat"]
     for place in places:
         try:
             # expanduser() raises RuntimeError if the user has no home directory.
-            folder = place.expanduser() / f"kernels-{digest.hexdigest()[:12]}"
+            folder = place.expanduser() / f"kernels-{key}"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return str(folder)

@@ -1,0 +1,63 @@
+"""Answers as data: which instances an answer keeps, and what a query says about its views."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support.viewer_scene import ball_scene
+
+from lexsplat.scenes.answers import Answers, answer_queries, file_name
+
+PROMPTS = ["ball 0", "ball 3"]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ball_scene(per_ball=80)[0]
+
+
+@pytest.mark.parametrize(("automatic", "kept"), [(True, [0]), (False, [0, 1])])
+def test_only_an_automatic_threshold_leaves_out_what_convinces_less(automatic, kept):
+    scene, known = ball_scene(per_ball=80)
+    labels = torch.from_numpy(known.labels)
+    scores = torch.where(labels == 0, 0.9, torch.where(labels == 1, 0.55, 0.1))
+    answers = Answers(("ball",), scores[None], torch.tensor([0.5]), ("yes",), scene, automatic=automatic)
+    found = answers.selection(0)
+    assert np.array_equal(found.mask.numpy(), np.isin(known.labels, kept))
+    assert (found.threshold, found.phrase, found.present) == (0.5, "ball", "yes")
+    assert answers.to_dict() == {"answers": [found.to_dict()]}
+
+
+def test_a_query_states_the_peak_of_each_view_and_the_best_of_them(scene, tmp_path):
+    views = list(scene.views)[:3]
+    found = answer_queries(scene, PROMPTS, views, 0.4, tmp_path)
+    assert (found["scene"], found["form"]) == (None, scene.query.form)
+    maps = {view: scene.relevancy(PROMPTS, view).numpy() for view in views}
+    for number, answer in enumerate(found["prompts"]):
+        peaks = {view: float(values[number].max()) for view, values in maps.items()}
+        assert answer["best_view"] == max(peaks, key=peaks.get)
+        assert answer["peak"] == pytest.approx(max(peaks.values()))
+        assert answer["threshold"] == 0.4
+        for view, entry in answer["views"].items():
+            values = maps[view][number]
+            column, row = entry["peak_pixel"]
+            assert values[row, column] == values.max()
+            assert entry["peak"] == pytest.approx(peaks[view], abs=1e-4)
+            assert entry["mask_share"] == pytest.approx((values >= 0.4).mean(), abs=1e-5)
+            with Image.open(entry["mask"]) as mask:
+                assert np.array_equal(np.asarray(mask) > 0, values >= 0.4)
+
+
+def test_a_query_without_a_folder_has_the_same_numbers_and_no_images(scene, tmp_path):
+    plain, drawn = (answer_queries(scene, PROMPTS, [], None, folder) for folder in (None, tmp_path))
+    for left, right in zip(plain["prompts"], drawn["prompts"]):
+        for view, entry in right["views"].items():
+            assert left["views"][view] == {k: v for k, v in entry.items() if k not in ("heatmap", "mask")}
+
+
+@pytest.mark.parametrize(
+    ("prompt", "name"),
+    [("Red Apple!", "red_apple"), ("дом / сад", "дом_сад"), ("?!", "prompt"), ("a" * 99, "a" * 80)],
+)
+def test_a_prompt_makes_a_file_name_in_any_alphabet(prompt, name):
+    assert file_name(prompt) == name
