@@ -8,6 +8,7 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,23 @@ _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.2613
 _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
 _FEW_PATCHES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class TextTower:
+    """The text half of a CLIP.
+
+    Args:
+        tensors: Weights by their names in transformers, without the prefix "text_model.".
+        heads: Attention heads of a layer.
+        activation: "quick_gelu" or "gelu".
+        tokenizer: The content of its ``tokenizer.json``.
+    """
+
+    tensors: dict[str, Tensor]
+    heads: int
+    activation: str
+    tokenizer: dict[str, Any]
 
 
 class ClipEncoder(PretrainedModel):
@@ -128,6 +146,18 @@ class ClipEncoder(PretrainedModel):
         ]
         features = [_pooled(self._model.get_text_features(**self._text_inputs(batch))) for batch in batches]
         return F.normalize(torch.cat(features).float(), dim=-1).cpu()
+
+    def text_tower(self) -> TextTower | None:
+        """The text tower for other programs; None if it is not of CLIP's own architecture."""
+        config = self._model.config.text_config
+        tokenizer = getattr(self._tokenizer, "backend_tokenizer", None)
+        if self._model.config.model_type != "clip" or tokenizer is None:
+            return None
+        tensors = {name: tensor.detach().cpu() for name, tensor in self._model.text_model.state_dict().items()}
+        tensors["text_projection.weight"] = self._model.text_projection.weight.detach().cpu()
+        tensors.pop("embeddings.position_ids", None)
+        content = json.loads(tokenizer.to_str())
+        return TextTower(tensors, int(config.num_attention_heads), str(config.hidden_act), content)
 
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask

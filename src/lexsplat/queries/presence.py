@@ -113,7 +113,7 @@ class PresenceClassifier:
         peaks = self._reference_peaks()
         middle = peaks.median()
         # 1.4826 scales the median absolute deviation to the standard deviation of a normal distribution.
-        self._middle, self._spread = float(middle), float((peaks - middle).abs().median()) * 1.4826
+        self.middle, self.spread = float(middle), float((peaks - middle).abs().median()) * 1.4826
 
     def evidence(self, scores: Tensor) -> Evidence:
         """Evidence for a phrase from its relevancies ``scores [N]``."""
@@ -123,7 +123,7 @@ class PresenceClassifier:
         region = self._shown[best.indices]
         there = (self.language.select(region).code_probabilities() @ self._table).mean(0)
         peak = float(best.values.mean())
-        height = (peak - self._middle) / max(self._spread, 1e-4)
+        height = (peak - self.middle) / max(self.spread, 1e-4)
         return Evidence(height, float((there < peak).float().mean()), peak)
 
     def classify(self, scores: Tensor) -> Presence:

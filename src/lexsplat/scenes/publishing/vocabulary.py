@@ -1,0 +1,96 @@
+"""The phrases that a published page answers without a text encoder, and their relevancy for every code."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from importlib.resources import files
+
+import torch
+from torch import Tensor
+
+from lexsplat.queries.presence import REFERENCE_PHRASES
+from lexsplat.queries.relevancy import Question, code_relevancy, embed_prompts
+from lexsplat.scenes.scene import Scene
+
+ASKED, NAME, COMBINED, USE = "a", "n", "c", "u"
+"""Kinds of phrases: asked of this scene before, the name of a thing, a name with a color, material or part, and what
+things are for."""
+
+_MOST_ASKED = 500
+_LONGEST = 120
+_BATCH = 256
+
+
+def everyday_phrases() -> dict[str, str]:
+    """The kind of each everyday phrase, in the order of ``words.txt``: names first."""
+    text = files(__package__).joinpath("page/words.txt").read_text(encoding="utf-8")
+    sections: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        name, colon, content = line.partition(":")
+        if colon and not line.startswith("#"):
+            separator = ";" if name == "parts" else ","
+            sections.setdefault(name, []).extend(part.strip() for part in content.split(separator))
+    phrases = dict.fromkeys([*sections["things"], *REFERENCE_PHRASES], NAME)
+    for adjectives, things in (("colors", "colored"), ("materials", "made")):
+        for thing in sections[things]:
+            for adjective in sections[adjectives]:
+                phrases.setdefault(f"{adjective} {thing}", COMBINED)
+    for entry in sections["parts"]:
+        owner, _, parts = entry.partition("=")
+        for part in parts.split(","):
+            phrases.setdefault(f"{owner.strip()} {part.strip()}", COMBINED)
+    for use in sections["uses"]:
+        phrases.setdefault(use, USE)
+    return phrases
+
+
+def page_phrases(asked: Iterable[str] = ()) -> dict[str, str]:
+    """The kind of each phrase of a page: those asked of the scene, then everyday ones."""
+    phrases: dict[str, str] = {}
+    for phrase in asked:
+        plain = " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", phrase).split())[:_LONGEST].lower()
+        if plain and len(phrases) < _MOST_ASKED:
+            phrases[plain] = ASKED
+    for phrase, kind in everyday_phrases().items():
+        phrases.setdefault(phrase, kind)
+    return phrases
+
+
+def asked_phrases(scene: Scene) -> list[str]:
+    """What was asked of a scene in the viewer, the latest first; nothing for a scene without a folder."""
+    from lexsplat.runtime.errors import LexsplatError
+    from lexsplat.runtime.files import read_json
+
+    if scene.folder is None:
+        return []
+    try:
+        content = read_json(scene.folder.root / "viewer.json")
+        history = content.get("history", []) if isinstance(content, dict) else []
+    except LexsplatError:
+        return []
+    return [phrase for phrase in history if isinstance(phrase, str)]
+
+
+@torch.no_grad()
+def relevancy_tables(scene: Scene, phrases: list[str]) -> Tensor:
+    """Relevancy of every phrase for every code: ``[P, K]`` uint8 in 255ths.
+
+    Raises:
+        ModelError: If the text encoder cannot be loaded.
+    """
+    negatives = scene.embed(scene.query.negatives)
+    codewords = scene.field.codebook.clip.cpu()
+    rows = []
+    for start in range(0, len(phrases), _BATCH):
+        embedded = embed_prompts(
+            phrases[start : start + _BATCH], scene.encode_batch, scene.query.templates
+        )
+        relevancy = code_relevancy(codewords, Question(embedded, negatives, scene.query))
+        rows.append((relevancy.T * 255).round().to(torch.uint8))
+    return torch.cat(rows)
+
+
+def words_file(phrases: dict[str, str]) -> bytes:
+    """The list of phrases for the page: one a line, its kind in front."""
+    return "".join(f"{kind}{phrase}\n" for phrase, kind in phrases.items()).encode("utf-8")
