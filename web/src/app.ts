@@ -23,6 +23,9 @@ export interface Content {
   table: Uint8Array;
 }
 
+/** In larger scenes, colors appear before the places are found. */
+const MOST_AT_ONCE = 200_000;
+
 export class App {
   readonly answers: Answer[] = [];
   readonly answerer: Answerer;
@@ -117,9 +120,12 @@ export class App {
       }
       this.answers.push(answer);
     }
-    this.#paint();
-    await new Promise((resolve) => setTimeout(resolve)); // colors first, then places
+    if (this.geometry.count > MOST_AT_ONCE) {
+      this.#paint(); // colors first, then places
+      await new Promise((resolve) => setTimeout(resolve));
+    }
     for (const answer of this.answers) placesOf(answer, this.geometry);
+    this.#paint();
     this.#refresh();
     const latest = this.answers.at(-1);
     if (latest) this.#say(this.answers.slice(-prompts.length).map((answer) => `${answer.prompt}: ${spoken(answer)}`).join(". "));
@@ -185,7 +191,7 @@ export class App {
 
   #paint(): void {
     const shown = this.answers.filter(painted);
-    this.#painter.paint(shown, this.#mode);
+    this.#painter.paint(shown.map((answer) => ({ ...answer, splats: answer.places?.flatMap((place) => place.splats) ?? null })), this.#mode);
     this.stage.draw();
     this.#write();
   }
@@ -212,6 +218,7 @@ export class App {
             clearTimeout(this.#later);
             this.#later = setTimeout(() => {
               placesOf(one, this.geometry);
+              this.#paint();
               const focused = document.activeElement?.getAttribute("aria-label");
               this.#refresh();
               if (focused) this.#list.querySelector<HTMLElement>(`[aria-label="${CSS.escape(focused)}"]`)?.focus();

@@ -21,7 +21,9 @@ export class Dictionary {
   readonly #words = new Map<string, number>();
   readonly #tables: Uint8Array;
   readonly #numCodes: number;
+  /** The best relevancy of each phrase among the codes of the scene, and its mean over the scene. */
   #strengths = new Float32Array(0);
+  #means = new Float32Array(0);
 
   /** `list` has a phrase a line, its kind in front; `tables` a relevancy for each phrase and code in 255ths. */
   constructor(list: string, tables: Uint8Array, numCodes: number) {
@@ -45,6 +47,11 @@ export class Dictionary {
       for (const code of used) best = Math.max(best, this.#tables[place * this.#numCodes + code]);
       return best / 255;
     });
+    this.#means = Float32Array.from(this.phrases, (_, place) => dot(this.#row(place), shares) / 255);
+  }
+
+  #row(place: number): Uint8Array {
+    return this.#tables.subarray(place * this.#numCodes, (place + 1) * this.#numCodes);
   }
 
   /** The place of a phrase as typed, without its question, or in the singular; -1 if it is unknown. */
@@ -60,8 +67,7 @@ export class Dictionary {
 
   /** The table of a phrase. */
   table(place: number): Table {
-    const row = this.#tables.subarray(place * this.#numCodes, (place + 1) * this.#numCodes);
-    return Float32Array.from(row, (value) => value / 255);
+    return Float32Array.from(this.#row(place), (value) => value / 255);
   }
 
   tableOf(phrase: string): Table {
@@ -88,15 +94,16 @@ export class Dictionary {
     return found.length ? found : this.similar(text, count);
   }
 
-  /** Phrases of this scene to begin with: names that different codes answer best, the surest first. */
+  /** Phrases to begin with: names of small things of this scene, each answered best by another code. */
   examples(count: number): string[] {
+    const merit = (place: number): number => this.#strengths[place] - 3 * this.#means[place];
     const order = [...this.phrases.keys()]
       .filter((place) => "na".includes(this.#kinds[place]) && this.#strengths[place] > 0.6)
-      .sort((a, b) => this.#strengths[b] - this.#strengths[a]);
+      .sort((a, b) => merit(b) - merit(a));
     const seen = new Set<number>();
     const chosen: string[] = [];
     for (const place of order) {
-      const row = this.#tables.subarray(place * this.#numCodes, (place + 1) * this.#numCodes);
+      const row = this.#row(place);
       const best = row.indexOf(Math.max(...row));
       if (seen.has(best) || chosen.some((other) => shareWord(other, this.phrases[place]))) continue;
       seen.add(best);
@@ -128,8 +135,7 @@ export class Dictionary {
     const scored: { phrase: string; score: number }[] = [];
     this.phrases.forEach((phrase, place) => {
       if (this.#kinds[place] === "u" || this.#kinds[place] === "c") return;
-      const row = this.#tables.subarray(place * this.#numCodes, (place + 1) * this.#numCodes);
-      scored.push({ phrase, score: dot(row, distribution) / 255 });
+      scored.push({ phrase, score: dot(this.#row(place), distribution) / 255 });
     });
     return scored.sort((a, b) => b.score - a.score).slice(0, count);
   }

@@ -16,6 +16,12 @@ const SMALLEST_SHARE = 0.1;
 /** Smallest peak of a cluster above the threshold, as a share of the best one's (lexsplat.queries.selection). */
 const CONVINCING = 0.65;
 const PEAK_COUNT = 20;
+/** Largest distance between linked splats, in usual distances to the sixth neighbor. */
+const LINK = 2.5;
+/** Splats that are linked, at most; the others of a larger selection join them. */
+const MOST_LINKED = 20_000;
+/** Splats of lower opacity join clusters but do not link them. */
+const FAINT = 0.1;
 /** A splat belongs to the surface of a hit if its depth differs by at most this share. */
 const SAME_SURFACE = 0.05;
 
@@ -54,7 +60,7 @@ export class Geometry {
     const step = Math.max(1, Math.floor(this.count / 20000));
     const axis = (a: number): number[] => {
       const values: number[] = [];
-      for (let i = 0; i < this.count; i += step) if (this.opacities[i] > 0.1) values.push(this.centers[3 * i + a]);
+      for (let i = 0; i < this.count; i += step) if (this.opacities[i] >= FAINT) values.push(this.centers[3 * i + a]);
       values.sort((x, y) => x - y);
       return [values[Math.floor(values.length * 0.1)] ?? 0, values[Math.floor(values.length * 0.9)] ?? 0];
     };
@@ -119,7 +125,7 @@ export class Geometry {
    */
   places(scores: Float32Array, threshold: number): Place[] {
     const chosen: number[] = [];
-    for (let i = 0; i < this.count; i++) if (scores[i] >= threshold && this.opacities[i] >= 0.1) chosen.push(i);
+    for (let i = 0; i < this.count; i++) if (scores[i] >= threshold) chosen.push(i);
     if (chosen.length === 0) return [];
     const clusters = this.#clusters(chosen).map((splats) => ({
       splats,
@@ -135,37 +141,58 @@ export class Geometry {
       .map(({ splats }) => this.#place(splats));
   }
 
+  /**
+   * Splats that are linked: nearer than 2.5 times the usual distance to the sixth neighbor. Faint splats, and of large
+   * selections those that are not in a sample, join the cluster of a linked one nearby.
+   */
   #clusters(chosen: number[]): number[][] {
-    const sizes = chosen.map((i) => Math.max(...this.#scales.subarray(3 * i, 3 * i + 3))).sort((a, b) => a - b);
-    const cell = Math.max(1e-6, 4 * sizes[Math.floor(sizes.length / 2)]);
-    const cells = new Map<string, number[]>();
-    const key = (x: number, y: number, z: number): string => `${x},${y},${z}`;
-    const at = (i: number): number[] => [0, 1, 2].map((axis) => Math.floor(this.centers[3 * i + axis] / cell));
-    for (const i of chosen) {
-      const [x, y, z] = at(i);
-      const name = key(x, y, z);
-      const own = cells.get(name);
-      if (own) own.push(i);
-      else cells.set(name, [i]);
-    }
-    const clusters: number[][] = [];
-    const left = new Set(cells.keys());
-    for (const first of cells.keys()) {
-      if (!left.delete(first)) continue;
-      const cluster: number[] = [];
-      const open = [first];
-      for (let name = open.pop(); name !== undefined; name = open.pop()) {
-        const own = cells.get(name)!;
-        for (const i of own) cluster.push(i);
-        const [x, y, z] = at(own[0]);
-        for (let n = 0; n < 27; n++) {
-          const next = key(x + (n % 3) - 1, y + (Math.floor(n / 3) % 3) - 1, z + Math.floor(n / 9) - 1);
-          if (left.delete(next)) open.push(next);
-        }
+    const firm = chosen.filter((i) => this.opacities[i] >= FAINT);
+    const all = firm.length ? firm : chosen;
+    const step = Math.ceil(all.length / MOST_LINKED);
+    const makers = step > 1 ? all.filter((_, n) => n % step === 0) : all;
+    const link = LINK * this.#spacing(makers);
+    const grid = new Grid(this.centers, makers, link);
+    const parents = new Map<number, number>(makers.map((i) => [i, i]));
+    const root = (i: number): number => {
+      let top = i;
+      for (let up = parents.get(top)!; up !== top; up = parents.get(top)!) top = up;
+      for (let up = parents.get(i)!; up !== top; up = parents.get(i)!) {
+        parents.set(i, top);
+        i = up;
       }
-      clusters.push(cluster);
+      return top;
+    };
+    for (const i of makers) grid.near(i, (j) => j < i && parents.set(root(i), root(j)) && false);
+    const clusters = new Map<number, number[]>();
+    for (const i of chosen) {
+      let own: number | null = parents.has(i) ? i : null;
+      if (own === null) grid.near(i, (j) => (own = j) !== null);
+      if (own === null) continue;
+      const top = root(own);
+      const cluster = clusters.get(top);
+      if (cluster) cluster.push(i);
+      else clusters.set(top, [i]);
     }
-    return clusters;
+    return [...clusters.values()];
+  }
+
+  /** Median distance to the sixth neighbor, of a sample. */
+  #spacing(splats: number[]): number {
+    const step = Math.max(1, Math.ceil((splats.length * splats.length) / 4e6));
+    const found: number[] = [];
+    for (let n = 0; n < splats.length; n += step) {
+      const nearest = new Array<number>(7).fill(Infinity); // itself and six others
+      for (const j of splats) {
+        const apart = squared(this.centers, splats[n], j);
+        if (apart >= nearest[6]) continue;
+        let place = 6;
+        for (; place > 0 && nearest[place - 1] > apart; place--) nearest[place] = nearest[place - 1];
+        nearest[place] = apart;
+      }
+      found.push(Math.sqrt(nearest.findLast(Number.isFinite) ?? 0));
+    }
+    found.sort((a, b) => a - b);
+    return found[Math.floor(found.length / 2)] || Math.max(...this.#scales.subarray(3 * splats[0], 3 * splats[0] + 3));
   }
 
   #place(splats: number[]): Place {
@@ -179,6 +206,43 @@ export class Geometry {
     center.divideScalar(sum || 1);
     const apart = splats.map((i) => this.center(i, point).distanceTo(center)).sort((a, b) => a - b);
     return { center, radius: apart[Math.floor(apart.length * 0.95)] || 0.01, splats };
+  }
+}
+
+function squared(centers: Float32Array, i: number, j: number): number {
+  const x = centers[3 * i] - centers[3 * j];
+  const y = centers[3 * i + 1] - centers[3 * j + 1];
+  const z = centers[3 * i + 2] - centers[3 * j + 2];
+  return x * x + y * y + z * z;
+}
+
+/** Splats in cubes, to find those within a distance. */
+class Grid {
+  readonly #cells = new Map<number, number[]>();
+
+  constructor(readonly centers: Float32Array, splats: number[], readonly side: number) {
+    for (const i of splats) {
+      const key = this.#key(i, 0, 0, 0);
+      const cell = this.#cells.get(key);
+      if (cell) cell.push(i);
+      else this.#cells.set(key, [i]);
+    }
+  }
+
+  /** Visit the splats within one side of a splat, until `visit` is true. */
+  near(splat: number, visit: (other: number) => boolean): void {
+    const limit = this.side * this.side;
+    for (let n = 0; n < 27; n++) {
+      const cell = this.#cells.get(this.#key(splat, (n % 3) - 1, (Math.floor(n / 3) % 3) - 1, Math.floor(n / 9) - 1));
+      for (const other of cell ?? []) if (squared(this.centers, splat, other) <= limit && visit(other)) return;
+    }
+  }
+
+  /** A number for each cube within 2^16 sides of the origin; cubes farther away share numbers. */
+  #key(splat: number, x: number, y: number, z: number): number {
+    const at = (axis: number, shift: number): number =>
+      ((Math.floor(this.centers[3 * splat + axis] / this.side) + shift) & 0x1ffff) >>> 0;
+    return (at(0, x) * 0x20000 + at(1, y)) * 0x20000 + at(2, z);
   }
 }
 

@@ -16,6 +16,8 @@ const WIDTH = 2048;
 
 export interface Painted {
   table: Table;
+  /** The splats of the places that were found; null marks all above the threshold. */
+  splats: number[] | null;
   threshold: number;
   color: string;
 }
@@ -45,6 +47,8 @@ export class Painter {
   readonly #count = dyno.dynoInt(0, "lexsplatCount");
   readonly #heat = dyno.dynoBool(false, "lexsplatHeat");
   readonly #fade = dyno.dynoFloat(0.75, "lexsplatFade");
+  /** Which prompts may mark each splat, a bit for each. */
+  readonly #masks: THREE.DataTexture;
   /** Color and threshold of each prompt, in row 0 of a texture. */
   readonly #prompts: THREE.DataTexture;
 
@@ -54,6 +58,7 @@ export class Painter {
     const rows = Math.max(1, Math.ceil(language.count / WIDTH));
     const codes = texture(padded(language.codes, rows), WIDTH, rows, THREE.RGBAIntegerFormat, "RGBA8UI");
     const shares = texture(padded(language.shares, rows), WIDTH, rows, THREE.RGBAFormat, "RGBA8");
+    this.#masks = texture(new Uint8Array(WIDTH * rows).fill(255), WIDTH, rows, THREE.RedIntegerFormat, "R8UI");
     this.#lut = texture(new Uint8Array(256 * MOST_PROMPTS), 256, MOST_PROMPTS, THREE.RedFormat, "R8");
     this.#prompts = new THREE.DataTexture(
       new Float32Array(4 * MOST_PROMPTS), MOST_PROMPTS, 1, THREE.RGBAFormat, THREE.FloatType,
@@ -62,6 +67,7 @@ export class Painter {
     const uniforms = {
       codes: dyno.dynoUsampler2D(codes, "lexsplatCodes"),
       shares: dyno.dynoSampler2D(shares, "lexsplatShares"),
+      masks: dyno.dynoUsampler2D(this.#masks, "lexsplatMasks"),
       lut: dyno.dynoSampler2D(this.#lut, "lexsplatLut"),
       prompts: dyno.dynoSampler2D(this.#prompts, "lexsplatPrompts"),
       count: this.#count,
@@ -83,21 +89,32 @@ export class Painter {
       prompts.set([color.r, color.g, color.b, answer.threshold], 4 * row);
     });
     this.#lut.needsUpdate = true;
+    this.#mask(answers);
     this.#prompts.needsUpdate = true;
     this.#count.value = Math.min(answers.length, MOST_PROMPTS);
     this.#heat.value = mode === "heat";
     this.#mesh.updateVersion();
   }
+
+  #mask(answers: Painted[]): void {
+    const masks = this.#masks.image.data as Uint8Array;
+    const open = answers.reduce((bits, { splats }, row) => (splats ? bits : bits | (1 << row)), 0);
+    masks.fill(open);
+    answers.forEach(({ splats }, row) => {
+      for (const splat of splats ?? []) masks[splat] |= 1 << row;
+    });
+    this.#masks.needsUpdate = true;
+  }
 }
 
-type Uniforms = Record<"codes" | "shares" | "lut" | "prompts" | "count" | "heat" | "fade", dyno.Dyno<never, never>>;
+type Uniforms = Record<"codes" | "shares" | "masks" | "lut" | "prompts" | "count" | "heat" | "fade", dyno.Dyno<never, never>>;
 
 function modifier(uniforms: Record<keyof Uniforms, unknown>, count: number) {
   const values = uniforms as { [name: string]: dyno.DynoVal<dyno.DynoType> };
   return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
     const paint = new dyno.Dyno({
       inTypes: {
-        gsplat: dyno.Gsplat, codes: "usampler2D", shares: "sampler2D", lut: "sampler2D", prompts: "sampler2D",
+        gsplat: dyno.Gsplat, codes: "usampler2D", shares: "sampler2D", masks: "usampler2D", lut: "sampler2D", prompts: "sampler2D",
         count: "int", heat: "bool", fade: "float",
       },
       outTypes: { gsplat: dyno.Gsplat },
@@ -109,6 +126,7 @@ function modifier(uniforms: Record<keyof Uniforms, unknown>, count: number) {
           ivec2 at = ivec2(place % ${WIDTH}, place / ${WIDTH});
           uvec4 codes = texelFetch(${i.codes}, at, 0);
           vec4 weights = lexsplatShares(texelFetch(${i.shares}, at, 0));
+          uint mask = texelFetch(${i.masks}, at, 0).r;
           vec3 own = ${i.gsplat}.rgba.rgb;
           float light = dot(own, vec3(0.299, 0.587, 0.114));
           vec3 rest = mix(own, vec3(0.12 + 0.5 * light), ${i.fade});
@@ -128,6 +146,7 @@ function modifier(uniforms: Record<keyof Uniforms, unknown>, count: number) {
               }
               continue;
             }
+            if ((mask & (1u << uint(p))) == 0u) continue;
             float margin = (score - prompt.w) / max(1e-3, 1.0 - prompt.w);
             if (margin >= 0.0 && margin > best) {
               best = margin;

@@ -40,6 +40,7 @@ COMMANDS = {
     "compare": CommandEntry("compare", "Compare", "measure several methods side by side"),
     "edit": CommandEntry("edit", "Edit", "delete, recolor, move or duplicate things by words"),
     "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
+    "publish": CommandEntry("publish", "Publish", "write a page that searches a scene with no server"),
     "view": CommandEntry("view", "View", "show and search a scene in the browser"),
     "info": CommandEntry("info", "Info", "show what a scene folder contains"),
 }

@@ -1,5 +1,11 @@
 """A scene as a static page that is searched in the browser, with no server: ``lexsplat publish``."""
 
-from lexsplat.scenes.publishing.publish import MOST_SPLATS, PublishOptions, Published, publish
+from lexsplat.scenes.publishing.publish import (
+    MOST_SPLATS,
+    Published,
+    PublishOptions,
+    check_target,
+    publish,
+)
 
-__all__ = ["MOST_SPLATS", "PublishOptions", "Published", "publish"]
+__all__ = ["MOST_SPLATS", "PublishOptions", "Published", "check_target", "publish"]

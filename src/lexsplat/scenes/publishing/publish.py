@@ -103,7 +103,7 @@ def publish(scene: Scene, target: Path, options: PublishOptions | None = None) -
         ModelError: If the text encoder cannot be loaded.
     """
     options = options or PublishOptions()
-    _check_target(target, options.single_file)
+    check_target(target, options.single_file)
     _check_scene(scene.gaussians, options.max_splats)
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as work:
@@ -133,7 +133,7 @@ def _check_scene(gaussians: Gaussians, max_splats: int | None) -> None:
         )
 
 
-def _check_target(target: Path, single_file: bool) -> None:
+def check_target(target: Path, single_file: bool) -> None:
     """Refuse a target that would lose files of others.
 
     Raises:
@@ -191,7 +191,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     language = stored_language(scene.field, identity).select(kept)
     (folder / "codes.bin").write_bytes(splat_codes(language))
     (folder / "samples.bin").write_bytes(threshold_samples(scene))
-    phrases = page_phrases(asked_phrases(scene))
+    phrases = page_phrases(asked_phrases(scene), bundled=scene.clip in ("bundled", "embedded"))
     (folder / "words.txt").write_bytes(words_file(phrases))
     (folder / "words.bin").write_bytes(relevancy_tables(scene, list(phrases)).numpy().tobytes())
     text = None

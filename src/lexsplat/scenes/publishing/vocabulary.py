@@ -11,19 +11,25 @@ from torch import Tensor
 
 from lexsplat.queries.presence import REFERENCE_PHRASES
 from lexsplat.queries.relevancy import Question, code_relevancy, embed_prompts
+from lexsplat.runtime.errors import LexsplatError
+from lexsplat.runtime.files import read_json
 from lexsplat.scenes.scene import Scene
 
 ASKED, NAME, COMBINED, USE = "a", "n", "c", "u"
-"""Kinds of phrases: asked of this scene before, the name of a thing, a name with a color, material or part, and what
-things are for."""
+"""Kinds of phrases: asked of this scene before; names, which answer "what is this?"; names with a color, material or
+part; what things are for."""
 
 _MOST_ASKED = 500
 _LONGEST = 120
 _BATCH = 256
 
 
-def everyday_phrases() -> dict[str, str]:
-    """The kind of each everyday phrase, in the order of ``words.txt``: names first."""
+def everyday_phrases(bundled: bool = False) -> dict[str, str]:
+    """The kind of each everyday phrase, in the order of ``words.txt``: names first.
+
+    Args:
+        bundled: Whether the encoder is the bundled one, which knows few names: the others count as `COMBINED`.
+    """
     text = files(__package__).joinpath("page/words.txt").read_text(encoding="utf-8")
     sections: dict[str, list[str]] = {}
     for line in text.splitlines():
@@ -31,7 +37,9 @@ def everyday_phrases() -> dict[str, str]:
         if colon and not line.startswith("#"):
             separator = ";" if name == "parts" else ","
             sections.setdefault(name, []).extend(part.strip() for part in content.split(separator))
-    phrases = dict.fromkeys([*sections["things"], *REFERENCE_PHRASES], NAME)
+    phrases = dict.fromkeys(sections["bundled"], NAME)
+    for name in (*sections["things"], *REFERENCE_PHRASES):
+        phrases.setdefault(name, COMBINED if bundled else NAME)
     for adjectives, things in (("colors", "colored"), ("materials", "made")):
         for thing in sections[things]:
             for adjective in sections[adjectives]:
@@ -45,23 +53,20 @@ def everyday_phrases() -> dict[str, str]:
     return phrases
 
 
-def page_phrases(asked: Iterable[str] = ()) -> dict[str, str]:
+def page_phrases(asked: Iterable[str] = (), bundled: bool = False) -> dict[str, str]:
     """The kind of each phrase of a page: those asked of the scene, then everyday ones."""
     phrases: dict[str, str] = {}
     for phrase in asked:
         plain = " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", phrase).split())[:_LONGEST].lower()
         if plain and len(phrases) < _MOST_ASKED:
             phrases[plain] = ASKED
-    for phrase, kind in everyday_phrases().items():
+    for phrase, kind in everyday_phrases(bundled).items():
         phrases.setdefault(phrase, kind)
     return phrases
 
 
 def asked_phrases(scene: Scene) -> list[str]:
     """What was asked of a scene in the viewer, the latest first; nothing for a scene without a folder."""
-    from lexsplat.runtime.errors import LexsplatError
-    from lexsplat.runtime.files import read_json
-
     if scene.folder is None:
         return []
     try:
