@@ -74,10 +74,6 @@ export class Dictionary {
     return this.table(this.find(phrase));
   }
 
-  knows(word: string): boolean {
-    return this.#words.has(word) || this.#words.has(word.replace(/e?s$/, ""));
-  }
-
   /** Phrases that begin with what was typed, or have a word that does; then with typing errors. */
   complete(text: string, count = 8): string[] {
     const typed = normalize(text);
@@ -115,7 +111,7 @@ export class Dictionary {
 
   /** The phrases with the most similar spelling, the nearest first. */
   similar(text: string, count = 3): string[] {
-    const typed = normalize(text).split(" ").filter((word) => word.length > 2);
+    const typed = normalize(text).split(" ").filter((word) => word.length > 2 || this.#words.has(word));
     const corrected = typed.map((word) => (this.#words.has(word) ? word : this.#nearestWord(word)));
     if (!corrected.some(Boolean)) return [];
     const scored: [number, number][] = [];
@@ -141,12 +137,15 @@ export class Dictionary {
   }
 
   #nearestWord(word: string): string {
+    const most = word.length > 6 ? 2 : 1;
     let best = "";
-    let least = word.length > 6 ? 3 : 2; // errors that are too many
+    let least = Infinity;
     for (const [known, uses] of this.#words) {
-      if (Math.abs(known.length - word.length) >= least || known.length < 3) continue;
-      const errors = typingErrors(word, known, least) - Math.min(0.5, uses / 1000);
-      if (errors < least) [best, least] = [known, errors];
+      if (Math.abs(known.length - word.length) > most || known.length < 3) continue;
+      const errors = typingErrors(word, known, most + 1);
+      if (errors > most) continue;
+      const cost = errors - Math.min(0.5, uses / 1000); // of two, the word of more phrases
+      if (cost < least) [best, least] = [known, cost];
     }
     return best;
   }

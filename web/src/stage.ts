@@ -195,8 +195,18 @@ export class Stage {
     return true;
   }
 
+  /** Resolves when the picture shows the latest state: drawn, and the splats sorted for it. */
+  async settled(): Promise<void> {
+    for (let quiet = 0; quiet < 3; quiet++) {
+      await new Promise(requestAnimationFrame);
+      const { dirty, sorting, sortDirty } = this.#spark;
+      if (this.#wanted || dirty || sorting || sortDirty) quiet = -1;
+    }
+  }
+
   /** The picture as a PNG. */
   async picture(): Promise<Blob> {
+    await this.settled();
     this.renderer.render(this.scene, this.camera); // a canvas can only be read right after it was drawn
     return new Promise((resolve, reject) =>
       this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture"))), "image/png"),

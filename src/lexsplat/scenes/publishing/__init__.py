@@ -1,6 +1,6 @@
 """A scene as a static page that is searched in the browser, with no server: ``lexsplat publish``."""
 
-from lexsplat.scenes.publishing.publish import (
+from lexsplat.scenes.publishing.writing import (
     MOST_SPLATS,
     Published,
     PublishOptions,
