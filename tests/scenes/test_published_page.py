@@ -30,6 +30,8 @@ PROMPTS = (
     "zebra",  # not in the scene
     "qwzx blorp",
 )
+SIZE = (664, 498)
+"""Of a window in which nothing covers the picture's bottom, with the sides of the demo's photos."""
 HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</script>\"'{{TITLE}}"
 
 
@@ -115,8 +117,12 @@ def test_answers_are_those_of_python(page, demo):
         scores = np.frombuffer(base64.b64decode(answer["scores"]), np.float32)
         assert np.abs(scores - asked.scores[number].numpy()).max() <= 1 / 255, answer["prompt"]
         assert answer["presence"] == asked.presences[number], answer["prompt"]
-        assert answer["threshold"] == pytest.approx(float(asked.thresholds[number]), abs=0.02), answer["prompt"]
-        cosine = torch.nn.functional.cosine_similarity(torch.tensor(answer["embedding"]), embeddings[number], dim=0)
+        assert answer["threshold"] == pytest.approx(float(asked.thresholds[number]), abs=0.02), answer[
+            "prompt"
+        ]
+        cosine = torch.nn.functional.cosine_similarity(
+            torch.tensor(answer["embedding"]), embeddings[number], dim=0
+        )
         assert float(cosine) > 1 - 1e-3, answer["prompt"]
         if answer["presence"] == "yes":
             selection = asked.selection(number)
@@ -127,16 +133,16 @@ def test_answers_are_those_of_python(page, demo):
 
 
 def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absent(browser, address, demo):
-    page = open_page(browser, address + "#view=view_010.jpg", 480, 360)
+    page = open_page(browser, address + "#view=view_010.jpg", *SIZE)
     bare = "document.querySelectorAll('.bar, .tools, .title').forEach((one) => { one.style.visibility = 'hidden'; })"
     page.evaluate(bare)
     before = picture(page)
     page.evaluate("lexsplat.app.ask('red apple', false, false)")
     after = picture(page)
-    view = demo.view("view_010")
-    mask = demo.select("red apple").mask.float()[:, None]
-    seen = render(demo.gaussians, view.camera.resized(480, 360), features=mask, color=False).features[..., 0].numpy()
-    ours = (render(demo.gaussians, view.camera.resized(480, 360)).image.detach().clamp(0, 1) * 255).numpy()
+    camera = demo.camera("view_010").resized(*SIZE)
+    mask = demo.select("red apple", 0.5).mask.float()[:, None]
+    seen = render(demo.gaussians, camera, features=mask, color=False).features[..., 0].numpy()
+    ours = (render(demo.gaussians, camera).image.detach().clamp(0, 1) * 255).numpy()
     inside, outside = binary_erosion(seen > 0.9, iterations=2), seen < 0.02
     assert inside.sum() > 100
     warm = after[..., 0] - after[..., 2]
@@ -193,7 +199,9 @@ def test_the_search_box_completes_and_the_keyboard_suffices(page):
     assert page.evaluate(f"{unnamed}.length") == 0
 
 
-def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_text_tower(browser, folder, ball_page):
+def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_text_tower(
+    browser, folder, ball_page
+):
     with serving(ball_page()) as address:
         page = open_page(browser, address)
         assert page.evaluate("lexsplat.app.answerer.dictionary.similar('bal 3')[0]") == "ball 3"

@@ -17,8 +17,8 @@ from support.viewer_scene import ball_scene
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import write_json
 from lexsplat.scenes import publishing
-from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.publishing import PublishOptions, publish, sidecar, splat_file, vocabulary
 
 WEB = Path(__file__).parents[2] / "web"
@@ -32,7 +32,9 @@ def balls():
 
 @pytest.fixture
 def small_dictionary(monkeypatch):
-    monkeypatch.setattr(vocabulary, "everyday_phrases", lambda bundled: dict.fromkeys(["ball 1", *REFERENCES], "n"))
+    monkeypatch.setattr(
+        vocabulary, "everyday_phrases", lambda bundled: dict.fromkeys(["ball 1", *REFERENCES], "n")
+    )
 
 
 REFERENCES = sidecar.REFERENCE_PHRASES
@@ -76,7 +78,10 @@ def test_the_manifest_lists_every_file_with_its_checksum(balls, tmp_path, small_
         assert manifest["files"][name]["bytes"] == len(content)
         assert manifest["files"][name]["crc32"] == zlib.crc32(content)
     assert manifest["text"] is None
-    assert manifest["words"]["count"] * manifest["language"]["num_codes"] == manifest["files"]["words.bin"]["bytes"]
+    assert (
+        manifest["words"]["count"] * manifest["language"]["num_codes"]
+        == manifest["files"]["words.bin"]["bytes"]
+    )
 
 
 def test_without_the_library_for_spz_the_splats_are_a_ply_of_the_same_order(balls, tmp_path, monkeypatch):
@@ -108,7 +113,9 @@ def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, 
     assert manifest["files"]["codes.bin"]["bytes"] == 8 * half
 
 
-def test_publishing_again_replaces_the_page_and_keeps_no_file_of_before(balls, tmp_path, small_dictionary, monkeypatch):
+def test_publishing_again_replaces_the_page_and_keeps_no_file_of_before(
+    balls, tmp_path, small_dictionary, monkeypatch
+):
     folder = tmp_path / "page"
     published(balls, folder, words_only=True)
     monkeypatch.setitem(sys.modules, "gaussforge", None)
@@ -132,7 +139,10 @@ def test_what_was_asked_in_the_viewer_comes_first_as_plain_text(balls, tmp_path)
     ("make", "found"),
     [
         (lambda folder: (folder / "holiday.jpg").write_text("mine"), "holiday.jpg"),
-        (lambda folder: (folder / "manifest.json").write_text('{"name": "another program"}'), "manifest.json"),
+        (
+            lambda folder: (folder / "manifest.json").write_text('{"name": "another program"}'),
+            "manifest.json",
+        ),
     ],
 )
 def test_a_folder_with_files_of_others_is_refused_and_left_alone(balls, tmp_path, make, found):
@@ -161,7 +171,9 @@ def test_a_single_file_that_would_be_too_large_is_refused(balls, tmp_path, small
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_scene_of_no_or_one_gaussian_is_refused(balls, tmp_path, count):
-    few = balls.with_content(balls.gaussians.select(torch.arange(count)), balls.field.select(torch.arange(count)))
+    few = balls.with_content(
+        balls.gaussians.select(torch.arange(count)), balls.field.select(torch.arange(count))
+    )
     with pytest.raises(QueryError, match=f"at least 2 Gaussians, found {count}"):
         publish(few, tmp_path / "page")
     assert not list(tmp_path.iterdir())

@@ -153,7 +153,9 @@ class ClipEncoder(PretrainedModel):
         tokenizer = getattr(self._tokenizer, "backend_tokenizer", None)
         if self._model.config.model_type != "clip" or tokenizer is None:
             return None
-        tensors = {name: tensor.detach().cpu() for name, tensor in self._model.text_model.state_dict().items()}
+        tensors = {
+            name: tensor.detach().cpu() for name, tensor in self._model.text_model.state_dict().items()
+        }
         tensors["text_projection.weight"] = self._model.text_projection.weight.detach().cpu()
         tensors.pop("embeddings.position_ids", None)
         content = json.loads(tokenizer.to_str())

@@ -88,9 +88,7 @@ def relevancy_tables(scene: Scene, phrases: list[str]) -> Tensor:
     codewords = scene.field.codebook.clip.cpu()
     rows = []
     for start in range(0, len(phrases), _BATCH):
-        embedded = embed_prompts(
-            phrases[start : start + _BATCH], scene.encode_batch, scene.query.templates
-        )
+        embedded = embed_prompts(phrases[start : start + _BATCH], scene.encode_batch, scene.query.templates)
         relevancy = code_relevancy(codewords, Question(embedded, negatives, scene.query))
         rows.append((relevancy.T * 255).round().to(torch.uint8))
     return torch.cat(rows)

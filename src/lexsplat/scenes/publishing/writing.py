@@ -115,7 +115,11 @@ def publish(scene: Scene, target: Path, options: PublishOptions | None = None) -
         else:
             written = _write_folder(folder, manifest, target)
     return Published(
-        target, written, manifest["scene"]["gaussians"], manifest["words"]["count"], manifest["text"] is not None
+        target,
+        written,
+        manifest["scene"]["gaussians"],
+        manifest["words"]["count"],
+        manifest["text"] is not None,
     )
 
 
@@ -144,7 +148,10 @@ def check_target(target: Path, single_file: bool) -> None:
             raise SceneFolderError(target, expected="a name that ends in .html", found=repr(target.suffix))
         if target.exists() and (not target.is_file() or _FORMAT not in _head(target)):
             raise SceneFolderError(
-                target, expected="a new file or an earlier page", found="another file", remedy="give another name"
+                target,
+                expected="a new file or an earlier page",
+                found="another file",
+                remedy="give another name",
             )
         return
     if not target.exists():
@@ -235,7 +242,9 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
         },
         "provenance": {
             **identity,
-            "built_with": {key: record.get("provenance", {}).get(key) for key in ("lexsplat", "versions", "seed")},
+            "built_with": {
+                key: record.get("provenance", {}).get(key) for key in ("lexsplat", "versions", "seed")
+            },
         },
     }
     manifest["files"] = {path.name: _checksums(path.read_bytes()) for path in sorted(folder.iterdir())}
@@ -318,7 +327,9 @@ def _write_single(folder: Path, manifest: dict[str, Any], target: Path) -> int:
         for path in data
     ]
     policy = _POLICY.format(script=_source(script), style=_source(style), connect="'none'")
-    page = _page(manifest, policy, f"<style>{style}</style>", "\n".join([*blocks, f"<script>{script}</script>"]))
+    page = _page(
+        manifest, policy, f"<style>{style}</style>", "\n".join([*blocks, f"<script>{script}</script>"])
+    )
     temporary = folder / "single.html"
     temporary.write_text(page, encoding="utf-8")
     temporary.replace(target)
