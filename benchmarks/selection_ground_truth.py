@@ -20,7 +20,7 @@ from torch import Tensor
 from lexsplat.geometry.boxes import Box, fit_box
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering import accumulate_codes, prepare
+from lexsplat.rendering import back_project
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,9 @@ def lift_labels(
     totals = torch.zeros(len(gaussians), num_labels)
     for view in views:
         camera = view.camera
-        prepared = prepare(gaussians, camera)
         at_surface = _near_surface(gaussians, view, tolerance)
-        weights = accumulate_codes(
-            gaussians, camera, view.labels.astype(np.int32), num_labels, prepared=prepared
-        )
+        one_hot = torch.nn.functional.one_hot(torch.from_numpy(view.labels.astype(np.int64)), num_labels)
+        weights = back_project(gaussians, camera, one_hot.float().to(gaussians.device))
         totals += weights.cpu() * at_surface[:, None]
     weights = totals.sum(1)
     best, labels = totals.max(1)

@@ -2,8 +2,8 @@
 
     python examples/04_labels_into_gaussians.py
 
-The labels may come from any tool, if they are small integers for each pixel. One pass over the views sums, for each
-Gaussian, the weight with which it contributes to pixels of each label.
+The labels may come from any tool, if they are small integers for each pixel. Back-projecting them one-hot sums, for
+each Gaussian, the weight with which it contributes to pixels of each label.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
-from lexsplat.rendering import accumulate_codes, render
+from lexsplat.rendering import back_project, render
 
 # Two clouds of points: label 0 on the left, label 1 on the right.
 rng = np.random.default_rng(0)
@@ -25,9 +25,9 @@ histogram = torch.zeros(600, 2)
 for angle in np.linspace(-0.5, 0.5, 5):
     position = [3 * np.sin(angle), -3 * np.cos(angle), 0.6]
     camera = look_at(position, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], width=160, height=120, fov_y=0.8)
-    label_map = torch.zeros(120, 160, dtype=torch.uint8)
+    label_map = torch.zeros(120, 160, dtype=torch.int64)
     label_map[:, 80:] = 1
-    histogram += accumulate_codes(gaussians, camera, label_map, num_codes=2)
+    histogram += back_project(gaussians, camera, torch.nn.functional.one_hot(label_map, 2).float())
 
 found = histogram.argmax(dim=1).numpy()
 seen = histogram.sum(dim=1).numpy() > 0.01  # a Gaussian that is hidden in all views receives no label

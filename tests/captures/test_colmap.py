@@ -16,7 +16,7 @@ from support.written_captures import (
     write_images,
 )
 
-from lexsplat.captures import load_capture, load_masks
+from lexsplat.captures import load_annotations, load_capture
 from lexsplat.captures.readers.colmap import read_colmap
 from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
 
@@ -285,7 +285,7 @@ def test_bonsai_is_loaded_with_points_and_masks():
     assert capture.points.shape == (68290, 3)
     assert capture.test_names == ("DSCF5653.JPG", "DSCF5805.JPG")
     assert capture.warnings == ()
-    masks = load_masks(capture)
+    masks = load_annotations(capture).masks
     assert sorted(masks) == sorted(capture.test_names)
     assert "plastic box" in masks["DSCF5805.JPG"]
     assert capture.views["DSCF5805.JPG"].load_image().shape == (133, 200, 3)

@@ -13,15 +13,15 @@ from support.written_captures import HEIGHT, WIDTH, save, write_colmap
 
 from lexsplat.captures import load_annotations, load_capture
 from lexsplat.captures.ground_truth.layouts import layout_of, load_ground_truth, polygon_mask
-from lexsplat.captures.ground_truth.prompt_lists import (
-    SCENES,
-    prompt_names,
-    prompts_of,
-)
+from lexsplat.captures.ground_truth.prompt_lists import SCENES, prompt_names
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 NAMES = [f"{number:02d}.jpg" for number in range(6)]
 FRAMES = [f"frame_{number:05d}.jpg" for number in range(1, 7)]
+
+
+def prompts_of(scene: str, prompt_list: str = "released") -> tuple[str, ...]:
+    return tuple(dict.fromkeys(prompt_names(scene, prompt_list).values()))
 
 
 def disk(x, y, radius):

@@ -12,10 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lexsplat.captures.images.reading import image_size, open_image, read_image, read_mask, resize_image
+from lexsplat.captures.images.bands import ArrayRows, resized, whole
+from lexsplat.captures.images.reading import PhotoRows, image_size, open_image, read_mask
 from lexsplat.runtime.errors import CaptureError
 
 WIDTH, HEIGHT = 24, 16
+
+
+def read_image(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    return whole(PhotoRows(path, background))
 
 
 def painted() -> np.ndarray:
@@ -191,11 +196,11 @@ def test_reducing_large_photos_in_bands_equals_reducing_them_whole(tmp_path, mon
         image.putalpha(Image.fromarray(painted()[..., 1]))
     name = "a.tif" if mode == "CMYK" else "a.png"
     (image if mode == "I;16" else image.convert(mode)).save(tmp_path / name)
-    whole = resize_image(read_image(tmp_path / name), size)
-    np.testing.assert_array_equal(read_image(tmp_path / name, size=size), whole)
+    at_once = resized(ArrayRows(read_image(tmp_path / name)), size)
+    np.testing.assert_array_equal(resized(PhotoRows(tmp_path / name), size), at_once)
     monkeypatch.setattr("lexsplat.captures.images.bands.LARGE_PIXELS", 0)
     monkeypatch.setattr("lexsplat.captures.images.bands.BAND_PIXELS", 4 * 48)
-    np.testing.assert_allclose(read_image(tmp_path / name, size=size), whole, atol=1e-6)
+    np.testing.assert_allclose(resized(PhotoRows(tmp_path / name), size), at_once, atol=1e-6)
 
 
 # -- images that claim to be larger than they are

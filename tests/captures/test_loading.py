@@ -17,7 +17,7 @@ from support.written_captures import (
     write_transforms,
 )
 
-from lexsplat.captures import load_capture, load_masks, stem_of
+from lexsplat.captures import load_annotations, load_capture, stem_of
 from lexsplat.captures.images.reading import read_mask
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
@@ -402,7 +402,7 @@ class TestMasks:
     def test_masks_are_found_by_view_and_prompt(self, tmp_path):
         self.capture(tmp_path, NAMES, **{"0004": (64, 48)})
         save(tmp_path / "segmentations" / "0004" / "pot.png", np.zeros((48, 64)))
-        masks = load_masks(load_capture(tmp_path))
+        masks = load_annotations(load_capture(tmp_path)).masks
         assert {name: list(prompts) for name, prompts in masks.items()} == {"0004.png": ["pot", "red apple"]}
         assert read_mask(masks["0004.png"]["red apple"]).all()
         assert not read_mask(masks["0004.png"]["pot"]).any()
@@ -410,30 +410,29 @@ class TestMasks:
     def test_a_capture_without_masks_has_none(self, tmp_path):
         write_transforms(tmp_path, NAMES)
         capture = load_capture(tmp_path)
-        assert capture.segmentations is None
-        assert load_masks(capture) == {}
+        assert load_annotations(capture).masks == {}
 
     def test_equal_stems_in_subfolders_need_the_subfolder(self, tmp_path):
         names = ["left/0001.png", "right/0001.png", "right/0002.png"]
         self.capture(tmp_path, names, left__0001=(64, 48), **{"0002": (64, 48)})
-        assert list(load_masks(load_capture(tmp_path))) == ["left/0001.png", "right/0002.png"]
+        assert list(load_annotations(load_capture(tmp_path)).masks) == ["left/0001.png", "right/0002.png"]
         save(tmp_path / "segmentations" / "0001" / "x.png", np.ones((48, 64)))
         with pytest.raises(CaptureError) as caught:
-            load_masks(load_capture(tmp_path))
+            load_annotations(load_capture(tmp_path))
         assert_tells(caught.value, "2 views")
 
     def test_a_mask_whose_stem_matches_no_view_is_reported(self, tmp_path):
         capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
         with pytest.raises(CaptureError) as caught:
-            load_masks(capture)
+            load_annotations(capture)
         assert_tells(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
 
     def test_a_mask_of_another_aspect_is_refused_and_a_scaled_one_accepted(self, tmp_path):
         capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
-        assert list(load_masks(capture)) == ["0004.png"]
+        assert list(load_annotations(capture).masks) == ["0004.png"]
         save(tmp_path / "segmentations" / "0004" / "bad.png", np.ones((48, 48)))
         with pytest.raises(CaptureError) as caught:
-            load_masks(capture)
+            load_annotations(capture)
         assert_tells(caught.value, "bad.png", "64x48", "48x48")
 
     @pytest.mark.parametrize(("high", "dtype"), [(1, np.uint8), (255, np.uint8), (65535, np.uint16)])
@@ -450,7 +449,7 @@ class TestMasks:
         save(tmp_path / "segmentations" / "0001" / "disk.png", disk)
         capture = load_capture(tmp_path)
         view = capture.views[NAMES[0]]
-        mask = view.load_mask(load_masks(capture)[NAMES[0]]["disk"])
+        mask = view.load_mask(load_annotations(capture).masks[NAMES[0]]["disk"])
         assert mask.shape == view.capture_size[::-1]
         seen = view.load_image(view.capture_size)[..., 0] > 0.5
         assert (mask != seen).mean() < 0.01

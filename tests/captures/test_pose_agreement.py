@@ -71,7 +71,7 @@ def test_a_mis_registered_photo_is_registered_again_correctly(registered, tmp_pa
     move(model, WRONG)
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
     with quiet_pycolmap(0):
-        again = register_again(model, [WRONG], path, tmp_path, tmp_path / "again", options)
+        again = register_again(model, [WRONG], path, tmp_path, options)
     assert set(again.reg_image_ids()) == set(ground_truth)
     # The mapper may apply a similarity transform: ratios of distances between photos are preserved.
     others = sorted(set(ground_truth) - {WRONG})
@@ -93,5 +93,5 @@ def test_a_photo_that_is_mis_registered_again_is_removed(registered, tmp_path, m
     misled = copy.deepcopy(model)
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **options: {0: misled})
     with quiet_pycolmap(0):
-        again = register_again(model, [WRONG], path, tmp_path, tmp_path / "again", None)
+        again = register_again(model, [WRONG], path, tmp_path, None)
     assert set(again.reg_image_ids()) == everyone - {WRONG}

@@ -5,7 +5,7 @@ from PIL import Image
 from support.written_captures import picture, save
 
 from lexsplat.captures.capture import View
-from lexsplat.captures.images.reading import resize_image
+from lexsplat.captures.images.bands import ArrayRows, resized
 from lexsplat.captures.images.undistortion import Lens, pinhole_of, undistort
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.memory import BAND_BYTES
@@ -49,7 +49,7 @@ def pinhole_picture(lens: Lens, size: tuple[int, int]) -> np.ndarray:
 def test_undistorted_photos_show_what_a_pinhole_camera_sees(model):
     lens = Lens(model, *SIZE, LENSES[model])
     width, height, _ = pinhole_of(lens)
-    seen = undistort(photo_through(lens), lens, (width, height))
+    seen = undistort(ArrayRows(photo_through(lens)), lens, (width, height))
     assert np.abs(seen - pinhole_picture(lens, (width, height))).max() < 0.012
     assert np.abs(seen - pinhole_picture(lens, (width, height))).mean() < 0.001
 
@@ -61,7 +61,7 @@ def test_smaller_undistorted_photos_average_the_area(divisor):
     size = (round(width / divisor), round(height / divisor))
     rng = np.random.default_rng(0)
     noisy = photo_through(lens) + rng.normal(0, 0.1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
-    seen = undistort(np.clip(noisy, 0, 1), lens, size)
+    seen = undistort(ArrayRows(np.clip(noisy, 0, 1)), lens, size)
     error = (seen - pinhole_picture(lens, size)).std()
     # The mean over divisor^2 independent pixels; skipping pixels would leave the noise at 0.1.
     assert error < 1.6 * 0.1 / divisor
@@ -119,13 +119,13 @@ def test_impossible_lenses_are_refused(model, size, params, message):
 
 def test_shrinking_is_the_mean_of_the_covered_area():
     image = np.random.default_rng(0).random((12, 18, 3)).astype(np.float32)
-    small = resize_image(image, (6, 4))
+    small = resized(ArrayRows(image), (6, 4))
     np.testing.assert_allclose(small, image.reshape(4, 3, 6, 3, 3).mean((1, 3)), atol=1e-6)
 
 
 def test_shrinking_by_a_fraction_keeps_the_mean():
     image = np.random.default_rng(0).random((11, 17, 3)).astype(np.float32)
-    assert resize_image(image, (7, 5)).mean() == pytest.approx(image.mean(), abs=1e-3)
+    assert resized(ArrayRows(image), (7, 5)).mean() == pytest.approx(image.mean(), abs=1e-3)
 
 
 # -- large photos, in bands

@@ -11,13 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat.language.losses import (
-    cross_entropy_loss,
-    semantic_loss,
-    smoothing_loss,
-    total_loss,
-    uncertainty_loss,
-)
+from lexsplat.language.losses import cross_entropy_loss, smoothing_loss, uncertainty_loss
 
 
 def numeric_gradient(function: Callable[[np.ndarray], float], at: np.ndarray) -> np.ndarray:
@@ -108,13 +102,6 @@ def test_log_form_has_the_stationary_point_the_linear_form_lacks(cross_entropy: 
     u = torch.tensor(1 - 1 / cross_entropy, dtype=torch.float64, requires_grad=True)
     (cross_entropy * (1 - u) + uncertainty_loss(u, "linear")).backward()
     assert float(u.grad) == pytest.approx(1 - cross_entropy)
-
-
-def test_equations_12_and_15_weight_their_terms() -> None:
-    one, two = torch.tensor(1.5), torch.tensor(4.0)
-    assert float(semantic_loss(one, two, 2.0, 0.5)) == 5.0
-    assert float(total_loss(one, two, 2.0, 0.25)) == 4.0
-    assert float(semantic_loss(one, two)) == float(total_loss(one, two)) == 5.5
 
 
 def reference_smoothing(

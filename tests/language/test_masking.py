@@ -12,7 +12,7 @@ from support.language_scene import make_scene
 from support.written_captures import write_colmap
 
 from lexsplat.captures import initial_points, load_capture
-from lexsplat.captures.capture import filled
+from lexsplat.captures.images.bands import ArrayRows, FilledRows, whole
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.features import FeatureConfig, FeatureMap, extract_features
 from lexsplat.features.masking import without_masked_cells
@@ -66,10 +66,10 @@ def test_masked_pixels_do_not_affect_images(tmp_path, camera, size):
 def test_masked_pixels_have_the_mean_color_of_the_others():
     image = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
     valid = np.random.default_rng(1).random((6, 8)) > 0.4
-    result = filled(image, valid)
+    result = whole(FilledRows(ArrayRows(image), valid))
     np.testing.assert_array_equal(result[valid], image[valid])
     np.testing.assert_allclose(result[~valid], np.tile(image[valid].mean(0), ((~valid).sum(), 1)), atol=1e-6)
-    assert not filled(image, np.zeros((6, 8), bool)).any()
+    assert not whole(FilledRows(ArrayRows(image), np.zeros((6, 8), bool))).any()
 
 
 def test_features_codebook_and_codes_do_not_depend_on_masked_pixels(tmp_path):

@@ -10,15 +10,12 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from lexsplat.geometry.rotations import covariances
-from lexsplat.reconstruction.densification import (
-    DensityConfig,
-    DensityControl,
-    DensitySchedule,
-    density_schedule,
-    relocate,
-)
+from lexsplat.reconstruction.densification import DensityControl, relocate
+from lexsplat.reconstruction.settings import DensitySchedule, ReconstructionConfig
 
-SCHEDULE = DensitySchedule(start=2, stop=100, every=5, reset_every=20)
+
+class Rules(ReconstructionConfig):
+    density_schedule = DensitySchedule(start=2, stop=100, every=5, reset_every=20)
 
 
 def some_parameters(count: int = 40, seed: int = 0) -> tuple[dict, dict]:
@@ -63,8 +60,8 @@ def run(control: DensityControl, parameters: dict, optimizers: dict, steps: rang
 
 def new_control(strategy: str = "default", **options) -> DensityControl:
     seed = options.pop("seed", 3)
-    rules = {"strategy": strategy, "schedule": SCHEDULE, "extent": 1.0, "max_gaussians": 10_000, **options}
-    return DensityControl(DensityConfig(**rules), seed=seed)
+    rules = {"strategy": strategy, "max_gaussians": 10_000, "reset_opacities": True, **options}
+    return DensityControl(Rules(**rules), extent=1.0, seed=seed)
 
 
 def assert_same(left: dict, right: dict) -> None:
@@ -192,6 +189,15 @@ def test_mcmc_relocates_faint_gaussians_and_grows_by_a_twentieth():
     assert float(parameters["opacities"].detach().sigmoid().min()) >= 0.005 * (1 - 1e-5)
 
 
+def test_mcmc_moves_nothing_where_all_gaussians_are_faint():
+    parameters, optimizers = some_parameters(count=100)
+    with torch.no_grad():
+        parameters["opacities"].fill_(-8.0)
+    before = parameters["means"].detach().clone()
+    run(new_control("mcmc", noise=0.0), parameters, optimizers, range(5, 6))
+    assert torch.equal(parameters["means"], before)
+
+
 def test_mcmc_noise_follows_the_covariance_and_spares_opaque_gaussians():
     parameters, optimizers = some_parameters(count=4000)
     with torch.no_grad():
@@ -269,21 +275,27 @@ def test_gsplats_own_operators_are_restored():
 
 
 def test_the_full_length_schedule_equals_that_of_3dgs():
-    assert density_schedule("default", 30_000) == DensitySchedule(500, 15_000, 100, 3_000)
-    assert density_schedule("mcmc", 30_000).stop == 25_000
+    assert ReconstructionConfig().density_schedule == DensitySchedule(500, 15_000, 100, 3_000)
+    assert ReconstructionConfig(strategy="mcmc").density_schedule.stop == 25_000
 
 
 def test_short_and_long_trainings_have_the_same_number_of_mcmc_rounds():
     """Each round adds a twentieth; a tenth of the rounds would mean growth by 3 instead of 150,000."""
-    short, full = density_schedule("mcmc", 3_000, minimum_every=100), density_schedule("mcmc", 30_000)
-    rounds = [(schedule.stop - schedule.start) // schedule.every for schedule in (short, full)]
+    configs = [ReconstructionConfig(iterations=count, strategy="mcmc") for count in (3_000, 30_000)]
+    schedules = [config.density_schedule for config in configs]
+    rounds = [(schedule.stop - schedule.start) // schedule.every for schedule in schedules]
     assert rounds == [245, 245]
+
+
+def test_a_short_mcmc_training_has_steps_between_its_rounds():
+    """Rounds after every step would halve opacities faster than steps can raise them, until all are faint."""
+    assert ReconstructionConfig(strategy="mcmc", iterations=400).density_schedule.every == 2
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 100_000), st.integers(1, 200))
 def test_every_schedule_is_in_order(iterations, minimum):
-    schedule = density_schedule("default", iterations, minimum_every=minimum)
+    schedule = ReconstructionConfig(iterations=iterations, densify_min_every=minimum).density_schedule
     assert 0 <= schedule.start <= schedule.stop <= iterations
     assert schedule.every >= minimum
     assert schedule.reset_every >= 1

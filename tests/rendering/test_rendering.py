@@ -10,7 +10,7 @@ from support.rendering_reference import front_camera, random_gaussians
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering import accumulate_codes, accumulate_weights, prepare, render
+from lexsplat.rendering import accumulate_weights, back_project, prepare, render
 from lexsplat.runtime.errors import BackendError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -457,6 +457,11 @@ def test_a_hundred_thousand_gaussians_in_one_tile():
 # ------------------------------------------------------------------------------------------------ reproducibility
 
 
+def one_hot(camera: Camera, count: int) -> torch.Tensor:
+    codes = np.random.default_rng(0).integers(0, count, (camera.height, camera.width))
+    return torch.nn.functional.one_hot(torch.from_numpy(codes), count).float()
+
+
 def all_results(gaussians: Gaussians, camera: Camera) -> list[torch.Tensor]:
     gaussians = with_gradients(gaussians)
     features = torch.randn(len(gaussians), 6, generator=torch.Generator().manual_seed(0), requires_grad=True)
@@ -465,8 +470,7 @@ def all_results(gaussians: Gaussians, camera: Camera) -> list[torch.Tensor]:
     (rendering.channels.square().sum() + rendering.alpha.sum()).backward()
     pose = torch.from_numpy(camera.viewmat).float().requires_grad_()
     render(with_gradients(gaussians), camera, viewmat=pose, depth=True).image.square().sum().backward()
-    codes = np.random.default_rng(0).integers(0, 9, (camera.height, camera.width))
-    weights = accumulate_codes(gaussians, camera, codes, 9)
+    weights = back_project(gaussians, camera, one_hot(camera, 9))
     gradients = [getattr(gaussians, name).grad for name in FIELDS]
     gradients += [background.grad, pose.grad, features.grad, rendering.means2d.grad]
     return [rendering.channels, rendering.alpha, weights, *gradients]
@@ -502,10 +506,9 @@ def test_a_prepared_view_renders_bit_identically_without_gradients_of_the_geomet
             torch.autograd.grad(r.features.square().sum(), features)[0] for r in (straight, again)
         )
         assert torch.equal(first, second)
-    codes = np.zeros((70, 100), int)
+    values = one_hot(camera, 2)
     assert torch.equal(
-        accumulate_codes(gaussians, camera, codes, 2),
-        accumulate_codes(gaussians, camera, codes, 2, prepared=prepared),
+        back_project(gaussians, camera, values), back_project(gaussians, camera, values, prepared)
     )
 
 
@@ -528,59 +531,25 @@ def test_the_image_is_the_same_without_gradients():
     assert torch.equal(alone.channels, render(with_gradients(gaussians), camera).channels)
 
 
-# ---------------------------------------------------------------------------------------------------- code weights
+# ------------------------------------------------------------------------------------------------- back-projection
 
 
-@pytest.mark.parametrize("num_codes", [1, 7, 200, 300])
-def test_code_weights_equal_the_float64_reference(num_codes):
+@pytest.mark.parametrize("channels", [1, 7, 200])
+def test_a_back_projected_map_equals_the_float64_reference(channels):
     gaussians, camera = random_gaussians(40, 9, antialiased=True), front_camera()
     leaves = {k: v.detach() for k, v in reference.to_float64(gaussians).items()}
     expected = reference.render(leaves, camera, antialiased=True, degree=3)
-    codes = np.random.default_rng(num_codes).integers(-1, num_codes, (camera.height, camera.width))
-    codes[~expected["clear"].numpy()] = -1
-    found = accumulate_codes(gaussians, camera, codes, num_codes)
-    exact = torch.zeros(40, num_codes, dtype=torch.float64)
-    inside = torch.from_numpy(codes >= 0)
-    exact.index_add_(1, torch.from_numpy(codes)[inside], expected["weights"][:, inside])
-    assert found.shape == (40, num_codes)
+    values = one_hot(camera, channels) * expected["clear"][..., None]
+    found = back_project(gaussians, camera, values)
+    exact = torch.einsum("nhw,hwc->nc", expected["weights"], values.double())
+    assert found.shape == (40, channels)
     assert (found - exact).abs().max() < 1e-4
 
 
-def test_code_weights_are_the_gradient_of_rendered_one_hot_codes():
+def test_the_weights_of_a_view_are_the_back_projection_of_ones():
     gaussians, camera = random_gaussians(500, 9), front_camera(130, 90)
-    codes = torch.from_numpy(np.random.default_rng(1).integers(0, 12, (90, 130)))
-    features = torch.zeros(500, 12, requires_grad=True)
-    render(gaussians, camera, features=features, color=False).features.backward(
-        torch.nn.functional.one_hot(codes, 12).float()
-    )
-    found = accumulate_codes(gaussians, camera, codes, 12)
-    assert torch.allclose(found, features.grad, rtol=1e-4, atol=1e-4)
-    assert torch.allclose(found.sum(1), accumulate_weights(gaussians, camera), rtol=1e-4, atol=1e-3)
-
-
-def test_code_weights_are_added_to_the_given_tensor():
-    gaussians, camera = random_gaussians(50, 9), front_camera()
-    codes = np.arange(37 * 50).reshape(37, 50) % 5
-    once = accumulate_codes(gaussians, camera, codes, 5)
-    twice = accumulate_codes(gaussians, camera, codes, 5, out=once.clone())
-    assert torch.allclose(twice, 2 * once, rtol=1e-6)
-
-
-def test_code_255_means_no_code_unless_there_are_256_codes():
-    gaussians, camera = random_gaussians(50, 9), front_camera()
-    codes = np.full((37, 50), 255, np.uint8)
-    assert not accumulate_codes(gaussians, camera, codes, 255).any()
-    assert accumulate_codes(gaussians, camera, codes, 256)[:, 255].sum() > 1
-
-
-def test_the_number_of_tile_batches_does_not_change_the_weights(monkeypatch):
-    from lexsplat.rendering import cpu_backend
-
-    gaussians, camera = random_gaussians(300, 9), front_camera(100, 70)
-    codes = np.random.default_rng(0).integers(0, 40, (70, 100))
-    whole = accumulate_codes(gaussians, camera, codes, 40)
-    monkeypatch.setattr(cpu_backend, "ENTRY_LIMIT", 1000)
-    assert torch.equal(whole, accumulate_codes(gaussians, camera, codes, 40))
+    parts = back_project(gaussians, camera, one_hot(camera, 12))
+    assert torch.allclose(parts.sum(1), accumulate_weights(gaussians, camera), rtol=1e-4, atol=1e-3)
 
 
 # ------------------------------------------------------------------------------------------------------- arguments
@@ -596,17 +565,6 @@ def test_invalid_arguments_are_refused():
         render(gaussians, camera, viewmat=torch.eye(3))
     with pytest.raises(ValueError, match="viewmat must be"):
         render(gaussians, camera, viewmat=torch.eye(4), prepared=prepare(gaussians, camera))
-    with pytest.raises(ValueError, match="code_map must be"):
-        accumulate_codes(gaussians, camera, np.zeros((3, 3), int), 4)
-    with pytest.raises(ValueError, match="code_map must be"):
-        accumulate_codes(gaussians, camera, np.zeros((37, 50)), 4)
-    with pytest.raises(ValueError, match="codes must be below 4"):
-        accumulate_codes(gaussians, camera, np.full((37, 50), 4), 4)
-    with pytest.raises(ValueError, match="codes must be below 4, got 4294967296"):
-        accumulate_codes(gaussians, camera, np.full((37, 50), 2**32), 4)
-    assert not accumulate_codes(gaussians, camera, np.full((37, 50), -(2**32)), 4).any()
-    with pytest.raises(ValueError, match="out must be"):
-        accumulate_codes(gaussians, camera, np.zeros((37, 50), int), 4, out=torch.zeros(5, 3))
     with pytest.raises(BackendError, match="found Gaussians on meta"):
         render(gaussians.to("meta"), camera)
 

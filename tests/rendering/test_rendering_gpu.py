@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from support.rendering_reference import front_camera, random_gaussians
 
-from lexsplat.rendering import accumulate_codes, prepare, render
+from lexsplat.rendering import back_project, prepare, render
 
 pytestmark = [
     pytest.mark.gpu,
@@ -27,11 +26,11 @@ def results(device: str, antialiased: bool, degree: int) -> dict[str, torch.Tens
     rendering = render(gaussians, camera, features=features, background=background)
     weight = torch.randn(rendering.channels.shape, generator=generator).to(device)
     ((rendering.channels * weight).sum() + rendering.alpha.sum()).backward()
-    codes = np.random.default_rng(0).integers(0, 40, (123, 165))
+    values = torch.rand(123, 165, 40, generator=generator).to(device)
     found = {
         "image": rendering.image, "features": rendering.features, "alpha": rendering.alpha,
         "means2d gradient": rendering.means2d.grad, "features gradient": features.grad,
-        "codes": accumulate_codes(gaussians, camera, codes, 40),
+        "back-projection": back_project(gaussians, camera, values),
         **{f"{name} gradient": getattr(gaussians, name).grad for name in FIELDS},
     }  # fmt: skip
     return {name: value.detach().cpu() for name, value in found.items()}

@@ -9,13 +9,12 @@ import importlib.machinery
 import sys
 import types
 
-import numpy as np
 import pytest
 import torch
 from support import gsplat_kernels
 from support.rendering_reference import front_camera, random_gaussians
 
-from lexsplat.rendering import accumulate_codes, backends, gsplat_backend, prepare, render
+from lexsplat.rendering import accumulate_weights, back_project, backends, gsplat_backend, prepare, render
 from lexsplat.runtime.errors import BackendError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -50,11 +49,11 @@ def results(antialiased, degree, viewmat=None):
     )
     weight = torch.randn(found.channels.shape, generator=generator)
     ((found.channels * weight).sum() + found.alpha.sum()).backward()
-    codes = np.random.default_rng(0).integers(0, 40, (HEIGHT, WIDTH))
+    values = torch.rand(HEIGHT, WIDTH, 40, generator=generator)
     made = {
         "image": found.image, "features": found.features, "alpha": found.alpha, "depth": found.depth,
         "means2d gradient": found.means2d.grad, "features gradient": features.grad,
-        "codes": accumulate_codes(gaussians, camera, codes, 40),
+        "back-projection": back_project(gaussians, camera, values),
         **{f"{name} gradient": getattr(gaussians, name).grad for name in FIELDS},
         **({"pose gradient": pose.grad} if viewmat else {}),
     }  # fmt: skip
@@ -109,7 +108,7 @@ def test_the_gsplat_backend_renders_zero_gaussians_as_an_empty_image(on_gsplat):
     assert not found.alpha.any()
     assert not found.depth.any()
     (found.image.sum() + found.alpha.sum()).backward()
-    assert accumulate_codes(nothing, camera, np.zeros((HEIGHT, WIDTH), int), 3).shape == (0, 3)
+    assert back_project(nothing, camera, torch.zeros(HEIGHT, WIDTH, 3)).shape == (0, 3)
 
 
 def test_the_gsplat_backend_renders_any_number_of_channels(on_gsplat):
@@ -122,8 +121,8 @@ def test_the_gsplat_backend_renders_any_number_of_channels(on_gsplat):
         alone = render(gaussians, camera, features=features[:, columns]).features
         torch.testing.assert_close(found.features[..., columns], alone)
     found.features.sum().backward()
-    weights = accumulate_codes(gaussians, camera, np.zeros((HEIGHT, WIDTH), int), 1)
-    torch.testing.assert_close(features.grad, weights.expand(-1, 600))
+    weights = accumulate_weights(gaussians, camera)
+    torch.testing.assert_close(features.grad, weights[:, None].expand(-1, 600))
 
 
 @pytest.mark.parametrize("kind", [ImportError, RuntimeError])
@@ -137,7 +136,7 @@ def test_an_extension_that_fails_to_compile_is_reported_in_one_line(monkeypatch,
     with pytest.raises(
         BackendError, match=r"expected its CUDA extension, found .*Error building extension.*nvcc"
     ):
-        gsplat_backend._require_gsplat()
+        gsplat_backend.require_gsplat()
 
 
 def test_gsplats_compiler_messages_are_not_printed(monkeypatch, capsys):
@@ -152,7 +151,7 @@ def test_gsplats_compiler_messages_are_not_printed(monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Talkative(), *sys.meta_path])
     try:
-        gsplat_backend._require_gsplat()
+        gsplat_backend.require_gsplat()
     finally:
         sys.modules.pop("gsplat.cuda._backend", None)
     said = capsys.readouterr()
@@ -165,10 +164,10 @@ def test_an_installation_without_the_extension_is_reported_in_one_line(monkeypat
     backend._C = None
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
     with pytest.raises(BackendError, match="expected its CUDA extension, found an installation without one"):
-        gsplat_backend._require_gsplat()
+        gsplat_backend.require_gsplat()
 
 
 def test_a_missing_gsplat_is_reported_in_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(BackendError, match=r"gsplat: found .*; pip install gsplat==1\.5\.3"):
-        gsplat_backend._require_gsplat()
+    with pytest.raises(BackendError, match=r"gsplat: found .*; run: pip install gsplat==1\.5\.3"):
+        gsplat_backend.require_gsplat()

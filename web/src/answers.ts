@@ -3,9 +3,10 @@
 import type { Geometry, Place } from "./geometry";
 import { h, iconButton } from "./dom";
 import { Dictionary, normalize } from "./dictionary";
-import type { Language, Samples, Table } from "./language";
+import type { Language, Table } from "./language";
 import { COLORS } from "./painter";
-import { type Presence, type PresenceClassifier, automaticThreshold } from "./rules";
+import { BORDER, type Presence, presenceOf } from "./rules";
+import type { Description } from "./tower";
 
 export interface Answer {
   /** What was typed, and the phrase that was looked up. */
@@ -31,36 +32,35 @@ export class Answerer {
   constructor(
     readonly dictionary: Dictionary,
     readonly language: Language,
-    readonly samples: Samples,
-    readonly classifier: PresenceClassifier,
-    /** The table of any phrase; null where the page has no text tower. */
-    readonly tower: ((phrase: string) => Promise<Table | null>) | null,
+    readonly shown: Uint32Array,
+    /** What any phrase means; null where the page has no text tower. */
+    readonly tower: ((phrase: string) => Promise<Description | null>) | null,
   ) {}
 
   /** The answer to a prompt; null if nothing in this page can tell what it means. */
   async answer(prompt: string, color: string): Promise<Answer | null> {
     const known = this.dictionary.find(prompt);
-    const phrase = known >= 0 ? this.dictionary.phrases[known] : normalize(prompt);
-    const table = known >= 0 ? this.dictionary.table(known) : ((await this.tower?.(phrase)) ?? null);
-    if (!table) return null;
+    if (known >= 0) {
+      const table = this.dictionary.table(known);
+      const scores = this.language.scores(table);
+      const phrase = this.dictionary.phrases[known];
+      return answered(prompt, phrase, "dictionary", table, scores, this.dictionary.presence(known), color);
+    }
+    const phrase = normalize(prompt);
+    const described = (await this.tower?.(phrase)) ?? null;
+    if (!described) return null;
+    const { table, heights, best, rule } = described;
     const scores = this.language.scores(table);
-    const presence = this.classifier.classify(scores);
-    const automatic = automaticThreshold(table, this.samples, presence);
-    return {
-      prompt,
-      phrase,
-      from: known >= 0 ? "dictionary" : "text tower",
-      table,
-      scores,
-      presence,
-      automatic,
-      threshold: automatic,
-      color,
-      anyway: false,
-      places: null,
-      place: 0,
-    };
+    const presence = presenceOf(scores, heights, best, rule, this.language, this.shown);
+    return answered(prompt, phrase, "text tower", table, scores, presence, color);
   }
+}
+
+function answered(
+  prompt: string, phrase: string, from: string, table: Table, scores: Float32Array, presence: Presence, color: string,
+): Answer {
+  const found = { automatic: BORDER, threshold: BORDER, anyway: false, places: null, place: 0 };
+  return { prompt, phrase, from, table, scores, presence, color, ...found };
 }
 
 /** The first color that no answer has. */

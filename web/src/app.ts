@@ -5,11 +5,10 @@ import { type Answer, Answerer, card, freeColor, painted, placesOf, spoken } fro
 import { Dictionary } from "./dictionary";
 import { h, icon, iconButton, save } from "./dom";
 import { Geometry, type Place } from "./geometry";
-import { Language, Samples, shownSplats } from "./language";
+import { Language, shownSplats } from "./language";
 import type { Manifest, ViewEntry } from "./manifest";
 import { Overlay } from "./overlay";
 import { MOST_PROMPTS, type Mode, Painter } from "./painter";
-import { PresenceClassifier } from "./rules";
 import { SearchBar } from "./search";
 import { type Stage, pose } from "./stage";
 import { readState, writeState } from "./state";
@@ -18,7 +17,6 @@ import type { TowerLoader } from "./tower-loader";
 
 export interface Content {
   codes: Uint8Array;
-  samples: Uint8Array;
   phrases: string;
   table: Uint8Array;
 }
@@ -60,9 +58,8 @@ export class App {
     const shown = shownSplats(this.geometry.opacities);
     const dictionary = new Dictionary(content.phrases, content.table, numCodes);
     dictionary.rank(this.language, shown);
-    const classifier = new PresenceClassifier(manifest.presence, this.language, shown, (phrase) => dictionary.tableOf(phrase));
-    const tower = loader ? async (phrase: string) => (await loader.load())?.table(phrase) ?? null : null;
-    this.answerer = new Answerer(dictionary, this.language, new Samples(content.samples), classifier, tower);
+    const tower = loader ? async (phrase: string) => (await loader.load())?.describe(phrase) ?? null : null;
+    this.answerer = new Answerer(dictionary, this.language, shown, tower);
 
     const examples = dictionary.examples(4);
     this.#search = new SearchBar(

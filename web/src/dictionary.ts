@@ -1,6 +1,7 @@
 // Phrases with their tables of relevancies, found by spelling: exact, by prefix, and with typing errors.
 
 import { type Language, type Table, dot } from "./language";
+import type { Presence } from "./rules";
 
 const QUESTION =
   /^(?:please |can you )?(?:where (?:is|are)|where can i find|show(?: me)?|find(?: me)?|is there|are there|how many|what is)\s+/;
@@ -17,6 +18,7 @@ export class Dictionary {
   readonly phrases: string[];
   /** What each phrase is: asked of this scene before (a), a name (n), a name with a color or part (c), a use (u). */
   readonly #kinds: string;
+  readonly #presences: string;
   readonly #places = new Map<string, number>();
   readonly #words = new Map<string, number>();
   readonly #tables: Uint8Array;
@@ -25,11 +27,12 @@ export class Dictionary {
   #strengths = new Float32Array(0);
   #means = new Float32Array(0);
 
-  /** `list` has a phrase a line, its kind in front; `tables` a relevancy for each phrase and code in 255ths. */
+  /** `list` has a phrase a line, its kind and presence in front; `tables` a relevancy for each phrase and code in 255ths. */
   constructor(list: string, tables: Uint8Array, numCodes: number) {
     const lines = list.split("\n").filter(Boolean);
     this.#kinds = lines.map((line) => line[0]).join("");
-    this.phrases = lines.map((line) => line.slice(1));
+    this.#presences = lines.map((line) => line[1]).join("");
+    this.phrases = lines.map((line) => line.slice(2));
     this.#tables = tables;
     this.#numCodes = numCodes;
     this.phrases.forEach((phrase, place) => {
@@ -70,8 +73,9 @@ export class Dictionary {
     return Float32Array.from(this.#row(place), (value) => value / 255);
   }
 
-  tableOf(phrase: string): Table {
-    return this.table(this.find(phrase));
+  /** Whether the scene holds a phrase, as found when the page was published. */
+  presence(place: number): Presence {
+    return ({ y: "yes", u: "unsure" } as const)[this.#presences[place]] ?? "no";
   }
 
   /** Phrases that begin with what was typed, or have a word that does; then with typing errors. */
@@ -84,7 +88,8 @@ export class Dictionary {
       const begins = lower.startsWith(typed);
       if (!begins && !lower.includes(` ${typed}`)) return;
       const asked = this.#kinds[place] === "a" ? 0.3 : 0;
-      scored.push([place, (begins ? 1 : 0) + asked + (this.#strengths[place] ?? 0) - lower.length / 200]);
+      const here = { y: 0.5, u: 0.2 }[this.#presences[place]] ?? 0;
+      scored.push([place, (begins ? 1 : 0) + asked + here + this.#strengths[place] * 0.3 - lower.length / 200]);
     });
     const found = scored.sort((a, b) => b[1] - a[1]).slice(0, count).map(([place]) => this.phrases[place]);
     return found.length ? found : this.similar(text, count);
@@ -94,7 +99,7 @@ export class Dictionary {
   examples(count: number): string[] {
     const merit = (place: number): number => this.#strengths[place] - 3 * this.#means[place];
     const order = [...this.phrases.keys()]
-      .filter((place) => "na".includes(this.#kinds[place]) && this.#strengths[place] > 0.6)
+      .filter((place) => "na".includes(this.#kinds[place]) && this.#presences[place] === "y")
       .sort((a, b) => merit(b) - merit(a));
     const seen = new Set<number>();
     const chosen: string[] = [];
@@ -130,7 +135,7 @@ export class Dictionary {
   name(distribution: Float32Array, count: number): { phrase: string; score: number }[] {
     const scored: { phrase: string; score: number }[] = [];
     this.phrases.forEach((phrase, place) => {
-      if (this.#kinds[place] === "u" || this.#kinds[place] === "c") return;
+      if (!"na".includes(this.#kinds[place]) || this.#presences[place] === "n") return;
       scored.push({ phrase, score: dot(this.#row(place), distribution) / 255 });
     });
     return scored.sort((a, b) => b.score - a.score).slice(0, count);

@@ -81,31 +81,6 @@ export function shownSplats(opacities: Float32Array): Uint32Array {
   return shown.subarray(0, count);
 }
 
-/**
- * Pixels of training views, with the codes that they show: from them a threshold is found for every prompt
- * (lexsplat.queries.thresholds). `content` is codes [S, 8] followed by weights [S, 8] in 255ths.
- */
-export class Samples {
-  readonly #content: Uint8Array;
-  readonly count: number;
-
-  constructor(content: Uint8Array) {
-    this.#content = content;
-    this.count = content.length / 16;
-  }
-
-  scores(table: Table): Float64Array {
-    const scores = new Float64Array(this.count);
-    const weights = this.count * 8;
-    for (let s = 0, i = 0; s < scores.length; s++) {
-      let sum = 0;
-      for (let t = 0; t < 8; t++, i++) sum += table[this.#content[i]] * this.#content[weights + i];
-      scores[s] = Math.min(1, sum / 255);
-    }
-    return scores;
-  }
-}
-
 export function dot(a: ArrayLike<number>, b: ArrayLike<number>): number {
   let sum = 0;
   for (let i = 0; i < a.length; i++) sum += a[i] * b[i];

@@ -40,15 +40,15 @@ async function load(
   const { scene, language, words } = manifest;
   const bytes = manifest.files[scene.file].bytes;
   tell(`Loading ${scene.gaussians.toLocaleString("en")} Gaussians (${(bytes / 1e6).toFixed(1)} MB)`);
-  const names = [scene.file, language.codes, language.samples, words.phrases, words.table];
-  const [splats, codes, samples, phrases, table] = await Promise.all(names.map((name) => files.read(name)));
+  const names = [scene.file, language.codes, words.phrases, words.table];
+  const [splats, codes, phrases, table] = await Promise.all(names.map((name) => files.read(name)));
   if (codes.length !== 8 * scene.gaussians) {
     throw new PageError(`${language.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
   }
   await stage.load(splats);
   const loader = manifest.text ? new TowerLoader(files, manifest) : null;
   window.lexsplat.loader = loader;
-  return new App(stage, manifest, { codes, samples, phrases: new TextDecoder().decode(phrases), table }, loader, root);
+  return new App(stage, manifest, { codes, phrases: new TextDecoder().decode(phrases), table }, loader, root);
 }
 
 /** Light or dark as chosen before, else as the system has it. */

@@ -17,13 +17,15 @@ export interface ViewEntry {
   viewmat: number[];
 }
 
-export interface PresenceRule {
-  weights: { bias: number; height: number; rank: number; peak: number };
+/** The constants of lexsplat.queries.everyday and lexsplat.queries.presence, and the peak of the scene. */
+export interface EverydayRule {
+  border: number;
+  steepness: number;
+  offset: number;
+  peak_share: number;
+  peak: number;
   yes: number;
   no: number;
-  middle: number;
-  spread: number;
-  references: string[];
 }
 
 export interface Manifest {
@@ -43,10 +45,16 @@ export interface Manifest {
     meters_per_unit: number | null;
     start_view: string;
   };
-  language: { codes: string; samples: string; num_codes: number; temperature: number; method: string };
+  language: { codes: string; num_codes: number; method: string };
   words: { phrases: string; table: string; count: number };
-  text: { weights: string; tokenizer: string; heads: number; activation: string; templates: string[] } | null;
-  presence: PresenceRule;
+  text: {
+    weights: string;
+    tokenizer: string;
+    heads: number;
+    activation: string;
+    templates: string[];
+    everyday: EverydayRule;
+  } | null;
   views: ViewEntry[];
   files: Record<string, FileEntry>;
   licenses: Record<string, string>;

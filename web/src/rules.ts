@@ -1,115 +1,61 @@
-// The automatic threshold and "not here", as lexsplat.queries.thresholds and lexsplat.queries.presence decide them.
-// tests/scenes/test_publishing.py compares them with Python's.
+// "Not here" and relevancy for phrases that are in no dictionary, relative to everyday words as
+// lexsplat.queries.everyday and lexsplat.queries.presence have it. tests/scenes/test_published_page.py compares them.
 
-import type { PresenceRule } from "./manifest";
-import { type Language, type Samples, type Table, dot } from "./language";
+import { type Language, type Table, dot } from "./language";
+import type { EverydayRule } from "./manifest";
 
 export type Presence = "yes" | "no" | "unsure";
 
-/** Relevancy at which a prompt and a canonical phrase are equally near. */
-const BORDER = 0.5;
-const TOP_SHARE = 5e-4;
-const BINS = 512;
-const TEMPERING = 0.5;
-const MIN_CONTRAST = 0.05;
+/** Relevancy at the border: the automatic threshold of every prompt. */
+export const BORDER = 0.5;
+const PEAK_SHARE = 5e-4;
 const PEAK_COUNT = 20;
+const LEAST = 1e-6;
 
-/** The threshold of a prompt; 0.5 for what the scene does not hold. */
-export function automaticThreshold(table: Table, samples: Samples, presence: Presence): number {
-  if (presence === "no") return BORDER;
-  let row = samples.scores(table);
-  const reached = topMean(row) > BORDER;
-  for (;;) {
-    const found = bestCut(row);
-    if (!found) return BORDER;
-    const { cut, lower, upper } = found;
-    if (!(reached && upper < BORDER)) return lower < BORDER && BORDER < upper ? BORDER : cut;
-    row = row.filter((value) => value >= cut);
-  }
-}
+/** How well a phrase describes each code, above its own offset. */
+export type Heights = Float32Array;
 
-function topMean(row: Float64Array): number {
-  const sorted = row.slice().sort().reverse();
-  const limit = sorted.length * TOP_SHARE;
-  let sum = 0;
-  for (let i = 0; i < sorted.length && i < limit; i++) sum += sorted[i] * Math.min(1, limit - i);
-  return sum / limit;
-}
-
-/** Otsu's cut on a histogram of square-rooted counts, and the means on either side; null without contrast. */
-function bestCut(row: Float64Array): { cut: number; lower: number; upper: number } | null {
-  let low = Infinity;
-  let high = -Infinity;
-  for (const value of row) {
-    low = Math.min(low, value);
-    high = Math.max(high, value);
-  }
-  if (!(high - low >= MIN_CONTRAST)) return null;
-  const width = (high - low) / BINS;
-  const counts = new Float64Array(BINS);
-  for (const value of row) counts[Math.min(BINS - 1, Math.floor((value - low) / width))]++;
-  const quantile = (q: number): number => {
+/**
+ * Heights of a phrase: its cosines with the codes, less those of the mean everyday word, less their quantile.
+ * `codewords` is [K, D] of unit length, `text` and `mean` are [D].
+ */
+export function heightsOf(codewords: Float32Array, text: Float32Array, mean: Float32Array, rule: EverydayRule): Heights {
+  const width = text.length;
+  const shared = new Float32Array(codewords.length / width);
+  for (let k = 0; k < shared.length; k++) {
     let sum = 0;
-    for (let i = 0; i < BINS; i++) if ((sum += counts[i] / row.length) >= q) return i;
-    return BINS - 1;
-  };
-  if ((quantile(0.998) - quantile(0.5)) * width < MIN_CONTRAST) return null;
-  const heights = counts.map((count) => count ** TEMPERING * Number(count > 0));
-  const center = (i: number): number => low + width * (i + 0.5);
-  let total = 0;
-  let moment = 0;
-  heights.forEach((height, i) => {
-    total += height;
-    moment += height * center(i);
-  });
-  const between = new Float64Array(BINS - 1);
-  const means: { lower: number; upper: number }[] = [];
-  for (let i = 0, below = 0, first = 0; i < BINS - 1; i++) {
-    below += heights[i];
-    first += heights[i] * center(i);
-    const lower = first / below;
-    const upper = (moment - first) / (total - below);
-    means.push({ lower, upper });
-    between[i] = below * (total - below) * (lower - upper) ** 2;
+    for (let d = 0; d < width; d++) sum += codewords[k * width + d] * (text[d] - mean[d]);
+    shared[k] = sum;
   }
-  const limit = between.reduce((a, b) => Math.max(a, b), 0) * (1 - 1e-12);
-  const best: number[] = []; // all cuts inside a gap score the same: the middle of them
-  between.forEach((value, i) => value >= limit && best.push(i));
-  const cut = low + width * (best.reduce((a, b) => a + b, 0) / best.length + 1);
-  return { cut, ...means[best[0]] };
+  const sorted = shared.slice().sort();
+  const place = rule.offset * (sorted.length - 1);
+  const low = Math.floor(place);
+  const offset = sorted[low] + (place - low) * (sorted[Math.min(low + 1, sorted.length - 1)] - sorted[low]);
+  return shared.map((value) => value - offset);
 }
 
-/** Decides whether the scene holds what a table of relevancies stands for. */
-export class PresenceClassifier {
-  readonly #references: Table[];
+/** Relevancy of each code for a phrase with these heights; `best` is the best height of an everyday word there. */
+export function relevancyOf(heights: Heights, best: Float32Array, rule: EverydayRule): Table {
+  const count = Math.max(1, Math.round(rule.peak_share * heights.length));
+  const highest = heights.slice().sort().subarray(-count);
+  const peak = Math.max(LEAST, highest.reduce((sum, value) => sum + value, 0) / count);
+  return heights.map((height, k) => {
+    const ratio = Math.min(height / peak, height / best[k]);
+    return 1 / (1 + Math.exp(-rule.steepness * (ratio - rule.border)));
+  });
+}
 
-  constructor(
-    readonly rule: PresenceRule,
-    readonly language: Language,
-    readonly shown: Uint32Array,
-    tableOf: (phrase: string) => Table,
-  ) {
-    this.#references = rule.references.map(tableOf);
-  }
-
-  classify(scores: Float32Array): Presence {
-    if (this.shown.length === 0) return "no";
-    const count = Math.min(this.shown.length, Math.max(PEAK_COUNT, Math.floor(TOP_SHARE * this.shown.length)));
-    const best = largest(scores, this.shown, count);
-    const peak = best.reduce((sum, splat) => sum + scores[splat], 0) / best.length;
-    const there = this.language.distribution(best);
-    const lower = this.#references.filter((table) => dot(table, there) < peak).length;
-    const { weights, yes, no, middle, spread } = this.rule;
-    const height = Math.min(10, Math.max(-5, (peak - middle) / Math.max(spread, 1e-4)));
-    const bounded = Math.min(1 - 1e-3, Math.max(1e-3, peak));
-    const logit =
-      weights.bias +
-      weights.height * height +
-      (weights.rank * lower) / this.#references.length +
-      weights.peak * Math.log(bounded / (1 - bounded));
-    const probability = 1 / (1 + Math.exp(-logit));
-    return probability >= yes ? "yes" : probability <= no ? "no" : "unsure";
-  }
+/** Whether the scene holds a phrase: how well it describes the splats that score best. */
+export function presenceOf(
+  scores: Float32Array, heights: Heights, best: Float32Array, rule: EverydayRule, language: Language, shown: Uint32Array,
+): Presence {
+  if (shown.length === 0) return "no";
+  const count = Math.min(shown.length, Math.max(PEAK_COUNT, Math.floor(PEAK_SHARE * shown.length)));
+  const place = language.distribution(largest(scores, shown, count));
+  const reached = dot(place, heights);
+  const ratio = Math.max(0, reached / Math.max(dot(place, best), LEAST));
+  const strength = Math.sqrt(ratio * Math.max(0, reached / rule.peak));
+  return strength >= rule.yes ? "yes" : strength < rule.no ? "no" : "unsure";
 }
 
 /** The `count` indices among `of` with the largest values, without sorting them all. */

@@ -1,8 +1,17 @@
 // The text tower of CLIP in plain TypeScript: a phrase to its relevancy for every code, without a server.
 
-import type { Manifest } from "./manifest";
 import type { Table } from "./language";
+import type { EverydayRule, Manifest } from "./manifest";
+import { type Heights, heightsOf, relevancyOf } from "./rules";
 import { Tokenizer } from "./tokenizer";
+
+/** What a phrase means to the codes of the scene. */
+export interface Description {
+  table: Table;
+  heights: Heights;
+  best: Float32Array;
+  rule: EverydayRule;
+}
 
 interface Matrix {
   data: Float32Array | Int8Array;
@@ -68,7 +77,6 @@ export class TextTower {
   readonly #heads: number;
   readonly #activation: (x: number) => number;
   readonly #layers: number;
-  readonly #temperature: number;
 
   constructor(weights: Uint8Array<ArrayBuffer>, tokenizer: Uint8Array, manifest: Manifest) {
     this.#tensors = readSafetensors(weights);
@@ -77,23 +85,18 @@ export class TextTower {
     this.#text = manifest.text!;
     this.#heads = this.#text.heads;
     this.#activation = this.#text.activation === "quick_gelu" ? QUICK_GELU : GELU;
-    this.#temperature = manifest.language.temperature;
     let layers = 0;
     while (this.#tensors.has(`encoder.layers.${layers}.layer_norm1.weight`)) layers++;
     this.#layers = layers;
   }
 
-  /** Relevancy of a phrase for every code: a softmax over the phrase and the nearest canonical phrase. */
-  table(phrase: string): Table {
-    const { templates } = this.#text;
+  /** Heights and relevancy of a phrase for every code. */
+  describe(phrase: string): Description {
+    const { templates, everyday } = this.#text;
     const embedding = unit(templates.map((template) => this.embed(template.replace("{}", phrase))));
-    const codewords = this.#get("codewords"); // of unit length
-    const canonical = this.#get("canonical").data; // the largest cosine of each code with a canonical phrase
-    return Float32Array.from(canonical, (nearest, code) => {
-      let cosine = 0;
-      for (let d = 0; d < embedding.length; d++) cosine += embedding[d] * codewords.data[code * codewords.columns + d];
-      return 1 / (1 + Math.exp(-this.#temperature * (cosine - nearest)));
-    });
+    const [codewords, mean, best] = ["codewords", "mean", "best"].map((name) => this.#get(name).data as Float32Array);
+    const heights = heightsOf(codewords, embedding, mean, everyday);
+    return { table: relevancyOf(heights, best, everyday), heights, best, rule: everyday };
   }
 
   /** The embedding of a phrase, of unit length. */

@@ -8,14 +8,14 @@ The path of a photo, file by file:
 - `images/`: reading, masking and undistorting the pixels of a view; `ground_truth/`: annotations for evaluation.
 
 To add a reader of camera files: write ``readers/FORMAT.py`` with ``find_FORMAT(root) -> Path | None`` and
-``read_FORMAT(path) -> CameraFiles`` (take names and poses through `checked_name` and `checked_pose`), call both in
-``loading._read_camera_files`` and ``loading.is_photo_folder``, and add a valid file to ``tests/support/hostile``.
+``read_FORMAT(path) -> CameraFiles`` (take names, lenses and poses through `checked_name`, `checked_lens` and
+`checked_pose`), call both in ``loading._read_camera_files`` and ``loading.is_photo_folder``, and add a valid file to
+``tests/support/hostile``.
 To add a layout of ground truth, see ``ground_truth/layouts.py``.
 """
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import Annotations, check_ground_truth_options, load_annotations
-from lexsplat.captures.ground_truth.masks import load_masks
 from lexsplat.captures.images.undistortion import Lens
 from lexsplat.captures.loading import is_photo_folder, load_capture
 from lexsplat.captures.sfm.photos import PhotoPoses, PoseConfig, poses_from_photos
@@ -39,7 +39,6 @@ __all__ = [
     "is_photo_folder",
     "load_annotations",
     "load_capture",
-    "load_masks",
     "poses_from_photos",
     "random_points_in_frusta",
     "stem_of",

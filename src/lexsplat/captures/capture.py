@@ -8,19 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
-from lexsplat.captures.images.bands import FilledRows, MaskRows, Rows, is_large, reduced, whole
-from lexsplat.captures.images.reading import (
-    image_size,
-    read_image,
-    read_mask,
-    read_rows,
-    resize_image,
-    resize_nearest,
-    sizes_agree,
-)
-from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_large
+from lexsplat.captures.images.bands import FilledRows, MaskRows, Rows, resized
+from lexsplat.captures.images.reading import PhotoRows, image_size, read_mask, resize_nearest, sizes_agree
+from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_nearest
 from lexsplat.geometry.cameras import Camera, camera_extent
 from lexsplat.runtime.errors import CaptureError
 
@@ -73,7 +64,8 @@ class View:
             ValueError: If ``size`` is not positive.
         """
         size = self._checked_size(size)
-        found = image_size(self.image_path)
+        source: Rows = PhotoRows(self.image_path, self.background)
+        found, remapped = (source.width, source.height), False
         if found != (self.lens.width, self.lens.height):
             raise CaptureError(
                 self.image_path,
@@ -81,37 +73,22 @@ class View:
                 found=f"{found[0]}x{found[1]}",
                 remedy="the file changed since the capture was loaded; load it again",
             )
-        if self.ignore_path is None and not self.lens.distorts:
-            return read_image(self.image_path, self.background, size=size)
-        if is_large(*found):
-            return self._load_large(size)
-        image = read_image(self.image_path, self.background)
-        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
-        if mask is not None and self._is_undistorted(mask):
-            image = undistort(image, self.lens, self.capture_size)
-            return resize_image(filled(image, mask), size)
-        if mask is not None:
-            self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-            image = filled(image, resize_nearest(mask, found))
-        if self.lens.distorts:
-            return undistort(image, self.lens, size)
-        return resize_image(image, size)
+        if self.ignore_path is not None:
+            mask, remapped = self._valid_pixels(self.ignore_path)
+            if remapped:
+                source = RemappedRows(source, self.lens, self.capture_size)
+            source = FilledRows(source, mask)
+        if self.lens.distorts and not remapped:
+            return undistort(source, self.lens, size)
+        return resized(source, size)
 
-    def _load_large(self, size: tuple[int, int]) -> NDArray[np.float32]:
-        """Load a large masked or distorted photo in bands."""
-        source: Rows = read_rows(self.image_path, self.background)
-        mask = None if self.ignore_path is None else read_mask(self.ignore_path, nonzero=True)
-        if mask is not None and self._is_undistorted(mask):
-            source = FilledRows(RemappedRows(source, self.lens, self.capture_size), mask)
-        else:
-            if mask is not None:
-                self._check_aspect(self.ignore_path or self.image_path, (mask.shape[1], mask.shape[0]))
-                source = FilledRows(source, resize_nearest(mask, (source.width, source.height)))
-            if self.lens.distorts:
-                return undistort_large(source, self.lens, size)
-        if size[0] <= source.width and size[1] <= source.height:
-            return reduced(source, size)
-        return resize_image(whole(source), size)
+    def _valid_pixels(self, path: Path) -> tuple[NDArray[np.bool_], bool]:
+        """Pixels that a mask leaves, at the size of the undistorted photo if it was drawn on it; whether it was."""
+        mask = read_mask(path, nonzero=True)
+        self._check_aspect(path, (mask.shape[1], mask.shape[0]))
+        undistorted = self._is_undistorted(mask)
+        size = self.capture_size if undistorted else (self.lens.width, self.lens.height)
+        return resize_nearest(mask, size), undistorted
 
     def load_mask(self, path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
         """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, by nearest pixel.
@@ -129,16 +106,7 @@ class View:
     def undistort_mask(
         self, mask: NDArray[np.bool_], subject: Path, size: tuple[int, int] | None = None
     ) -> NDArray[np.bool_]:
-        """A mask ``[h, w]`` drawn on the photo, undistorted as by `load_mask`.
-
-        Args:
-            mask: The mask.
-            subject: The file named in messages.
-            size: Width and height of the result; None keeps the mask's own resolution.
-
-        Raises:
-            CaptureError: If the aspect of the mask is not the photo's.
-        """
+        """A mask ``[h, w]`` as `load_mask` undistorts one; ``subject`` is the file named in errors."""
         height, width = mask.shape
         self._check_aspect(subject, (width, height))
         if self._is_undistorted(mask) or not self.lens.distorts:
@@ -149,8 +117,7 @@ class View:
                 max(1, round(full[0] * width / self.lens.width)),
                 max(1, round(full[1] * height / self.lens.height)),
             )
-        pixels = mask[..., None].astype(np.float32)
-        return undistort(pixels, self.lens, self._checked_size(size), nearest=True)[..., 0] > 0.5
+        return undistort_nearest(mask, self.lens, self._checked_size(size))
 
     def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
         """Pixels that losses use, ``[H, W]`` bool at the camera's size, or None for all.
@@ -174,23 +141,11 @@ class View:
         if self.ignore_path is None:
             return None
         size = self._checked_size(size)
-        mask = read_mask(self.ignore_path, nonzero=True)
-        self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
-        undistorted = self._is_undistorted(mask)
-        masked = ~resize_nearest(
-            mask, self.capture_size if undistorted else (self.lens.width, self.lens.height)
-        )
-        large = is_large(masked.shape[1], masked.shape[0])
-        shrinks = size[0] <= masked.shape[1] and size[1] <= masked.shape[0]
-        if large and (undistorted or not self.lens.distorts) and shrinks:
-            return 1.0 - reduced(MaskRows(masked), size)[..., 0]
-        if large and not undistorted and self.lens.distorts:
-            return 1.0 - undistort_large(MaskRows(masked, reach=2), self.lens, size)[..., 0]
+        mask, undistorted = self._valid_pixels(self.ignore_path)
         if undistorted or not self.lens.distorts:
-            return 1.0 - resize_image(masked[..., None].astype(np.float32), size)[..., 0]
+            return 1.0 - resized(MaskRows(~mask), size)[..., 0]
         # Bicubic interpolation has a support of two pixels.
-        reach = binary_dilation(masked, np.ones((5, 5), bool))[..., None].astype(np.float32)
-        return 1.0 - undistort(reach, self.lens, size)[..., 0]
+        return 1.0 - undistort(MaskRows(~mask, reach=2), self.lens, size)[..., 0]
 
     def check_mask(self, path: Path) -> None:
         """Compare a mask's size with the photo's by their headers.
@@ -222,22 +177,13 @@ class View:
         return int(width), int(height)
 
 
-def filled(image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """An image ``[H, W, C]`` whose invalid pixels are replaced by the mean of the valid ones ``[H, W]``."""
-    if valid.all():
-        return image
-    kept = image[valid]
-    mean = kept.mean(0, dtype=np.float64) if len(kept) else np.zeros(image.shape[2])
-    return np.where(valid[..., None], image, mean.astype(np.float32))
-
-
 def _no_points() -> NDArray[np.float32]:
     return np.zeros((0, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture: its views, their split, points and ground-truth masks.
+    """A capture: its views, their split, and points.
 
     Args:
         root: The capture folder.
@@ -246,7 +192,6 @@ class Capture:
         test_names: Names of the held-out views, sorted.
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
         point_colors: Their colors ``[P, 3]``, RGB in 0..1.
-        segmentations: Folder with ``STEM/PROMPT.png``, or None.
         warnings: What was skipped and why, one line each.
         source: Format of the camera files: ``"colmap"`` or ``"transforms"``.
         background: Color behind transparent pixels, RGB in 0..1.
@@ -258,7 +203,6 @@ class Capture:
     test_names: tuple[str, ...] = ()
     points: NDArray[np.float32] = field(default_factory=_no_points)
     point_colors: NDArray[np.float32] = field(default_factory=_no_points)
-    segmentations: Path | None = None
     warnings: tuple[str, ...] = ()
     source: str = "colmap"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

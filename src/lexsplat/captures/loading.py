@@ -15,12 +15,9 @@ from lexsplat.captures.readers.camera_files import CameraFiles, Photo
 from lexsplat.captures.readers.colmap import find_model, read_colmap
 from lexsplat.captures.readers.transforms_json import find_transforms, read_transforms
 from lexsplat.captures.readers.video import is_video
-from lexsplat.captures.splits import choose_test_names, mask_folders
+from lexsplat.captures.splits import choose_test_names
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import CaptureError
-
-SEGMENTATIONS = "segmentations"
-"""Folder of a capture with ground-truth masks ``STEM/PROMPT.png``."""
 
 
 def load_capture(
@@ -64,14 +61,13 @@ def load_capture(
     }
     _check_names([photo.name for photo in files.photos], files.origin)
     root = files.root if beside is None else Path(beside)
-    segmentations = root / SEGMENTATIONS
-    has_masks = segmentations.is_dir() and bool(mask_folders(segmentations))
+    annotations = find_annotations(root)
     chosen, split_warnings = choose_test_names(
         list(views),
         root=root,
         test_names=test_names,
         listed=files.test_names,
-        annotated=_annotated(root, list(views)),
+        annotated=annotated_names(*annotations, views, root / "images") if annotations else (),
         test_every=test_every,
     )
     warnings += split_warnings
@@ -84,7 +80,6 @@ def load_capture(
         test_names=chosen,
         points=files.points,
         point_colors=files.point_colors,
-        segmentations=segmentations if has_masks else None,
         warnings=tuple(warnings),
         source=files.source,
         background=files.background,
@@ -136,12 +131,6 @@ def _check_names(names: list[str], origin: Path) -> None:
                 found=f"{other} and {name}",
                 remedy="rename or remove one of the two",
             )
-
-
-def _annotated(root: Path, names: list[str]) -> set[str]:
-    """Names of the views with ground truth, in any layout."""
-    found = find_annotations(root)
-    return set() if found is None else annotated_names(*found, names, root / "images")
 
 
 def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:

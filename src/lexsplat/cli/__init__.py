@@ -16,6 +16,7 @@ from typing import NamedTuple, NoReturn
 
 from lexsplat import __version__
 from lexsplat.runtime.errors import STOPPED, LexsplatError
+from lexsplat.runtime.progress import NOTE
 
 
 class CommandEntry(NamedTuple):
@@ -34,6 +35,7 @@ COMMANDS = {
     "language": CommandEntry("build", "Language", "the later stages of build: language on the Gaussians"),
     "query": CommandEntry("query", "Query", "heatmaps, masks and scores for free text"),
     "find": CommandEntry("find", "Find", "where things are in 3D, how many and how large"),
+    "ask": CommandEntry("ask", "Ask", "questions in your own words, many a second with --stdin"),
     "scale": CommandEntry("scale", "Scale", "set the length of a meter and the up direction of a scene"),
     "evaluate": CommandEntry("evaluate", "Evaluate", "measure a scene on its held-out views"),
     "ablate": CommandEntry("ablate", "Ablate", "measure the method without its parts"),
@@ -42,6 +44,10 @@ COMMANDS = {
     "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
     "publish": CommandEntry("publish", "Publish", "write a page that searches a scene with no server"),
     "view": CommandEntry("view", "View", "show and search a scene in the browser"),
+    "encoders": CommandEntry(
+        "encoders", "EncodersCommand", "fetch, check and time encoders before a long build"
+    ),
+    "mcp": CommandEntry("mcp", "Mcp", "tools for language models"),
     "info": CommandEntry("info", "Info", "show what a scene folder contains"),
 }
 """Commands by name, in the order of the help page."""
@@ -57,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         SystemExit: With status 2 after wrong usage, with status 0 after the help page of a command.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    logging.getLogger("lexsplat").setLevel(NOTE)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = _run(words)

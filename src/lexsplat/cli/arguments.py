@@ -4,7 +4,7 @@ A command class may have these attributes beside its fields:
 
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
-- ``defaults``: what help pages state as the default of an option that is None or empty;
+- ``defaults``: defaults of options that are None or empty, in words, beside the usual ones;
 - ``synonyms``: other spellings of options.
 
 Its method ``check``, if it has one, raises ValueError for options that are invalid together.
@@ -32,12 +32,23 @@ ESSENTIAL_SETTINGS = (
 )  # fmt: skip
 """Settings of a build that people use."""
 
-_PLACEHOLDERS = {"clip": "NAME", "dino": "NAME", "memory": "SIZE", "up": "X,Y,Z", "height_of": "PHRASE"}
-_SETTINGS_DEFAULTS = {
+_PLACEHOLDERS = {
+    "clip": "NAME", "dino": "NAME", "view": "NAME", "test_views": "NAME", "name": "NAME", "host": "ADDRESS",
+    "select": "PHRASE", "height_of": "PHRASE", "between": "PHRASE PHRASE", "negatives": "PHRASE",
+    "template": "SENTENCE", "points": "X,Y,Z X,Y,Z", "up": "X,Y,Z", "memory": "SIZE",
+}  # fmt: skip
+"""Placeholders by name of option; that of an option with any number of values is followed by an ellipsis."""
+_DEFAULTS = {
+    "clip": "the encoder of the build",
+    "view": "the view that shows the other thing best",
+    "threshold": "chosen for each phrase",
+    "masks": "the ground truth in the capture or beside it",
+    "prompt_list": "the prompts of the ground truth",
     "downscale": "chosen for the device",
     "iterations": "chosen for the device",
     "up": "from the cameras",
 }
+"""What help pages state as the default of an option that is None or empty, unless the command states another."""
 
 CommandT = TypeVar("CommandT")
 REGISTRY = ConstructorRegistry()
@@ -118,12 +129,12 @@ def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
         factory: Any = field.default_factory
         if field.name == "settings" and factory is not dataclasses.MISSING:
             example = factory()
-            page = _help_page(type(example), hidden, _SETTINGS_DEFAULTS)
+            page = _help_page(type(example), hidden, {})
             values = {part.name: getattr(example, part.name) for part in dataclasses.fields(example)}
             hint = Annotated[page, tyro.conf.arg(name="")]  # as `options.Settings`
             factory = _maker(page, values)
         elif get_origin(hint) is not Annotated:
-            hint = Annotated[hint, _in_words(field.name, default, defaults)]
+            hint = Annotated[hint, _in_words(field.name, hint, default, defaults)]
         if field.name in hidden:
             hint = Annotated[hint, tyro.conf.Suppress]
         fields.append((field.name, hint, dataclasses.field(default=default, default_factory=factory)))
@@ -144,13 +155,16 @@ def _maker(page: type, values: dict[str, Any]) -> Any:
     return lambda: page(**values)
 
 
-def _in_words(name: str, default: Any, defaults: dict[str, str]) -> Any:
-    hint = None
+def _in_words(name: str, kind: Any, default: Any, defaults: dict[str, str]) -> Any:
+    hint, placeholder = None, _PLACEHOLDERS.get(name)
+    if placeholder and get_origin(kind) is tuple and Ellipsis in get_args(kind):
+        placeholder += " ..."
     if default is None or default == ():
-        hint = f"(default: {defaults.get(name, 'none')})"
+        words = {**_DEFAULTS, **defaults}
+        hint = f"(default: {words.get(name, 'none')})"
     elif default is False or default is True:
         hint = ""
-    return tyro.conf.arg(metavar=_PLACEHOLDERS.get(name), help_behavior_hint=hint)
+    return tyro.conf.arg(metavar=placeholder, help_behavior_hint=hint)
 
 
 @REGISTRY.primitive_rule

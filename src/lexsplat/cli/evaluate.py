@@ -33,7 +33,7 @@ class Evaluate:
         form: How codes and text are compared (see lexsplat query --help).
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
-        json: Print metrics.json on standard output.
+        json: Print metrics.json on standard output (docs/schemas/metrics.json).
     """
 
     scene: SceneArgument
@@ -47,11 +47,8 @@ class Evaluate:
     json: bool = False
 
     defaults: ClassVar[dict[str, str]] = {
-        "masks": "the ground truth in the capture or beside it",
-        "prompt_list": "the prompts of the ground truth",
         "capture": "where the build found it",
         "form": "the form of the scene",
-        "clip": "the encoder of the build",
     }
 
     def run(self) -> None:

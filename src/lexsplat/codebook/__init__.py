@@ -7,25 +7,22 @@ codes. Held-out views take no part in the fit.
 Equations are numbered 1 to 15 through the main text of the paper; supplement A describes the load-balancing loss.
 """
 
-from lexsplat.codebook.assignment import CodeUsage, assign_code_maps, code_usage
+from lexsplat.codebook.assignment import assign_code_maps, code_usage
 from lexsplat.codebook.fitting import fit_codebook, mean_cosine, sample_features, spherical_kmeans
-from lexsplat.codebook.losses import cosine_loss, load_balancing_loss, quantization_loss
+from lexsplat.codebook.losses import load_balancing_loss, quantization_loss
 from lexsplat.codebook.settings import MAX_CODES, CodebookConfig
-from lexsplat.codebook.space import Codebook, quantize, similarity
+from lexsplat.codebook.space import Codebook, similarity
 
 __all__ = [
     "MAX_CODES",
-    "CodeUsage",
     "Codebook",
     "CodebookConfig",
     "assign_code_maps",
     "code_usage",
-    "cosine_loss",
     "fit_codebook",
     "load_balancing_loss",
     "mean_cosine",
     "quantization_loss",
-    "quantize",
     "sample_features",
     "similarity",
     "spherical_kmeans",

@@ -4,34 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from lexsplat.codebook.settings import CodebookConfig
 from lexsplat.codebook.space import similarity
-
-
-def cosine_loss(
-    clip: Tensor,
-    dino: Tensor | None,
-    quantized_clip: Tensor,
-    quantized_dino: Tensor | None,
-    lambda_dino: float,
-) -> Tensor:
-    """Eq. 5: (1 - cos CLIP) + lambda_DINO (1 - cos DINO), averaged over the M features.
-
-    Args:
-        clip: ``[M, Dc]``.
-        dino: ``[M, Dd]`` or None.
-        quantized_clip: Their codes by Eq. 3 ``[M, Dc]``.
-        quantized_dino: ``[M, Dd]`` or None to leave the second term out.
-        lambda_dino: Weight of the second term.
-    """
-    loss = 1 - functional.cosine_similarity(clip, quantized_clip, dim=-1)
-    if quantized_dino is not None:
-        if dino is None:
-            raise ValueError("quantized DINO features without DINO features")
-        loss = loss + lambda_dino * (1 - functional.cosine_similarity(dino, quantized_dino, dim=-1))
-    return loss.mean()
 
 
 def load_balancing_loss(similarities: Tensor, temperature: float = 1.0) -> Tensor:
@@ -57,9 +32,9 @@ def quantization_loss(
     """Eq. 7: lambda_cos L_cos + lambda_lb L_lb for a batch of features.
 
     The index m is the argmax of Eq. 4 and has no gradient; the gradient reaches the codes through Eq. 3 and the
-    softmax. Eq. 5 of the chosen codes (`cosine_loss`) is 1 + lambda_DINO minus the similarity by which they were
-    chosen, so no row of the codebook is gathered. The gradient of a gather would be a scatter-add, which torch sums
-    in an order that depends on its threads.
+    softmax. Eq. 5 of the chosen codes is 1 + lambda_DINO minus the similarity by which they were chosen, so no row of
+    the codebook is gathered. The gradient of a gather would be a scatter-add, which torch sums in an order that
+    depends on its threads.
     """
     scores = similarity(clip, dino, code_clip, code_dino, config.lambda_dino)
     chosen = scores.detach().argmax(-1, keepdim=True)

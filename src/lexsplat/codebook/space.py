@@ -51,19 +51,6 @@ def similarity(
     )
 
 
-def quantize(codewords: Tensor, code_indices: Tensor) -> Tensor:
-    """Eq. 3: the quantized feature, sum_i f_i onehot(m)_i, which is row m.
-
-    Args:
-        codewords: ``[K, D]``.
-        code_indices: Integers ``[...]`` in 0 to K - 1.
-
-    Returns:
-        ``[..., D]``.
-    """
-    return codewords[code_indices.long()]
-
-
 @dataclass(frozen=True)
 class Codebook:
     """The discrete language feature space S.
@@ -100,11 +87,6 @@ class Codebook:
     def similarity(self, clip: Tensor, dino: Tensor | None = None) -> Tensor:
         """Eq. 4 between features ``[M, Dc]``, ``[M, Dd]`` and all codes: ``[M, K]``."""
         return similarity(clip, dino, self.clip, self.dino, self.lambda_dino)
-
-    def quantize(self, code_indices: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Eq. 3 for both halves: ``[..., Dc]`` and ``[..., Dd]`` or None."""
-        dino = None if self.dino is None else quantize(self.dino, code_indices)
-        return quantize(self.clip, code_indices), dino
 
     @torch.no_grad()
     def assign(self, feature_map: FeatureMap) -> NDArray[np.uint8]:
@@ -153,9 +135,9 @@ class Codebook:
 
 def _blocks(feature_map: Any, device: torch.device, use_dino: bool) -> Iterator[tuple[Tensor, Tensor | None]]:
     clip = torch.as_tensor(feature_map.clip).flatten(0, 1)
-    if use_dino and feature_map.dino is None:
-        raise ValueError("the codebook was fitted with DINO features, but the feature map has none")
-    dino = torch.as_tensor(feature_map.dino).flatten(0, 1) if use_dino else None
+    dino = (
+        torch.as_tensor(feature_map.dino).flatten(0, 1) if use_dino and feature_map.dino is not None else None
+    )
     for start in range(0, len(clip), BLOCK_ROWS):
         rows = slice(start, start + BLOCK_ROWS)
         yield (

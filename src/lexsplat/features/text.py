@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import Tensor
 from lexsplat.features.encoders import ImageTextEncoder
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import digest
 
 log = logging.getLogger("lexsplat")
 
@@ -29,10 +29,11 @@ class TextCache:
 
     Args:
         folder: Folder of the files; created on the first write.
+        writable: Whether new embeddings are stored.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = Path(folder)
+    def __init__(self, folder: Path, *, writable: bool = True) -> None:
+        self._folder, self._writable = Path(folder), writable
         self._known: dict[str, dict[str, Tensor]] = {}
 
     def encode(
@@ -58,7 +59,8 @@ class TextCache:
                 raise ValueError(f"{model.name} is not the model of the features ({content_hash})")
             known.update(zip(new, encode_each(model, new)))
             try:
-                self._write(content_hash, known)
+                if self._writable:
+                    self._write(content_hash, known)
             except OSError as error:  # the cache is optional
                 log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
         return torch.stack([known[prompt] for prompt in prompts])
@@ -83,5 +85,5 @@ class TextCache:
 
     def _write(self, content_hash: str, known: dict[str, Tensor]) -> None:
         # Tensors are named by hashes: prompts may contain any character, and "__metadata__" is reserved.
-        keys = {hashlib.blake2b(prompt.encode(), digest_size=16).hexdigest(): prompt for prompt in known}
+        keys = {digest([prompt.encode()], 16): prompt for prompt in known}
         write_tensors(self._path(content_hash), {key: known[prompt] for key, prompt in keys.items()}, keys)

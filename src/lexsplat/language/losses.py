@@ -1,4 +1,4 @@
-"""Losses of the language field: Eq. 9 to 12, 14 and 15 of the paper.
+"""Losses of the language field: Eq. 9 to 11 and 14 of the paper. `FieldTrainer` adds them up (Eq. 12 and 15).
 
 All are means over pixels or Gaussians, so a random sample of them is an unbiased estimate of the full loss.
 """
@@ -58,13 +58,6 @@ def uncertainty_loss(uncertainties: Tensor, form: UncertaintyForm = "linear") ->
     raise ValueError(f'form must be "linear" or "log", got {form!r}')
 
 
-def semantic_loss(
-    cross_entropy: Tensor, uncertainty: Tensor, lambda_ce: float = 1, lambda_u: float = 1
-) -> Tensor:
-    """Eq. 12: lambda_CE L_CE + lambda_u L_u."""
-    return lambda_ce * cross_entropy + lambda_u * uncertainty
-
-
 def smoothing_loss(
     smoothed: Tensor,
     semantics: Tensor,
@@ -99,8 +92,3 @@ def smoothing_loss(
     if squared:
         teach, follow = teach.square(), follow.square()
     return (teach + pull * follow).mean()
-
-
-def total_loss(semantic: Tensor, smoothing: Tensor, lambda_s: float = 1, lambda_smo: float = 1) -> Tensor:
-    """Eq. 15: lambda_s L_s + lambda_smo L_smo."""
-    return lambda_s * semantic + lambda_smo * smoothing

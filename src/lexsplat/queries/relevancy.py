@@ -3,12 +3,13 @@
 Nothing here needs an encoder: texts arrive as embeddings. Dimension letters: P prompts (positives),
 M negatives, T texts, K codes, D feature dimensions, N Gaussians, H and W image size.
 
-Relevancy follows LERF: a prompt is compared with each canonical phrase by a softmax over the two, and the
-smallest result counts. 0.5 means that the prompt and a canonical phrase are equally near. There are two forms:
+LERF and the paper compare a prompt with each canonical phrase by a softmax over the two, and the smallest result
+counts. 0.5 means that the prompt and a canonical phrase are equally near. There are two forms:
 
 - ``"feature"`` (the paper): code probabilities p become a feature, F = p S, which is compared with the text.
 - ``"code"``: each code is compared with the text once (a table r of K numbers per prompt), and the results
   are blended, sum over k of p_k r_k. This is linear: the map of a view is the rendering of the Gaussians' scores.
+  In a scene the table is relative to everyday words (`lexsplat.queries.everyday`) unless negatives are given.
 
 Both forms give relevancy 0 to the transparent part of a pixel: relevancy is an expectation over what the pixel
 shows. Dividing by the coverage instead would give a faint floater in front of an empty background the full
@@ -27,6 +28,7 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
+from lexsplat.queries.everyday import EverydayScale
 from lexsplat.runtime.errors import QueryError
 
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
@@ -34,14 +36,6 @@ CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
 
 NO_TEMPLATE = ("{}",)
 """The prompt as it is, as in the paper."""
-
-PHOTO_TEMPLATES = (
-    "a photo of {}",
-    "a photo of a {}",
-    "a close-up photo of the {}",
-    "there is a {} in the scene",
-)
-"""A small prompt ensemble; its embeddings are averaged."""
 
 _CHUNK = 1 << 13  # pixels per block; small enough for a block to stay in the cache
 _GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
@@ -60,14 +54,15 @@ class QueryConfig:
         temperature: Factor on cosines before the pairwise softmax (the paper and LERF: 10).
         form: ``"code"`` blends the relevancies of codes; ``"feature"`` (the paper) compares the blended feature.
             "code" measures better for every field (docs/results.md).
-        negatives: Phrases that each prompt is compared with.
+        negatives: Phrases that each prompt is compared with. None given: form "code" compares with everyday words
+            (`lexsplat.queries.everyday`), form "feature" with `CANONICAL_PHRASES` (LERF and the paper).
         templates: Sentences with ``{}`` for the prompt; the embeddings of several are averaged.
         threshold: Fixed relevancy threshold of masks, in 0..1 (paper: 0.5).
     """
 
     temperature: float = 10.0
     form: QueryForm = "code"
-    negatives: tuple[str, ...] = CANONICAL_PHRASES
+    negatives: tuple[str, ...] = ()
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5
 
@@ -76,13 +71,23 @@ class QueryConfig:
             raise ValueError(f"temperature must be positive, got {self.temperature}")
         if self.form not in ("feature", "code"):
             raise ValueError(f"form must be 'feature' or 'code', got {self.form!r}")
-        if not self.negatives:
-            raise ValueError("negatives must hold at least one phrase")
+        if not self.templates:
+            raise ValueError("templates must hold at least one sentence with {}")
         for template in self.templates:
             if template.count("{}") != 1:
                 raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"threshold must be in 0..1, got {self.threshold}")
+
+    @property
+    def everyday(self) -> bool:
+        """Whether relevancy is relative to everyday words."""
+        return self.form == "code" and not self.negatives
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """The negatives, by default the canonical phrases."""
+        return self.negatives or CANONICAL_PHRASES
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +98,13 @@ class Question:
         positives: Text embeddings of the prompts ``[P, D]``, of any length.
         negatives: Text embeddings of the negatives ``[M, D]``, M > 0, of any length.
         config: Temperature and form.
+        scale: What everyday words reach in the scene; replaces the negatives in form "code".
     """
 
     positives: Tensor
     negatives: Tensor
     config: QueryConfig = field(default_factory=QueryConfig)
+    scale: EverydayScale | None = None
 
     def __len__(self) -> int:
         return len(self.positives)
@@ -150,34 +157,17 @@ def check_prompts(prompts: str | Sequence[str]) -> list[str]:
     return cleaned
 
 
-def expand_templates(prompts: str | Sequence[str], templates: Sequence[str] = NO_TEMPLATE) -> list[str]:
-    """Every prompt in every template, prompts outermost: ``P * len(templates)`` texts.
-
-    Raises:
-        QueryError: If a prompt is empty.
-        ValueError: If there is no template, or one does not contain ``{}`` exactly once.
-    """
-    if not templates:
-        raise ValueError("templates must hold at least one sentence with {}")
-    for template in templates:
-        if template.count("{}") != 1:
-            raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
-    return [template.replace("{}", prompt) for prompt in check_prompts(prompts) for template in templates]
-
-
-def average_templates(embeddings: Tensor, num_templates: int) -> Tensor:
-    """Mean direction over each prompt's templates: ``[P * num_templates, D]`` to unit rows ``[P, D]``."""
-    if num_templates < 1 or embeddings.ndim != 2 or len(embeddings) % num_templates:
-        raise ValueError(f"{list(embeddings.shape)} embeddings do not divide into {num_templates} templates")
-    unit = torch.nn.functional.normalize(embeddings.float(), dim=-1)
-    return torch.nn.functional.normalize(unit.view(-1, num_templates, unit.shape[-1]).mean(1), dim=-1)
-
-
 def embed_prompts(
     prompts: str | Sequence[str], encode_text: TextEncoder, templates: Sequence[str] = NO_TEMPLATE
 ) -> Tensor:
-    """Unit embeddings ``[P, D]`` of prompts, averaged over templates, in one call of the encoder."""
-    return average_templates(encode_text(expand_templates(prompts, templates)), len(templates))
+    """Unit embeddings ``[P, D]`` of prompts, in one call of the encoder: the mean direction over the templates.
+
+    Raises:
+        QueryError: If there is no prompt, or one is empty.
+    """
+    texts = [template.replace("{}", prompt) for prompt in check_prompts(prompts) for template in templates]
+    unit = torch.nn.functional.normalize(encode_text(texts).float(), dim=-1)
+    return torch.nn.functional.normalize(unit.unflatten(0, (-1, len(templates))).mean(1), dim=-1)
 
 
 # Relevancy
@@ -210,6 +200,8 @@ def code_relevancy(codewords: Tensor, question: Question) -> Tensor:
         question: Embeddings of the prompts.
     """
     positives, negatives = question.units(codewords)
+    if question.scale is not None:
+        return question.scale.relevancy(codewords, positives)
     unit = torch.nn.functional.normalize(codewords.float(), dim=-1)
     return pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
 
@@ -273,12 +265,6 @@ def render_relevancy(
     field: LanguageField, gaussians: Gaussians, camera: Camera, question: Question
 ) -> Tensor:
     """Relevancy of every prompt at every pixel of a view (supplement B).
-
-    Args:
-        field: The language of the scene.
-        gaussians: Its geometry.
-        camera: The view.
-        question: Embeddings of the prompts.
 
     Returns:
         ``[P, H, W]`` in 0..1, on the device of the Gaussians.

@@ -11,147 +11,81 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lexsplat.geometry.rotations import covariances
+from lexsplat.reconstruction.settings import ReconstructionConfig
 
-REFERENCE_ITERATIONS = 30_000
-"""Number of iterations to which all step numbers of 3DGS refer."""
 NEVER = 1 << 62
 """A step that no training reaches."""
 MAX_COPIES = 51
 """Upper limit of the copies of one Gaussian; larger numbers are clamped to it, as in gsplat."""
 
+GSPLAT_NAMES = {"log_scales": "scales", "opacity_logits": "opacities"}
+"""Parameters that gsplat's strategies expect under another name."""
+
+STATISTICS = ("grad2d", "count")
+"""State of "default": sums of gradients, and numbers of views that drew each Gaussian."""
+
 _operators_lock = threading.Lock()
-
-
-@dataclass(frozen=True)
-class DensitySchedule:
-    """Steps at which density control acts.
-
-    Args:
-        start: Step after which Gaussians are added.
-        stop: Step at which the number of Gaussians becomes final.
-        every: Steps between two rounds.
-        reset_every: Steps between two opacity resets ("default" only).
-    """
-
-    start: int
-    stop: int
-    every: int
-    reset_every: int
-
-
-def density_schedule(
-    strategy: Literal["default", "mcmc"], iterations: int, *, every: int = 100, minimum_every: int = 1
-) -> DensitySchedule:
-    """The schedule of 3DGS (or of MCMC) for 30,000 iterations, scaled to ``iterations``.
-
-    Args:
-        strategy: "default" or "mcmc".
-        iterations: Number of iterations of the training.
-        every: Steps between two rounds in a training of 30,000.
-        minimum_every: Lower limit of the actual steps between two rounds of "default", so that enough views
-            contribute to each decision. It does not apply to "mcmc", which adds a twentieth per round at random and
-            would never reach its cap in few rounds.
-    """
-    scale = iterations / REFERENCE_ITERATIONS
-    closest = minimum_every if strategy == "default" else 1
-    return DensitySchedule(
-        start=round(500 * scale),
-        stop=round((15_000 if strategy == "default" else 25_000) * scale),
-        every=max(1, closest, round(every * scale)),
-        reset_every=max(1, round(3_000 * scale)),
-    )
-
-
-@dataclass(frozen=True)
-class DensityConfig:
-    """Rules of density control.
-
-    Args:
-        strategy: "default" or "mcmc".
-        schedule: Steps at which it acts.
-        extent: Radius of the scene in world units; sizes are relative to it.
-        max_gaussians: Upper limit of the number of Gaussians.
-        grow_gradient: Mean gradient of the projected centers, in halves of the image, above which "default" adds
-            Gaussians.
-        min_opacity: Gaussians below this opacity are removed ("default") or moved ("mcmc").
-        reset_opacities: Whether "default" regularly lowers the opacities to twice ``min_opacity``, and after the
-            first reset removes Gaussians larger than a tenth of the scene.
-        noise: Strength of the noise of "mcmc", times the learning rate of the means.
-
-    Raises:
-        ValueError: If the strategy is unknown or the cap is not positive.
-    """
-
-    strategy: Literal["default", "mcmc"]
-    schedule: DensitySchedule
-    extent: float
-    max_gaussians: int
-    grow_gradient: float = 2e-4
-    min_opacity: float = 0.005
-    reset_opacities: bool = True
-    noise: float = 5e5
-
-    def __post_init__(self) -> None:
-        if self.max_gaussians < 1:
-            raise ValueError(f"max_gaussians must be positive, got {self.max_gaussians}")
-        if self.strategy not in ("default", "mcmc"):
-            raise ValueError(f'strategy must be "default" or "mcmc", got {self.strategy!r}')
 
 
 class DensityControl:
     """One of gsplat's strategies on any device, with a cap, a random generator of its own, and a state.
 
-    Parameters have gsplat's names: means, quats, scales (logarithms), opacities (logits), and any other.
-
     Args:
-        config: The rules.
+        config: Strategy, schedule and rules.
+        extent: Radius of the scene in world units; sizes are relative to it.
         seed: Seed of the random generator.
         device: Device of the parameters.
     """
 
-    def __init__(self, config: DensityConfig, *, seed: int = 0, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        config: ReconstructionConfig,
+        extent: float,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
         from gsplat.strategy import DefaultStrategy, MCMCStrategy  # imported here: it takes seconds
 
-        self.config = config
+        self.config, self.schedule = config, config.density_schedule
         self._device = torch.device(device)
-        self._random_state = _initial_random_state(self._device, seed)
-        schedule = config.schedule
+        self._cap = config.cap(self._device)
+        self._random_state = torch.Generator(device=self._device).manual_seed(seed).get_state()
         steps: dict[str, Any] = {
-            "refine_start_iter": schedule.start,
-            "refine_stop_iter": schedule.stop,
-            "refine_every": schedule.every,
+            "refine_start_iter": self.schedule.start,
+            "refine_stop_iter": self.schedule.stop,
+            "refine_every": self.schedule.every,
         }
-        self._default = self._mcmc = None
-        if config.strategy == "default":
-            self._default = DefaultStrategy(
+        self._strategy: Any
+        if config.strategy == "mcmc":
+            self._strategy = MCMCStrategy(
+                cap_max=self._cap, noise_lr=config.noise, min_opacity=config.min_opacity, **steps
+            )
+            self._state = self._strategy.initialize_state()
+        else:
+            self._strategy = DefaultStrategy(
                 prune_opa=config.min_opacity,
                 grow_grad2d=config.grow_gradient,
                 # After the first reset gsplat also removes Gaussians larger than a tenth of the scene. Without
                 # resets this would only punch holes into a background covered by few Gaussians.
-                reset_every=schedule.reset_every if config.reset_opacities else NEVER,
+                reset_every=self.schedule.reset_every if config.resets_opacities else NEVER,
                 **steps,
             )
-            self._state = self._default.initialize_state(scene_scale=config.extent)
-        else:
-            self._mcmc = MCMCStrategy(
-                cap_max=config.max_gaussians, noise_lr=config.noise, min_opacity=config.min_opacity, **steps
-            )
-            self._state = self._mcmc.initialize_state()
+            self._state = self._strategy.initialize_state(scene_scale=extent)
 
     def step(
         self,
         parameters: dict[str, torch.nn.Parameter],
-        optimizers: dict[str, torch.optim.Optimizer],
+        optimizers: Mapping[str, torch.optim.Optimizer],
         step: int,
         *,
         means2d: Tensor,
@@ -162,7 +96,7 @@ class DensityControl:
         """Add, move and remove Gaussians after the optimizers' step; replaces entries of ``parameters``.
 
         Args:
-            parameters: The parameters by gsplat's names.
+            parameters: The parameters by the names of `Gaussians`, and any other of the same length.
             optimizers: One optimizer per parameter, each with one group.
             step: Number of steps before this one.
             means2d: Projected centers ``[N, 2]`` in pixels with their ``grad``.
@@ -173,36 +107,28 @@ class DensityControl:
         Returns:
             Whether the set of Gaussians changed.
         """
-        with self._own_randomness(), _operators_for(self._device):
-            if self._mcmc is not None:
-                self._mcmc.step_post_backward(
-                    parameters, optimizers, self._state, step, {}, lr=means_learning_rate
-                )
-                return self.refines_at(step)
-            return self._default_step(parameters, optimizers, step, means2d, radii, image_size)
-
-    def _default_step(
-        self,
-        parameters: dict[str, torch.nn.Parameter],
-        optimizers: dict[str, torch.optim.Optimizer],
-        step: int,
-        means2d: Tensor,
-        radii: Tensor,
-        image_size: tuple[int, int],
-    ) -> bool:
-        from gsplat.strategy import ops
-
-        if step >= self.config.schedule.stop or self._default is None:
-            return False
-        self._accumulate(means2d, radii, image_size)
         changed = self.refines_at(step)
-        if changed:
-            # gsplat accumulates and refines in one call; shown no visible Gaussian, it only refines.
-            self._default.grow_grad2d = self._threshold_within_cap(len(parameters["means"]))
-            info = _nothing_visible(len(means2d), self._device)
-            self._default.step_post_backward(parameters, optimizers, self._state, step, info)
-        if self.config.reset_opacities and step > 0 and step % self.config.schedule.reset_every == 0:
-            ops.reset_opa(parameters, optimizers, self._state, value=2.0 * self._default.prune_opa)
+        theirs = {GSPLAT_NAMES.get(name, name): value for name, value in parameters.items()}
+        subjects = theirs, {GSPLAT_NAMES.get(name, name): value for name, value in optimizers.items()}
+        with self._own_randomness(), _operators_for(self._device):
+            if self.config.strategy == "mcmc":
+                # gsplat moves faint Gaussians to others and fails if there are none: such a round is skipped.
+                changed = changed and bool((theirs["opacities"].sigmoid() > self.config.min_opacity).any())
+                self._strategy.step_post_backward(
+                    *subjects, self._state, step if changed else 0, {}, lr=means_learning_rate
+                )
+            elif step < self.schedule.stop:
+                self._accumulate(means2d, radii, image_size)
+                if changed:
+                    # gsplat accumulates and refines in one call; shown no visible Gaussian, it only refines.
+                    self._strategy.grow_grad2d = self._threshold_within_cap(len(means2d))
+                    nothing = _nothing_visible(len(means2d), self._device)
+                    self._strategy.step_post_backward(*subjects, self._state, step, nothing)
+                if self.config.resets_opacities and step > 0 and step % self.schedule.reset_every == 0:
+                    from gsplat.strategy import ops
+
+                    ops.reset_opa(*subjects, self._state, value=2.0 * self.config.min_opacity)
+        parameters.update({name: theirs[GSPLAT_NAMES.get(name, name)] for name in parameters})
         return changed
 
     def _accumulate(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
@@ -219,13 +145,12 @@ class DensityControl:
 
     def refines_at(self, step: int) -> bool:
         """Whether `step` changes the set of Gaussians after ``step`` finished steps."""
-        schedule = self.config.schedule
-        return schedule.start < step < schedule.stop and step % schedule.every == 0
+        return self.schedule.start < step < self.schedule.stop and step % self.schedule.every == 0
 
     def _threshold_within_cap(self, count: int) -> float:
         """The lowest threshold, not below the configured one, that keeps the number within the cap."""
         grow_gradient = self.config.grow_gradient
-        room = max(0, self.config.max_gaussians - count)
+        room = max(0, self._cap - count)
         gradients = self._state["grad2d"] / self._state["count"].clamp_min(1)
         if int((gradients > grow_gradient).sum()) <= room:
             return grow_gradient
@@ -233,12 +158,9 @@ class DensityControl:
 
     def state_tensors(self) -> dict[str, Tensor]:
         """Everything `load_state_tensors` needs to continue bit for bit."""
-        tensors = {"random_state": self._random_state.clone()}
-        if self._default is not None:
-            tensors.update(
-                {k: self._state[k].clone() for k in ("grad2d", "count") if self._state[k] is not None}
-            )
-        return tensors
+        statistics = {name: self._state.get(name) for name in STATISTICS}
+        known = {"random_state": self._random_state, **statistics}
+        return {name: tensor.clone() for name, tensor in known.items() if tensor is not None}
 
     def load_state_tensors(self, tensors: dict[str, Tensor]) -> None:
         """Continue where `state_tensors` was called.
@@ -249,21 +171,28 @@ class DensityControl:
         state = tensors["random_state"]
         if state.dtype != self._random_state.dtype or state.shape != self._random_state.shape:
             raise ValueError("the state of the random generator is invalid")
-        self._random_state = tensors["random_state"].clone().cpu()
-        if self._default is not None:
-            for name in ("grad2d", "count"):
+        self._random_state = state.clone().cpu()
+        if self.config.strategy == "default":
+            for name in STATISTICS:
                 self._state[name] = tensors[name].clone().to(self._device) if name in tensors else None
 
     @contextmanager
     def _own_randomness(self) -> Iterator[None]:
         """Lend our random stream to gsplat, which draws from torch's global generator; restore the global one."""
-        outside = _get_random_state(self._device)
-        _set_random_state(self._device, self._random_state)
+        cuda = self._device.type == "cuda"
+        place = (self._device,) if cuda else ()
+        current, change = (
+            (torch.cuda.get_rng_state, torch.cuda.set_rng_state)
+            if cuda
+            else (torch.get_rng_state, torch.set_rng_state)
+        )
+        outside = current(*place)
+        change(self._random_state, *place)
         try:
             yield
         finally:
-            self._random_state = _get_random_state(self._device)
-            _set_random_state(self._device, outside)
+            self._random_state = current(*place)
+            change(outside, *place)
 
 
 def relocate(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
@@ -325,18 +254,3 @@ def _nothing_visible(count: int, device: torch.device) -> dict[str, Any]:
         "radii": torch.zeros(1, count, 2, device=device),
         **{"width": 1, "height": 1, "n_cameras": 1, "gaussian_ids": None},
     }
-
-
-def _initial_random_state(device: torch.device, seed: int) -> Tensor:
-    return torch.Generator(device=device).manual_seed(seed).get_state()
-
-
-def _get_random_state(device: torch.device) -> Tensor:
-    return torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
-
-
-def _set_random_state(device: torch.device, state: Tensor) -> None:
-    if device.type == "cuda":
-        torch.cuda.set_rng_state(state, device)
-    else:
-        torch.set_rng_state(state)

@@ -11,10 +11,28 @@ from typing import Literal
 
 import torch
 
-from lexsplat.reconstruction.densification import REFERENCE_ITERATIONS
+REFERENCE_ITERATIONS = 30_000
+"""Number of iterations to which all step numbers of 3DGS refer."""
 
 LONG_TRAINING = 15_000
 """Trainings of this length reset opacities and run entirely at full resolution, unless a setting overrides it."""
+
+
+@dataclass(frozen=True)
+class DensitySchedule:
+    """Steps at which density control acts.
+
+    Args:
+        start: Step after which Gaussians are added.
+        stop: Step at which the number of Gaussians becomes final.
+        every: Steps between two rounds.
+        reset_every: Steps between two opacity resets ("default" only).
+    """
+
+    start: int
+    stop: int
+    every: int
+    reset_every: int
 
 
 @dataclass(frozen=True)
@@ -29,12 +47,15 @@ class ReconstructionConfig:
         strategy: Density control: "default" (3DGS) or "mcmc".
         max_gaussians: Upper limit of the number of Gaussians; None is 3,000,000 on CUDA and 40,000 on a CPU.
         densify_every: Steps between two rounds of density control.
-        densify_min_every: Lower limit of the actual steps between two rounds of "default".
-        grow_gradient: Mean gradient of projected centers above which "default" adds Gaussians.
+        densify_min_every: Lower limit of the actual steps between two rounds of "default", so that enough views
+            contribute to each decision.
+        grow_gradient: Mean gradient of projected centers, in halves of the image, above which "default" adds
+            Gaussians.
         min_opacity: Gaussians below this opacity are removed ("default") or moved ("mcmc").
-        reset_opacities: Whether "default" lowers all opacities every 3,000 steps; None enables it from 15,000
+        reset_opacities: Whether "default" lowers all opacities every 3,000 steps to twice ``min_opacity``, and after
+            the first reset removes Gaussians larger than a tenth of the scene; None enables it from 15,000
             iterations on, where the training has time to recover.
-        noise: Strength of the noise of "mcmc".
+        noise: Strength of the noise of "mcmc", times the learning rate of the means.
         opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
         scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as above.
         antialiased: Train and render with the mip filter.
@@ -87,6 +108,8 @@ class ReconstructionConfig:
             raise ValueError(f"iterations must be positive, got {self.iterations}")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians must be positive, got {self.max_gaussians}")
+        if self.strategy not in ("default", "mcmc"):
+            raise ValueError(f'strategy must be "default" or "mcmc", got {self.strategy!r}')
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must be in 0..1, got {self.ssim_weight:g}")
         if not 0 <= self.sh_degree <= 4:
@@ -106,6 +129,25 @@ class ReconstructionConfig:
     def is_long(self) -> bool:
         """Whether the defaults reset opacities and skip the warm-up."""
         return self.iterations >= LONG_TRAINING
+
+    @property
+    def resets_opacities(self) -> bool:
+        """Whether "default" resets opacities."""
+        return self.is_long if self.reset_opacities is None else self.reset_opacities
+
+    @property
+    def density_schedule(self) -> DensitySchedule:
+        """The schedule of 3DGS (or of MCMC) for 30,000 iterations, scaled to ``iterations``."""
+        scale = self.iterations / REFERENCE_ITERATIONS
+        # "mcmc" adds a twentieth per round at random and would never reach its cap in few rounds. Rounds after every
+        # step would leave no step in which the moved Gaussians regain opacity.
+        least, stop = (self.densify_min_every, 15_000) if self.strategy == "default" else (2, 25_000)
+        return DensitySchedule(
+            start=round(500 * scale),
+            stop=round(stop * scale),
+            every=max(1, least, round(self.densify_every * scale)),
+            reset_every=max(1, round(3_000 * scale)),
+        )
 
     @property
     def warm_up_iterations(self) -> int:

@@ -8,13 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
-from lexsplat.reconstruction.densification import (
-    REFERENCE_ITERATIONS,
-    DensityConfig,
-    DensityControl,
-    density_schedule,
-)
+from lexsplat.geometry.gaussians import TENSORS, Gaussians, gaussians_from_points
+from lexsplat.reconstruction.densification import STATISTICS, DensityControl
 from lexsplat.reconstruction.exposures import Exposures
 from lexsplat.reconstruction.optimizers import (
     adam,
@@ -23,7 +18,7 @@ from lexsplat.reconstruction.optimizers import (
     optimizer_tensors,
     with_prefix,
 )
-from lexsplat.reconstruction.settings import ReconstructionConfig
+from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, ReconstructionConfig
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Listener, silent
@@ -41,15 +36,6 @@ EVENT_EVERY = 10
 """Iterations between two events."""
 PHOTO_BYTES_MAX = 1 << 30
 """Upper limit of the memory for cached photos, whatever the budget."""
-GSPLAT_NAMES = {
-    "means": "means",
-    "quats": "quats",
-    "log_scales": "scales",
-    "opacity_logits": "opacities",
-    "sh0": "sh0",
-    "shN": "shN",
-}
-"""Names of the parameters here, and the names that gsplat's strategies expect."""
 
 
 class Reconstructor:
@@ -68,7 +54,7 @@ class Reconstructor:
         TrainingError: If there is no training view or no point.
     """
 
-    parameter_prefixes = ("parameters/", "exposures/")
+    parameter_prefixes: tuple[str, ...] = ("parameters/", "exposures/")
 
     def __init__(
         self,
@@ -108,23 +94,7 @@ class Reconstructor:
         self._exposures = None
         if config.exposure:
             self._exposures = Exposures(len(self._names), config.exposure_rate, self.device)
-        schedule = density_schedule(
-            config.strategy,
-            config.iterations,
-            every=config.densify_every,
-            minimum_every=config.densify_min_every,
-        )
-        rules = DensityConfig(
-            strategy=config.strategy,
-            schedule=schedule,
-            extent=self._extent,
-            max_gaussians=config.cap(self.device),
-            grow_gradient=config.grow_gradient,
-            min_opacity=config.min_opacity,
-            reset_opacities=config.is_long if config.reset_opacities is None else config.reset_opacities,
-            noise=config.noise,
-        )
-        self._density = DensityControl(rules, seed=seed, device=self.device)
+        self._density = DensityControl(config, self._extent, seed=seed, device=self.device)
         self._images: TrainingImages | None = None
         self._images_shrink = 0.0
         self.last_view = ""
@@ -153,7 +123,7 @@ class Reconstructor:
     def rate_factor(self, factor: float) -> None:
         self._rate_factor = factor
         for name, rate in self._rates().items():
-            self._optimizers[GSPLAT_NAMES[name]].param_groups[0]["lr"] = rate
+            self._optimizers[name].param_groups[0]["lr"] = rate
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -180,7 +150,7 @@ class Reconstructor:
         """Run one iteration on one view.
 
         Returns:
-            The loss; 0 where it was not read from the GPU (`_reads_loss`).
+            The loss; 0 where it was not read from the GPU (`reads_loss`).
 
         Raises:
             TrainingError: If the loss is not finite, the images diverge, or no Gaussian is left.
@@ -203,7 +173,7 @@ class Reconstructor:
             image = torch.where(valid[..., None], image, target.image)
         loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularization()
         loss.backward()
-        value = loss.item() if self._reads_loss() else 0.0
+        value = loss.item() if self.reads_loss(self.steps_done + 1) else 0.0
         if not math.isfinite(value):
             raise TrainingError(
                 "reconstruction",
@@ -238,7 +208,7 @@ class Reconstructor:
             self._optimizers["origins"] = adam(self._parameters["origins"], 0.0)
         self._density.step(
             self._parameters,
-            self._optimizers,  # type: ignore[arg-type]
+            self._optimizers,
             self.steps_done,
             means2d=means2d,
             radii=radii,
@@ -260,9 +230,9 @@ class Reconstructor:
             "views/order": self._order.clone(),
             "views/generator": self._generator.get_state(),
         }
-        for ours, theirs in GSPLAT_NAMES.items():
-            tensors[f"parameters/{ours}"] = self._parameters[theirs].detach().clone()
-            tensors.update(with_prefix(f"optimizers/{ours}/", optimizer_tensors(self._optimizers[theirs])))
+        for name, parameter in self._parameters.items():
+            tensors[f"parameters/{name}"] = parameter.detach().clone()
+            tensors.update(with_prefix(f"optimizers/{name}/", optimizer_tensors(self._optimizers[name])))
         tensors.update(with_prefix("density/", self._density.state_tensors()))
         if self._exposures is not None:
             tensors.update(with_prefix("exposures/", self._exposures.state_tensors()))
@@ -270,14 +240,8 @@ class Reconstructor:
 
     def find_invalid(self) -> str:
         """The first defect of the parameters, such as "NaN or Inf in means"; empty if there is none."""
-        invalid = self.gaussians().find_invalid()
-        if (
-            not invalid
-            and self._exposures is not None
-            and not bool(self._exposures.matrices.isfinite().all())
-        ):
-            return "NaN or Inf in the exposures"
-        return invalid
+        finite = self._exposures is None or bool(self._exposures.matrices.isfinite().all())
+        return self.gaussians().find_invalid() or ("" if finite else "NaN or Inf in the exposures")
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Continue where `state_dict` was called; capture, settings and device must be the same.
@@ -292,13 +256,11 @@ class Reconstructor:
         self._rate_factor = float(tensors.get("rate_factor", 1.0))
         self._order = tensors["views/order"].clone()
         self._generator.set_state(tensors["views/generator"])
-        for ours, theirs in GSPLAT_NAMES.items():
-            value = parameters[ours].to(self.device, copy=True)
-            self._parameters[theirs] = torch.nn.Parameter(value)
+        for name in TENSORS:
+            self._parameters[name] = torch.nn.Parameter(parameters[name].to(self.device, copy=True))
         self._optimizers = self._new_optimizers()
-        for ours, theirs in GSPLAT_NAMES.items():
-            state = below_prefix(f"optimizers/{ours}/", tensors)
-            load_optimizer_tensors(self._optimizers[theirs], state)
+        for name, optimizer in self._optimizers.items():
+            load_optimizer_tensors(optimizer, below_prefix(f"optimizers/{name}/", tensors))
         self._density.load_state_tensors(below_prefix("density/", tensors))
         if self._exposures is not None:
             self._exposures.load_state_tensors(below_prefix("exposures/", tensors))
@@ -320,19 +282,16 @@ class Reconstructor:
             opacity=self.config.initial_opacity,
             device=self.device,
         )
-        tensors = gaussians.tensors()
-        return {theirs: torch.nn.Parameter(tensors[ours]) for ours, theirs in GSPLAT_NAMES.items()}
+        return {name: torch.nn.Parameter(value) for name, value in gaussians.tensors().items()}
 
     def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
-        rates = self._rates()
-        return {theirs: adam(self._parameters[theirs], rates[ours]) for ours, theirs in GSPLAT_NAMES.items()}
+        return {name: adam(self._parameters[name], rate) for name, rate in self._rates().items()}
 
     def _rates(self) -> dict[str, float]:
         return {name: rate * self._rate_factor for name, rate in self.config.rates(self._extent).items()}
 
     def _as_gaussians(self) -> Gaussians:
-        tensors = {ours: self._parameters[theirs] for ours, theirs in GSPLAT_NAMES.items()}
-        return Gaussians(**tensors, antialiased=self.config.antialiased)
+        return Gaussians(**self._parameters, antialiased=self.config.antialiased)
 
     def _active_sh_degree(self) -> int:
         every = self.config.sh_degree_every * self.config.iterations / REFERENCE_ITERATIONS
@@ -366,14 +325,13 @@ class Reconstructor:
         opacity_weight, scale_weight = self.config.regularizers
         total: Tensor | float = 0.0
         if opacity_weight > 0:
-            total = total + opacity_weight * self._parameters["opacities"].sigmoid().mean()
+            total = total + opacity_weight * self._parameters["opacity_logits"].sigmoid().mean()
         if scale_weight > 0:
-            total = total + scale_weight * self._parameters["scales"].exp().mean() / self._extent
+            total = total + scale_weight * self._parameters["log_scales"].exp().mean() / self._extent
         return total
 
-    def _reads_loss(self) -> bool:
-        """Whether this step reads its loss: always on a CPU, every few steps on CUDA, where reading synchronizes."""
-        done = self.steps_done + 1
+    def reads_loss(self, done: int) -> bool:
+        """Whether step ``done`` reads its loss: always on a CPU, every few steps on CUDA, where reading waits."""
         return self.device.type == "cpu" or done % EVENT_EVERY == 0 or done == self.config.iterations
 
     def _update_errors(self, image: Tensor, target: Tensor) -> None:
@@ -382,7 +340,7 @@ class Reconstructor:
         Raises:
             TrainingError: If the renderings are much worse than the background, which means divergence.
         """
-        if not self._reads_loss():
+        if not self.reads_loss(self.steps_done + 1):
             return
         errors = torch.mean((image.detach() - target) ** 2), torch.mean((self._background - target) ** 2)
         olds = self._recent_error, self._background_error
@@ -421,16 +379,16 @@ def check_state(tensors: dict[str, Tensor], views: int, iterations: int) -> dict
         ValueError: If an entry is missing or does not fit the others.
     """
     expected = {"steps_done", "recent_error", "views/order", "views/generator", "density/random_state"}
-    missing = (expected | {f"parameters/{name}" for name in GSPLAT_NAMES}) - tensors.keys()
+    missing = (expected | {f"parameters/{name}" for name in TENSORS}) - tensors.keys()
     if missing:
         raise ValueError(f"checkpoint lacks {', '.join(sorted(missing))}")
-    parameters = {name: tensors[f"parameters/{name}"] for name in GSPLAT_NAMES}
+    parameters = {name: tensors[f"parameters/{name}"] for name in TENSORS}
     Gaussians(**parameters, antialiased=False)  # raises if the shapes are inconsistent
     if sorted(tensors["views/order"].tolist()) not in ([], list(range(views))):
         raise ValueError("the view order belongs to another capture")
     if any(value.dtype != torch.float32 for value in parameters.values()):
         raise ValueError("parameters must be float32")
-    statistics = [tensors[name] for name in ("density/grad2d", "density/count") if name in tensors]
+    statistics = [tensors[name] for name in (f"density/{name}" for name in STATISTICS) if name in tensors]
     if any(value.shape != parameters["opacity_logits"].shape for value in statistics):
         raise ValueError("the statistics of density control belong to other Gaussians")
     if not 0 <= int(tensors["steps_done"]) <= iterations:

@@ -2,13 +2,12 @@
 
 `render` composites color, features and alpha of one view. Gradients of color and alpha reach the geometry; gradients
 of features reach the features only. `prepare` computes once what depends on geometry and camera alone.
-`back_project` and `accumulate_codes` go the other way, from pixels to Gaussians. The device of the Gaussians decides
+`back_project` goes the other way, from pixels to Gaussians. The device of the Gaussians decides
 the rasterizer: our kernels on a CPU, gsplat on CUDA.
 """
 
 from lexsplat.rendering.back_projection import (
     BACK_PROJECTED_CHANNELS,
-    accumulate_codes,
     accumulate_weights,
     back_project,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "PreparedView",
     "Projection",
     "Rendering",
-    "accumulate_codes",
     "accumulate_weights",
     "back_project",
     "prepare",

@@ -19,7 +19,7 @@ NEAR = 0.01
 
 
 def prepare(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> PreparedView:
-    """Project and sort once, for many calls of `render` or `accumulate_codes` with the same geometry.
+    """Project and sort once, for many calls of `render` or `back_project` with the same geometry.
 
     The result does not follow later changes of the Gaussians and passes no gradients to their geometry.
 
@@ -71,19 +71,15 @@ def render(
         BackendError: If there is no rasterizer for the device.
     """
     module = backends.backend_for(gaussians)
-    count = len(gaussians)
-    if features is not None and (features.ndim != 2 or len(features) != count):
-        raise ValueError(f"features must be [{count}, C], got {list(features.shape)}")
-    if background is not None and background.shape != (3,):
-        raise ValueError(f"background must be [3], got {list(background.shape)}")
+    _check_shapes(len(gaussians), features, background)
+    posed = gaussians
     if viewmat is not None:
         if viewmat.shape != (4, 4) or prepared is not None:
             raise ValueError("viewmat must be [4, 4] and cannot be combined with a prepared view")
         viewmat = viewmat.to(gaussians.means)
-        camera = posing.at_the_origin(camera)
+        camera, posed = replace(camera, viewmat=np.eye(4)), posing.in_camera_frame(gaussians, viewmat)
     if prepared is None:
-        body = gaussians if viewmat is None else posing.in_camera_frame(gaussians, viewmat)
-        projection: Projection = module.project(body, camera, near)
+        projection: Projection = module.project(posed, camera, near)
         pairs = module.find_tiles(projection, camera)
     else:
         check_prepared(prepared, module, gaussians, camera)
@@ -92,26 +88,31 @@ def render(
         projection.means2d.retain_grad()
     colors = None
     if color:
-        stored = gaussians.sh_degree
-        degree = stored if sh_degree is None else max(0, min(sh_degree, stored))
-        if viewmat is None:
-            colors = module.shade(gaussians, camera, projection, degree)
-        else:  # colors depend on directions in the world, and the projection is in camera axes
-            around = posing.around_the_camera(gaussians, viewmat)
-            colors = module.shade(around, camera, replace(projection, means=around.means), degree)
-    extra = features
+        degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
+        shaded, seen = gaussians, projection
+        if (
+            viewmat is not None
+        ):  # colors depend on directions in the world, and the projection is in camera axes
+            shaded = posing.around_the_camera(gaussians, viewmat)
+            seen = replace(projection, means=shaded.means)
+        colors = module.shade(shaded, camera, seen, degree)
     if depth:
         column = projection.depths[:, None]
-        extra = column if features is None else torch.cat([features, column], 1)
-    channels, alpha = module.blend(projection, pairs, colors, extra, background if color else None)
+        features = column if features is None else torch.cat([features, column], 1)
+    channels, alpha = module.blend(projection, pairs, colors, features, background if color else None)
     mean_depth = None
     if depth:
         mean_depth = (channels[..., -1] / alpha.clamp_min(1e-8)).detach()
         channels = channels[..., :-1]
-    radii = projection.radii
-    if radii.ndim == 2:
-        radii = radii.amax(-1)
+    radii = projection.radii if projection.radii.ndim == 1 else projection.radii.amax(-1)
     return Rendering(channels, alpha, projection.means2d, radii, 3 if color else 0, mean_depth)
+
+
+def _check_shapes(count: int, features: Tensor | None, background: Tensor | None) -> None:
+    if features is not None and (features.ndim != 2 or len(features) != count):
+        raise ValueError(f"features must be [{count}, C], got {list(features.shape)}")
+    if background is not None and background.shape != (3,):
+        raise ValueError(f"background must be [3], got {list(background.shape)}")
 
 
 def check_prepared(prepared: PreparedView, module: ModuleType, gaussians: Gaussians, camera: Camera) -> None:

@@ -12,15 +12,13 @@ from torch.autograd.function import once_differentiable
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering.kernels import blending, code_weights, gradients, projection, spherical_harmonics
+from lexsplat.rendering.kernels import blending, gradients, projection, spherical_harmonics
 from lexsplat.rendering.kernels.jit import parallel
 from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs
 from lexsplat.rendering.results import Projection
 
 TILE_GRAIN = 8
 """Tiles per work item of a thread."""
-ENTRY_LIMIT = 1 << 24
-"""Size of the buffer between the two passes of `accumulate_codes`, in float32 numbers (64 MiB)."""
 
 
 def camera_vector(camera: Camera, near: float) -> NDArray[np.float64]:
@@ -187,35 +185,29 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
     """Project every Gaussian; means2d, conics, opacities and means have gradients."""
     g = gaussians
     tensors = (g.means, g.quats, g.log_scales, g.opacity_logits)
-    return Projection(*_Project.apply(*tensors, camera_vector(camera, near), g.antialiased))
+    means2d, conics, opacities, depths, radii, extents, means = _Project.apply(
+        *tensors, camera_vector(camera, near), g.antialiased
+    )
+    return Projection(
+        means2d=means2d,
+        conics=conics,
+        opacities=opacities,
+        depths=depths,
+        radii=radii,
+        extents=extents,
+        means=means,
+    )
 
 
 def find_tiles(projection: Projection, camera: Camera) -> TilePairs:
     """The (tile, Gaussian) pairs of a projection, sorted by depth."""
-    p = projection
-    return find_pairs(
-        _array(p.means2d),
-        _array(p.conics),
-        _array(p.opacities),
-        _array(_present(p.extents)),
-        _array(p.depths),
-        _array(p.radii),
-        camera.width,
-        camera.height,
-    )
+    return find_pairs(projection, camera.width, camera.height)
 
 
 def shade(gaussians: Gaussians, camera: Camera, projection: Projection, degree: int) -> Tensor:
     """RGB ``[N, 3]`` of the visible Gaussians as seen from the camera: max(0, SH + 0.5)."""
     eye = np.ascontiguousarray(camera.position)
-    means = _present(projection.means)
-    return _Shade.apply(means, gaussians.sh0, gaussians.shN, projection.radii, eye, degree)
-
-
-def _present(tensor: Tensor | None) -> Tensor:
-    if tensor is None:
-        raise ValueError("the projection was made by another backend")
-    return tensor
+    return _Shade.apply(projection.means, gaussians.sh0, gaussians.shN, projection.radii, eye, degree)
 
 
 def blend(
@@ -239,37 +231,3 @@ def blend(
     """
     p = projection
     return _Blend.apply(p.means2d, p.conics, p.opacities, colors, features, background, pairs)
-
-
-def accumulate_codes(
-    projection: Projection, pairs: TilePairs, codes: NDArray[np.int32], num_codes: int, totals: Tensor
-) -> None:
-    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``; negative codes are ignored."""
-    tiles = pairs.tiles
-    local = np.empty_like(codes)
-    listed = np.empty((tiles, min(num_codes, blending.PIXELS)), np.int32)
-    counts = np.empty(tiles, np.int64)
-    parallel(
-        code_weights.list_codes, tiles, 4 * TILE_GRAIN,
-        codes, num_codes, pairs.tiles_x, local, listed, counts,
-    )  # fmt: skip
-    sizes = np.diff(pairs.tile_offsets) * counts
-    ends = np.cumsum(sizes)
-    lists = pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members
-    parts = max(1, torch.get_num_threads())
-    first = 0
-    while first < tiles:
-        base = int(ends[first] - sizes[first])
-        last = max(first + 1, int(np.searchsorted(ends, base + ENTRY_LIMIT, side="right")))
-        entries = np.zeros(int(ends[last - 1]) - base, np.float32)
-        offsets = ends[first:last] - sizes[first:last] - base
-        parallel(
-            code_weights.weigh_codes, last - first, TILE_GRAIN,
-            first, *lists, pairs.tiles_x, local, counts, offsets, entries,
-        )  # fmt: skip
-        parallel(
-            code_weights.scatter_codes, parts, 1,
-            parts, first, last, pairs.order, pairs.tile_offsets, pairs.members, listed, counts, entries,
-            totals.numpy(),
-        )  # fmt: skip
-        first = last

@@ -23,7 +23,7 @@ from lexsplat.runtime.errors import BackendError
 
 TILE = 16
 CHANNELS = 32
-"""Channels blended, and codes accumulated, at a time. This bounds memory to [N, 32] and [H, W, 32]. In the backward
+"""Channels blended at a time. This bounds memory to [N, 32] and [H, W, 32]. In the backward
 pass gsplat keeps the colors of 256 Gaussians in a block's shared memory; 64 channels do not fit on small cards."""
 CAMERAS = 4096
 """Number of camera matrices cached on the device, so that rendering a view again needs no copy."""
@@ -51,11 +51,18 @@ class TileLists:
         return sum(t.numel() * t.element_size() for t in (self.offsets, self.members))
 
 
-def _require_gsplat() -> None:
+def require_gsplat() -> None:
+    """Load gsplat with its CUDA extension.
+
+    Raises:
+        BackendError: If it is not installed, or has no extension and no compiler to build it with.
+    """
     try:
         import gsplat  # noqa: F401
     except ImportError as error:
-        raise BackendError("gsplat", found=str(error), remedy="pip install gsplat==1.5.3") from error
+        raise BackendError(
+            "gsplat", found=str(error), remedy="run: pip install gsplat==1.5.3; or use --device cpu"
+        ) from error
     found = "an installation without one"
     # The import may compile the extension and print to standard output, which carries our JSON.
     first = "gsplat.cuda._backend" not in sys.modules
@@ -69,7 +76,8 @@ def _require_gsplat() -> None:
             "gsplat",
             expected="its CUDA extension",
             found=found,
-            remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH",
+            remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH, or "
+            "rasterize on the CPU: --device cpu --encoder-device cuda",
         )
 
 
@@ -87,14 +95,17 @@ def _cached(content: bytes, shape: tuple[int, ...], device: torch.device) -> Ten
 
 def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
     """Project every Gaussian; means2d, conics and opacities have gradients."""
-    _require_gsplat()
+    require_gsplat()
     from gsplat.cuda._wrapper import fully_fused_projection
 
     g = gaussians
     opacities = g.opacities
     if len(g) == 0:  # gsplat divides by the number of Gaussians, which kills the process
         none = g.means.new_zeros(0, 2).int()
-        return Projection(g.means[:, :2], g.means, opacities, g.means[:, 2].detach(), none)
+        depths = g.means[:, 2].detach()
+        return Projection(
+            means2d=g.means[:, :2], conics=g.means, opacities=opacities, depths=depths, radii=none
+        )
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         g.means, None, g.quats, g.scales,
         _matrix(camera.viewmat, g.device), _matrix(camera.K, g.device), camera.width, camera.height,
@@ -102,7 +113,9 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
     )  # fmt: skip
     if compensations is not None:
         opacities = opacities * compensations[0]
-    return Projection(means2d[0], conics[0], opacities, depths[0].detach(), radii[0])
+    return Projection(
+        means2d=means2d[0], conics=conics[0], opacities=opacities, depths=depths[0].detach(), radii=radii[0]
+    )
 
 
 def find_tiles(projection: Projection, camera: Camera) -> TileLists:
@@ -158,7 +171,7 @@ def blend(
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Channels ``[H, W, C]`` and alpha ``[H, W]``: a color pass, then a feature pass over detached geometry."""
-    geometry = _geometry(projection)
+    geometry = projection.means2d, projection.conics, projection.opacities
     detached = tuple(t.detach() for t in geometry)
     alone = not any(t.requires_grad for t in geometry)
     images = []
@@ -176,30 +189,3 @@ def blend(
     if not images:
         return alpha.new_empty(pairs.height, pairs.width, 0), alpha
     return (images[0] if len(images) == 1 else torch.cat(images, -1)), alpha
-
-
-def _geometry(projection: Projection) -> tuple[Tensor, Tensor, Tensor]:
-    return projection.means2d, projection.conics, projection.opacities
-
-
-def accumulate_codes(
-    projection: Projection, pairs: TileLists, codes: NDArray[np.int32], num_codes: int, totals: Tensor
-) -> None:
-    """Add the weight of each Gaussian at the pixels of each code to ``totals [N, K]``.
-
-    The weights are the gradient of rendered features under one-hot codes, computed a few channels at a time.
-    """
-    detached = tuple(t.detach() for t in _geometry(projection))
-    wanted = torch.as_tensor(codes, device=totals.device).long()
-    for first in range(0, num_codes, CHANNELS):
-        channels = min(CHANNELS, num_codes - first)
-        inside = (wanted >= first) & (wanted < first + channels)
-        if not bool(inside.any()):
-            continue
-        one_hot = torch.zeros(*codes.shape, channels, device=totals.device)
-        one_hot.scatter_(2, (wanted - first).clamp(0, channels - 1)[..., None], inside[..., None].float())
-        with torch.enable_grad():
-            features = torch.zeros(len(totals), channels, device=totals.device, requires_grad=True)
-            image, _ = _rasterize(detached, pairs, features, None)
-            (gradient,) = torch.autograd.grad(image, features, one_hot)
-        totals[:, first : first + channels] += gradient

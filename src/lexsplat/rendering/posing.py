@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from torch import Tensor
 
-from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import differentiable_quaternion, multiply_quaternions
 
@@ -36,8 +34,3 @@ def around_the_camera(gaussians: Gaussians, viewmat: Tensor) -> Gaussians:
     """The Gaussians in world axes with the camera's center at the origin, as shading needs them."""
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
     return replace(gaussians, means=gaussians.means - center)
-
-
-def at_the_origin(camera: Camera) -> Camera:
-    """The same intrinsics with the identity as pose."""
-    return replace(camera, viewmat=np.eye(4))

@@ -63,7 +63,7 @@ class PreparedView:
         return self.projection.nbytes + int(self.pairs.nbytes)
 
 
-@dataclass
+@dataclass(repr=False)
 class Rendering:
     """One rendered view.
 
@@ -83,6 +83,10 @@ class Rendering:
     radii: Tensor
     color_channels: int
     depth: Tensor | None = None
+
+    def __repr__(self) -> str:
+        height, width, count = self.channels.shape
+        return f"Rendering({width}x{height}, {count} channels, {len(self.radii):,} Gaussians)"
 
     @property
     def image(self) -> Tensor:

@@ -36,38 +36,26 @@ KEEP_EVERY = {"cpu": 100, "cuda": 1000}
 class Training(Protocol):
     """A training that can be stepped, and whose whole state is named tensors."""
 
-    @property
-    def parameter_prefixes(self) -> tuple[str, ...]:
-        """Prefixes of the entries of `state_dict` that must be finite; running means, for example, may be unset."""
-        ...
+    parameter_prefixes: tuple[str, ...]
+    """Prefixes of the entries of `state_dict` that must be finite; running means, for example, may be unset."""
+    rate_factor: float
+    """Factor of all learning rates; part of the state."""
 
     @property
     def device(self) -> torch.device:
         """Where the training runs."""
-        ...
 
     @property
     def steps_done(self) -> int:
         """Number of finished steps."""
-        ...
 
     @property
     def total_steps(self) -> int:
         """Number of steps of the whole training."""
-        ...
 
     @property
     def metrics(self) -> Mapping[str, float]:
         """Numbers to show with the progress; read only when an event is sent."""
-        ...
-
-    @property
-    def rate_factor(self) -> float:
-        """Factor of all learning rates; part of the state."""
-        ...
-
-    @rate_factor.setter
-    def rate_factor(self, factor: float) -> None: ...
 
     def step(self) -> Any:
         """Run one step.
@@ -75,11 +63,9 @@ class Training(Protocol):
         Raises:
             TrainingError: If the training has diverged.
         """
-        ...
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of everything needed to continue."""
-        ...
 
     def load_state_dict(self, state: dict[str, Tensor], /) -> None:
         """Continue from a state.
@@ -87,11 +73,9 @@ class Training(Protocol):
         Raises:
             ValueError: If the state does not fit.
         """
-        ...
 
     def find_invalid(self) -> str:
         """The first defect of the parameters, such as "NaN or Inf in means"; empty if there is none."""
-        ...
 
 
 def run_training(
@@ -160,8 +144,7 @@ class Checkpoint:
             state, metadata = read_tensors(self.path)
             if metadata.get("fingerprint") != self.fingerprint:
                 return False
-            invalid = _find_not_finite(state, training.parameter_prefixes)
-            if invalid:
+            if invalid := _find_not_finite(state, training.parameter_prefixes):
                 raise ValueError(f"NaN or infinity in {invalid}")
             seconds = float(metadata.get("seconds", 0.0))
             if not 0 <= seconds < 1e9:
@@ -195,8 +178,7 @@ class Checkpoint:
         """
         start = time.perf_counter()
         state = training.state_dict()
-        invalid = _find_not_finite(state, training.parameter_prefixes)
-        if invalid:
+        if invalid := _find_not_finite(state, training.parameter_prefixes):
             raise TrainingError(
                 "training",
                 expected="finite numbers",
@@ -270,8 +252,7 @@ class DivergenceGuard:
         self._steps += 1
         if not finished and self._steps - self._kept_at < self._every:
             return
-        invalid = self._training.find_invalid()
-        if invalid:
+        if invalid := self._training.find_invalid():
             raise TrainingError(
                 self._name, expected="finite numbers", found=invalid, remedy="lower the learning rates"
             )
@@ -312,11 +293,7 @@ def _on_host(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _find_not_finite(state: Mapping[str, Tensor], prefixes: tuple[str, ...]) -> str:
     """Name of the first tensor below one of ``prefixes`` that holds NaN or infinity; empty if there is none."""
-    for name, tensor in state.items():
-        if (
-            name.startswith(prefixes)
-            and tensor.is_floating_point()
-            and not bool(torch.isfinite(tensor).all())
-        ):
-            return name
-    return ""
+    floats = (
+        name for name, tensor in state.items() if name.startswith(prefixes) and tensor.is_floating_point()
+    )
+    return next((name for name in floats if not bool(torch.isfinite(state[name]).all())), "")

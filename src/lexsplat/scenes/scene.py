@@ -10,6 +10,7 @@ apple = scene.find("red apple left of the mug")  # a Selection: instances, boxes
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,29 +23,37 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
-from lexsplat.queries.phrases import parse, things_of
+from lexsplat.queries.everyday import EverydayScale, everyday_words
+from lexsplat.queries.phrases import Understood
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
-from lexsplat.queries.relations import answer
+from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,
+    TextEncoder,
     check_prompts,
     embed_prompts,
     gaussian_relevancy,
     render_relevancy,
 )
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.thresholds import check_threshold, scene_thresholds
+from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
+from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
-from lexsplat.runtime.errors import ModelError, QueryError
-from lexsplat.scenes.answers import Answers
+from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
+from lexsplat.scenes.answers import Answers, Word
+from lexsplat.scenes.finding import find_in, named_objects, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.reading import read_scene
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import ImageTextEncoder
+
+_KEPT_BYTES = 128 << 20
+"""Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
+_KEPT_TEXTS = 4096
+"""Number of text embeddings and of parsed phrases that are kept."""
 
 
 class Scene:
@@ -53,6 +62,8 @@ class Scene:
     Wherever a list of prompts is expected, a single text is one prompt. Wherever a view is expected, the name of a
     view (with or without suffix), a `StoredView` or any `Camera` will do.
 
+    A scene keeps what it has computed for a word (bounded), and may be asked by many threads at once.
+
     Args:
         gaussians: Geometry and appearance.
         field: Their language.
@@ -60,6 +71,7 @@ class Scene:
         clip: Name or folder of the text encoder that belongs to the language.
         query: How text is compared with the scene.
         folder: The folder that the scene was opened from, if any.
+        encode_text: Texts to embeddings, in place of the encoder that ``clip`` names.
     """
 
     def __init__(
@@ -70,13 +82,17 @@ class Scene:
         clip: str,
         query: QueryConfig | None = None,
         folder: SceneFolder | None = None,
+        encode_text: TextEncoder | None = None,
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.folder = clip, folder
+        self._working = threading.RLock()
+        """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
+        self._given_encode_text = encode_text
         self._encoder: ImageTextEncoder | None = None
         self._cache: TextCache | None = None
-        self._texts: dict[str, Tensor] = {}
+        self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
 
     def __repr__(self) -> str:
@@ -92,11 +108,18 @@ class Scene:
     def query(self, query: QueryConfig) -> None:
         self._query = query
         self._classifier: PresenceClassifier | None = None
-        self._thresholds: dict[str, float] = {}
+        self._scale: EverydayScale | None = None
+        self._objects: tuple[Selection, ...] | None = None
+        kept = max(32, min(1024, _KEPT_BYTES // (5 * max(1, len(self.gaussians)))))
+        self._words: Bounded[str, Word] = Bounded(kept)
+        self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
+        self._understood: Bounded[str, Understood] = Bounded(_KEPT_TEXTS)
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
-        other = Scene(gaussians, field, self.views, self.clip, self.query, self.folder)
+        other = Scene(
+            gaussians, field, self.views, self.clip, self.query, self.folder, self._given_encode_text
+        )
         other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
         return other
 
@@ -110,10 +133,13 @@ class Scene:
             ModelError: If the text encoder cannot be loaded.
         """
         prompts = check_prompts(prompts)
-        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._texts]
+        found = {prompt: self._texts.get(prompt) for prompt in dict.fromkeys(prompts)}
+        new = [prompt for prompt, vector in found.items() if vector is None]
         if new:  # in one call, so that the cache on disk is written once
-            self._texts.update(zip(new, embed_prompts(new, self.encode_text, self.query.templates)))
-        return torch.stack([self._texts[prompt] for prompt in prompts])
+            with self._working:
+                vectors = embed_prompts(new, self.encode_text, self.query.templates)
+            found.update((prompt, self._texts.put(prompt, vector)) for prompt, vector in zip(new, vectors))
+        return torch.stack([vector for prompt in prompts if (vector := found[prompt]) is not None])
 
     def encode_text(self, texts: list[str]) -> Tensor:
         """Embeddings ``[T, D]`` of whole sentences, from the encoder that belongs to the language.
@@ -123,12 +149,14 @@ class Scene:
         Raises:
             ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
         """
+        if self._given_encode_text is not None:
+            return self._given_encode_text(texts)
         known = self._encoder_hash
-        writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
-        if self.folder is None or known is None or not writable:
+        if self.folder is None or known is None:
             return encode_each(self._load_encoder(known), texts)
         if self._cache is None:
-            self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
+            writable = not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
+            self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     def encode_batch(self, texts: list[str]) -> Tensor:
@@ -137,7 +165,7 @@ class Scene:
         Raises:
             ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
         """
-        return self.encoder.encode_text(texts)
+        return (self._given_encode_text or self.encoder.encode_text)(texts)
 
     @property
     def encoder(self) -> ImageTextEncoder:
@@ -179,8 +207,17 @@ class Scene:
             )
         return self._encoder
 
-    def _question(self, prompts: str | Sequence[str]) -> Question:
-        return Question(self.embed(prompts), self.embed(self.query.negatives), self.query)
+    def question(self, prompts: str | Sequence[str]) -> Question:
+        """The embedded prompts with what they are compared with."""
+        scale = self.everyday_scale if self.query.everyday else None
+        return Question(self.embed(prompts), self.embed(self.query.compared), self.query, scale)
+
+    @property
+    def everyday_scale(self) -> EverydayScale:
+        """What everyday words reach in the scene; made at first use."""
+        if self._scale is None:
+            self._scale = EverydayScale.of(self.field.codebook.clip, self.embed(everyday_words()))
+        return self._scale
 
     # -- answers
 
@@ -198,14 +235,26 @@ class Scene:
         """
         prompts = check_prompts(prompts)
         given = None if threshold is None else check_threshold(threshold)
-        question = self._question(prompts)
-        scores = gaussian_relevancy(self.field, question)
-        presences = tuple(self.presence_classifier.classify(row) for row in scores)
-        if given is None:
-            thresholds = self._automatic_thresholds(prompts, question, presences)
-        else:
-            thresholds = torch.full((len(prompts),), given)
-        return Answers(tuple(prompts), scores, thresholds, presences, self, automatic=given is None)
+        words_of = self._words  # another query replaces it
+        found = {prompt: words_of.get(prompt) for prompt in dict.fromkeys(prompts)}
+        new = [prompt for prompt, word in found.items() if word is None]
+        if new:
+            with self._working:
+                made = zip(new, self._new_words(new))
+                found.update((prompt, words_of.put(prompt, word)) for prompt, word in made)
+        words = [word for prompt in prompts if (word := found[prompt]) is not None]
+        presences = tuple(word.presence for word in words)
+        scores = torch.stack([word.scores for word in words])
+        if given is not None:
+            return Answers(
+                tuple(prompts), scores, torch.full((len(words),), given), presences, self, automatic=False
+            )
+        unknown = {prompt: word for prompt, word in zip(prompts, words) if word.threshold is None}
+        if unknown:
+            with self._working:
+                self._find_thresholds(unknown)
+        limits = torch.tensor([word.threshold for word in words])
+        return Answers(tuple(prompts), scores, limits, presences, self, words=tuple(words))
 
     def relevancy(self, prompts: str | Sequence[str], view: str | StoredView | Camera) -> Tensor:
         """Relevancy maps ``[P, H, W]`` of the prompts in a view, in 0..1.
@@ -214,11 +263,11 @@ class Scene:
             QueryError: If a prompt is empty or the view is unknown.
         """
         camera = self.camera(view)
-        return render_relevancy(self.field, self.gaussians, camera, self._question(prompts))
+        return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        return gaussian_relevancy(self.field, self._question(prompts))
+        return gaussian_relevancy(self.field, self.question(prompts))
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
@@ -246,7 +295,7 @@ class Scene:
     ) -> Selection:
         """The Gaussians that match a phrase with relations, such as "mug on the cloth".
 
-        `lexsplat.queries.phrases` describes the grammar.
+        `lexsplat.queries.grammar` describes the grammar.
 
         Args:
             phrase: What to look for.
@@ -256,57 +305,78 @@ class Scene:
         Raises:
             QueryError: If a part of the phrase is empty, the view is unknown, or the threshold is not in 0..1.
         """
-        parsed = parse(_one_phrase(phrase))
-        chosen = None if view is None else self.camera(view)
-        things = things_of(parsed)
-        answers = self.ask(things, threshold)
+        understood = self.understand(phrase)
+        camera = None if view is None else self.camera(view)
+        if isinstance(view, Camera):
+            return find_in(self, understood, camera, threshold)
+        name = view.name if isinstance(view, StoredView) else view
+        key = (str(understood.phrase), name, threshold)
+        return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
-        def viewer(reference: Selection) -> Camera | None:
-            return chosen or self.cameras.get(reference.best_view)
+    def understand(self, phrase: str) -> Understood:
+        """How `find` understands a phrase; its typing errors are mended where the scene holds what is meant.
 
-        return answer(parsed, lambda text: answers.selection(things.index(text)), viewer)
+        Raises:
+            QueryError: If a part of the phrase is empty.
+        """
+        text = _one_phrase(phrase)
+        return self._understood.get_or_make(text, lambda: understood_in(self, text))
 
-    def click(
-        self, view: str | StoredView | Camera, x: float, y: float, *, similarity: float | None = None
-    ) -> Selection:
+    @property
+    def objects(self) -> tuple[Selection, ...]:
+        """The things of the everyday vocabulary that the scene holds, each with its name in ``phrase``."""
+        if self._objects is None:
+            with self._working:
+                self._objects = self._objects or named_objects(self)
+        return self._objects
+
+    def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
         """The surface at a pixel, and what is connected to it and means the same.
 
         Args:
             view: The view that was clicked.
             x: Pixels from the left; the first pixel's center is 0.5.
             y: Pixels from the top.
-            similarity: Smallest similarity in language, in 0..1; None derives it from the scene.
 
         Raises:
             QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
         hit = surface_at(self.gaussians, self.camera(view), x, y)
-        return select_hit(hit, self.gaussians, self.field, self.cameras, similarity, self.world)
+        return select_hit(hit, self.gaussians, self.field, self.cameras, self.world)
 
     @property
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            references = self._question(REFERENCE_PHRASES)
-            self._classifier = PresenceClassifier(self.gaussians, self.field, references)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale)
         return self._classifier
 
-    def _automatic_thresholds(
-        self, prompts: Sequence[str], question: Question, presences: Sequence[Presence]
-    ) -> Tensor:
-        """The threshold ``[P]`` of each prompt; known ones are not computed again."""
-        new = [place for place, prompt in enumerate(prompts) if prompt not in self._thresholds]
-        if new:
-            asked = Question(question.positives[new], question.negatives, question.config)
+    def _new_words(self, prompts: list[str]) -> list[Word]:
+        """Scores and presence of prompts that were not asked before."""
+        question = self.question(prompts)
+        scores = gaussian_relevancy(self.field, question)
+        presences = self.presence_classifier.classify(question.positives, scores)
+        # Copies: a row would keep the scores of all prompts asked with it.
+        return [Word(row.clone(), presence) for row, presence in zip(scores, presences)]
+
+    def _find_thresholds(self, words: Mapping[str, Word]) -> None:
+        """The automatic thresholds of words, from one rendering of the training views.
+
+        Relative to everyday words, a relevancy of 0.5 is the border itself.
+        """
+        question = self.question(list(words))
+        if question.scale is not None:
+            found = [BORDER] * len(words)
+        else:
             views = list(self.views.values())
             training = [view.camera for view in views if view.split == "train"]
             found = scene_thresholds(
-                lambda camera: render_relevancy(self.field, self.gaussians, camera, asked),
+                lambda camera: render_relevancy(self.field, self.gaussians, camera, question),
                 training or [view.camera for view in views],
-                [presences[place] for place in new],
-            )
-            self._thresholds.update(zip((prompts[place] for place in new), found.tolist()))
-        return torch.tensor([self._thresholds[prompt] for prompt in prompts])
+                [word.presence for word in words.values()],
+            ).tolist()
+        for word, threshold in zip(words.values(), found):
+            word.threshold = threshold
 
     # -- views
 
@@ -396,6 +466,10 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         ValueError: If the device is not one of the three.
     """
     place = choose_device(device)
+    if not isinstance(path, (str, os.PathLike)):
+        raise SceneFolderError(
+            repr(path)[:60], expected="the path of a scene folder", found=type(path).__name__
+        )
     found = read_scene(Path(path), place)
     clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
     return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder)

@@ -16,17 +16,17 @@ import torch
 from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.grammar import parse
 from lexsplat.queries.heatmaps import overlay_mask
-from lexsplat.queries.phrases import Thing, parse
+from lexsplat.queries.phrases import Thing
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
-from lexsplat.queries.relevancy import Question as TextQuestion
+from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import check_prompts, probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
-from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.exporting import export_gaussians
 from lexsplat.scenes.scene import Scene
@@ -37,9 +37,6 @@ from lexsplat.viewer.vocabulary import MAX_LENGTH
 MAX_QUESTIONS = len(PROMPT_COLORS)
 CLICKED_COLOR = (0, 168, 150)
 EXPORT_ENDINGS = (".ply", ".glb", ".splat", ".spz", ".points.ply")
-_CANDIDATE_VIEWS = 16
-_MANY_GAUSSIANS = 500_000
-"""From this size on, `Session.best_views` tries fewer views, because each render is slow."""
 
 
 @dataclass(eq=False)  # compared by identity: the same prompt can be removed and asked again
@@ -107,7 +104,7 @@ class Session:
         """
         with self._encoding:
             self.scene.preload()
-        for phrase in [*self.scene.query.negatives, *self.history.vocabulary, *REFERENCE_PHRASES]:
+        for phrase in [*self.scene.query.compared, *self.history.vocabulary, *everyday_words()]:
             with self._encoding:  # one phrase at a time, so that a prompt waits for one phrase at most
                 self.scene.embed([phrase])
         self._presence = self.scene.presence_classifier
@@ -131,7 +128,7 @@ class Session:
             with self._encoding:
                 self.scene.embed([text])
             scores = self.scene.scores([text])[0].cpu().numpy()
-            layer = Layer(text, scores, self._provisional_threshold(scores), self._free_color())
+            layer = Layer(text, scores, self._provisional_threshold(text, scores), self._free_color())
             question = Question(layer)
             self.questions = [*self.questions[-(MAX_QUESTIONS - 1) :], question]
         self.current, self.mode = question, "relevancy"
@@ -180,7 +177,7 @@ class Session:
         elif question.automatic is not None:
             question.layer.threshold = question.automatic
         else:
-            question.layer.threshold = self._provisional_threshold(question.layer.scores)
+            question.layer.threshold = self._provisional_threshold(question.layer.text, question.layer.scores)
 
     def remove(self, question: Question) -> None:
         """Remove a prompt; the latest remaining one becomes the current one."""
@@ -191,11 +188,12 @@ class Session:
             shown = self.all_questions()
             self.current = shown[-1] if shown else None
 
-    def _provisional_threshold(self, scores: NDArray[np.float32]) -> float:
+    def _provisional_threshold(self, text: str, scores: NDArray[np.float32]) -> float:
         """A threshold in milliseconds. It is 0.5 for an absent object, as the automatic one will be."""
-        presence = self._presence  # None until `warm_up` has encoded the reference phrases
-        if presence is not None and presence.classify(torch.from_numpy(scores)) == "no":
-            return BORDER
+        if self._presence is not None:  # None until `warm_up` has encoded the everyday words
+            (present,) = self._presence.classify(self.scene.embed([text]), torch.from_numpy(scores)[None])
+            if present == "no":
+                return BORDER
         return quick_threshold(scores, self._opacities)
 
     def _free_color(self) -> tuple[int, int, int]:
@@ -223,8 +221,7 @@ class Session:
         probabilities = shares @ scene.field.select(hit.indices).code_probabilities()
         vocabulary = self.history.vocabulary
         with self._encoding:
-            words, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
-        asked = TextQuestion(words, negatives, scene.query)
+            asked = scene.question(vocabulary)
         relevancy = probability_relevancy(probabilities[None], scene.field.codebook.clip, asked)[0]
         order = relevancy.argsort(descending=True)[:count].tolist()
         phrases = [(vocabulary[i], float(relevancy[i])) for i in order]
@@ -252,29 +249,10 @@ class Session:
         """The selection of the current question; None until `refine`."""
         return self.current.selection if self.current else None
 
-    def best_views(self, selection: Selection, count: int = 3) -> list[tuple[str, float]]:
-        """The views that show most of a selection, with the share of the image it covers; best first."""
-        if not selection:
-            return []
-        tried = _CANDIDATE_VIEWS if len(self.scene.gaussians) < _MANY_GAUSSIANS else _CANDIDATE_VIEWS // 4
-        names = evenly(list(self.scene.views), tried)
-        if selection.best_view and selection.best_view not in names:
-            names.append(selection.best_view)
-        mask = selection.mask.float()[:, None]
-        shares = []
-        for name in names:
-            camera = self.scene.views[name].camera
-            small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 96))
-            with torch.no_grad():
-                drawn = render(self.scene.gaussians, small, features=mask, color=False).features
-            shares.append((name, float(drawn.mean())))
-        shares.sort(key=lambda entry: -entry[1])
-        return [entry for entry in shares[:count] if entry[1] > 0]
-
-    def thumbnail(self, name: str, selection: Selection, long_side: int = 280) -> NDArray[np.uint8]:
+    def thumbnail(self, name: str, selection: Selection) -> NDArray[np.uint8]:
         """A view ``[h, w, 3]`` with the selection tinted and the rest dimmed."""
         camera = self.scene.view(name).camera
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
+        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 280))
         with torch.no_grad():
             drawn = render(self.scene.gaussians, small, features=selection.mask.float()[:, None])
         image = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
@@ -284,10 +262,6 @@ class Session:
 
     def export(self, selection: Selection, ending: str = ".ply") -> tuple[str, bytes]:
         """File name and content of an export of the selected Gaussians.
-
-        Args:
-            selection: The Gaussians to export.
-            ending: One of `EXPORT_ENDINGS`.
 
         Raises:
             ValueError: If the ending is not one of them.
@@ -310,12 +284,6 @@ def answer_prompt(
     """The scene's answer to a prompt: scores, threshold, presence and selection.
 
     All final answers of the viewer come from here. Phrases with relations are answered by `Scene.find`.
-
-    Args:
-        scene: The scene.
-        prompt: A thing or a phrase with relations.
-        threshold: See `Scene.select`.
-        viewpoint: See `Session.refine`.
     """
     if is_plain(prompt):
         return scene.select(prompt, threshold)

@@ -45,11 +45,12 @@ def pictures_of(ending: str, **options: Any) -> Callable[[], Reader]:
         Image.fromarray(values).save(folder / f"a{ending}", **options)
 
     def read(folder: Path) -> Any:
-        from lexsplat.captures.images.reading import image_size, read_image, read_mask
+        from lexsplat.captures.images.bands import whole
+        from lexsplat.captures.images.reading import PhotoRows, image_size, read_mask
 
         image_size(folder / f"a{ending}")
         read_mask(folder / f"a{ending}")
-        return read_image(folder / f"a{ending}", (1.0, 1.0, 1.0))
+        return whole(PhotoRows(folder / f"a{ending}", (1.0, 1.0, 1.0)))
 
     def check(image: Any) -> None:
         finite(image)

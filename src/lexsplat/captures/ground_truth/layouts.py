@@ -1,7 +1,7 @@
 """Ground truth in the layouts of public data sets; nothing has to be copied or renamed by hand.
 
 - **segmentations**: ``segmentations/STEM/PROMPT.png``, the layout of lexsplat and of the authors' Mip-NeRF 360 and
-  LERF folders (`masks.load_masks`).
+  LERF folders; "_" in the name of a mask stands for a space.
 - **3d-ovs**: ``segmentations/NN/CLASS.png`` and ``segmentations/classes.txt``; NN is the index of the image.
 - **lerf-ovs**: LangSplat's ``label/SCENE/frame_*.json`` beside the capture ``SCENE``: polygons and boxes.
 
@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from lexsplat.captures.capture import Capture, View, stem_of
-from lexsplat.captures.ground_truth.masks import load_masks
 from lexsplat.captures.ground_truth.prompt_lists import PromptList, capture_prompt_names
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, MAX_PIXELS
 from lexsplat.captures.images.undistortion import MAX_SIDE
@@ -195,46 +194,39 @@ def _with_prompts_of(ground_truth: Annotations, root: Path, prompt_list: PromptL
 
 def _read_ground_truth(capture: Capture, folder: Path | None) -> Annotations:
     if folder is None:
-        found = find_annotations(capture.root)
-        if capture.segmentations is not None:
-            found = layout_of(capture.segmentations), capture.segmentations
-        if found is None:
-            return Annotations("segmentations", capture.root / "segmentations", {})
-        layout, folder = found
+        layout, folder = find_annotations(capture.root) or ("segmentations", capture.root / "segmentations")
     else:
         layout = layout_of(folder)
     if layout == "lerf-ovs":
         return _read_lerf_ovs(capture, folder)
-    if layout == "3d-ovs":
-        return _read_3d_ovs(capture, folder)
-    if folder != capture.segmentations:
-        capture = replace(capture, segmentations=folder)
-    return Annotations(layout, folder, load_masks(capture))
+    return _read_masks(capture, folder, layout)
 
 
-# 3D-OVS
+# Folders of masks
 
 
-def _read_3d_ovs(capture: Capture, folder: Path) -> Annotations:
-    classes = _read_classes(folder / CLASSES_FILE)
+def _read_masks(capture: Capture, folder: Path, layout: str) -> Annotations:
+    """``STEM/PROMPT.png``, or 3D-OVS's ``NN/CLASS.png`` with a mask for each class of the list."""
+    classes = _read_classes(folder / CLASSES_FILE) if layout == "3d-ovs" else ()
     masks: dict[str, dict[str, Path]] = {}
     for view_folder in mask_folders(folder):
         stem = view_folder.relative_to(folder).as_posix()
-        view = capture.views[_the_image(stem, "3d-ovs", capture, view_folder)]
-        prompts = masks.setdefault(view.name, {})
-        for name in classes:
-            path = view_folder / f"{name}.png"
+        view = capture.views[_the_image(stem, layout, capture, view_folder)]
+        files = {path.stem.replace("_", " "): path for path in sorted(view_folder.glob("*.png"))}
+        if layout == "3d-ovs":
+            files = {name: view_folder / f"{name}.png" for name in classes}
+        for path in files.values():
             if not path.is_file():
                 raise CaptureError(
                     view_folder,
                     expected=f"a mask for each of the {len(classes)} classes of {CLASSES_FILE}",
-                    found=f"no {name}.png",
+                    found=f"no {path.name}",
                     remedy="draw it (black if the class is not visible), or remove the class from the list",
                 )
             view.check_mask(path)
-            prompts[name] = path
+        masks.setdefault(view.name, {}).update(files)
     ordered = {name: dict(sorted(masks[name].items())) for name in sorted(masks)}
-    return Annotations("3d-ovs", folder, ordered, classes=tuple(sorted(classes)))
+    return Annotations(layout, folder, ordered, classes=tuple(sorted(classes)))
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:
@@ -269,12 +261,12 @@ def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: 
 def _the_image(stem: str, layout: str, capture: Capture, subject: Path) -> str:
     matches = _images_meant(stem, layout, capture.views, capture.root / "images")
     if len(matches) != 1:
-        found = "no view of that name" if not matches else f"views {' and '.join(matches[:3])}"
+        found = f"{len(matches)} views: {' and '.join(matches[:3])}" if matches else "no view of that name"
         raise CaptureError(
             subject,
             expected="ground truth of one view",
             found=found,
-            remedy="name it like the image, or remove it",
+            remedy="name it like the image, with the image's subfolder if it has one, or remove it",
         )
     return matches[0]
 
@@ -286,15 +278,14 @@ def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
     masks: dict[str, dict[str, NDArray[np.bool_]]] = {}
     boxes: dict[str, dict[str, NDArray[np.float64]]] = {}
     for path in sorted(folder.glob("frame_*.json")):
-        labels = _read_labels(path)
-        view = capture.views[_the_image(stem_of(labels.image), "lerf-ovs", capture, path)]
+        image, size, objects = _read_labels(path)
+        view = capture.views[_the_image(stem_of(image), "lerf-ovs", capture, path)]
         parts: dict[str, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {}
-        for labeled in labels.objects:
-            box = labeled.box
-            mask = view.undistort_mask(polygon_mask(labeled.polygon, *labels.size), path)
+        for category, box, polygon in objects:
+            mask = view.undistort_mask(polygon_mask(polygon, *size), path)
             if view.lens.distorts:  # the label's box is around the object in the distorted photo
                 box = _box_around(mask)
-            parts.setdefault(labeled.category, []).append((mask, box))
+            parts.setdefault(category, []).append((mask, box))
         masks[view.name] = {
             category: np.logical_or.reduce([mask for mask, _ in found])
             for category, found in sorted(parts.items())
@@ -305,8 +296,7 @@ def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
     return Annotations("lerf-ovs", folder, masks, boxes)
 
 
-@dataclass(frozen=True)
-class _LabeledObject:
+class _LabeledObject(NamedTuple):
     """One object of a label file: category, box ``[4]`` and polygon ``[n, 2]``, in pixels."""
 
     category: str
@@ -314,16 +304,8 @@ class _LabeledObject:
     polygon: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class _Labels:
-    """One label file: the name of its image, its width and height, and the objects."""
-
-    image: str
-    size: tuple[int, int]
-    objects: list[_LabeledObject]
-
-
-def _read_labels(path: Path) -> _Labels:
+def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_LabeledObject]]:
+    """Name, width and height of the image of a label file, and the objects."""
     content = read_json(path, remedy="copy the file again or correct it")
     try:
         info = content["info"]
@@ -351,7 +333,7 @@ def _read_labels(path: Path) -> _Labels:
     # Corners may lie outside the image, but not so far that integers overflow or drawing takes minutes.
     if not all((np.abs(part) <= 10 * MAX_SIDE).all() for part in numbers):
         raise FileFormatError(path, expected="finite coordinates in or near the photo", found="others")
-    return _Labels(name, size, objects)
+    return name, size, objects
 
 
 def polygon_mask(points: Sequence[Sequence[float]] | NDArray, width: int, height: int) -> NDArray[np.bool_]:
@@ -364,18 +346,13 @@ def polygon_mask(points: Sequence[Sequence[float]] | NDArray, width: int, height
         width: Width of the mask.
         height: Height of the mask.
     """
-    from skimage.measure import points_in_poly
+    from skimage.draw import polygon
 
     corners = np.asarray(points, dtype=np.float64).reshape(-1, 2).astype(np.int32)
     mask = np.zeros((height, width), dtype=bool)
     if len(corners) == 0:
         return mask
-    low = np.clip(corners.min(0), 0, (width, height))
-    high = np.clip(corners.max(0) + 1, 0, (width, height))
-    if (high > low).all() and len(corners) > 2:
-        ys, xs = np.mgrid[low[1] : high[1], low[0] : high[0]]
-        inside = points_in_poly(np.stack([xs.ravel(), ys.ravel()], axis=1), corners)
-        mask[low[1] : high[1], low[0] : high[0]] = inside.reshape(ys.shape)
+    mask[polygon(corners[:, 1], corners[:, 0], mask.shape)] = True
     image = Image.fromarray(mask)
     closed = [(int(x), int(y)) for x, y in [*corners, corners[0]]]
     ImageDraw.Draw(image).line(closed, fill=1)

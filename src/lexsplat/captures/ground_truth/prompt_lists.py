@@ -13,82 +13,31 @@ from lexsplat.runtime.errors import CaptureError
 
 PromptList = Literal["paper", "released"]
 
-_SAME = None
-# By scene: the prompts of the supplement, and those of the released code where they differ.
-_PROMPTS: dict[str, dict[str, str | None]] = {
-    "bicycle": {
-        "green grass": _SAME,
-        "white bicycle": _SAME,
-        "tire": _SAME,
-        "bench": _SAME,
-        "asphalt ground": "Asphalt ground",
-        "silver oak tree": "Silver Oak Tree",
-    },
-    "bonsai": {
-        "piano keyboard": _SAME,
-        "bicycle": _SAME,
-        "purple table cloth": _SAME,
-        "black stool": _SAME,
-        "plastic bonsai tree": _SAME,
-        "dark grey patterned carpet": _SAME,
-    },
-    "counter": {
-        "jar of coconut oil": "Jar of coconut oil",
-        "fruit oranges": _SAME,
-        "onions": _SAME,
-        "plants": _SAME,
-        "blue oven gloves": "blue Oven Gloves",
-        "wood rolling pin": "Wood Rolling Pin",
-        "free range eggs box": _SAME,
-        "stable bread": "stale bread",
-        "garofalo pasta": "Garofalo pasta",
-        "napolina tomatoes": "Napolina Tomatoes",
-        "gold ripple baking pan": "gold Ripple Baking Pan",
-    },
-    "garden": {
-        "football": _SAME,
-        "wood round table": _SAME,
-        "green grass": _SAME,
-        "wood pot": _SAME,
-        "elderflower": _SAME,
-        "green plant": _SAME,
-        "bricks wall": _SAME,
-        "windows": _SAME,
-        "stone ground": "Hexagonal Stone ground",
-    },
-    "kitchen": {
-        "LEGO Technic 856 Bulldozer": _SAME,
-        "basket weave cloth": "Basket Weave Cloth",
-        "wood plat": "Wood plat",
-        "old pink striped cloth": _SAME,
-        "red oven gloves": "Red Oven Gloves",
-    },
-    "room": {
-        "blue grey chair": _SAME,
-        "curtain": "silver gray curtain",
-        "brown shoes": _SAME,
-        "books": "yellow books",
-        "windows": _SAME,
-        "door": "white wood door",
-        "piano keyboard": _SAME,
-        "wood floor": "yellow wood floors",
-        "wine glasses and bottles": _SAME,
-        "yucca plant": "green Yucca plant",
-        "deep green carpets": "deep dark green carpets",
-    },
+# By scene: the prompts of the supplement; after "=", the released code's spelling where it differs.
+_TABLE = {
+    "bicycle": """green grass, white bicycle, tire, bench, asphalt ground=Asphalt ground,
+        silver oak tree=Silver Oak Tree""",
+    "bonsai": """piano keyboard, bicycle, purple table cloth, black stool, plastic bonsai tree,
+        dark grey patterned carpet""",
+    "counter": """jar of coconut oil=Jar of coconut oil, fruit oranges, onions, plants,
+        blue oven gloves=blue Oven Gloves, wood rolling pin=Wood Rolling Pin, free range eggs box,
+        stable bread=stale bread, garofalo pasta=Garofalo pasta, napolina tomatoes=Napolina Tomatoes,
+        gold ripple baking pan=gold Ripple Baking Pan""",
+    "garden": """football, wood round table, green grass, wood pot, elderflower, green plant, bricks wall,
+        windows, stone ground=Hexagonal Stone ground""",
+    "kitchen": """LEGO Technic 856 Bulldozer, basket weave cloth=Basket Weave Cloth, wood plat=Wood plat,
+        old pink striped cloth, red oven gloves=Red Oven Gloves""",
+    "room": """blue grey chair, curtain=silver gray curtain, brown shoes, books=yellow books, windows,
+        door=white wood door, piano keyboard, wood floor=yellow wood floors, wine glasses and bottles,
+        yucca plant=green Yucca plant, deep green carpets=deep dark green carpets""",
+}
+_PROMPTS = {
+    scene: [pair.strip().partition("=")[::2] for pair in prompts.split(",")]
+    for scene, prompts in _TABLE.items()
 }
 
 SCENES = tuple(_PROMPTS)
 """The scenes of the paper's evaluation."""
-
-
-def prompts_of(scene: str, prompt_list: PromptList = "released") -> tuple[str, ...]:
-    """The prompts of a scene.
-
-    Raises:
-        ValueError: If the scene or the list is unknown.
-    """
-    return tuple(dict.fromkeys(prompt_names(scene, prompt_list).values()))
 
 
 def prompt_names(scene: str, prompt_list: PromptList) -> dict[str, str]:
@@ -102,7 +51,7 @@ def prompt_names(scene: str, prompt_list: PromptList) -> dict[str, str]:
             f"prompt lists are paper and released, for {', '.join(SCENES)}; got {prompt_list!r} for {scene!r}"
         )
     names: dict[str, str] = {}
-    for paper, other in _PROMPTS[scene].items():
+    for paper, other in _PROMPTS[scene]:
         released = other or paper
         names |= dict.fromkeys((paper, released), paper if prompt_list == "paper" else released)
     return names

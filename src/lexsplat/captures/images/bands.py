@@ -1,8 +1,8 @@
 """Processes large images in bands of rows: as floats they take 12 bytes per pixel, several times over.
 
 A source has a width, a height, and rows on demand. Operations on it (filling masked pixels, undistortion) are sources
-again; `reduced` and `whole` turn a source into an image. Whether an image is large depends on its size alone, so
-results do not depend on the available memory.
+again; `resized` and `whole` turn a source into an image. A small image is one band. Whether an image is large depends
+on its size alone, so results do not depend on the available memory.
 """
 
 from __future__ import annotations
@@ -19,12 +19,7 @@ LARGE_PIXELS = 2_000_000
 """Images with more pixels are processed in bands."""
 
 BAND_PIXELS = 1 << 19
-"""Pixels per band, of the source or the result, whichever is more."""
-
-
-def is_large(width: int, height: int) -> bool:
-    """Whether an image of this size is processed in bands."""
-    return width * height > LARGE_PIXELS
+"""Pixels per band of a large image, of the source or the result, whichever is more."""
 
 
 class Rows(Protocol):
@@ -55,7 +50,7 @@ class FilledRows:
     def __init__(self, source: Rows, valid: NDArray[np.bool_]) -> None:
         self._source, self._valid = source, valid
         self.width, self.height = source.width, source.height
-        total, count = np.zeros(3), 0
+        total, count = np.zeros(1), 0
         for first, last in band_ranges(self.height, self.width):
             kept = source.rows(first, last)[valid[first:last]]
             total, count = total + kept.sum(0, dtype=np.float64), count + len(kept)
@@ -85,30 +80,47 @@ class MaskRows:
 
 def band_ranges(height: int, width: int, step: float = 1.0) -> list[tuple[int, int]]:
     """First and last row of every band, if each row is computed from ``step`` rows of ``width`` pixels."""
-    count = max(1, int(BAND_PIXELS / (max(1, width) * max(1.0, step))))
+    pixels = max(1, width) * max(1.0, step)
+    count = max(1, int(BAND_PIXELS / pixels)) if height * pixels > LARGE_PIXELS else max(1, height)
     return [(first, min(first + count, height)) for first in range(0, height, count)]
 
 
 def whole(source: Rows) -> NDArray[np.float32]:
     """All rows ``[H, W, C]``."""
-    found = np.empty((source.height, source.width, source.rows(0, 1).shape[2]), np.float32)
-    for first, last in band_ranges(source.height, source.width):
-        found[first:last] = source.rows(first, last)
-    return found
+    return resized(source, (source.width, source.height))
 
 
-def reduced(source: Rows, size: tuple[int, int]) -> NDArray[np.float32]:
-    """A source at a smaller ``(width, height)``: each pixel is the mean over the area it covers."""
-    if size == (source.width, source.height):
-        return whole(source)
+def resized(source: Rows, size: tuple[int, int]) -> NDArray[np.float32]:
+    """A source at another ``(width, height)``, ``[H, W, C]``.
+
+    Shrinking takes the mean over the area of each new pixel; enlarging is bilinear.
+    """
+    shrinks = size[0] <= source.width and size[1] <= source.height
+    if not shrinks:
+        return _scaled(whole(source), size, Image.Resampling.BILINEAR)
     step = source.height / size[1]
-    found = np.empty((size[1], size[0], source.rows(0, 1).shape[2]), dtype=np.float32)
-    for top, bottom in band_ranges(size[1], source.width, step):
+    bands = band_ranges(size[1], source.width, step)
+    found = np.empty(0, np.float32)
+    for top, bottom in bands:
         first, last = int(top * step), min(source.height, math.ceil(bottom * step))
-        band = source.rows(first, last)
+        part = source.rows(first, last)
         box = (0.0, top * step - first, float(source.width), min(bottom * step - first, float(last - first)))
-        for channel in range(band.shape[2]):
-            plane = Image.fromarray(np.ascontiguousarray(band[..., channel]))
-            smaller = plane.resize((size[0], bottom - top), Image.Resampling.BOX, box=box)
-            found[top:bottom, :, channel] = np.asarray(smaller)
+        part = _scaled(part, (size[0], bottom - top), Image.Resampling.BOX, box)
+        if len(bands) == 1:
+            return part
+        if not len(found):
+            found = np.empty((size[1], size[0], part.shape[2]), np.float32)
+        found[top:bottom] = part
     return found
+
+
+def _scaled(
+    image: NDArray[np.float32],
+    size: tuple[int, int],
+    resample: Image.Resampling,
+    box: tuple[float, float, float, float] | None = None,
+) -> NDArray[np.float32]:
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    planes = (Image.fromarray(np.ascontiguousarray(plane)) for plane in np.moveaxis(image, 2, 0))
+    return np.stack([np.asarray(plane.resize(size, resample, box=box)) for plane in planes], axis=-1)

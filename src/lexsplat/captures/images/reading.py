@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lexsplat.captures.images.bands import band_ranges, is_large, reduced
+from lexsplat.captures.images.bands import band_ranges
 from lexsplat.runtime.errors import CaptureError
 
 HEIC_SUFFIXES = (".heic", ".heif")
@@ -49,46 +49,31 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with _BoundedFile(path) as file, Image.open(file) as image:
                 yield image
-    except Image.DecompressionBombError as error:
-        raise CaptureError(
-            path,
-            expected=f"at most {MAX_PIXELS:,} pixels",
-            found="more",
-            remedy="scale the image down before building",
-        ) from error
-    except Image.UnidentifiedImageError as error:
-        raise CaptureError(
-            path,
-            expected="an image",
-            found=f"{path.stat().st_size} bytes that are not an image format Pillow supports",
-            remedy="replace it with a JPEG or PNG, or remove it from the capture",
-        ) from error
     except CaptureError:
         raise
-    except MemoryError as error:
-        raise CaptureError(
-            path,
-            expected="an image that fits into memory",
-            found="a larger one",
-            remedy="scale the image down before building",
-        ) from error
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        LookupError,
-        TypeError,
-        ArithmeticError,
-        struct.error,
-    ) as error:
-        # The types that Pillow's decoders raise on damaged files; the block contains only decoding.
-        raise CaptureError(
-            path,
-            expected="a complete image",
-            found=f"damaged data ({error or type(error).__name__})",
-            remedy="copy the file again, or remove it from the capture",
-        ) from error
+    except _UNREADABLE as error:  # the block contains only decoding
+        raise _unreadable(path, error) from error
+
+
+_UNREADABLE = (
+    Image.DecompressionBombError,
+    MemoryError,
+    # The other types that Pillow's decoders raise on damaged files.
+    *(OSError, SyntaxError, ValueError, EOFError, LookupError, TypeError, ArithmeticError, struct.error),
+)
+
+
+def _unreadable(path: Path, error: BaseException) -> CaptureError:
+    expected, remedy = "a complete image", "copy the file again, or remove it from the capture"
+    found = f"damaged data ({error or type(error).__name__})"
+    if isinstance(error, Image.UnidentifiedImageError):
+        expected, remedy = "an image", "replace it with a JPEG or PNG, or remove it from the capture"
+        found = f"{path.stat().st_size} bytes that are not an image format Pillow supports"
+    elif isinstance(error, (Image.DecompressionBombError, MemoryError)):
+        many = isinstance(error, Image.DecompressionBombError)
+        expected = f"at most {MAX_PIXELS:,} pixels" if many else "an image that fits into memory"
+        found, remedy = "more", "scale the image down before building"
+    return CaptureError(path, expected=expected, found=found, remedy=remedy)
 
 
 class _BoundedFile(io.BufferedReader):
@@ -132,36 +117,18 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def read_image(
-    path: Path,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    *,
-    size: tuple[int, int] | None = None,
-) -> NDArray[np.float32]:
-    """An image as ``[H, W, 3]`` float32 in 0..1; alpha is composited on ``background``.
+class PhotoRows:
+    """An image as a source of rows ``[rows, W, 3]`` in 0..1, composited on ``background``.
 
-    Args:
-        path: The file.
-        background: Color behind transparent pixels.
-        size: Width and height of the result, as in :func:`resize_image`; large photos are reduced in bands
-            (`lexsplat.captures.images.bands`). None keeps the image's size.
+    The decoded pixels stay in memory, three or four bytes per pixel.
 
     Raises:
         CaptureError: As :func:`open_image`.
     """
-    with open_image(path) as image:
-        shrinks = size is not None and size[0] <= image.width and size[1] <= image.height
-        if size is not None and shrinks and is_large(*image.size):
-            return reduced(PhotoRows(image, background), size)
-        whole = _as_floats(image, background)
-    return whole if size is None else resize_image(whole, size)
 
-
-class PhotoRows:
-    """An opened image as a source of rows, composited on ``background``."""
-
-    def __init__(self, image: Image.Image, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        image.load()
+    def __init__(self, path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        with open_image(path) as image:
+            image.load()
         self._image, self._background = image, background
         self.width, self.height = image.size
 
@@ -170,23 +137,13 @@ class PhotoRows:
         return _as_floats(self._image.crop((0, first, self.width, last)), self._background)
 
 
-def read_rows(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PhotoRows:
-    """An image as a source of rows; the decoded pixels stay in memory, three or four bytes per pixel.
-
-    Raises:
-        CaptureError: As :func:`open_image`.
-    """
-    with open_image(path) as image:
-        return PhotoRows(image, background)
-
-
 def read_bytes(path: Path) -> NDArray[np.uint8]:
-    """An image as ``[H, W, 3]`` uint8, composited on black: the values of `read_image`, rounded.
+    """An image as ``[H, W, 3]`` uint8, composited on black, rounded.
 
     Raises:
         CaptureError: As :func:`open_image`.
     """
-    source = read_rows(path)
+    source = PhotoRows(path)
     found = np.empty((source.height, source.width, 3), np.uint8)
     for first, last in band_ranges(source.height, source.width):
         found[first:last] = (source.rows(first, last) * 255.0).round()
@@ -195,7 +152,6 @@ def read_bytes(path: Path) -> NDArray[np.uint8]:
 
 def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> NDArray[np.float32]:
     """All pixels of an image of any mode as floats in 0..1."""
-    image.load()
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, dtype=np.float32)
         # Pillow decodes 16-bit gray as I or I;16; float images are in 0..1 by convention.
@@ -248,23 +204,6 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
             remedy="save it as black and white",
         )
     return values > half
-
-
-def resize_image(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """An image ``[H, W, C]`` at another ``(width, height)``.
-
-    Shrinking takes the mean over the area of each new pixel; enlarging is bilinear.
-    """
-    height, width = image.shape[:2]
-    if (width, height) == tuple(size):
-        return image
-    shrinks = size[0] <= width and size[1] <= height
-    resample = Image.Resampling.BOX if shrinks else Image.Resampling.BILINEAR
-    channels = [
-        np.asarray(Image.fromarray(np.ascontiguousarray(image[..., c])).resize(size, resample))
-        for c in range(image.shape[2])
-    ]
-    return np.stack(channels, axis=-1)
 
 
 def resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.captures.images.bands import ArrayRows, Rows, reduced, whole
-from lexsplat.captures.images.reading import resize_image
+from lexsplat.captures.images import bands
+from lexsplat.captures.images.bands import ArrayRows, Rows, resized
 
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
@@ -125,50 +125,38 @@ def _covers(lens: Lens, pinhole: pycolmap.Camera) -> bool:
     return bool(((where >= -slack) & (where <= 1 + slack)).all())
 
 
-def undistort(
-    image: NDArray[Any], lens: Lens, size: tuple[int, int], *, nearest: bool = False
-) -> NDArray[np.float32]:
-    """The pinhole image at ``size`` (width, height) of a photo ``[H, W, C]`` taken through ``lens``.
+def undistort(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
+    """The pinhole image at ``size`` (width, height) of a photo taken through ``lens``.
 
     If the result is much smaller, the photo is area-averaged before resampling and the result once more, so that no
-    pixel of the photo is skipped.
+    pixel of the photo is skipped. Of a large photo, only the result and a band are held in memory as floats.
 
     Args:
-        image: The photo, float32; its size may be any uniform scale of the lens's.
+        source: The photo; its size may be any uniform scale of the lens's.
         lens: The lens.
         size: Width and height of the result in pixels.
-        nearest: Take the nearest pixel at ``size`` directly instead of interpolating, for masks.
 
     Raises:
         ValueError: If the lens maps a pixel to NaN or infinity.
     """
     width, height, _ = pinhole_of(lens)
-    shrink = 1 if nearest else max(1, int(min(width / size[0], height / size[1]) / 2))
-    if shrink > 1:
-        reduced = (max(1, image.shape[1] // shrink), max(1, image.shape[0] // shrink))
-        image = resize_image(image, reduced)
-    enlarges = nearest or size[0] > width or size[1] > height
-    between = size if enlarges else (max(1, round(width / shrink)), max(1, round(height / shrink)))
-    remapped = _remap(image, _sampling_grid(lens, between), nearest)
-    return remapped if between == tuple(size) else resize_image(remapped, size)
-
-
-def undistort_large(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
-    """As `undistort`, in bands: only the result and a band of the photo are held in memory as floats."""
-    width, height, _ = pinhole_of(lens)
     shrink = max(1, int(min(width / size[0], height / size[1]) / 2))
     if shrink > 1:
         smaller = (max(1, source.width // shrink), max(1, source.height // shrink))
-        source = ArrayRows(reduced(source, smaller))
+        source = ArrayRows(resized(source, smaller))
     enlarges = size[0] > width or size[1] > height
     between = size if enlarges else (max(1, round(width / shrink)), max(1, round(height / shrink)))
-    remapped = RemappedRows(source, lens, between)
-    shrinks = between[0] >= size[0] and between[1] >= size[1]
-    return reduced(remapped, size) if shrinks else resize_image(whole(remapped), size)
+    return resized(RemappedRows(source, lens, between), size)
+
+
+def undistort_nearest(mask: NDArray[np.bool_], lens: Lens, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask ``[h, w]`` drawn on a photo, at ``size`` (width, height) on its pinhole image, by nearest pixel."""
+    grid = _sampling_grid(lens, size)
+    return _remap(mask[..., None].astype(np.float32), grid, "nearest")[..., 0] > 0.5
 
 
 class RemappedRows:
-    """The pinhole image of a source; each band reads only the rows of the photo that it samples."""
+    """The pinhole image of a source; each band of a large photo reads only the rows that it samples."""
 
     def __init__(self, source: Rows, lens: Lens, size: tuple[int, int]) -> None:
         self._source, self._lens = source, lens
@@ -176,14 +164,16 @@ class RemappedRows:
 
     def rows(self, first: int, last: int) -> NDArray[np.float32]:
         """Rows of the pinhole image."""
-        grid = _grid_rows(self._lens, (self.width, self.height), first, last)
-        height = self._source.height
+        size, height = (self.width, self.height), self._source.height
+        if self._source.width * height <= bands.LARGE_PIXELS:
+            return _remap(self._source.rows(0, height), _sampling_grid(self._lens, size)[first:last])
+        grid = _grid_rows(self._lens, size, first, last)
         y = (grid[..., 1].astype(np.float64) + 1.0) * (height / 2)  # pixels from the top edge of the photo
         # Bicubic interpolation has a support of two pixels; beyond the photo, its border is repeated.
         top = int(np.clip(np.floor(y.min()) - 3, 0, height - 1))
         bottom = int(np.clip(np.ceil(y.max()) + 3, top + 1, height))
         grid[..., 1] = (y - top) * (2.0 / (bottom - top)) - 1.0
-        return _remap(self._source.rows(top, bottom), grid, nearest=False)
+        return _remap(self._source.rows(top, bottom), grid)
 
 
 @lru_cache(maxsize=2)
@@ -212,16 +202,14 @@ def _grid_rows(lens: Lens, size: tuple[int, int], first: int, last: int) -> NDAr
     return grid
 
 
-def _remap(image: NDArray[Any], grid: NDArray[np.float32], nearest: bool) -> NDArray[np.float32]:
+def _remap(
+    image: NDArray[np.float32], grid: NDArray[np.float32], mode: str = "bicubic"
+) -> NDArray[np.float32]:
     import torch
 
-    source = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
+    source = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
     # Without align_corners, -1 and 1 are the outer edges, which matches pixel centers at +0.5.
     sampled = torch.nn.functional.grid_sample(
-        source,
-        torch.from_numpy(grid)[None],
-        mode="nearest" if nearest else "bicubic",
-        padding_mode="border",
-        align_corners=False,
+        source, torch.from_numpy(grid)[None], mode=mode, padding_mode="border", align_corners=False
     )
     return sampled[0].permute(1, 2, 0).clamp(0.0, 1.0).contiguous().numpy()

@@ -10,12 +10,9 @@ import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from lexsplat.captures.sfm.pycolmap_import import pycolmap
 from lexsplat.runtime import memory as budget
-
-if TYPE_CHECKING:
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
 HELD_AT_MOST = 1225
 """Most photos whose features are held at once: pycolmap's own limit."""
@@ -31,19 +28,16 @@ def extraction_threads(
     Raises:
         MemoryBudgetError: If not even one thread fits.
     """
-    need = {
-        threads: budget.extraction_bytes(photo, max_side, max_features, threads, masked=masked)
-        for threads in range(1, _cores() + 1)
-    }
-    side = min(max_side, max(photo))
-    fitting = next((s for s in range(side, 63, -32) if _fits(photo, s, max_features, memory, masked)), None)
+
+    def need_of(side: int, threads: int) -> int:
+        return budget.extraction_bytes(photo, side, max_features, threads, masked=masked)
+
+    need = {threads: need_of(max_side, threads) for threads in range(1, _cores() + 1)}
+    sides = range(min(max_side, max(photo)), 63, -32)
+    fitting = next((side for side in sides if need_of(side, 1) <= memory), None)
     remedy = "scale the photos down first" if fitting is None else f"a max-side of {fitting}"
     budget.require(_STAGE, need[1], memory, f"features of photos of {photo[0]}x{photo[1]} pixels", remedy)
     return budget.most_within(memory, need)
-
-
-def _fits(photo: tuple[int, int], side: int, max_features: int, memory: int, masked: bool) -> bool:
-    return budget.extraction_bytes(photo, side, max_features, 1, masked=masked) <= memory
 
 
 def matching_plan(
@@ -59,8 +53,6 @@ def matching_plan(
     Raises:
         MemoryBudgetError: If ``least`` photos do not fit even with one thread.
     """
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
-
     most, _, photos, _ = _counts(database)
     least = min(least, max(2, photos))
     need = budget.matching_bytes(most, least, 1)

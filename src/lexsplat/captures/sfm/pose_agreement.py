@@ -10,13 +10,11 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
 MAX_ERROR = 4.0
 """Sampson distance in pixels within which a match agrees with two cameras; pycolmap's threshold for pairs."""
@@ -39,7 +37,7 @@ def agreements(model: pycolmap.Reconstruction, database: pycolmap.Database) -> d
     rays = {number: _rays(_camera(model, number), database.read_keypoints(number)) for number in registered}
     agreeing, compared = dict.fromkeys(registered, 0), dict.fromkeys(registered, 0)
     for pair, geometry in zip(*database.read_two_view_geometries()):
-        first, second = _images_of(pair)
+        first, second = map(int, pycolmap.pair_id_to_image_pair(pair))
         matches = geometry.inlier_matches
         if first not in registered or second not in registered or not len(matches):
             continue
@@ -102,7 +100,6 @@ def register_again(
     images: list[int],
     database: Path,
     photos: Path,
-    folder: Path,
     options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.Reconstruction:
     """Register photos again in a model of all the others; those that are mis-registered again are removed.
@@ -110,17 +107,15 @@ def register_again(
     Args:
         model: The model; the photos are removed from it.
         images: Ids of the mis-registered photos.
-        database: Features and matches.
+        database: Features and matches; intermediate files are written beside it.
         photos: Folder of the photos.
-        folder: For intermediate files; its content is deleted.
         options: Mapper options.
 
     Returns:
         A model without mis-registered photos.
     """
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
-
     deregister(model, images)
+    folder = database.parent / "again"
     shutil.rmtree(folder, ignore_errors=True)
     trusted = folder / "trusted"
     trusted.mkdir(parents=True)
@@ -143,11 +138,3 @@ def _rays(camera: pycolmap.Camera, keypoints: NDArray[np.floating]) -> NDArray[n
     if not len(keypoints):
         return np.empty((0, 2))
     return np.asarray(camera.cam_from_img(np.asarray(keypoints[:, :2], np.float64)))
-
-
-def _images_of(pair: int) -> tuple[int, int]:
-    """The two image ids of a COLMAP pair id."""
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
-
-    first, second = pycolmap.pair_id_to_image_pair(pair)
-    return int(first), int(second)

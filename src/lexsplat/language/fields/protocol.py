@@ -24,35 +24,27 @@ class LanguageField(Protocol):
     @property
     def uncertainties(self) -> Tensor:
         """u_G of every Gaussian ``[N]`` in 0..1; high where the views disagree."""
-        ...
 
     def code_probabilities(self) -> Tensor:
         """Distribution over codes of every Gaussian ``[N, K]``; rows sum to 1, or to 0 where nothing is known."""
-        ...
 
     def scores(self, table: Tensor) -> Tensor:
         """Expected table entry of every Gaussian, the sum over codes of p_k table[k]: ``[K, P]`` to ``[N, P]``.
 
         ``[N, K]`` is never held.
         """
-        ...
 
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """Distribution over codes at every pixel ``[H, W, K]``."""
-        ...
 
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
         """Expected table entry at every pixel, the sum over codes of p_k table[k]: ``[K, P]`` to ``[H, W, P]``."""
-        ...
 
     def select(self, index: Tensor) -> LanguageField:
         """The language of the Gaussians given by a mask ``[N]`` or an index ``[M]``, as `Gaussians.select`."""
-        ...
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors."""
-        ...
 
     def metadata(self) -> dict[str, str]:
         """Everything that is not a tensor, for the header of the safetensors file."""
-        ...

@@ -43,7 +43,7 @@ class JointTrainer:
         ValueError: If there is no view, or a view has no index map.
     """
 
-    parameter_prefixes = (
+    parameter_prefixes: tuple[str, ...] = (
         *(f"geometry/{prefix}" for prefix in Reconstructor.parameter_prefixes),
         *(f"language/{prefix}" for prefix in FieldTrainer.parameter_prefixes),
     )
@@ -91,11 +91,6 @@ class JointTrainer:
         """Those of the reconstruction, and the loss of the language."""
         return {**self.reconstructor.metrics, "language": self._losses["loss"]}
 
-    @property
-    def done(self) -> bool:
-        """Whether all iterations have run."""
-        return self.reconstructor.done
-
     def step(self) -> dict[str, float]:
         """One iteration of both on one view; returns the losses of the language, on a GPU those that were read last.
 
@@ -110,8 +105,7 @@ class JointTrainer:
         name = self.reconstructor.last_view
         losses = self.language.step(self.cameras[name], self.code_maps[name])
         done = self.reconstructor.steps_done
-        # Reading waits for a GPU, so there only as often as the reconstruction reads its own loss.
-        if self.reconstructor.device.type == "cpu" or done % EVENT_EVERY == 0 or self.done:
+        if self.reconstructor.reads_loss(done):
             self._losses = {key: float(value) for key, value in losses.items()}
             self.language.check_loss(self._losses["loss"])
         return self._losses

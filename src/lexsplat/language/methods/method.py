@@ -93,32 +93,26 @@ class LanguageMethod(Protocol):
     @property
     def name(self) -> str:
         """Name in settings, tables and stored fields."""
-        ...
 
     @property
     def settings(self) -> tuple[str, ...]:
         """Parts of the build settings that decide what `fit` makes, beside the seed."""
-        ...
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Stages before "language" that it needs beside the Gaussians, in order."""
-        ...
 
     @property
     def uses_dino(self) -> bool:
         """Whether DINO features take part."""
-        ...
 
     @property
     def trains_jointly(self) -> bool:
         """Whether it can also be trained together with the reconstruction (``--joint``)."""
-        ...
 
     @property
     def variants(self) -> Mapping[str, Variant]:
         """Its ablations by name, in the order of the table; "full" changes nothing."""
-        ...
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> LanguageField:
         """Make the language field.
@@ -129,4 +123,3 @@ class LanguageMethod(Protocol):
             config: The build settings (`lexsplat.pipeline.config.BuildConfig`), of which `settings` are read.
             run: Seed, memory, checkpoint and listener.
         """
-        ...

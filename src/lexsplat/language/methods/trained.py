@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import Camera
@@ -99,12 +97,11 @@ def train_field(
         ValueError: If there is no view, or a view has no index map.
         TrainingError: If the training diverges again and again.
     """
-    names = sorted(cameras)
-    check_views(names, code_maps)
+    check_views(sorted(cameras), code_maps)
     trainer = trainer or FieldTrainer(gaussians, codebook, config, seed=seed)
     views = _prepare_views(trainer.gaussians, cameras, config, memory)
     run_training(
-        _FrozenGeometryTraining(trainer, names, views, code_maps),
+        _FrozenGeometryTraining(trainer, views, code_maps),
         stage="language",
         name="language field",
         every=REPORT_EVERY,
@@ -117,29 +114,23 @@ def train_field(
 class _FrozenGeometryTraining:
     """A `FieldTrainer` with its views, as `run_training` steps it."""
 
-    parameter_prefixes = FieldTrainer.parameter_prefixes
+    parameter_prefixes: tuple[str, ...] = FieldTrainer.parameter_prefixes
 
     def __init__(
         self,
         trainer: FieldTrainer,
-        names: list[str],
         views: Mapping[str, tuple[Camera, PreparedView | None]],
         code_maps: Mapping[str, NDArray[np.integer]],
     ) -> None:
-        self.trainer, self._names, self._views, self._code_maps = trainer, names, views, code_maps
+        self.trainer, self._views, self._code_maps = trainer, views, code_maps
+        self.device, self.total_steps = trainer.gaussians.device, trainer.config.iterations
         self.metrics: dict[str, float] = {}
-
-    @property
-    def device(self) -> torch.device:
-        return self.trainer.gaussians.device
+        self.state_dict, self.load_state_dict = trainer.state_dict, trainer.load_state_dict
+        self.find_invalid = trainer.find_invalid
 
     @property
     def steps_done(self) -> int:
         return self.trainer.iteration
-
-    @property
-    def total_steps(self) -> int:
-        return self.trainer.config.iterations
 
     @property
     def rate_factor(self) -> float:
@@ -150,22 +141,13 @@ class _FrozenGeometryTraining:
         self.trainer.rate_factor = factor
 
     def step(self) -> None:
-        name = self.trainer.view_of_step(self._names)
+        name = self.trainer.view_of_step(sorted(self._views))
         camera, prepared = self._views[name]
         losses = self.trainer.step(camera, self._code_maps[name], prepared=prepared)
         done = self.trainer.iteration
         if done % REPORT_EVERY == 0 or done == self.total_steps:  # reading losses synchronizes a GPU
             self.metrics = {key: float(value) for key, value in losses.items()}
             self.trainer.check_loss(self.metrics["loss"])
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return self.trainer.state_dict()
-
-    def load_state_dict(self, state: dict[str, Tensor], /) -> None:
-        self.trainer.load_state_dict(state)
-
-    def find_invalid(self) -> str:
-        return self.trainer.find_invalid()
 
 
 def _prepare_views(

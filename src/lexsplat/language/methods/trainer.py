@@ -16,15 +16,9 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import MASKED_CODE, codes_at_pixels
 from lexsplat.language.fields import TrainedField
-from lexsplat.language.losses import (
-    cross_entropy_loss,
-    semantic_loss,
-    smoothing_loss,
-    total_loss,
-    uncertainty_loss,
-)
+from lexsplat.language.losses import cross_entropy_loss, smoothing_loss, uncertainty_loss
 from lexsplat.language.methods.trained_settings import TrainedConfig
-from lexsplat.reconstruction.optimizers import check_moments
+from lexsplat.reconstruction.optimizers import below_prefix, check_moments, with_prefix
 from lexsplat.rendering import PreparedView
 from lexsplat.runtime.errors import TrainingError
 
@@ -40,7 +34,7 @@ class FieldTrainer:
         field: A field to continue from; None takes `TrainedField.initial`.
     """
 
-    parameter_prefixes = ("field.",)
+    parameter_prefixes: tuple[str, ...] = ("field.",)
 
     def __init__(
         self,
@@ -109,7 +103,7 @@ class FieldTrainer:
         smoothing = semantics.new_zeros(())
         if config.use_smoothing and self.iteration % config.smoothing_every == 0:
             smoothing = losses["smoothing"] = self._smoothing_term()
-        loss = losses["loss"] = total_loss(losses["semantic"], smoothing, config.lambda_s, config.lambda_smo)
+        loss = losses["loss"] = config.lambda_s * losses["semantic"] + config.lambda_smo * smoothing  # Eq. 15
         loss.backward()
         if config.clip_decoder_grad is not None:
             nn.utils.clip_grad_norm_(field.decoder.parameters(), config.clip_decoder_grad)
@@ -131,7 +125,7 @@ class FieldTrainer:
             return {"cross_entropy": cross_entropy, "semantic": config.lambda_ce * cross_entropy}
         cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten().index_select(0, pixels))
         regularizer = uncertainty_loss(self._not_masked(uncertainty, code_map), config.uncertainty_form)
-        semantic = semantic_loss(cross_entropy, regularizer, config.lambda_ce, config.lambda_u)
+        semantic = config.lambda_ce * cross_entropy + config.lambda_u * regularizer  # Eq. 12
         return {"cross_entropy": cross_entropy, "uncertainty": regularizer, "semantic": semantic}
 
     def _not_masked(self, uncertainty: Tensor, code_map: Any) -> Tensor:
@@ -205,10 +199,9 @@ class FieldTrainer:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that an exact continuation needs, as named tensors."""
-        state = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        state = with_prefix("field.", self.field.state_dict())
         for name, parameter in self.field.named_parameters():
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                state[f"optimizer.{name}.{key}"] = value
+            state |= with_prefix(f"optimizer.{name}.", self.optimizer.state.get(parameter, {}))
         state["generator"] = self.generator.get_state()
         state["iteration"] = torch.tensor(self.iteration)
         state["rate_factor"] = torch.tensor(self.rate_factor, dtype=torch.float64)
@@ -242,10 +235,8 @@ class FieldTrainer:
         Raises:
             ValueError: If the state belongs to another scene or is incomplete.
         """
-        prefix = "field."
-        own = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
         try:
-            self.field.load_state_dict(own)
+            self.field.load_state_dict(below_prefix("field.", state))
             self.generator.set_state(state["generator"].cpu())
             self.iteration = int(state["iteration"])
             self.rate_factor = float(state.get("rate_factor", 1.0))
@@ -256,8 +247,7 @@ class FieldTrainer:
             raise ValueError(f"the training state does not fit: {error}") from error
         self.optimizer.state.clear()
         for name, parameter in self.field.named_parameters():
-            prefix = f"optimizer.{name}."
-            moments = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+            moments = below_prefix(f"optimizer.{name}.", state)
             check_moments(moments, parameter)
             if moments:
                 self.optimizer.state[parameter] = {

@@ -1,4 +1,4 @@
-"""Front-to-back blending by tiles: the forward pass, and the functions shared with its gradient and code weights.
+"""Front-to-back blending by tiles: the forward pass, and the functions shared with its gradient.
 
 The outer loop is over Gaussians, and the inner loop processes rows of sixteen pixels (see `lanes`). Per-tile arrays
 are flat: row j of the tile starts at 16 j, and row j of channel c of C at 16 (j C + c).

@@ -124,6 +124,69 @@ def _feature_gradients(
 
 
 @kernel
+def _pair_gradients(
+    k: int,
+    left: int,
+    top: int,
+    ellipses: F32,
+    boxes: I32,
+    values: F32,
+    columns: Any,
+    colors: int,
+    channels: int,
+    geometry: bool,
+    live: F32,
+    behind: F32,
+    upstream: F32,
+    weights: F32,
+    row: int,
+    rows: F32,
+) -> None:
+    """Gradients of ellipse ``k`` in the tile at pixel (left, top), written from ``rows[row]``, which is zero, on.
+
+    Updates ``live`` and ``behind``; ``weights`` is scratch.
+    """
+    dx, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
+    red, green, blue = ZERO, ZERO, ZERO
+    if colors == 3:
+        red, green, blue = values[k, 0], values[k, 1], values[k, 2]
+    zeros = splat(ZERO)
+    g0, g1, g2, r0, r1, r2 = zeros, zeros, zeros, zeros, zeros, zeros
+    first, last = rows_in_tile(boxes, k, top)
+    touched = False
+    for j in range(first, last):
+        dy = np.float32(j) + dy0
+        row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
+        weight = pass_row(live, j, row_alpha)
+        store(weights, j * TILE, weight)
+        if not any_positive(weight):
+            continue
+        touched = True
+        dots = zeros
+        if colors == 3:
+            place = j * channels * TILE
+            u0, u1 = load(upstream, place), load(upstream, place + TILE)
+            u2 = load(upstream, place + 2 * TILE)
+            r0 += weight * u0
+            r1 += weight * u1
+            r2 += weight * u2
+            dots = u0 * red + u1 * green + u2 * blue
+        if not geometry:
+            continue
+        gradient = _exponent_gradient(behind, j, weight, row_alpha, dots)
+        g0 += gradient
+        g1 += gradient * dy
+        g2 += gradient * (dy * dy)
+    if touched:
+        # Without colors, the two sums after the moments are zero and are overwritten by the features.
+        store_totals(rows, row, g0, g0 * dx, g1, g0 * dx * dx)
+        store_totals(rows, row + 4, g1 * dx, g2, r0, r1)
+        if colors == 3:
+            rows[row + GEOMETRY_FIELDS + 2] = total(r2)
+        _feature_gradients(first, last, colors, channels, weights, upstream, row, rows)
+
+
+@kernel
 def blend_backward(
     start: int,
     stop: int,
@@ -154,7 +217,6 @@ def blend_backward(
     behind, upstream = np.empty(PIXELS, np.float32), np.empty(PIXELS * channels, np.float32)
     fields = row_width(channels)
     columns = column_numbers()
-    zeros = splat(ZERO)
     for tile in range(start, stop):
         if tile_offsets[tile] == tile_offsets[tile + 1]:
             continue
@@ -169,44 +231,10 @@ def blend_backward(
                 rows[field] = ZERO
             if finished:
                 continue
-            k = members[slot]
-            dx, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
-            red, green, blue = ZERO, ZERO, ZERO
-            if colors == 3:
-                red, green, blue = values[k, 0], values[k, 1], values[k, 2]
-            g0, g1, g2, r0, r1, r2 = zeros, zeros, zeros, zeros, zeros, zeros
-            first, last = rows_in_tile(boxes, k, top)
-            touched = False
-            for j in range(first, last):
-                dy = np.float32(j) + dy0
-                row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
-                weight = pass_row(live, j, row_alpha)
-                store(weights, j * TILE, weight)
-                if not any_positive(weight):
-                    continue
-                touched = True
-                dots = zeros
-                if colors == 3:
-                    place = j * channels * TILE
-                    u0, u1 = load(upstream, place), load(upstream, place + TILE)
-                    u2 = load(upstream, place + 2 * TILE)
-                    r0 += weight * u0
-                    r1 += weight * u1
-                    r2 += weight * u2
-                    dots = u0 * red + u1 * green + u2 * blue
-                if not geometry:
-                    continue
-                gradient = _exponent_gradient(behind, j, weight, row_alpha, dots)
-                g0 += gradient
-                g1 += gradient * dy
-                g2 += gradient * (dy * dy)
-            if touched:
-                # Without colors, the two sums after the moments are zero and are overwritten by the features.
-                store_totals(rows, row, g0, g0 * dx, g1, g0 * dx * dx)
-                store_totals(rows, row + 4, g1 * dx, g2, r0, r1)
-                if colors == 3:
-                    rows[row + GEOMETRY_FIELDS + 2] = total(r2)
-                _feature_gradients(first, last, colors, channels, weights, upstream, row, rows)
+            _pair_gradients(
+                members[slot], left, top, ellipses, boxes, values, columns, colors, channels, geometry,
+                live, behind, upstream, weights, row, rows,
+            )  # fmt: skip
             countdown -= 1
             if countdown == 0:
                 countdown = CHECK_EVERY

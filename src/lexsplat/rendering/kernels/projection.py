@@ -178,6 +178,22 @@ def _through_inverse(grad_conics: F32, n: int, a: float, b: float, c: float, det
 
 
 @kernel
+def _through_mip_filter(
+    grad: float, a: float, b: float, c: float, sharp: float, det: float
+) -> tuple[float, float, float, float]:
+    """Gradients w.r.t. a, b and c through the factor sqrt(sharp / det) of the opacity, and the factor."""
+    compensation = math.sqrt(sharp / det)
+    factor = grad / (2.0 * compensation * det)
+    share = compensation * compensation
+    return (
+        factor * (c - share * (c + DILATION)),
+        factor * (-2.0 * b * (1.0 - share)),
+        factor * (a - share * (a + DILATION)),
+        compensation,
+    )
+
+
+@kernel
 def _along_axis(grad_square: float, grad_product: float, axis: Triple, other: Triple) -> Triple:
     """Gradient w.r.t. an image axis from those w.r.t. its square and its product with the other axis."""
     return (
@@ -185,6 +201,15 @@ def _along_axis(grad_square: float, grad_product: float, axis: Triple, other: Tr
         2.0 * grad_square * axis[1] + grad_product * other[1],
         2.0 * grad_square * axis[2] + grad_product * other[2],
     )
+
+
+@kernel
+def _through_image_axis(row: int, focal: float, axes: F64, grad: Triple, grad_axes: F64) -> float:
+    """Write row ``row`` of ``grad_axes`` from the gradient w.r.t. `_image_axis`; returns that w.r.t. the slope."""
+    grad_axes[3 * row] = focal * grad[0]
+    grad_axes[3 * row + 1] = focal * grad[1]
+    grad_axes[3 * row + 2] = focal * grad[2]
+    return -focal * (axes[6] * grad[0] + axes[7] * grad[1] + axes[8] * grad[2])
 
 
 @kernel
@@ -245,12 +270,10 @@ def project_backward(
     grad_axes, grad_rotation = np.empty(9), np.empty(9)
     fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
     for n in range(start, stop):
-        for j in range(3):
-            grad_means[n, j] = grad_log_scales[n, j] = np.float32(0)
-        for j in range(4):
-            grad_quats[n, j] = np.float32(0)
-        grad_opacity_logits[n] = np.float32(0)
         if radii[n] == 0:
+            grad_means[n, :] = grad_log_scales[n, :] = np.float32(0)
+            grad_quats[n, :] = np.float32(0)
+            grad_opacity_logits[n] = np.float32(0)
             continue
         # Recomputing the forward pass is cheaper than storing its intermediate values.
         tx, ty, tz = _to_camera(camera, means, n)
@@ -266,27 +289,20 @@ def project_backward(
         sigmoid = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[n])))
         grad_opacity = np.float64(grad_opacities[n])
         if antialiased:
-            # compensation = sqrt(sharp / det)
-            compensation = math.sqrt(sharp / det)
-            factor = grad_opacity * sigmoid / (2.0 * compensation * det)
-            share = compensation * compensation
-            grad_a += factor * (c - share * (c + DILATION))
-            grad_b += factor * (-2.0 * b * (1.0 - share))
-            grad_c += factor * (a - share * (a + DILATION))
-            grad_opacity *= compensation
+            more_a, more_b, more_c, factor = _through_mip_filter(grad_opacity * sigmoid, a, b, c, sharp, det)
+            grad_a += more_a
+            grad_b += more_b
+            grad_c += more_c
+            grad_opacity *= factor
         grad_opacity_logits[n] = grad_opacity * sigmoid * (1.0 - sigmoid)
 
         # Through rows u and v of Jacobian times axes to the Jacobian and the axes.
-        gu0, gu1, gu2 = _along_axis(grad_a, grad_b, u, v)
-        gv0, gv1, gv2 = _along_axis(grad_c, grad_b, v, u)
-        grad_axes[0], grad_axes[1], grad_axes[2] = px * gu0, px * gu1, px * gu2
-        grad_axes[3], grad_axes[4], grad_axes[5] = py * gv0, py * gv1, py * gv2
-        grad_axes[6] = -slope_x * grad_axes[0] - slope_y * grad_axes[3]
-        grad_axes[7] = -slope_x * grad_axes[1] - slope_y * grad_axes[4]
-        grad_axes[8] = -slope_x * grad_axes[2] - slope_y * grad_axes[5]
-        grad_slope_x = -px * (axes[6] * gu0 + axes[7] * gu1 + axes[8] * gu2)
-        grad_slope_y = -py * (axes[6] * gv0 + axes[7] * gv1 + axes[8] * gv2)
-        gtz = -(gu0 * u[0] + gu1 * u[1] + gu2 * u[2] + gv0 * v[0] + gv1 * v[1] + gv2 * v[2]) / tz
+        gu, gv = _along_axis(grad_a, grad_b, u, v), _along_axis(grad_c, grad_b, v, u)
+        grad_slope_x = _through_image_axis(0, px, axes, gu, grad_axes)
+        grad_slope_y = _through_image_axis(1, py, axes, gv, grad_axes)
+        for j in range(3):
+            grad_axes[6 + j] = -slope_x * grad_axes[j] - slope_y * grad_axes[3 + j]
+        gtz = -(gu[0] * u[0] + gu[1] * u[1] + gu[2] * u[2] + gv[0] * v[0] + gv[1] * v[1] + gv[2] * v[2]) / tz
 
         # A clamped slope is constant; an unclamped slope and the center depend on t / tz.
         if slope_x != tx / tz:

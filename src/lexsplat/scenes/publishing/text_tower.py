@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lexsplat.features.clip import ClipEncoder
+from lexsplat.queries import everyday, presence
 from lexsplat.runtime.files import save_tensors
 from lexsplat.scenes.scene import Scene
 
@@ -22,8 +23,8 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
 
     Args:
         scene: The scene, whose text encoder is taken.
-        weights: Safetensors to write: the tower, the codewords of unit length ``[K, D]``, and the largest cosine of
-            each code with a canonical phrase ``[K]``.
+        weights: Safetensors to write: the tower, the codewords of unit length ``[K, D]``, and the mean embedding
+            ``[D]`` and the best height at each code ``[K]`` of everyday words.
         tokenizer: JSON to write.
 
     Returns:
@@ -35,10 +36,8 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
         return None
     tensors = _stored(tower.tensors)
     codewords = torch.nn.functional.normalize(scene.field.codebook.clip.detach().cpu().float(), dim=-1)
-    canonical = torch.nn.functional.normalize(scene.embed(scene.query.negatives).float(), dim=-1)
-    tensors["codewords"] = codewords
-    tensors["canonical"] = (codewords @ canonical.T).amax(1)
-    save_tensors(tensors, weights, scene.encoder_identity())
+    tensors |= {"codewords": codewords, "mean": scene.everyday_scale.mean, "best": scene.everyday_scale.best}
+    save_tensors({name: tensor.contiguous().cpu() for name, tensor in tensors.items()}, weights, scene.encoder_identity())
     tokenizer.write_text(json.dumps(_plain_tokenizer(tower.tokenizer), ensure_ascii=False), encoding="utf-8")
     return {
         "weights": weights.name,
@@ -46,6 +45,15 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
         "heads": tower.heads,
         "activation": tower.activation,
         "templates": list(scene.query.templates),
+        "everyday": {
+            "border": everyday.BORDER,
+            "steepness": everyday.STEEPNESS,
+            "offset": everyday.OFFSET,
+            "peak_share": everyday.PEAK_SHARE,
+            "peak": scene.everyday_scale.peak,
+            "yes": presence.YES,
+            "no": presence.NO,
+        },
     }
 
 

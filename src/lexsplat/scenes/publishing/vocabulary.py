@@ -1,4 +1,4 @@
-"""The phrases that a published page answers without a text encoder, and their relevancy for every code."""
+"""The phrases that a published page answers without a text encoder, and what it answers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from importlib.resources import files
 import torch
 from torch import Tensor
 
-from lexsplat.queries.presence import REFERENCE_PHRASES
-from lexsplat.queries.relevancy import Question, code_relevancy, embed_prompts
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.relevancy import embed_prompts
 from lexsplat.runtime.errors import LexsplatError
 from lexsplat.runtime.files import read_json
 from lexsplat.scenes.scene import Scene
@@ -21,7 +21,7 @@ part; what things are for."""
 
 _MOST_ASKED = 500
 _LONGEST = 120
-_BATCH = 256
+_BATCH = 128
 
 
 def everyday_phrases(bundled: bool = False) -> dict[str, str]:
@@ -38,7 +38,7 @@ def everyday_phrases(bundled: bool = False) -> dict[str, str]:
             separator = ";" if name == "parts" else ","
             sections.setdefault(name, []).extend(part.strip() for part in content.split(separator))
     phrases = dict.fromkeys(sections["bundled"], NAME)
-    for name in (*sections["things"], *REFERENCE_PHRASES):
+    for name in (*sections["things"], *everyday_words()):
         phrases.setdefault(name, COMBINED if bundled else NAME)
     for adjectives, things in (("colors", "colored"), ("materials", "made")):
         for thing in sections[things]:
@@ -78,22 +78,27 @@ def asked_phrases(scene: Scene) -> list[str]:
 
 
 @torch.no_grad()
-def relevancy_tables(scene: Scene, phrases: list[str]) -> Tensor:
-    """Relevancy of every phrase for every code: ``[P, K]`` uint8 in 255ths.
+def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]:
+    """Relevancy of every phrase for every code, ``[P, K]`` uint8 in 255ths, and its presence: "y", "u" or "n".
+
+    Both are relative to everyday words (`lexsplat.queries.everyday`).
 
     Raises:
         ModelError: If the text encoder cannot be loaded.
     """
-    negatives = scene.embed(scene.query.negatives)
-    codewords = scene.field.codebook.clip.cpu()
-    rows = []
+    scale, field = scene.everyday_scale, scene.field
+    codewords = field.codebook.clip
+    tables, presences = [], []
     for start in range(0, len(phrases), _BATCH):
-        embedded = embed_prompts(phrases[start : start + _BATCH], scene.encode_batch, scene.query.templates)
-        relevancy = code_relevancy(codewords, Question(embedded, negatives, scene.query))
-        rows.append((relevancy.T * 255).round().to(torch.uint8))
-    return torch.cat(rows)
+        texts = embed_prompts(phrases[start : start + _BATCH], scene.encode_batch, scene.query.templates)
+        relevancy = scale.relevancy(codewords, texts.to(codewords.device))
+        tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
+        scores = field.scores(relevancy).T.contiguous()
+        presences += [presence[0] for presence in scene.presence_classifier.classify(texts, scores)]
+    return torch.cat(tables), presences
 
 
-def words_file(phrases: dict[str, str]) -> bytes:
-    """The list of phrases for the page: one a line, its kind in front."""
-    return "".join(f"{kind}{phrase}\n" for phrase, kind in phrases.items()).encode("utf-8")
+def words_file(phrases: dict[str, str], presences: list[str]) -> bytes:
+    """The list of phrases for the page: one a line, its kind and its presence in front."""
+    lines = (f"{kind}{present}{phrase}\n" for (phrase, kind), present in zip(phrases.items(), presences))
+    return "".join(lines).encode("utf-8")

@@ -19,18 +19,13 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.formats.language import stored_language
-from lexsplat.scenes.publishing.sidecar import (
-    presence_rule,
-    splat_codes,
-    threshold_samples,
-    view_entries,
-)
+from lexsplat.scenes.publishing.sidecar import splat_codes, view_entries
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
 from lexsplat.scenes.publishing.vocabulary import (
     asked_phrases,
     page_phrases,
-    relevancy_tables,
+    phrase_answers,
     words_file,
 )
 from lexsplat.scenes.scene import Scene
@@ -197,10 +192,10 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     identity = scene.encoder_identity()
     language = stored_language(scene.field, identity).select(kept)
     (folder / "codes.bin").write_bytes(splat_codes(language))
-    (folder / "samples.bin").write_bytes(threshold_samples(scene))
     phrases = page_phrases(asked_phrases(scene), bundled=scene.clip in ("bundled", "embedded"))
-    (folder / "words.txt").write_bytes(words_file(phrases))
-    (folder / "words.bin").write_bytes(relevancy_tables(scene, list(phrases)).numpy().tobytes())
+    tables, presences = phrase_answers(scene, list(phrases))
+    (folder / "words.txt").write_bytes(words_file(phrases, presences))
+    (folder / "words.bin").write_bytes(tables.numpy().tobytes())
     text = None
     if not options.words_only:
         text = write_text_tower(scene, folder / "text.safetensors", folder / "tokenizer.json")
@@ -225,14 +220,11 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
         },
         "language": {
             "codes": "codes.bin",
-            "samples": "samples.bin",
             "num_codes": scene.field.codebook.num_codes,
-            "temperature": scene.query.temperature,
             "method": scene.field.method,
         },
         "words": {"phrases": "words.txt", "table": "words.bin", "count": len(phrases)},
         "text": text,
-        "presence": presence_rule(scene),
         "views": view_entries(scene),
         "licenses": {
             "page.js": "Apache-2.0 and those of LICENSES.txt",

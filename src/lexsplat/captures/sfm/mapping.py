@@ -1,0 +1,268 @@
+"""Structure from motion on prepared photos with pycolmap: features, matches and models.
+
+Everything here runs inside `quiet_pycolmap`. Memory determines threads and batches, never a result.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from PIL import Image
+
+from lexsplat.captures.images.reading import image_size
+from lexsplat.captures.sfm.feature_budget import extraction_threads, matching_plan
+from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
+from lexsplat.captures.sfm.pycolmap_import import pycolmap
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.files import atomic_path
+
+if TYPE_CHECKING:
+    from lexsplat.captures.sfm.photos import PoseConfig
+    from lexsplat.captures.sfm.preparation import PreparedPhotos
+
+SEQUENTIAL_OVERLAP = 12
+BATCH = 8
+"""Photos per call of SIFT extraction: the most work that an interruption can lose."""
+
+MAX_LEFTOVER_PAIRS = 20_000
+"""Most pairs that are matched to register photos which sequential matching left unregistered."""
+
+SMALL_ANGLE = 4.0
+"""Smallest triangulation angle of the first pair of "small angles", in degrees; pycolmap's default is 16.
+Forward-facing photos rarely reach that."""
+
+MIN_MATCHES = 15
+"""Fewest verified matches of a pair, and fewest inliers of a photo in "small angles" (pycolmap: 30)."""
+
+HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
+
+Mapper = Literal["incremental", "small angles", "global"]
+"""How models are found: photo by photo, the same from pairs with small angles, or all photos at once (GLOMAP)."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The largest model that a mapper finds.
+
+    Args:
+        mapper: The mapper.
+        model: The model, without mis-registered photos.
+        models: Number of models that could not be joined.
+    """
+
+    mapper: Mapper
+    model: pycolmap.Reconstruction
+    models: int
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Larger is better: the number of registered photos, then a small reprojection error."""
+        return self.model.num_reg_images(), -self.model.compute_mean_reprojection_error()
+
+
+def extract_features(
+    database: Path,
+    photos: PreparedPhotos,
+    config: PoseConfig,
+    memory: int,
+    listener: Callable[[int], None],
+    camera_model: str = "SIMPLE_RADIAL",
+) -> None:
+    """Extract SIFT features of all photos, one camera per lens; features already in the database are kept.
+
+    Args:
+        database: pycolmap's database; it is created if it does not exist.
+        photos: The photos, grouped by lens.
+        config: Limits of the features.
+        memory: Bytes of host memory available.
+        listener: Receives the number of finished photos.
+        camera_model: Model of the lenses.
+    """
+    pycolmap.Database.open(database).close()
+    reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
+    if photos.masks is not None:
+        reader.mask_path = _complete_masks(photos, photos.masks, database.parent / "all-masks")
+    single = pycolmap.CameraMode.SINGLE
+    for group in photos.lenses:
+        # Importing first assigns image ids in order; extraction alone assigns them as threads finish.
+        pycolmap.import_images(database, photos.images, single, list(group), reader)
+    masked = photos.masks is not None
+    threads = extraction_threads(photos.largest, config.max_side, config.max_features, memory, masked=masked)
+    options = pycolmap.FeatureExtractionOptions(max_image_size=config.max_side, num_threads=threads)
+    options.sift.max_num_features = config.max_features
+    for start in range(0, len(photos.names), BATCH):
+        batch = list(photos.names[start : start + BATCH])
+        pycolmap.extract_features(
+            database,
+            photos.images,
+            batch,
+            camera_mode=single,
+            reader_options=reader,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+        listener(start + len(batch))
+
+
+def _complete_masks(photos: PreparedPhotos, masks: Path, folder: Path) -> Path:
+    """A folder with a mask for every photo, white where the user gave none: pycolmap skips photos without a mask."""
+    for name in photos.names:
+        target, source = folder / f"{name}.png", masks / f"{name}.png"
+        if target.is_file():
+            continue
+        with atomic_path(target) as temporary:
+            if source.is_file():
+                shutil.copyfile(source, temporary)
+            else:
+                Image.new("L", image_size(photos.images / name), 255).save(temporary, format="PNG")
+    return folder
+
+
+def match_photos(database: Path, count: int, config: PoseConfig, seed: int, memory: int) -> None:
+    """Match ``count`` photos, all pairs or each with the next ones, and verify the matches."""
+    if config.compares_all(count):
+        matching, held = matching_plan(database, memory, least=2 * budget.CACHED_BLOCKS)
+        pycolmap.match_exhaustive(
+            database,
+            matching_options=matching,
+            pairing_options=pycolmap.ExhaustivePairingOptions(
+                block_size=min(50, held // budget.CACHED_BLOCKS)
+            ),
+            verification_options=_verification(seed),
+            device=pycolmap.Device.cpu,
+        )
+        return
+    # Quadratic overlap adds photos 2, 4, 8, ... further on, which closes loops.
+    pairing = pycolmap.SequentialPairingOptions(overlap=SEQUENTIAL_OVERLAP, quadratic_overlap=True)
+    if hasattr(pairing, "loop_detection_num_images"):  # unused, but pycolmap sizes its feature cache by it
+        pairing.loop_detection_num_images = 1
+    matching, _ = matching_plan(database, memory, least=budget.SEQUENTIAL_BLOCKS * SEQUENTIAL_OVERLAP)
+    pycolmap.match_sequential(
+        database,
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=_verification(seed),
+        device=pycolmap.Device.cpu,
+    )
+
+
+def match_leftover(
+    database: Path, names: tuple[str, ...], leftover: tuple[str, ...], seed: int, memory: int
+) -> None:
+    """Match unregistered photos with all others, or with every n-th so that `MAX_LEFTOVER_PAIRS` is not exceeded."""
+    step = max(1, -(-len(leftover) * len(names) // MAX_LEFTOVER_PAIRS))
+    pairs = {(min(a, b), max(a, b)) for a in leftover for b in names[::step] if a != b}
+    match_pairs(database, pairs, memory, seed)
+
+
+def match_pairs(database: Path, pairs: Iterable[tuple[str, str]], memory: int, seed: int | None) -> None:
+    """Match pairs of photos by name, and verify the matches with a seed; None leaves them unverified."""
+    listed = database.with_name("pairs.txt")
+    listed.write_text("".join(f"{first} {second}\n" for first, second in sorted(pairs)), encoding="utf-8")
+    matching, held = matching_plan(database, memory)
+    matching.skip_geometric_verification = seed is None
+    pycolmap.match_image_pairs(
+        database,
+        matching_options=matching,
+        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=held),
+        verification_options=_verification(seed or 0),
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    return options
+
+
+def map_photos(
+    database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int, another: Callable[[], None]
+) -> Attempt | None:
+    """The largest model of all verified matches, or None if no photo can be registered.
+
+    Args:
+        database: Features and matches.
+        photos: The photos.
+        mapper: How models are found.
+        seed: Seed for pycolmap.
+        another: Called for each registered photo.
+    """
+    models = database.parent / "models"
+    shutil.rmtree(models, ignore_errors=True)
+    models.mkdir()
+    if mapper == "global":
+        # GLOMAP needs focal lengths: those that are guesses are calibrated from the pairs first, in a copy.
+        calibrated = Path(shutil.copyfile(database, database.with_name("calibrated.db")))
+        pycolmap.calibrate_view_graph(calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+        options = pycolmap.GlobalPipelineOptions(random_seed=seed, min_model_size=3)
+        found = pycolmap.global_mapping(calibrated, photos.images, models, options)
+    else:
+        found = pycolmap.incremental_mapping(
+            database,
+            photos.images,
+            models,
+            _mapper_options(mapper, seed),
+            initial_image_pair_callback=another,
+            next_image_callback=another,
+        )
+    ordered = [found[key] for key in sorted(found)]
+    if not ordered:
+        return None
+    largest = max(ordered, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    return Attempt(mapper, _without_misregistered(largest, database, photos, mapper, seed), len(found))
+
+
+def _mapper_options(mapper: Mapper, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3)
+    if mapper == "small angles":
+        options.mapper.init_min_tri_angle = SMALL_ANGLE
+        options.mapper.abs_pose_min_num_inliers = MIN_MATCHES
+    return options
+
+
+def _without_misregistered(
+    model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int
+) -> pycolmap.Reconstruction:
+    """The model with its mis-registered photos registered again, or removed."""
+    with pycolmap.Database.open(database) as opened:
+        wrong = misregistered(model, opened)
+    options = _mapper_options(mapper, seed)
+    return register_again(model, wrong, database, photos.images, options) if wrong else model
+
+
+def unregistered(names: Iterable[str], attempt: Attempt | None) -> tuple[str, ...]:
+    """Names of the photos without a pose, sorted."""
+    model = None if attempt is None else attempt.model
+    registered = set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
+    return tuple(sorted(set(names) - registered))
+
+
+def matched(database: Path) -> set[str]:
+    """Names of the photos with verified matches with another photo: no mapper can register the others."""
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        pairs = zip(*opened.read_two_view_geometries())
+        kept = [pair for pair, geometry in pairs if len(geometry.inlier_matches) >= MIN_MATCHES]
+    return {names[number] for pair in kept for number in pycolmap.pair_id_to_image_pair(pair)}
+
+
+def write_model(model: pycolmap.Reconstruction, output: Path) -> None:
+    """Write the model beside ``sparse/0`` and then swap it in, so that no partial model is ever visible."""
+    final = output / "sparse" / "0"
+    final.parent.mkdir(parents=True, exist_ok=True)
+    temporary = final.with_name(f".0.{os.getpid()}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        model.write_binary(temporary)
+        if final.exists():
+            shutil.rmtree(final)
+        os.replace(temporary, final)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
