@@ -39,7 +39,7 @@ def test_every_file_of_the_demo_of_the_page_and_every_template_is_packaged():
     assert len(bundled) > 400
     templates = {path.relative_to(DATA).as_posix() for path in DATA.rglob("templates/*.*")}
     page = {f"scenes/publishing/page/{name}" for name in PAGE}
-    assert bundled | templates | page | {"py.typed"} == packaged(DATA)
+    assert bundled | templates | page | {"py.typed", "queries/everyday_words.txt"} == packaged(DATA)
 
 
 def test_package_data_take_less_than_38_megabytes():

@@ -15,9 +15,9 @@ from support.language_scene import CENTERS
 from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
 from support.viewer_scene import ball_scene
 
+from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
 from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
-from lexsplat.scenes.publishing.sidecar import REFERENCE_PHRASES
 from lexsplat.scenes.scene import open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -44,7 +44,9 @@ def browser():
 
 @pytest.fixture(scope="module")
 def demo():
-    return open_scene("demo")
+    scene = open_scene("demo")
+    scene.query = QueryConfig(form="code")  # the page's
+    return scene
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,7 @@ def page(browser, address):
 @pytest.fixture
 def ball_page(tmp_path, monkeypatch):
     """Publishes the scene of balls with some options; returns the folder and the ground truth."""
-    words = [*(f"ball {n}" for n in range(5)), *REFERENCE_PHRASES]
+    words = [*(f"ball {n}" for n in range(5)), "toy", "chair", "bed"]
     monkeypatch.setattr(vocabulary, "everyday_phrases", lambda bundled: dict.fromkeys(words, "n"))
     scene, ground_truth = ball_scene()
 

@@ -159,21 +159,9 @@ class Scene:
             self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
-    def encode_batch(self, texts: list[str]) -> Tensor:
-        """Embeddings ``[T, D]`` of many texts at once; unlike those of `encode_text`, they are not cached.
-
-        Raises:
-            ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
-        """
-        return (self._given_encode_text or self.encoder.encode_text)(texts)
-
     @property
     def encoder(self) -> ImageTextEncoder:
-        """The text encoder that belongs to the language; loaded at first use.
-
-        Raises:
-            ModelError: See `encode_batch`.
-        """
+        """The text encoder that belongs to the language, loaded at first use (`preload`)."""
         return self._load_encoder(self._encoder_hash)
 
     def encoder_identity(self) -> dict[str, str]:

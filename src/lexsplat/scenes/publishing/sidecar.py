@@ -37,4 +37,3 @@ def view_entries(scene: Scene) -> list[dict[str, Any]]:
         }
         for name, view in sorted(scene.views.items())
     ]
-

@@ -37,7 +37,11 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
     tensors = _stored(tower.tensors)
     codewords = torch.nn.functional.normalize(scene.field.codebook.clip.detach().cpu().float(), dim=-1)
     tensors |= {"codewords": codewords, "mean": scene.everyday_scale.mean, "best": scene.everyday_scale.best}
-    save_tensors({name: tensor.contiguous().cpu() for name, tensor in tensors.items()}, weights, scene.encoder_identity())
+    save_tensors(
+        {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
+        weights,
+        scene.encoder_identity(),
+    )
     tokenizer.write_text(json.dumps(_plain_tokenizer(tower.tokenizer), ensure_ascii=False), encoding="utf-8")
     return {
         "weights": weights.name,

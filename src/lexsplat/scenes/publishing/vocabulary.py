@@ -39,7 +39,7 @@ def everyday_phrases(bundled: bool = False) -> dict[str, str]:
             sections.setdefault(name, []).extend(part.strip() for part in content.split(separator))
     phrases = dict.fromkeys(sections["bundled"], NAME)
     for name in (*sections["things"], *everyday_words()):
-        phrases.setdefault(name, COMBINED if bundled else NAME)
+        phrases.setdefault(name.lower(), COMBINED if bundled else NAME)
     for adjectives, things in (("colors", "colored"), ("materials", "made")):
         for thing in sections[things]:
             for adjective in sections[adjectives]:
@@ -90,7 +90,9 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
     codewords = field.codebook.clip
     tables, presences = [], []
     for start in range(0, len(phrases), _BATCH):
-        texts = embed_prompts(phrases[start : start + _BATCH], scene.encode_batch, scene.query.templates)
+        texts = embed_prompts(
+            phrases[start : start + _BATCH], scene.encoder.encode_text, scene.query.templates
+        )
         relevancy = scale.relevancy(codewords, texts.to(codewords.device))
         tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
         scores = field.scores(relevancy).T.contiguous()
