@@ -159,6 +159,11 @@ class Scene:
             self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
+    @property
+    def encoder(self) -> ImageTextEncoder:
+        """The text encoder that belongs to the language, loaded at first use (`preload`)."""
+        return self._load_encoder(self._encoder_hash)
+
     def encoder_identity(self) -> dict[str, str]:
         """Name and content hash (if known) of the text encoder, for files of other programs."""
         known = self._encoder_hash
