@@ -55,7 +55,7 @@ class Ablate:
     wrong_labels: float = 0.0
     masks: Path | None = None
     prompt_list: PromptListName | None = None
-    forms: tuple[Literal["feature", "code"], ...] = ("feature",)
+    forms: tuple[Literal["segment", "code", "feature"], ...] = ("feature",)
     as_in_paper: bool = False
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
@@ -72,7 +72,7 @@ class Ablate:
         """Refuse invalid options."""
         check_seeds(self.seeds)
         if not self.forms:
-            raise ValueError("--forms needs at least one of feature, code")
+            raise ValueError("--forms needs at least one of segment, code, feature")
         if not 0 <= self.wrong_labels <= 1:
             raise ValueError(f"--wrong-labels must be in 0..1, got {self.wrong_labels:g}")
 

@@ -31,7 +31,7 @@ class Compare:
     Args:
         capture: Folder with photos, cameras and ground truth, or the word "demo" or "second" for a bundled capture.
         output: Folder for all results. ``ablate`` with the same folder uses the same Gaussians and features.
-        methods: Rows to measure. "-feature" is the paper's form of relevancy in place of our default.
+        methods: Rows to measure. "-code" answers by single Gaussians, "-feature" in the paper's form.
         seeds: Seeds of codebook and language.
         masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
@@ -45,10 +45,10 @@ class Compare:
     output: Path
     methods: tuple[
         Literal[
-            "averaged", "averaged-feature", "trained", "trained-feature", "dff", "lerf", "3dovs", "nearest",
+            "averaged", "averaged-code", "averaged-feature", "trained", "trained-code", "trained-feature", "dff", "lerf", "3dovs", "nearest",
         ],
         ...,
-    ] = ("averaged", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
+    ] = ("averaged", "averaged-code", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
     seeds: tuple[int, ...] = (0,)
     masks: Path | None = None
     prompt_list: PromptListName | None = None

@@ -14,16 +14,19 @@ from lexsplat.evaluation.experiments import Bench, Made, Results
 from lexsplat.evaluation.methods import Method
 from lexsplat.language import methods as language
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.queries.relevancy import embed_prompts
+from lexsplat.queries.relevancy import QueryForm, embed_prompts
 from lexsplat.runtime.progress import Listener, silent
 
 OURS = language.names()
-"""Our methods. With the suffix "-feature" they answer in the paper's form of relevancy."""
+"""Our methods. With the suffix "-code" they answer by single Gaussians, with "-feature" in the paper's form."""
 
 BASELINES = ("dff", "lerf", "3dovs", "nearest")
 """The methods that the paper compares with, and "nearest", a lower bound without 3D."""
 
-METHODS = (*OURS, *(f"{name}-feature" for name in OURS), *BASELINES)
+FORMS: tuple[QueryForm, ...] = ("code", "feature")
+"""Suffixes of our methods."""
+
+METHODS = (*OURS, *(f"{name}-{form}" for name in OURS for form in FORMS), *BASELINES)
 """Everything that can be compared."""
 
 
@@ -39,7 +42,7 @@ class ComparisonPlan:
         ValueError: If a method is unknown, or there is no method or seed.
     """
 
-    methods: Sequence[str] = ("averaged", "trained-feature", *BASELINES)
+    methods: Sequence[str] = ("averaged", "averaged-code", "trained-feature", *BASELINES)
     seeds: Sequence[int] = (0,)
 
     def __post_init__(self) -> None:
@@ -85,7 +88,8 @@ def compare(
     results = Results(bench, "comparison", plan.methods, plan.seeds)
     for seed in plan.seeds:
         for name in plan.methods:
-            bench.evaluation = in_form(shared, "feature") if name.endswith("-feature") else shared
+            forms = [form for form in FORMS if name.endswith(f"-{form}")]
+            bench.evaluation = in_form(shared, forms[0]) if forms else shared
             settings, make = _method(bench, name, seed)
             results.add(bench.run(name, seed, settings, make, pictures=seed == plan.seeds[0]))
     return results.rows()
@@ -93,7 +97,7 @@ def compare(
 
 def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[], Made]]:
     """The settings a method depends on, and a function that makes its language."""
-    own = name.removesuffix("-feature")
+    own = name.removesuffix("-feature").removesuffix("-code")
     if own in OURS:
         config = replace(bench.config, method=own, seed=seed)  # type: ignore[arg-type]
         return language_settings(config), lambda: make_language(bench, config)

@@ -1,8 +1,8 @@
 """Measuring a scene on its held-out views: images, language, speed and size, as in the paper's Table 1.
 
 Nothing is chosen on the views it is reported on. Three thresholds are reported side by side: ``fixed`` (0.5, the
-paper), ``auto`` (per prompt, from renderings of training views, `lexsplat.queries.thresholds.scene_thresholds`) and
-``oracle`` (per prompt, the best one for the ground truth: an upper bound, never a result).
+paper), ``auto`` (per prompt, as for users: `lexsplat.evaluation.methods.automatic_answers`) and ``oracle`` (per
+prompt, the best one for the ground truth: an upper bound, never a result).
 
 Relevancy is rendered at the size of the ground truth, so that neither is resized. Only for masks larger than
 ``max_pixels`` is the map rendered at the working size and enlarged. The official protocol renders at the working
@@ -24,7 +24,7 @@ from torch import Tensor
 from lexsplat.captures.ground_truth.layouts import load_ground_truth
 from lexsplat.evaluation.ground_truth import GroundTruth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
-from lexsplat.evaluation.methods import FieldMethod, Method, method_presences
+from lexsplat.evaluation.methods import FieldMethod, Method, automatic_answers
 from lexsplat.evaluation.metrics import (
     THRESHOLDS,
     Perceptual,
@@ -43,7 +43,6 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.presence import REFERENCE_PHRASES
 from lexsplat.queries.relevancy import QueryConfig, Question, TextEncoder, embed_prompts
-from lexsplat.queries.thresholds import scene_thresholds
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.sampling import evenly
 
@@ -179,12 +178,12 @@ class _Evaluation:
         self.texts = dict(zip(self.prompts, embeddings))
         self.negatives = embed_prompts(query.negatives, encode_text, query.templates)
         references = embed_prompts(REFERENCE_PHRASES, encode_text, query.templates)
-        method, question = self.method, Question(embeddings, self.negatives, query)
-        scores = method.gaussian_scores(question)
-        found = scene_thresholds(
-            lambda camera: method.relevancy(self.gaussians, camera, question),
+        scores, found = automatic_answers(
+            self.method,
+            self.gaussians,
             [view.camera for view in self.capture.train_views or self.views],
-            method_presences(method, self.gaussians, scores, Question(references, self.negatives, query)),
+            Question(embeddings, self.negatives, query),
+            Question(references, self.negatives, query),
         )
         for prompt, value in zip(self.prompts, found.tolist()):
             self.thresholds[prompt] = {"auto": round(value, 3), "fixed": query.threshold}

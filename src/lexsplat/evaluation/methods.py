@@ -9,13 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.presence import PresenceClassifier
-from lexsplat.queries.relevancy import Question, gaussian_relevancy, render_relevancy
-from lexsplat.queries.selection import Presence
+from lexsplat.queries.relevancy import Question
+from lexsplat.queries.scoring import Classify, render_scored, score_prompts
+from lexsplat.queries.segments import SEGMENT_THRESHOLD
+from lexsplat.queries.thresholds import scene_thresholds
 
 if TYPE_CHECKING:
     from lexsplat.language.fields import LanguageField
@@ -50,32 +53,45 @@ class FieldMethod:
     def __init__(self, field: LanguageField) -> None:
         self.field = field
         self.method = field.method
+        self.classify: Classify | None = None
 
     def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
-        """See `lexsplat.queries.relevancy.render_relevancy`."""
-        return render_relevancy(self.field, gaussians, camera, question)
+        """See `lexsplat.queries.scoring.render_scored`."""
+        return render_scored(self.field, gaussians, camera, question, self.classify)
 
     def gaussian_scores(self, question: Question) -> Tensor | None:
-        """See `lexsplat.queries.relevancy.gaussian_relevancy`."""
-        return gaussian_relevancy(self.field, question)
+        """See `lexsplat.queries.scoring.score_prompts`."""
+        return score_prompts(self.field, question, self.classify).scores
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors of the field."""
         return self.field.tensors()
 
 
-def method_presences(
-    method: Method, gaussians: Gaussians, scores: Tensor | None, references: Question
-) -> Sequence[Presence] | None:
-    """Whether the scene holds each prompt, as for its users; None for methods other than language fields.
+def automatic_answers(
+    method: Method,
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    question: Question,
+    references: Question,
+) -> tuple[Tensor | None, Tensor]:
+    """Scores ``[P, N]`` of the Gaussians, if the method has any, and automatic thresholds ``[P]``, as for its users.
 
     Args:
-        method: The method.
+        method: The method. A language field learns here what decides presence.
         gaussians: The reconstruction.
-        scores: Relevancy of the prompts ``[P, N]``.
+        cameras: The training views.
+        question: The embedded prompts.
         references: The embedded `lexsplat.queries.presence.REFERENCE_PHRASES`.
     """
-    if not isinstance(method, FieldMethod) or scores is None:
-        return None
-    classifier = PresenceClassifier(gaussians, method.field, references)
-    return [classifier.classify(row) for row in scores]
+
+    def maps(camera: Camera) -> Tensor:
+        return method.relevancy(gaussians, camera, question)
+
+    if not isinstance(method, FieldMethod):
+        return method.gaussian_scores(question), scene_thresholds(maps, cameras)
+    method.classify = PresenceClassifier(gaussians, method.field, references).classify
+    scored = score_prompts(method.field, question, method.classify)
+    if scored.by_segments:
+        return scored.scores, torch.full((len(question),), SEGMENT_THRESHOLD)
+    return scored.scores, scene_thresholds(maps, cameras, scored.presences)

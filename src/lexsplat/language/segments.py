@@ -128,7 +128,9 @@ def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segme
     order = np.argsort(lengths, kind="stable")
     smallest = max(_SMALLEST, count // _MOST)
     tolerance = _TOLERANCE * float(np.median(lengths))
-    labels = np.unique(join_linked(first, second, lengths, order, tolerance, smallest, count), return_inverse=True)[1]
+    labels = np.unique(
+        join_linked(first, second, lengths, order, tolerance, smallest, count), return_inverse=True
+    )[1]
     described = _describe(labels, features, colors, weights)
     segments = int(labels.max()) + 1
     merges = _merge(*described, labels[first], labels[second])
@@ -205,9 +207,9 @@ def join_linked(
 def _describe(
     labels: IntArray, features: Rows, colors: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean language and color of each segment ``[S, D + 3]``, scaled by their spread in the scene, and its mass ``[S]``."""
+    """Mean language and color ``[S, D + 3]``, each scaled by its spread in the scene, and mass ``[S]`` of segments."""
     segments, total = int(labels.max()) + 1, max(float(weights.sum()), 1e-12)
-    masses = np.bincount(labels, weights, segments)
+    masses = np.bincount(labels, weights, segments).astype(np.float64)
     described = []
     step = 1 << 14
 
@@ -250,7 +252,7 @@ def _merge(means: FloatArray, masses: FloatArray, first: IntArray, second: IntAr
 
     waiting = [(cost(a, b), a, b) for a in range(count) for b in neighbors[a] if a < b]
     heapq.heapify(waiting)
-    alive, merges = set(range(count)), []
+    alive, merges = set(range(count)), list[tuple[int, int]]()
     while waiting:
         _, a, b = heapq.heappop(waiting)
         if a not in alive or b not in alive:

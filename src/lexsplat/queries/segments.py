@@ -75,8 +75,8 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
         return relevancy
     labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
     levels = segments.levels.cpu().numpy()
-    lowest = np.stack([np.bincount(labels, weights * row, levels.shape[1]) for row in own])
-    masses = np.bincount(labels, weights, levels.shape[1])
+    lowest = np.stack([_sums(labels, weights * row, levels.shape[1]) for row in own])
+    masses = _sums(labels, weights, levels.shape[1])
     cuts = [_cut(lowest, masses, level) for level in levels]
     result = np.empty_like(own)
     for prompt in range(len(own)):
@@ -95,8 +95,8 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
 def _cut(lowest: FloatArray, lowest_masses: FloatArray, level: NDArray[np.int64]) -> _Cut:
     """The widest gap between the scores of the segments of a level, for each prompt."""
     count = int(level.max()) + 1
-    masses = np.bincount(level, lowest_masses, count)
-    sums = np.stack([np.bincount(level, row, count) for row in lowest])
+    masses = _sums(level, lowest_masses, count)
+    sums = np.stack([_sums(level, row, count) for row in lowest])
     scores = sums / np.maximum(masses, 1e-12)
     order = np.argsort(-scores, axis=1, kind="stable")
     ranked = np.take_along_axis(scores, order, 1)
@@ -108,3 +108,8 @@ def _cut(lowest: FloatArray, lowest_masses: FloatArray, level: NDArray[np.int64]
     taken = scores >= limits
     means = [(sums * side).sum(1) / np.maximum((masses * side).sum(1), 1e-12) for side in (taken, ~taken)]
     return _Cut(scores, masses, np.take_along_axis(gaps, best, 1)[:, 0], limits[:, 0], *means)
+
+
+def _sums(places: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
+    """Sums of the values ``[M]`` at each of ``count`` places, in the order of the values."""
+    return np.bincount(places, values, count).astype(np.float64)

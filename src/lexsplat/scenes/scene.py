@@ -31,9 +31,10 @@ from lexsplat.queries.relevancy import (
     Question,
     check_prompts,
     embed_prompts,
-    gaussian_relevancy,
     render_relevancy,
 )
+from lexsplat.queries.scoring import render_scored, score_prompts
+from lexsplat.queries.segments import SEGMENT_THRESHOLD
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
@@ -172,8 +173,9 @@ class Scene:
 
         Args:
             prompts: What to look for.
-            threshold: Smallest score of a selected Gaussian, in 0..1; None derives one for each prompt from the
-                training views (`lexsplat.queries.thresholds.scene_thresholds`).
+            threshold: Smallest score of a selected Gaussian, in 0..1; None takes whole segments
+                (`lexsplat.queries.segments`), or derives one for each prompt from the training views
+                (`lexsplat.queries.thresholds.scene_thresholds`) if there are no segments.
 
         Raises:
             QueryError: If there is no prompt, one is empty, or the threshold is not in 0..1.
@@ -182,13 +184,15 @@ class Scene:
         prompts = check_prompts(prompts)
         given = None if threshold is None else check_threshold(threshold)
         question = self._question(prompts)
-        scores = gaussian_relevancy(self.field, question)
-        presences = tuple(self.presence_classifier.classify(row) for row in scores)
-        if given is None:
-            thresholds = self._automatic_thresholds(prompts, question, presences)
-        else:
+        scored = score_prompts(self.field, question, self.presence_classifier.classify)
+        if given is not None:
             thresholds = torch.full((len(prompts),), given)
-        return Answers(tuple(prompts), scores, thresholds, presences, self, automatic=given is None)
+        elif scored.by_segments:
+            thresholds = torch.full((len(prompts),), SEGMENT_THRESHOLD)
+        else:
+            thresholds = self._automatic_thresholds(prompts, question, scored.presences)
+        automatic = given is None
+        return Answers(tuple(prompts), scored.scores, thresholds, scored.presences, self, automatic)
 
     def relevancy(self, prompts: str | Sequence[str], view: str | StoredView | Camera) -> Tensor:
         """Relevancy maps ``[P, H, W]`` of the prompts in a view, in 0..1.
@@ -196,12 +200,13 @@ class Scene:
         Raises:
             QueryError: If a prompt is empty or the view is unknown.
         """
-        camera = self.camera(view)
-        return render_relevancy(self.field, self.gaussians, camera, self._question(prompts))
+        camera, question = self.camera(view), self._question(prompts)
+        return render_scored(self.field, self.gaussians, camera, question, self.presence_classifier.classify)
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        return gaussian_relevancy(self.field, self._question(prompts))
+        question = self._question(prompts)
+        return score_prompts(self.field, question, self.presence_classifier.classify).scores
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
