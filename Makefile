@@ -18,10 +18,10 @@ demo: $(VENV)/.runtime  ## build, query and evaluate the scene that ships with t
 	$(BIN)/lexsplat demo --output "$(OUTPUT)"
 
 test: $(VENV)/.dev  ## run all tests
-	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadgroup
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile --no-loadscope-reorder
 
 test-fast: $(VENV)/.dev  ## run the tests that are not marked slow, in about a minute
-	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadgroup -m "not slow"
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: $(VENV)/.dev  ## style and types
 	$(BIN)/ruff check .

@@ -33,7 +33,7 @@ from sklearn.linear_model import LogisticRegression
 
 import lexsplat
 from lexsplat.geometry.boxes import gravity_up
-from lexsplat.geometry.cameras import camera_from_opengl
+from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, Camera
 from lexsplat.queries.presence import CALIBRATION, Calibration, Evidence
 
 KINDS = (
@@ -228,7 +228,8 @@ def load_ground_truth(folder: Path, stride: int) -> list[GroundTruthView]:
     views = []
     for name in sorted(record["camera_to_world"])[::stride]:
         pose = np.array(record["camera_to_world"][name], float)
-        camera = camera_from_opengl(record["width"], record["height"], np.array(record["K"], float), pose)
+        viewmat = np.linalg.inv(pose @ OPENGL_TO_OPENCV)
+        camera = Camera(record["width"], record["height"], np.array(record["K"], float), viewmat)
         with np.load(folder / "truth" / f"{name}.npz", allow_pickle=False) as content:
             views.append(GroundTruthView(camera, content["index"], content["depth"].astype(np.float64)))
     return views

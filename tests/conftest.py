@@ -1,10 +1,18 @@
 """Fixtures shared by the tests."""
 
 import os
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # The processes share the cores; with all cores each, their threads would wait for one another.
+    share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, share)))
+
 import pytest
-from support.tiny_capture import write_capture
+from filelock import FileLock
+from support.tiny_capture import QUICK_BUILD, write_capture
 
 import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
 from lexsplat.runtime import device as threads
@@ -13,10 +21,15 @@ TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] 
 
 
 def pytest_collection_modifyitems(items):
-    """Tests marked ``gpu`` are skipped without a CUDA device; tests of a scene built for them are slow."""
+    """Tests marked ``gpu`` are skipped without a CUDA device; tests of a scene built for them are slow.
+
+    Files with slow tests come first, so that none of pytest-xdist's processes starts one when the others are done.
+    """
     for item in items:
         if "built" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
+    slow = {item.path for item in items if "slow" in item.keywords}
+    items.sort(key=lambda item: item.path not in slow)
     import torch
 
     if torch.cuda.is_available():
@@ -34,26 +47,61 @@ def one_thread():
 
 
 @pytest.fixture(scope="session")
-def tiny_capture(tmp_path_factory) -> Path:
-    """Twelve ray-traced views of two spheres with cameras, points and masks; read-only."""
-    return write_capture(tmp_path_factory.mktemp("capture") / "tiny")
+def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Makes a folder once a run, whichever of pytest-xdist's processes asks first; the others wait for it."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder = shared / name
+        with FileLock(shared / f"{name}.lock"):
+            if not folder.exists():
+                make(shared / f"{name}.unfinished")
+                (shared / f"{name}.unfinished").rename(folder)
+        return folder
 
-QUICK_BUILD = [
-    "--clip", "bundled", "--dino", "bundled", "--device", "cpu", "--iterations", "120",
-    "--codebook.num-codes", "16", "--trained.iterations", "60",
-]  # fmt: skip
-"""Options of ``lexsplat build`` that make a small scene in seconds."""
+    return made
 
 
 @pytest.fixture(scope="session")
-def built(tiny_capture, tmp_path_factory) -> Path:
+def tiny_capture(made_once) -> Path:
+    """Twelve ray-traced views of two spheres with cameras, points and masks; read-only."""
+    return made_once("tiny_capture", write_capture)
+
+
+@pytest.fixture(scope="session")
+def built(tiny_capture, made_once, tmp_path_factory) -> Path:
     """A scene built from the tiny capture by the command line; its results must not be changed."""
     from lexsplat import cli
 
-    output = tmp_path_factory.mktemp("scene") / "tiny"
-    assert cli.main(["build", str(tiny_capture), "--output", str(output), *QUICK_BUILD]) == 0
-    return output
+    def build(output: Path) -> None:
+        assert cli.main(["build", str(tiny_capture), "--output", str(output), *QUICK_BUILD]) == 0
+
+    # A copy for each process: commands write beside the results, such as metrics and embeddings of prompts.
+    return shutil.copytree(made_once("tiny_scene", build), tmp_path_factory.mktemp("scene") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def built_trained(built, tiny_capture, made_once) -> Path:
+    """The scene `built` with language by method "trained"; read-only."""
+    from lexsplat import cli
+
+    def build(output: Path) -> None:
+        shutil.copytree(built, output)
+        arguments = ["build", str(tiny_capture), "--output", str(output), *QUICK_BUILD, "--method", "trained"]
+        assert cli.main(arguments) == 0
+
+    return made_once("tiny_scene_trained", build)
+
+
+@pytest.fixture(scope="module")
+def color_encoders() -> Iterator[None]:
+    """The color encoders in place of CLIP and DINO."""
+    from support import color_encoder
+
+    with pytest.MonkeyPatch.context() as patch:
+        color_encoder.install(patch)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Have programs that are not ours read what we export: splat-transform, Babylon.js and the Khronos glTF validator.
+"""Check exports with other programs: splat-transform, Babylon.js and the Khronos glTF validator.
 
 python tools/check_exports.py SCENE FOLDER
 
@@ -80,7 +80,7 @@ def transform(node: Path) -> list[str]:
 
 
 def summary(node: Path, file: Path) -> dict[str, list[float]]:
-    """Count, and minimum, maximum and median of the columns, as splat-transform sees them."""
+    """Count, and minimum, maximum and median of the columns, read by splat-transform."""
     # By way of a PLY: every format has its own axes in the file, and the program knows them.
     plain = file.with_name(f"{file.name}.theirs.ply").resolve()
     subprocess.run([*transform(node), "-w", str(file.resolve()), str(plain)], check=True)
@@ -95,7 +95,7 @@ def summary(node: Path, file: Path) -> dict[str, list[float]]:
 
 
 def compare(expected: dict, found: dict) -> list[str]:
-    """What differs by more than 8 bits and a logit's ends explain."""
+    """Differences larger than 8-bit rounding and clipped logits explain."""
     problems = [] if found["count"] == expected["count"] else [f"count {found['count']}"]
     for column in COLUMNS:
         median, other = expected[column][2], found[column][2]
@@ -122,7 +122,7 @@ def validate(node: Path, file: Path, count: int) -> list[str]:
 
 
 def babylon(node: Path, file: Path, gaussians: Gaussians) -> list[str]:
-    """What Babylon.js reads differently: floats must be equal, 8-bit colors and rotations within a step."""
+    """Differences in Babylon.js: floats must be equal, 8-bit colors and rotations within a step."""
     output = file.with_name(f"{file.name}.babylon").resolve()
     subprocess.run(["node", "babylon.js", str(file.resolve()), str(output)], cwd=node, check=True)
     found = np.fromfile(output, BABYLON_SPLAT)

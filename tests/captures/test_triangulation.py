@@ -52,22 +52,22 @@ def wall(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def points(wall, tmp_path_factory):
+def triangulated(wall, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
     events = []
     return *triangulate(wall, cache_dir=cache, listener=events.append), cache, events
 
 
-def test_triangulated_points_lie_on_the_wall(points):
-    positions, *_ = points
+def test_triangulated_points_lie_on_the_wall(triangulated):
+    positions, *_ = triangulated
     assert len(positions) > 300
     assert np.median(np.abs(positions[:, 2])) < 0.01
     assert np.mean(np.abs(positions[:, 2]) < 0.05) > 0.95
     assert np.abs(positions[:, :2]).max() < 1.1
 
 
-def test_triangulated_points_have_the_colors_of_the_wall(points):
-    positions, colors, *_ = points
+def test_triangulated_points_have_the_colors_of_the_wall(triangulated):
+    positions, colors, *_ = triangulated
     where = ((positions[:, :2] + 1) * 128).clip(0, 255).astype(int)
     ground_truth = texture()[where[:, 1], where[:, 0]]
     right = np.abs(colors - ground_truth).mean()
@@ -75,8 +75,8 @@ def test_triangulated_points_have_the_colors_of_the_wall(points):
     assert right < 0.4 * wrong
 
 
-def test_triangulation_reports_progress_and_is_deterministic(wall, points):
-    positions, colors, _, events = points
+def test_triangulation_reports_progress_and_is_deterministic(wall, triangulated):
+    positions, colors, _, events = triangulated
     assert {event.stage for event in events} == {"triangulate"}
     assert (events[-1].done, events[-1].metrics) == (events[-1].total, {"points": len(positions)})
     again = triangulate(wall)
@@ -95,10 +95,10 @@ def test_masked_pixels_are_not_matched(tmp_path):
     assert positions[:, 0].min() > -0.02
 
 
-def test_cached_points_are_used_until_a_pose_changes_or_the_file_is_damaged(wall, points, monkeypatch):
+def test_cached_points_are_used_until_a_pose_changes_or_the_file_is_damaged(wall, triangulated, monkeypatch):
     from lexsplat.captures.sfm import triangulation
 
-    positions, _, cache, _ = points
+    positions, _, cache, _ = triangulated
     (file,) = cache.iterdir()
 
     def refuse(*args):
@@ -116,11 +116,11 @@ def test_cached_points_are_used_until_a_pose_changes_or_the_file_is_damaged(wall
     file.write_bytes(whole)
 
 
-def test_initial_points_are_triangulated_where_possible(wall, points):
-    found = initial_points(wall, cache_dir=points[2])
+def test_initial_points_are_triangulated_where_possible(wall, triangulated):
+    found = initial_points(wall, cache_dir=triangulated[2])
     assert found.origin == "triangulated"
-    np.testing.assert_array_equal(found.points, points[0])
-    assert f"{len(points[0]):,} points triangulated" in found.note
+    np.testing.assert_array_equal(found.points, triangulated[0])
+    assert f"{len(triangulated[0]):,} points triangulated" in found.note
 
 
 def test_initial_points_are_random_on_a_wall_without_texture(tmp_path):

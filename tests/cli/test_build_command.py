@@ -5,13 +5,11 @@ import os
 import shutil
 
 import pytest
-from conftest import QUICK_BUILD as QUICK
 from support.command_line import fails_in_one_line, modified
+from support.tiny_capture import QUICK_BUILD as QUICK
 
 from lexsplat import cli, open_scene
 from lexsplat.features import hub
-
-pytestmark = pytest.mark.xdist_group("built")
 
 
 def test_build_writes_the_scene_folder_of_the_design(built):
@@ -26,14 +24,11 @@ def test_build_writes_the_scene_folder_of_the_design(built):
     assert not list((built / "checkpoints" / "features").glob("*.dino.*")), "averaged features need no DINO"
 
 
-def test_a_method_that_uses_code_maps_writes_them(built, tiny_capture, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(built, copy)
-    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "trained"]) == 0
-    record = json.loads((copy / "scene.json").read_text())
+def test_a_method_that_uses_code_maps_writes_them(built_trained):
+    record = json.loads((built_trained / "scene.json").read_text())
     assert set(record["stages"]) == {"reconstruct", "features", "codebook", "language"}
-    assert list((copy / "checkpoints" / "features").glob("*.dino.*"))
-    codes = {p.stem for p in (copy / "codes").iterdir()}
+    assert list((built_trained / "checkpoints" / "features").glob("*.dino.*"))
+    codes = {p.stem for p in (built_trained / "codes").iterdir()}
     assert codes.isdisjoint({"view_02", "view_06", "view_10"}), "held-out views take no part in the codebook"
     assert len(codes) == 9
 
@@ -81,11 +76,8 @@ def test_other_bundled_encoders_make_new_features(built, tiny_capture, tmp_path,
     assert cli.main(["query", str(copy), "red ball", "--json"]) == 0
 
 
-def test_a_trained_language_makes_a_scene_that_answers(built, tiny_capture, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(built, copy)
-    assert cli.main(["build", str(tiny_capture), "--output", str(copy), *QUICK, "--method", "trained"]) == 0
-    scene = open_scene(copy, device="cpu")
+def test_a_trained_language_makes_a_scene_that_answers(built_trained):
+    scene = open_scene(built_trained, device="cpu")
     assert scene.field.method == "trained"
     relevancy = scene.relevancy(["red apple"], "view_02")
     assert relevancy.shape == (1, 72, 96)

@@ -7,8 +7,6 @@ from support.command_line import Terminal, fails_in_one_line
 
 from lexsplat import cli
 
-pytestmark = pytest.mark.xdist_group("built")
-
 
 def test_export_writes_the_standard_ply(built, tmp_path):
     assert cli.main(["export", str(built), str(tmp_path / "a.ply")]) == 0

@@ -9,8 +9,6 @@ from support.command_line import fails_in_one_line
 
 from lexsplat import cli, open_scene
 
-pytestmark = pytest.mark.xdist_group("built")
-
 
 def test_query_writes_images_and_json(built, tmp_path, capsys):
     arguments = ["query", str(built), "red apple", "blue ball", "--view", "view_02.png", "--json"]

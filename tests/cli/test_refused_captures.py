@@ -5,14 +5,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from conftest import QUICK_BUILD as QUICK
 from PIL import Image
 from support.command_line import fails_in_one_line
+from support.tiny_capture import QUICK_BUILD as QUICK
 from support.tiny_capture import write_capture
 
 from lexsplat import cli
-
-pytestmark = pytest.mark.xdist_group("built")
 
 
 def test_an_unknown_encoder_is_refused_with_three_remedies(tiny_capture, tmp_path, capsys, monkeypatch):

@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from support import color_encoder
 from support.experiments import CONFIG
+from support.experiments import ablated as measure_variants
 from support.report_pages import Page
+from support.schemas import validated
 
 from lexsplat import cli
+from lexsplat.captures import Annotations
 from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
 from lexsplat.evaluation.ablate import AblationPlan
@@ -25,22 +27,14 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.memory import parse_bytes
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 
 
 @pytest.fixture(scope="module")
 def ablated(tiny_capture, tmp_path_factory):
     """All variants with two seeds."""
     folder = tmp_path_factory.mktemp("ablation")
-    ablation.ablate(tiny_capture, folder, CONFIG, AblationPlan(seeds=(0, 1)))
+    measure_variants(tiny_capture, folder, CONFIG, AblationPlan(seeds=(0, 1)))
     return folder
 
 
@@ -91,18 +85,18 @@ def test_each_method_has_the_variants_that_change_it():
 def test_a_variant_that_no_method_has_is_refused_before_any_work(tiny_capture, tmp_path):
     for methods in (("averaged",), ("trained", "averaged")):
         with pytest.raises(ValueError, match="with neighbors"):
-            ablation.ablate(
+            measure_variants(
                 tiny_capture,
                 tmp_path / "a",
                 CONFIG,
                 AblationPlan(methods=methods, variants=("with neighbors",)),
             )
     with pytest.raises(ValueError, match="averaged"):
-        ablation.ablate(
+        measure_variants(
             tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("averaged",), variants=("w/o MLP",))
         )
     with pytest.raises(ValueError, match="lifted"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
+        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -111,7 +105,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
 ):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     methods = ("trained", "averaged")
-    rows = ablation.ablate(
+    rows = measure_variants(
         tiny_capture,
         tmp_path,
         CONFIG,
@@ -120,7 +114,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
     assert [row["name"] for row in rows] == ["trained: full", "averaged: full", "averaged: one code"]
     assert "trained has no variant 'one code': the row is left out" in caplog.text
     assert all(row["language_seconds"][0] > 0 and row["storage_bytes"][0] > 0 for row in rows)
-    clean = ablation.ablate(
+    clean = measure_variants(
         tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), methods=methods, variants=("full",))
     )
     assert len(fits) == 5, "other labels are other runs"
@@ -132,7 +126,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
 
 def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
-    rows = ablation.ablate(
+    rows = measure_variants(
         tiny_capture,
         tmp_path,
         CONFIG,
@@ -150,7 +144,7 @@ def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_captur
     ]
     assert again["strict"] == known["strict"], "as if it stood alone"
     with pytest.raises(ValueError, match="form"):
-        ablation.ablate(tiny_capture, tmp_path, CONFIG, AblationPlan(forms=()))
+        measure_variants(tiny_capture, tmp_path, CONFIG, AblationPlan(forms=()))
 
 
 def test_wrong_labels_differ_in_every_view_and_keep_their_share():
@@ -171,23 +165,24 @@ def test_the_tables_have_all_rows_with_mean_and_spread(ablated):
     assert [row["name"] for row in rows] == list(METHODS["trained"].variants)
     assert all(row["runs"] == "2" for row in rows)
     record = json.loads((ablated / "ablation.json").read_text())
+    validated("ablation", record)
     values = [run["auto"]["mIoU"] for run in record["runs"]["full"]]
     assert float(rows[-1]["mIoU"]) == pytest.approx(sum(values) / 2, abs=1e-5)
     assert float(rows[-1]["mAP"]) > 0.2, "the colors are found"
     assert record["config"]["method"] == "trained"
-    assert record["evaluation"]["query"]["form"] == "feature"
+    assert set(record["forms"].values()) == {"feature"}
     assert r"w/o u\_G \& MLP" in (ablated / "ablation.tex").read_text()
 
 
-def test_the_report_has_mean_and_spread_and_the_pictures_of_the_first_seed(ablated):
+def test_the_report_has_mean_and_spread_and_the_images_of_the_first_seed(ablated):
     text = (ablated / "ablation.html").read_text(encoding="utf-8")
     rows = {row[0]: row for row in reversed(Page(text).rows) if row}
     values = [float(entry["mIoU"]) for entry in rows_of(ablated) if entry["name"] == "w/o MLP"]
     assert rows["w/o MLP"][3].startswith(f"{values[0]:.3f} ± ")
     assert text.count('class="answer"') == text.count('class="versus"') * 6 > 0
     assert "over 2 seeds" in text
-    assert (ablated / "runs" / "full" / "seed-0.pictures.safetensors").is_file()
-    assert not (ablated / "runs" / "full" / "seed-1.pictures.safetensors").exists()
+    assert (ablated / "runs" / "full" / "seed-0.images.safetensors").is_file()
+    assert not (ablated / "runs" / "full" / "seed-1.images.safetensors").exists()
 
 
 def test_codebooks_are_shared_where_the_quantization_is_the_same(ablated):
@@ -203,7 +198,7 @@ def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_captur
         peaks = json.loads(facts["peaks"])
         assert peaks["peak_rss_bytes"] is None or peaks["peak_rss_bytes"] > 1e7
         write_tensors(path, tensors, {**facts, "peaks": json.dumps({"peak_rss_bytes": 10**15})})
-    rows = ablation.ablate(tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
+    rows = measure_variants(tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
     assert rows[0]["host_bytes"][0] in (None, 10**15)
 
 
@@ -214,7 +209,7 @@ def test_codebook_and_language_receive_the_memory_budget(ablated, tiny_capture, 
         experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
     )
     config = replace(CONFIG, memory="800MB")
-    ablation.ablate(tiny_capture, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
+    measure_variants(tiny_capture, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
     assert [*granted, fits[0][2].memory] == [parse_bytes("800MB")] * 2
 
 
@@ -231,7 +226,7 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
     missing.unlink()
     (ablated / "runs" / "full" / "seed-0.json").write_text("{")  # damaged
     next((ablated / "codebooks").glob("*.safetensors")).write_bytes(b"damaged")
-    ablation.ablate(tiny_capture, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
+    measure_variants(tiny_capture, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
     assert [run.seed for _, _, run in fits] == [0, 1]
     again = json.loads(missing.read_text())["metrics"]["language"]
     assert again == language, "the same seed gives the same numbers"
@@ -244,23 +239,23 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
 def test_another_version_of_the_code_measures_again(ablated, tiny_capture, tmp_path, monkeypatch, fits):
     output = shutil.copytree(ablated, tmp_path / "ablated")
     monkeypatch.setattr(experiments, "code_identity", lambda: "another")
-    ablation.ablate(tiny_capture, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
+    measure_variants(tiny_capture, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
     assert [run.seed for _, _, run in fits] == [0]
 
 
 def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="seed"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
+        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
     with pytest.raises(ValueError, match="variants"):
-        ablation.ablate(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
+        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
     assert not (tmp_path / "a").exists()
 
 
 def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
-    empty = experiments.Annotations("segmentations", tiny_capture, {})
+    empty = Annotations("segmentations", tiny_capture, {})
     monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
-        ablation.ablate(tiny_capture, ablated, replace(CONFIG, seed=0))
+        measure_variants(tiny_capture, ablated, replace(CONFIG, seed=0))
 
 
 def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp_path, fits):
@@ -276,7 +271,7 @@ def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp
 
     def measure(source=None):
         before = len(fits)
-        rows = ablation.ablate(
+        rows = measure_variants(
             capture,
             tmp_path / "out",
             CONFIG,

@@ -10,7 +10,9 @@ from dataclasses import replace
 import pytest
 from support import color_encoder
 from support.experiments import CONFIG
+from support.experiments import compared as measure_methods
 from support.report_pages import Page
+from support.schemas import validated
 
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.evaluation import EvaluationConfig, baselines
@@ -33,21 +35,10 @@ def compared(tiny_capture, tmp_path_factory):
             comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
         )
         methods = ("averaged", "averaged-feature", *comparison.BASELINES)
-        comparison.compare(
-            tiny_capture,
-            folder,
-            CONFIG,
-            ComparisonPlan(methods=methods),
-            evaluation=EvaluationConfig(lpips=False),
-        )
+        settings = {"plan": ComparisonPlan(methods=methods), "evaluation": EvaluationConfig(lpips=False)}
+        measure_methods(tiny_capture, folder, CONFIG, **settings)
         start = time.perf_counter()
-        comparison.compare(
-            tiny_capture,
-            folder,
-            CONFIG,
-            ComparisonPlan(methods=methods),
-            evaluation=EvaluationConfig(lpips=False),
-        )
+        measure_methods(tiny_capture, folder, CONFIG, **settings)
         again = time.perf_counter() - start
     return folder, again
 
@@ -99,7 +90,7 @@ def test_forms_follow_the_names(compared):
         stored = json.loads(path.read_text())
         forms[stored["name"]] = stored["metrics"]["language"]["form"]
     assert forms["averaged-feature"] == "feature"
-    assert forms["averaged"] == "code"
+    assert forms["averaged"] == "segment"
     stages = json.loads((folder / "runs" / "dff" / "seed-0.json").read_text())["metrics"]["speed"][
         "stage_seconds"
     ]
@@ -113,6 +104,7 @@ def test_the_report_shows_every_method_and_loads_nothing(compared):
     assert not {"script", "link", "iframe"} & set(page.tags)
     assert not re.search(r"https?:|@import|srcset", text)
     record = json.loads((folder / "comparison.json").read_text())
+    validated("comparison", record)
     names = [row["name"] for row in record["rows"]]
     rows = [row for row in page.rows if row]
     table = {row[0]: row for row in rows[1 : 1 + len(names)]}
@@ -135,7 +127,7 @@ def test_the_report_shows_every_method_and_loads_nothing(compared):
 
 def test_unknown_methods_are_refused_before_any_work(tiny_capture, tmp_path):
     with pytest.raises(ValueError, match="nerf"):
-        comparison.compare(tiny_capture, tmp_path / "a", CONFIG, ComparisonPlan(methods=("nerf",)))
+        measure_methods(tiny_capture, tmp_path / "a", CONFIG, ComparisonPlan(methods=("nerf",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -145,7 +137,7 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
     for part in ("scene", "runs"):
         shutil.copytree(folder / part, tmp_path / part)
     before = rows_of(folder)["averaged"]
-    comparison.compare(
+    measure_methods(
         tiny_capture,
         tmp_path,
         CONFIG,
@@ -158,7 +150,7 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
     assert not {"official", "lerf_3d"} & set(language)
     assert row["mIoU"] == before["mIoU"], "strict is always measured, with the same result"
     with pytest.raises(ValueError, match="lerf-4d"):
-        comparison.compare(
+        measure_methods(
             tiny_capture, tmp_path / "a", CONFIG, evaluation=EvaluationConfig(protocols=("lerf-4d",))
         )
     assert not (tmp_path / "a").exists()
@@ -177,7 +169,7 @@ def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_p
 
     monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)
     config = replace(CONFIG, memory="800MB")
-    comparison.compare(
+    measure_methods(
         tiny_capture,
         tmp_path,
         config,

@@ -16,21 +16,21 @@ from lexsplat.captures import load_annotations, load_capture
 from lexsplat.evaluation import (
     EvaluationConfig,
     GroundTruth,
+    MethodScene,
     Metrics,
     PairResult,
-    Subject,
-    ViewPictures,
+    ViewImages,
     evaluate,
-    measuring,
     peak_memory,
     precision_curves,
     summarize_language,
 )
-from lexsplat.evaluation.metrics import average_precision, threshold_counts
+from lexsplat.evaluation.metrics import average_precision, mask_scores, threshold_counts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.relevancy import QueryConfig
-from lexsplat.queries.thresholds import scene_thresholds
+from lexsplat.scenes.folder import StoredView
+from lexsplat.scenes.scene import Scene
 
 WORDS = {"red apple": 1, "blue ball": 2}
 
@@ -95,9 +95,18 @@ def gaussians(capture):
     return gaussians_from_points(capture.points, capture.point_colors, sh_degree=0)
 
 
+def traced(capture, gaussians, field=None):
+    """A scene whose language is known by ray tracing."""
+    views = {
+        name: StoredView(name, view.camera, "test" if name in capture.test_names else "train")
+        for name, view in capture.views.items()
+    }
+    return Scene(gaussians, field or PerfectField(), views, "traced", encode_text=encode_text)
+
+
 @pytest.fixture(scope="module")
 def perfect(capture, gaussians):
-    return evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK)
+    return evaluate(capture, traced(capture, gaussians), QUICK)
 
 
 def larger_masks(capture, scale):
@@ -110,8 +119,9 @@ def larger_masks(capture, scale):
 
 @pytest.mark.parametrize("form", ["feature", "code"])
 def test_a_field_that_knows_the_truth_scores_one_everywhere(capture, gaussians, form):
-    config = replace(QUICK, query=QueryConfig(form=form))
-    language = evaluate(capture, Subject(gaussians, PerfectField(), encode_text), config).language
+    scene = traced(capture, gaussians)
+    scene.query = QueryConfig(form=form)
+    language = evaluate(capture, scene, QUICK).language
     assert language["form"] == form
     strict = language["strict"]
     for kind in ("auto", "fixed", "oracle"):
@@ -122,7 +132,7 @@ def test_a_field_that_knows_the_truth_scores_one_everywhere(capture, gaussians, 
 
 
 def test_a_field_that_confuses_two_things_scores_zero(capture, gaussians):
-    metrics = evaluate(capture, Subject(gaussians, PerfectField(order=(0, 2, 1)), encode_text), QUICK)
+    metrics = evaluate(capture, traced(capture, gaussians, PerfectField(order=(0, 2, 1))), QUICK)
     assert metrics.language["strict"]["auto"]["mIoU"] == 0
     assert metrics.language["strict"]["localization"] == 0
     assert metrics.language["strict"]["mAP"] < 0.2
@@ -130,7 +140,7 @@ def test_a_field_that_confuses_two_things_scores_zero(capture, gaussians):
 
 def test_relevancy_is_rendered_at_the_size_of_the_truth(capture, gaussians):
     field = PerfectField()
-    subject, ground_truth = Subject(gaussians, field, encode_text), GroundTruth(larger_masks(capture, 3))
+    subject, ground_truth = traced(capture, gaussians, field), GroundTruth(larger_masks(capture, 3))
     metrics = evaluate(capture, subject, QUICK, ground_truth=ground_truth)
     assert (288, 216) in field.sizes
     assert metrics.language["strict"]["auto"]["mIoU"] == pytest.approx(1)
@@ -142,7 +152,7 @@ def test_relevancy_is_rendered_at_the_size_of_the_truth(capture, gaussians):
 def test_masks_larger_than_allowed_are_met_by_an_enlarged_map(capture, gaussians):
     field = PerfectField()
     config = replace(QUICK, max_pixels=96 * 72)
-    subject, ground_truth = Subject(gaussians, field, encode_text), GroundTruth(larger_masks(capture, 3))
+    subject, ground_truth = traced(capture, gaussians, field), GroundTruth(larger_masks(capture, 3))
     metrics = evaluate(capture, subject, config, ground_truth=ground_truth)
     assert set(field.sizes) == {(96, 72)}
     assert 0.85 < metrics.language["strict"]["oracle"]["mIoU"] < 1
@@ -153,7 +163,7 @@ def test_automatic_thresholds_never_see_the_truth(capture, gaussians, perfect):
         view.name: {prompt: ~mask for prompt, mask in prompts.items()}
         for view, prompts in zip(capture.test_views, larger_masks(capture, 1).values())
     }
-    subject = Subject(gaussians, PerfectField(), encode_text)
+    subject = traced(capture, gaussians)
     misled = evaluate(capture, subject, QUICK, ground_truth=GroundTruth(wrong))
     for prompt in WORDS:
         assert misled.thresholds[prompt]["auto"] == perfect.thresholds[prompt]["auto"]
@@ -161,39 +171,37 @@ def test_automatic_thresholds_never_see_the_truth(capture, gaussians, perfect):
     assert misled.language["strict"]["oracle"]["mIoU"] > 0.5
 
 
-def test_automatic_thresholds_look_at_training_views_only(capture, gaussians, monkeypatch):
-    cameras = []
-    monkeypatch.setattr(
-        measuring,
-        "scene_thresholds",
-        lambda relevancy, views, *rest: cameras.extend(views) or scene_thresholds(relevancy, views, *rest),
-    )
-    evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK)
-    training = [view.camera for view in capture.train_views]
-    assert len(cameras) == len(training)
-    assert all(camera is other for camera, other in zip(cameras, training))
+def test_automatic_thresholds_are_those_of_the_scene_and_not_rounded(capture, gaussians, monkeypatch):
+    scene, seen, ask = traced(capture, gaussians), [], Scene.ask
+
+    def ask_precisely(self, prompts):
+        seen.append(replace(ask(self, prompts), thresholds=torch.tensor([0.1234567, 0.7654321])))
+        return seen[-1]
+
+    monkeypatch.setattr(Scene, "ask", ask_precisely)
+    found = evaluate(capture, scene, QUICK).thresholds
+    (answers,) = seen
+    assert [found[prompt]["auto"] for prompt in answers.prompts] == answers.thresholds.tolist()
+
+
+def test_the_automatic_mask_is_that_of_the_threshold_itself():
+    scores, mask = np.array([[0.5004, 0.5002, 0.2]], np.float32), np.array([[True, False, False]])
+    assert mask_scores(scores >= 0.5003, mask).iou == 1
+    assert threshold_counts(scores, mask).at(0.5003).iou == 0.5, "counts are of thresholds of three decimals"
 
 
 def test_masks_of_training_views_do_not_count(capture, gaussians):
     masks = {capture.train_names[0]: {"red apple": np.ones((72, 96), bool)}}
-    subject = Subject(gaussians, PerfectField(), encode_text)
+    subject = traced(capture, gaussians)
     assert evaluate(capture, subject, QUICK, ground_truth=GroundTruth(masks)).language is None
 
 
-@pytest.mark.parametrize("masks", [{}, None])
-def test_without_masks_or_language_pictures_are_measured_alone(capture, gaussians, masks):
-    language = PerfectField() if masks is not None else None
-    ground_truth = None if masks is None else GroundTruth(masks)
-    metrics = evaluate(capture, Subject(gaussians, language), QUICK, ground_truth=ground_truth)
+def test_without_masks_images_are_measured_alone(capture, gaussians):
+    metrics = evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=GroundTruth({}))
     assert metrics.language is None
     assert metrics.speed["query_ms"] is None
     assert metrics.speed["rgb_fps"] > 0
     assert set(metrics.quality["per_view"]) == set(capture.test_names)
-
-
-def test_masks_and_language_need_an_encoder(capture, gaussians):
-    with pytest.raises(ValueError, match="encode_text"):
-        evaluate(capture, Subject(gaussians, PerfectField()), QUICK)
 
 
 def test_quality_is_the_mean_over_the_held_out_views(capture, gaussians, perfect):
@@ -209,8 +217,8 @@ def test_quality_is_the_mean_over_the_held_out_views(capture, gaussians, perfect
 
 
 def test_observers_see_every_view_once(capture, gaussians):
-    seen: list[ViewPictures] = []
-    evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK, observer=seen.append)
+    seen: list[ViewImages] = []
+    evaluate(capture, traced(capture, gaussians), QUICK, observer=seen.append)
     assert [pictures.name for pictures in seen] == list(capture.test_names)
     for pictures in seen:
         assert pictures.photo.shape == pictures.image.shape == (72, 96, 3)
@@ -219,14 +227,14 @@ def test_observers_see_every_view_once(capture, gaussians):
 
 def test_progress_is_told(capture, gaussians):
     events = []
-    evaluate(capture, Subject(gaussians), QUICK, listener=events.append)
+    evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=GroundTruth({}), listener=events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [
         ("evaluate", i, 3) for i in (1, 2, 3)
     ]
 
 
 def test_metrics_json_has_the_sections_of_the_design_and_is_strict_json(capture, gaussians):
-    metrics = evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK)
+    metrics = evaluate(capture, traced(capture, gaussians), QUICK)
     tensors = metrics.size["language_bytes"], metrics.size["gaussian_bytes"]
     assert tensors == (10, 4 * 14 * len(gaussians)), "in memory, while nothing is known about files"
     metrics = metrics.with_facts(
@@ -242,13 +250,13 @@ def test_metrics_json_has_the_sections_of_the_design_and_is_strict_json(capture,
     assert found["size"]["gaussians"] == len(gaussians)
     assert found["size"]["language_bytes"] == 7
     assert found["size"]["gaussian_bytes"] == 4 * 14 * len(gaussians)
-    assert found["config"]["evaluation"]["query"]["form"] == "code"
+    assert found["config"]["evaluation"]["query"]["form"] == "segment"
     assert found["config"]["seed"] == 3
     assert found["machine"] == {"cores": 2}
 
 
 def test_the_same_scene_gives_the_same_numbers_times_aside(capture, gaussians, perfect):
-    again = evaluate(capture, Subject(gaussians, PerfectField(), encode_text), QUICK).to_json()
+    again = evaluate(capture, traced(capture, gaussians), QUICK).to_json()
     first = perfect.to_json()
     for section in ("quality", "language", "config"):
         assert again[section] == first[section]
@@ -260,8 +268,10 @@ def test_the_same_scene_gives_the_same_numbers_times_aside(capture, gaussians, p
 def pair(scores, ground_truth):
     scores, ground_truth = np.asarray(scores), np.asarray(ground_truth, dtype=bool)
     official = OfficialScores(0.25, 0.5, 0.75, 1.0)
+    counts = threshold_counts(scores, ground_truth)
     return PairResult(
-        threshold_counts(scores, ground_truth),
+        counts,
+        counts.at(0.5),
         average_precision(scores, ground_truth),
         float(scores.argmax() == 0),
         official,
@@ -350,7 +360,7 @@ def test_the_lerf_protocols_average_all_pairs_alike():
     assert found["per_prompt"]["x"]["IoU_lerf_3d"] == pytest.approx(0.15)
 
 
-class PaintedScene:
+class PaintedMethod:
     """A `Method` whose Gaussians know what they are: those near a sphere belong to it."""
 
     method = "painted"
@@ -372,24 +382,29 @@ class PaintedScene:
         return {"owner": self.owner}
 
 
+def painted_scene(capture, gaussians, method):
+    cameras = [view.camera for view in capture.train_views]
+    return MethodScene(gaussians, method, cameras, encode_text, QueryConfig())
+
+
 def test_lerf_3d_scores_what_is_selected_in_space_and_any_method_can_be_measured(capture):
     dense = gaussians_from_points(capture.points, capture.point_colors, sh_degree=0, opacity=0.95)
     config = replace(QUICK, protocols=("strict", "lerf-3d"))
-    language = evaluate(capture, Subject(dense, PaintedScene(dense), encode_text), config).language
+    language = evaluate(capture, painted_scene(capture, dense, PaintedMethod(dense)), config).language
     assert language["method"] == "painted"
     assert language["strict"]["auto"]["mIoU"] == 1
     assert 0.4 < language["lerf_3d"]["mIoU"] < 1, "the silhouette of sparse points is ragged"
     assert "official" not in language
-    painted = PaintedScene(dense)
+    painted = PaintedMethod(dense)
     painted.owner[:] = 0
-    missed = evaluate(capture, Subject(dense, painted, encode_text), config).language
+    missed = evaluate(capture, painted_scene(capture, dense, painted), config).language
     assert missed["lerf_3d"] == {"mIoU": 0, "acc_25": 0, "acc_50": 0}
 
 
 def test_boxes_of_the_annotation_decide_about_localization(capture, gaussians):
     elsewhere = {v: {p: np.array([[0.0, 0.0, 1.0, 1.0]]) for p in WORDS} for v in capture.test_names}
     ground_truth = GroundTruth(load_annotations(capture).masks, elsewhere)
-    subject = Subject(gaussians, PerfectField(), encode_text)
+    subject = traced(capture, gaussians)
     right = evaluate(capture, subject, QUICK).language["lerf_2d"]
     wrong = evaluate(capture, subject, QUICK, ground_truth=ground_truth).language["lerf_2d"]
     assert wrong["localization"] == 0 < right["localization"]

@@ -8,22 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support import color_encoder
 from support.experiments import CONFIG
+from support.schemas import validated
 
-from lexsplat.evaluation.ablate import language_settings, make_language, paper_evaluation
-from lexsplat.evaluation.experiments import Bench, Results
+from lexsplat.evaluation.ablate import make_language, paper_evaluation
+from lexsplat.evaluation.experiments import Bench, Row
 from lexsplat.runtime.errors import CaptureError
 
+pytestmark = pytest.mark.usefixtures("color_encoders")
+
 AVERAGED = replace(CONFIG, method="averaged", iterations=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
 
 
 @pytest.fixture
@@ -33,9 +27,14 @@ def open_bench(tiny_capture, tmp_path_factory):
     return lambda: Bench(tiny_capture, output, AVERAGED, paper_evaluation())
 
 
-def make(bench, calls):
-    """What `Bench.run` is given to make the language of the settings, counted."""
-    return lambda: calls.append(1) or make_language(bench, bench.config)
+def row(bench, calls, name="mine", settings=()):
+    """A row of the language of the bench's settings; counts how often it is made."""
+
+    def make(seed):
+        calls.append(seed)
+        return make_language(bench, replace(bench.config, seed=seed))
+
+    return Row(name, settings, make)
 
 
 def test_features_have_dino_whatever_the_method_of_the_settings(open_bench):
@@ -63,36 +62,40 @@ def test_a_codebook_is_made_once_and_again_if_its_file_is_damaged(open_bench):
 
 def test_a_run_is_kept_until_its_settings_change_or_its_file_is_damaged(open_bench):
     bench, calls = open_bench(), []
-    settings = language_settings(bench.config)
-    first = bench.run("mine", 0, settings, make(bench, calls))
+    first = bench.run(row(bench, calls), 0)
     assert not first.kept
     bench = open_bench()
-    kept = bench.run("mine", 0, settings, make(bench, calls))
+    kept = bench.run(row(bench, calls), 0)
     assert kept.kept
     assert kept.result == json.loads(json.dumps(first.result))
-    assert len(calls) == 1
-    other = bench.run("mine", 0, [*settings, "another"], make(bench, calls))
-    assert not other.kept
+    assert calls == [0]
+    assert not bench.run(row(bench, calls, settings=["another"]), 0).kept
     path = bench.output / "runs" / "mine" / "seed-0.json"
     path.write_text("{")
-    assert not bench.run("mine", 0, [*settings, "another"], make(bench, calls)).kept
+    assert not bench.run(row(bench, calls, settings=["another"]), 0).kept
 
 
-def test_results_write_every_file_after_every_run(open_bench):
+def test_every_file_is_written_after_every_run_and_both_commands_keep_their_own(open_bench):
     bench = open_bench()
-    results = Results(bench, "comparison", ["one", "two"], [0], ("mIoU", "mAP"))
-    settings = language_settings(bench.config)
-    results.add(bench.run("one", 0, settings, make(bench, []), pictures=True))
+
+    def stop(seed):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bench.measure(
+            "comparison", [row(bench, [], "one"), Row("two", ["stopped"], stop)], [0], ("mIoU", "mAP")
+        )
     names = {f"comparison.{ending}" for ending in ("json", "csv", "tex", "html")}
     assert names <= {path.name for path in bench.output.iterdir()}
     record = json.loads((bench.output / "comparison.json").read_text())
     assert [row["name"] for row in record["rows"]] == ["one"]
     assert record["ground_truth"]["layout"] == "segmentations"
-    ablation = Results(bench, "ablation", ["one"], [0])
+    validated("comparison", record)
     before = (bench.output / "comparison.html").read_bytes()
-    ablation.add(bench.run("one", 0, settings, make(bench, [])))
-    assert (bench.output / "comparison.html").read_bytes() == before, "both keep their own report"
+    bench.measure("ablation", [row(bench, [], "one")], [0])
+    assert (bench.output / "comparison.html").read_bytes() == before
     assert (bench.output / "ablation.html").is_file()
+    validated("ablation", json.loads((bench.output / "ablation.json").read_text()))
 
 
 def test_crop_sizes_of_features_of_another_program_are_refused(open_bench, tmp_path):

@@ -11,6 +11,7 @@ from support.report_pages import NASTY, Page, evaluated
 from lexsplat.evaluation import Metrics
 from lexsplat.evaluation.report import (
     Comparison,
+    Gallery,
     MeasuredMethod,
     format_rows,
     format_table,
@@ -88,10 +89,11 @@ def test_its_numbers_are_those_of_the_metrics(result, page_text):
     assert "31.23" in page.text
 
 
-def test_worst_cases_come_first_and_are_bounded(result, tmp_path):
+def test_worst_cases_come_first_and_are_bounded(result, tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.evaluation.report.page.MAX_CASES", 4)
     metrics, gallery = result
     path = tmp_path / "report.html"
-    write_report(path, metrics, gallery, max_cases=4)
+    write_report(path, metrics, gallery)
     cases = re.findall(r'<div class="case"><p>.*?IoU ([0-9.]+)', path.read_text(encoding="utf-8"))
     assert len(cases) == 4
     assert cases == sorted(cases)
@@ -103,7 +105,7 @@ def test_a_scene_without_masks_has_a_report(result, tmp_path):
     bare = Metrics(
         metrics.quality, None, {**metrics.speed, "render_fps": None, "query_ms": None}, metrics.size, {}, {}
     )
-    write_report(tmp_path / "report.html", bare)
+    write_report(tmp_path / "report.html", bare, Gallery())
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     Page(text)
     assert "no masks" in text

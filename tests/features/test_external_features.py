@@ -151,17 +151,6 @@ def embed(capture: Path, output: Path, built: Path, features: Path, *options: st
 
 def test_segments_of_another_program_answer_queries(tiny_capture, built, segments, tmp_path, capsys):
     output = tmp_path / "scene"
-    assert (
-        embed(tiny_capture, output, built, segments, "--method", "trained", "--trained.iterations", "300")
-        == 0
-    )
-    with Image.open(output / "codes" / "view_01.png") as image:
-        codes = np.asarray(image)
-    assert codes.shape == SIZE[::-1]
-    assert (codes[:, -8:] == 255).all()
-    assert (codes[:, :-8] < 16).all()
-    measure(output)
-
     assert embed(tiny_capture, output, built, segments) == 0  # averaged, the default
     measure(output)
     stages = json.loads((output / "scene.json").read_text())["stages"]
@@ -169,6 +158,21 @@ def test_segments_of_another_program_answer_queries(tiny_capture, built, segment
     assert embed(tiny_capture, output, built, segments) == 0
     assert "features: 1/1 kept" in capsys.readouterr().err
     assert json.loads((output / "scene.json").read_text())["stages"] == stages
+
+
+def test_segments_of_another_program_have_a_code_each(tiny_capture, built, segments, tmp_path):
+    output = tmp_path / "scene"
+    assert (
+        embed(tiny_capture, output, built, segments, "--method", "trained", "--trained.iterations", "2") == 0
+    )
+    with Image.open(output / "codes" / "view_01.png") as image:
+        codes = np.asarray(image)
+    assert codes.shape == SIZE[::-1]
+    assert (codes[:, -8:] == 255).all(), "pixels without a feature"
+    levels = np.load(segments / "view_01_s.npy")[0][:, :-8]
+    of_segments = [set(codes[:, :-8][levels == number]) for number in (-1, 1, 2)]
+    assert [len(found) for found in of_segments] == [1, 1, 1]
+    assert len(set.union(*of_segments)) == 3
 
 
 def measure(output: Path) -> None:

@@ -30,7 +30,6 @@ from lexsplat.scenes.formats.reading import read_splats
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("hostile"),  # the corpus runs once for all tests of this file
     pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux"),
 ]
 

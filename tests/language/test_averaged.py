@@ -31,7 +31,7 @@ FULL_SIZE = AveragedConfig(shortest_side=10_000)
 
 
 @pytest.fixture(scope="module")
-def scene():
+def balls():
     return make_scene()
 
 
@@ -132,43 +132,43 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
 
 
-def test_known_labels_and_features_are_recovered(scene) -> None:
-    maps = features_of_codes(scene.code_maps, scene.codebook)
-    found = average_features(scene.gaussians, scene.cameras, maps, AveragedConfig())
+def test_known_labels_and_features_are_recovered(balls) -> None:
+    maps = features_of_codes(balls.code_maps, balls.codebook)
+    found = average_features(balls.gaussians, balls.cameras, maps, AveragedConfig())
     field = field_from_means(found, replace(CODES, num_codes=20), AveragedConfig())
     assert field.codebook.dino is None
-    ball = (field.codebook.clip @ scene.codebook.clip.T).argmax(1)  # that each code speaks of
-    assert (ball[field.codes[:, 0].long()].numpy() == scene.labels).mean() > 0.97
+    ball = (field.codebook.clip @ balls.codebook.clip.T).argmax(1)  # that each code speaks of
+    assert (ball[field.codes[:, 0].long()].numpy() == balls.labels).mean() > 0.97
     renamed = CodeField(
-        scene.codebook, ball[field.codes.long()].to(torch.uint8), field.weights, field.uncertainties
+        balls.codebook, ball[field.codes.long()].to(torch.uint8), field.weights, field.uncertainties
     )
-    assert label_accuracy(renamed, scene) > 0.97
+    assert label_accuracy(renamed, balls) > 0.97
 
 
-def test_an_object_keeps_its_code_despite_random_disagreement(scene) -> None:
+def test_an_object_keeps_its_code_despite_random_disagreement(balls) -> None:
     """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still identifies it."""
     generator = np.random.default_rng(1)
     wrong = {
         name: np.where(
             (codes == 4) & (generator.random(codes.shape) < 0.4), generator.integers(0, 4, codes.shape), codes
         )
-        for name, codes in scene.code_maps.items()
+        for name, codes in balls.code_maps.items()
     }
-    maps = features_of_codes(wrong, scene.codebook)
-    found = average_features(scene.gaussians, scene.cameras, maps, AveragedConfig())
+    maps = features_of_codes(wrong, balls.codebook)
+    found = average_features(balls.gaussians, balls.cameras, maps, AveragedConfig())
     field = field_from_means(found, CODES, AveragedConfig())
-    said = (normalize(found.rows(slice(None)), dim=-1) @ scene.codebook.clip.T).argmax(1).numpy()
-    assert (said[scene.labels == 4] == 4).mean() > 0.9
-    assert float(field.uncertainties[scene.labels == 4].mean()) > 1.5 * float(
-        field.uncertainties[scene.labels == 0].mean()
+    said = (normalize(found.rows(slice(None)), dim=-1) @ balls.codebook.clip.T).argmax(1).numpy()
+    assert (said[balls.labels == 4] == 4).mean() > 0.9
+    assert float(field.uncertainties[balls.labels == 4].mean()) > 1.5 * float(
+        field.uncertainties[balls.labels == 0].mean()
     )
 
 
-def test_a_gaussian_that_no_view_shows_has_no_language(scene) -> None:
-    hidden = scene.gaussians.map(lambda tensor: torch.cat([tensor, tensor[:1]]))
+def test_a_gaussian_that_no_view_shows_has_no_language(balls) -> None:
+    hidden = balls.gaussians.map(lambda tensor: torch.cat([tensor, tensor[:1]]))
     hidden.means[-1] = torch.tensor([50.0, 0.0, 50.0])
-    maps = features_of_codes(scene.code_maps, scene.codebook)
-    found = average_features(hidden, scene.cameras, maps, AveragedConfig())
+    maps = features_of_codes(balls.code_maps, balls.codebook)
+    found = average_features(hidden, balls.cameras, maps, AveragedConfig())
     field = field_from_means(found, CODES, AveragedConfig())
     assert float(field.weights[-1].sum()) == 0
     assert float(field.uncertainties[-1]) == 1
@@ -210,12 +210,12 @@ def test_averages_are_bit_identical_on_any_number_of_threads() -> None:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other))
 
 
-def test_weights_do_not_depend_on_the_size_of_the_views(scene) -> None:
+def test_weights_do_not_depend_on_the_size_of_the_views(balls) -> None:
     """Half of the size gives nearly the same means; without the mip filter views stay as they are."""
-    cameras = {name: camera.downscaled(0.25) for name, camera in scene.cameras.items()}  # four times as large
-    maps = features_of_codes(scene.code_maps, scene.codebook)
-    small = average_features(scene.gaussians, cameras, maps, AveragedConfig(shortest_side=24))
-    large = average_features(scene.gaussians, cameras, maps, AveragedConfig(shortest_side=96))
+    cameras = {name: camera.downscaled(0.25) for name, camera in balls.cameras.items()}  # four times as large
+    maps = features_of_codes(balls.code_maps, balls.codebook)
+    small = average_features(balls.gaussians, cameras, maps, AveragedConfig(shortest_side=24))
+    large = average_features(balls.gaussians, cameras, maps, AveragedConfig(shortest_side=96))
     well = large.totals > 1
     assert int(well.sum()) > 100
     cosine = normalize(small.rows(well.nonzero()[:, 0]), dim=-1) * normalize(
@@ -223,7 +223,7 @@ def test_weights_do_not_depend_on_the_size_of_the_views(scene) -> None:
     )
     assert float(cosine.sum(-1).median()) > 0.99
     assert float((small.totals.sum() / large.totals.sum() - 1).abs()) < 0.1
-    classic = replace(scene.gaussians, antialiased=False)
+    classic = replace(balls.gaussians, antialiased=False)
     first = average_features(classic, cameras, maps, AveragedConfig(shortest_side=24))
     second = average_features(classic, cameras, maps, AveragedConfig(shortest_side=96))
     assert torch.equal(first.totals, second.totals)
@@ -241,10 +241,10 @@ def test_a_sample_that_does_not_fit_is_refused_with_one_that_does() -> None:
     field_from_means(found, replace(CODES, sample_size=fits), AveragedConfig(), memory=2_000_000)
 
 
-def test_codes_out_of_range_give_zero_features(scene) -> None:
+def test_codes_out_of_range_give_zero_features(balls) -> None:
     codes = np.array([[0, 4], [255, -1]], np.int16)
-    found = features_of_codes({"a": codes}, scene.codebook)["a"].clip
-    assert torch.equal(found[0], scene.codebook.clip[[0, 4]])
+    found = features_of_codes({"a": codes}, balls.codebook)["a"].clip
+    assert torch.equal(found[0], balls.codebook.clip[[0, 4]])
     assert float(found[1].abs().sum()) == 0
 
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def scene():
+def balls():
     return make_scene(per_ball=8, views=2, width=16, height=12, num_codes=70)
 
 
@@ -34,24 +34,24 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def make_trained(scene, **options) -> TrainedField:
-    field = TrainedField.initial(scene.gaussians, scene.codebook, generator=generator(), **options)
+def make_trained(balls, **options) -> TrainedField:
+    field = TrainedField.initial(balls.gaussians, balls.codebook, generator=generator(), **options)
     with torch.no_grad():
-        field.uncertainty_logits.copy_(torch.randn(len(scene.gaussians), generator=generator(1)))
+        field.uncertainty_logits.copy_(torch.randn(len(balls.gaussians), generator=generator(1)))
     return field
 
 
-def make_coded(scene, columns: int = 4) -> CodeField:
+def make_coded(balls, columns: int = 4) -> CodeField:
     rng = np.random.default_rng(0)
-    count = len(scene.gaussians)
-    codes = np.stack([rng.permutation(scene.codebook.num_codes)[:columns] for _ in range(count)]).astype(
+    count = len(balls.gaussians)
+    codes = np.stack([rng.permutation(balls.codebook.num_codes)[:columns] for _ in range(count)]).astype(
         np.uint8
     )
     weights = rng.random((count, columns))
     weights /= weights.sum(1, keepdims=True)
     weights[3] = 0
     return CodeField(
-        scene.codebook, torch.tensor(codes), torch.tensor(weights), torch.tensor(rng.random(count))
+        balls.codebook, torch.tensor(codes), torch.tensor(weights), torch.tensor(rng.random(count))
     )
 
 
@@ -69,13 +69,13 @@ def softmax(values: np.ndarray) -> np.ndarray:
     return exponentials / exponentials.sum(-1, keepdims=True)
 
 
-def rendered_by_definition(scene, name: str, values: np.ndarray) -> np.ndarray:
-    projected = project(to_float64(scene.gaussians), scene.cameras[name], scene.gaussians.antialiased)
-    return blend(projected, torch.from_numpy(values), scene.cameras[name])[0].detach().numpy()
+def rendered_by_definition(balls, name: str, values: np.ndarray) -> np.ndarray:
+    projected = project(to_float64(balls.gaussians), balls.cameras[name], balls.gaussians.antialiased)
+    return blend(projected, torch.from_numpy(values), balls.cameras[name])[0].detach().numpy()
 
 
-def test_layers_are_those_of_the_papers_tables(scene) -> None:
-    field = make_trained(scene)
+def test_layers_are_those_of_the_papers_tables(balls) -> None:
+    field = make_trained(balls)
     decoder = [
         (layer.in_features, layer.out_features) for layer in field.decoder if isinstance(layer, nn.Linear)
     ]
@@ -92,20 +92,20 @@ def test_layers_are_those_of_the_papers_tables(scene) -> None:
         assert kinds[-1] is nn.Linear
 
 
-def test_training_starts_from_normal_semantics_and_almost_no_uncertainty(scene) -> None:
-    field = TrainedField.initial(scene.gaussians, scene.codebook, generator=generator())
+def test_training_starts_from_normal_semantics_and_almost_no_uncertainty(balls) -> None:
+    field = TrainedField.initial(balls.gaussians, balls.codebook, generator=generator())
     assert abs(float(field.semantics.detach().mean())) < 0.2
     assert float(field.semantics.detach().std()) == pytest.approx(1, abs=0.1)
     np.testing.assert_allclose(field.uncertainties, INITIAL_UNCERTAINTY, rtol=1e-5)
 
 
-def test_the_start_depends_on_its_generator_only(scene) -> None:
+def test_the_start_depends_on_its_generator_only(balls) -> None:
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    first = make_trained(scene).tensors()
+    first = make_trained(balls).tensors()
     assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(2)
-    second = make_trained(scene).tensors()
+    second = make_trained(balls).tensors()
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
@@ -137,13 +137,13 @@ def test_scene_box_holds_the_scene_and_not_its_floaters() -> None:
 
 
 @pytest.mark.parametrize("normalize", [False, True])
-def test_trained_field_renders_equation_8(scene, normalize: bool) -> None:
-    field = make_trained(scene, normalize_rendering=normalize)
-    semantics = rendered_by_definition(scene, "view1", field.semantics.detach().double().numpy())
+def test_trained_field_renders_equation_8(balls, normalize: bool) -> None:
+    field = make_trained(balls, normalize_rendering=normalize)
+    semantics = rendered_by_definition(balls, "view1", field.semantics.detach().double().numpy())
     if normalize:
         semantics = semantics / np.maximum(np.linalg.norm(semantics, axis=-1, keepdims=True), 1e-12)
     expected = softmax(layers_by_hand(field.decoder, semantics))
-    found = field.render_code_probabilities(scene.gaussians, scene.cameras["view1"])
+    found = field.render_code_probabilities(balls.gaussians, balls.cameras["view1"])
     assert found.shape == (12, 16, 70)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     own = field.semantics.detach().double().numpy()
@@ -153,73 +153,73 @@ def test_trained_field_renders_equation_8(scene, normalize: bool) -> None:
     )
 
 
-def test_semantics_and_uncertainty_are_rendered_together(scene) -> None:
-    field = make_trained(scene)
-    semantics, uncertainty = field.render_semantics(scene.gaussians, scene.cameras["view0"])
-    expected = rendered_by_definition(scene, "view0", field.uncertainties.double().numpy()[:, None])[..., 0]
+def test_semantics_and_uncertainty_are_rendered_together(balls) -> None:
+    field = make_trained(balls)
+    semantics, uncertainty = field.render_semantics(balls.gaussians, balls.cameras["view0"])
+    expected = rendered_by_definition(balls, "view0", field.uncertainties.double().numpy()[:, None])[..., 0]
     np.testing.assert_allclose(uncertainty.detach(), expected, atol=1e-5)
     assert semantics.shape == (12, 16, 8)
     assert uncertainty.min() >= 0
     assert uncertainty.max() <= 1
 
 
-def test_language_gradients_never_reach_geometry(scene) -> None:
-    gaussians = scene.gaussians.map(lambda tensor: tensor.clone().requires_grad_())
-    field = make_trained(scene)
-    semantics, uncertainty = field.render_semantics(gaussians, scene.cameras["view0"])
+def test_language_gradients_never_reach_geometry(balls) -> None:
+    gaussians = balls.gaussians.map(lambda tensor: tensor.clone().requires_grad_())
+    field = make_trained(balls)
+    semantics, uncertainty = field.render_semantics(gaussians, balls.cameras["view0"])
     (field.decode(semantics).square().sum() + uncertainty.sum()).backward()
     assert all(tensor.grad is None for tensor in gaussians.tensors().values())
     assert field.semantics.grad.abs().sum() > 0
     assert field.uncertainty_logits.grad.abs().sum() > 0
 
 
-def test_smoothing_gradients_never_reach_the_places(scene) -> None:
-    means = scene.gaussians.means.clone().requires_grad_()
-    smoother = make_trained(scene).smoother
+def test_smoothing_gradients_never_reach_the_places(balls) -> None:
+    means = balls.gaussians.means.clone().requires_grad_()
+    smoother = make_trained(balls).smoother
     smoother(means).square().sum().backward()
     assert means.grad is None
     assert smoother.layers[0].weight.grad.abs().sum() > 0
 
 
-def test_a_code_field_renders_its_distributions(scene) -> None:
-    field = make_coded(scene)
-    dense = np.zeros((len(scene.gaussians), 70))
+def test_a_code_field_renders_its_distributions(balls) -> None:
+    field = make_coded(balls)
+    dense = np.zeros((len(balls.gaussians), 70))
     for n in range(len(dense)):
         for code, weight in zip(field.codes[n].tolist(), field.weights[n].tolist()):
             dense[n, code] += weight
     np.testing.assert_allclose(field.code_probabilities(), dense, atol=1e-7)
-    found = field.render_code_probabilities(scene.gaussians, scene.cameras["view1"])
-    np.testing.assert_allclose(found, rendered_by_definition(scene, "view1", dense), atol=1e-5)
+    found = field.render_code_probabilities(balls.gaussians, balls.cameras["view1"])
+    np.testing.assert_allclose(found, rendered_by_definition(balls, "view1", dense), atol=1e-5)
 
 
 @pytest.mark.parametrize("make", [make_trained, make_coded])
-def test_rendered_scores_are_the_table_applied_to_the_probabilities(scene, make) -> None:
-    field, camera = make(scene), scene.cameras["view0"]
+def test_rendered_scores_are_the_table_applied_to_the_probabilities(balls, make) -> None:
+    field, camera = make(balls), balls.cameras["view0"]
     table = torch.rand(70, 3, generator=generator(3))
-    probabilities = field.render_code_probabilities(scene.gaussians, camera)
-    scores = field.render_scores(scene.gaussians, camera, table)
+    probabilities = field.render_code_probabilities(balls.gaussians, camera)
+    scores = field.render_scores(balls.gaussians, camera, table)
     torch.testing.assert_close(scores, probabilities @ table, rtol=0, atol=1e-5)
 
 
-def test_scores_of_a_code_field_render_as_its_3d_scores(scene) -> None:
-    field = make_coded(scene)
+def test_scores_of_a_code_field_render_as_its_3d_scores(balls) -> None:
+    field = make_coded(balls)
     table = torch.rand(70, 40, generator=generator(3))
     in_space = (field.code_probabilities() @ table).double().numpy()
-    found = field.render_scores(scene.gaussians, scene.cameras["view0"], table)
-    np.testing.assert_allclose(found, rendered_by_definition(scene, "view0", in_space), atol=1e-5)
+    found = field.render_scores(balls.gaussians, balls.cameras["view0"], table)
+    np.testing.assert_allclose(found, rendered_by_definition(balls, "view0", in_space), atol=1e-5)
 
 
 @pytest.mark.parametrize("make", [make_trained, make_coded])
-def test_scores_are_the_table_applied_to_the_probabilities_of_each_gaussian(scene, make) -> None:
-    field, table = make(scene), torch.rand(70, 3, generator=generator(3))
+def test_scores_are_the_table_applied_to_the_probabilities_of_each_gaussian(balls, make) -> None:
+    field, table = make(balls), torch.rand(70, 3, generator=generator(3))
     torch.testing.assert_close(field.scores(table), field.code_probabilities() @ table, rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match=r"table must be \[70, P\]"):
         field.scores(torch.ones(3, 1))
 
 
 @pytest.mark.parametrize("method", ["lifted", "averaged", "lifted+tuned", "trained"])
-def test_stored_fields_of_earlier_versions_open(scene, method) -> None:
-    field = make_trained(scene) if method in ("lifted+tuned", "trained") else make_coded(scene)
+def test_stored_fields_of_earlier_versions_open(balls, method) -> None:
+    field = make_trained(balls) if method in ("lifted+tuned", "trained") else make_coded(balls)
     kind = "trained" if isinstance(field, TrainedField) else "lifted"
     metadata = {"kind": kind, "method": method, "dropped": "0.0312"}
     again = field_from_tensors(field.tensors(), metadata)
@@ -228,8 +228,8 @@ def test_stored_fields_of_earlier_versions_open(scene, method) -> None:
 
 
 @pytest.mark.parametrize("make", [make_trained, make_coded])
-def test_a_field_survives_a_safetensors_file(scene, make, tmp_path) -> None:
-    field = make(scene)
+def test_a_field_survives_a_safetensors_file(balls, make, tmp_path) -> None:
+    field = make(balls)
     field.method = "renamed"
     save_file(field.tensors(), tmp_path / "language.safetensors", field.metadata())
     with safe_open(tmp_path / "language.safetensors", "pt") as file:
@@ -238,22 +238,22 @@ def test_a_field_survives_a_safetensors_file(scene, make, tmp_path) -> None:
     assert isinstance(again, LanguageField)
     assert again.method == "renamed"
     assert again.codebook.lambda_dino == field.codebook.lambda_dino
-    camera = scene.cameras["view0"]
+    camera = balls.cameras["view0"]
     assert torch.equal(
-        again.render_code_probabilities(scene.gaussians, camera),
-        field.render_code_probabilities(scene.gaussians, camera),
+        again.render_code_probabilities(balls.gaussians, camera),
+        field.render_code_probabilities(balls.gaussians, camera),
     )
     assert torch.equal(again.uncertainties, field.uncertainties)
 
 
-def test_settings_of_a_trained_field_are_stored(scene) -> None:
-    field = make_trained(scene, normalize_rendering=True, num_frequencies=2)
+def test_settings_of_a_trained_field_are_stored(balls) -> None:
+    field = make_trained(balls, normalize_rendering=True, num_frequencies=2)
     again = TrainedField.from_tensors(field.tensors(), field.metadata())
     assert again.normalize_rendering
     assert again.smoother.num_frequencies == 2
 
 
-def test_bad_input_is_refused(scene) -> None:
+def test_bad_input_is_refused(balls) -> None:
     book = make_codebook(3)
     with pytest.raises(ValueError, match="code 3 is not in a codebook of 3"):
         CodeField(book, torch.tensor([[3]], dtype=torch.uint8), torch.ones(1, 1), torch.zeros(1))
@@ -261,7 +261,7 @@ def test_bad_input_is_refused(scene) -> None:
         CodeField(book, torch.tensor([[1]]), torch.ones(1, 1), torch.zeros(1))
     with pytest.raises(ValueError, match="neither semantics"):
         field_from_tensors({})
-    tensors = make_trained(scene).tensors()
+    tensors = make_trained(balls).tensors()
     del tensors["decoder.0.weight"]
     with pytest.raises(ValueError, match="does not fit"):
         field_from_tensors(tensors)

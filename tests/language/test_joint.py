@@ -23,32 +23,32 @@ CODES = 4
 
 
 @pytest.fixture(scope="module")
-def scene(tiny_capture):
+def capture(tiny_capture):
     return load_capture(tiny_capture, downscale=2.0)
 
 
 @pytest.fixture(scope="module")
-def points(scene):
-    return initial_points(scene)
+def points(capture):
+    return initial_points(capture)
 
 
-def trainer(scene, points, strategy="default") -> JointTrainer:
+def trainer(capture, points, strategy="default") -> JointTrainer:
     from dataclasses import replace
 
-    cameras = {name: scene.views[name].camera for name in scene.train_names}
+    cameras = {name: capture.views[name].camera for name in capture.train_names}
     rng = np.random.default_rng(0)
     code_maps = {name: rng.integers(0, CODES, (12, 16), dtype=np.uint8) for name in cameras}
     codebook = Codebook(torch.eye(CODES, 6), None, 0.0)
-    reconstructor = Reconstructor(scene, replace(GEOMETRY, strategy=strategy), points, seed=1)
+    reconstructor = Reconstructor(capture, replace(GEOMETRY, strategy=strategy), points, seed=1)
     return JointTrainer(reconstructor, cameras, code_maps, codebook, LANGUAGE, seed=2)
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_language_does_not_change_geometry(scene, points, strategy):
-    joint = trainer(scene, points, strategy)
+def test_language_does_not_change_geometry(capture, points, strategy):
+    joint = trainer(capture, points, strategy)
     joint.run()
     gaussians, field = joint.result()
-    alone = Reconstructor(scene, joint.reconstructor.config, points, seed=1)
+    alone = Reconstructor(capture, joint.reconstructor.config, points, seed=1)
     alone.run()
     for name, tensor in alone.gaussians().tensors().items():
         assert torch.equal(gaussians.tensors()[name], tensor), name
@@ -56,10 +56,10 @@ def test_language_does_not_change_geometry(scene, points, strategy):
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_language_follows_density_control(scene, points, strategy):
-    joint = trainer(scene, points, strategy)
+def test_language_follows_density_control(capture, points, strategy):
+    joint = trainer(capture, points, strategy)
     changes = 0
-    while not joint.done:
+    while not joint.reconstructor.done:
         before = joint.language.field.semantics.detach().clone()
         colors = joint.reconstructor.gaussians().sh0.clone()
         joint.reconstructor.step()
@@ -78,8 +78,8 @@ def test_language_follows_density_control(scene, points, strategy):
     assert changes > 2
 
 
-def test_a_resumed_joint_training_is_bit_identical(scene, points, tmp_path):
-    whole = trainer(scene, points)
+def test_a_resumed_joint_training_is_bit_identical(capture, points, tmp_path):
+    whole = trainer(capture, points)
     whole.run()
 
     class StopsAtSixty(Checkpoint):
@@ -89,8 +89,8 @@ def test_a_resumed_joint_training_is_bit_identical(scene, points, tmp_path):
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trainer(scene, points).run(checkpoint=StopsAtSixty(tmp_path / "state", "same"))
-    resumed = trainer(scene, points)
+        trainer(capture, points).run(checkpoint=StopsAtSixty(tmp_path / "state", "same"))
+    resumed = trainer(capture, points)
     assert Checkpoint(tmp_path / "state", "same").resume(resumed)
     assert resumed.reconstructor.steps_done == 60
     resumed.run()
@@ -113,7 +113,8 @@ def test_the_command_line_trains_jointly(tiny_capture, tmp_path):
 
     output = tmp_path / "scene"
     options = ["--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "60",
-               "--codebook.num-codes", "8", "--method", "trained", "--joint", "--downscale", "2"]  # fmt: skip
+               "--codebook.num-codes", "8", "--method", "trained", "--joint", "--downscale", "2",
+               "--features.crop-sizes", "0.36", "--features.crop-strides", "0.5"]  # fmt: skip
     assert cli.main(["build", str(tiny_capture), "--output", str(output), *options]) == 0
     stages = json.loads((output / "scene.json").read_text())["stages"]
     assert list(stages) == ["features", "codebook", "reconstruct", "language"]

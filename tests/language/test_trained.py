@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from support.language_scene import IGNORED, label_accuracy, make_scene
 
 from lexsplat.language.code_maps import codes_at_pixels
-from lexsplat.language.methods.trained import train_field
+from lexsplat.language.methods.trained import _prepare_views, train_field
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.runtime.errors import TrainingError
@@ -35,12 +35,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def scene():
+def balls():
     return make_scene()
 
 
-def train(scene, config, **options):
-    return train_field(scene.gaussians, scene.cameras, scene.code_maps, scene.codebook, config, **options)
+def train(balls, config, **options):
+    return train_field(balls.gaussians, balls.cameras, balls.code_maps, balls.codebook, config, **options)
 
 
 @settings(max_examples=60, deadline=None)
@@ -55,41 +55,41 @@ def test_a_pixel_takes_the_cell_its_center_lies_in(rows: int, columns: int, heig
         assert code == row * columns + column
 
 
-def test_training_recovers_known_labels_and_keeps_geometry(scene) -> None:
-    before = {name: tensor.clone() for name, tensor in scene.gaussians.tensors().items()}
+def test_training_recovers_known_labels_and_keeps_geometry(balls) -> None:
+    before = {name: tensor.clone() for name, tensor in balls.gaussians.tensors().items()}
     events: list[Event] = []
-    field = train(scene, QUICK, listener=events.append)
-    assert label_accuracy(field, scene) > 0.95
-    for name, tensor in scene.gaussians.tensors().items():
+    field = train(balls, QUICK, listener=events.append)
+    assert label_accuracy(field, balls) > 0.95
+    for name, tensor in balls.gaussians.tensors().items():
         assert torch.equal(tensor, before[name]), name
         assert tensor.grad is None
     assert events[-1].done == events[-1].total == 80
     assert events[-1].metrics["cross_entropy"] < events[0].metrics["cross_entropy"]
 
 
-def test_coarse_index_maps_are_enough_for_coarse_balls(scene) -> None:
-    coarse = {name: code_map[::2, ::2] for name, code_map in scene.code_maps.items()}
-    field = train_field(scene.gaussians, scene.cameras, coarse, scene.codebook, QUICK)
-    assert label_accuracy(field, scene) > 0.9
+def test_coarse_index_maps_are_enough_for_coarse_balls(balls) -> None:
+    coarse = {name: code_map[::2, ::2] for name, code_map in balls.code_maps.items()}
+    field = train_field(balls.gaussians, balls.cameras, coarse, balls.codebook, QUICK)
+    assert label_accuracy(field, balls) > 0.9
 
 
-def test_rendering_smaller_learns_too(scene) -> None:
-    assert label_accuracy(train(scene, replace(QUICK, render_downscale=2.0)), scene) > 0.9
+def test_rendering_smaller_learns_too(balls) -> None:
+    assert label_accuracy(train(balls, replace(QUICK, render_downscale=2.0)), balls) > 0.9
 
 
 @pytest.mark.parametrize("released", [False, True])
-def test_a_full_step_has_the_loss_of_equation_15(scene, released: bool) -> None:
+def test_a_full_step_has_the_loss_of_equation_15(balls, released: bool) -> None:
     config = TrainedConfig().as_released() if released else TrainedConfig().as_in_paper()
     config = replace(config, lambda_ce=0.7, lambda_u=1.3, lambda_s=0.9, lambda_smo=0.4)
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, config, seed=4)
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, config, seed=4)
     with torch.no_grad():
-        trainer.field.uncertainty_logits.copy_(torch.randn(len(scene.gaussians)))
-    camera, code_map = scene.cameras["view0"], scene.code_maps["view0"]
+        trainer.field.uncertainty_logits.copy_(torch.randn(len(balls.gaussians)))
+    camera, code_map = balls.cameras["view0"], balls.code_maps["view0"]
     with torch.no_grad():
         semantics, uncertainty = (
-            part.double() for part in trainer.field.render_semantics(scene.gaussians, camera)
+            part.double() for part in trainer.field.render_semantics(balls.gaussians, camera)
         )
-        smoothed = trainer.field.smoother(scene.gaussians.means).double().numpy()
+        smoothed = trainer.field.smoother(balls.gaussians.means).double().numpy()
         own = trainer.field.semantics.double().numpy().copy()
         u = trainer.field.uncertainties.double().numpy()
         cross_entropy, regularizer, known = 0.0, 0.0, 0
@@ -110,20 +110,20 @@ def test_a_full_step_has_the_loss_of_equation_15(scene, released: bool) -> None:
     assert float(losses["loss"]) == pytest.approx(0.9 * semantic + 0.4 * smoothing, rel=1e-4)
 
 
-def test_the_field_depends_on_the_seed_only(scene) -> None:
+def test_the_field_depends_on_the_seed_only(balls) -> None:
     config = replace(QUICK, iterations=6)
     torch.manual_seed(1)
-    first = train(scene, config, seed=3).tensors()
+    first = train(balls, config, seed=3).tensors()
     torch.manual_seed(2)
-    second = train(scene, config, seed=3).tensors()
-    other = train(scene, config, seed=4).tensors()
+    second = train(balls, config, seed=3).tensors()
+    other = train(balls, config, seed=4).tensors()
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not torch.equal(first["semantics"], other["semantics"])
 
 
-def test_a_resumed_training_is_bit_identical(scene, tmp_path) -> None:
+def test_a_resumed_training_is_bit_identical(balls, tmp_path) -> None:
     config = replace(QUICK, iterations=20)
-    whole = train(scene, config, seed=5)
+    whole = train(balls, config, seed=5)
 
     class StopsAfterSeven(Checkpoint):
         def after_step(self, trainer) -> None:
@@ -132,26 +132,26 @@ def test_a_resumed_training_is_bit_identical(scene, tmp_path) -> None:
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(scene, config, seed=5, checkpoint=StopsAfterSeven(tmp_path / "state", "same"))
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, config, seed=5)
+        train(balls, config, seed=5, checkpoint=StopsAfterSeven(tmp_path / "state", "same"))
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, config, seed=5)
     checkpoint = Checkpoint(tmp_path / "state", "same")
     assert checkpoint.resume(trainer)
     assert trainer.iteration == 7
-    resumed = train(scene, config, seed=5, checkpoint=checkpoint)
+    resumed = train(balls, config, seed=5, checkpoint=checkpoint)
     for name, tensor in whole.tensors().items():
         assert torch.equal(resumed.tensors()[name], tensor), name
 
 
-def test_a_state_of_another_scene_is_refused(scene) -> None:
+def test_a_state_of_another_scene_is_refused(balls) -> None:
     small = make_scene(per_ball=3, views=1)
     state = FieldTrainer(small.gaussians, small.codebook, QUICK).state_dict()
     with pytest.raises(ValueError, match="does not fit"):
-        FieldTrainer(scene.gaussians, scene.codebook, QUICK).load_state_dict(state)
+        FieldTrainer(balls.gaussians, balls.codebook, QUICK).load_state_dict(state)
 
 
-def test_every_view_has_its_turn_before_one_comes_again(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, QUICK, seed=2)
-    names, order = sorted(scene.cameras), []
+def test_every_view_has_its_turn_before_one_comes_again(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, QUICK, seed=2)
+    names, order = sorted(balls.cameras), []
     for trainer.iteration in range(3 * len(names)):
         order.append(trainer.view_of_step(names))
     epochs = [order[i : i + len(names)] for i in range(0, len(order), len(names))]
@@ -159,64 +159,74 @@ def test_every_view_has_its_turn_before_one_comes_again(scene) -> None:
     assert epochs[0] != epochs[1] != epochs[2]
 
 
-def test_views_without_a_camera_are_not_looked_at(scene) -> None:
+def test_views_without_a_camera_are_not_looked_at(balls) -> None:
     class Explosive(dict):
         def __getitem__(self, name):
             assert name != "view7", "a held-out view was read"
             return super().__getitem__(name)
 
-    cameras = {name: camera for name, camera in scene.cameras.items() if name != "view7"}
-    code_maps = Explosive(scene.code_maps)
-    train_field(scene.gaussians, cameras, code_maps, scene.codebook, replace(QUICK, iterations=20))
+    cameras = {name: camera for name, camera in balls.cameras.items() if name != "view7"}
+    code_maps = Explosive(balls.code_maps)
+    train_field(balls.gaussians, cameras, code_maps, balls.codebook, replace(QUICK, iterations=20))
+
+
+def test_projections_are_kept_as_long_as_the_memory_lasts(balls) -> None:
+    views = _prepare_views(balls.gaussians, balls.cameras, QUICK, 1 << 30)
+    assert all(prepared is not None for _, prepared in views.values())
+    first = next(iter(views.values()))[1].nbytes
+    few = _prepare_views(
+        balls.gaussians, balls.cameras, QUICK, 4 * (first + 1)
+    )  # a quarter is for projections
+    assert [prepared is not None for _, prepared in few.values()] == [True, True] + [False] * (len(views) - 2)
 
 
 @pytest.mark.parametrize(
     ("switch", "untouched"),
     [("use_uncertainty", "uncertainty_logits"), ("use_smoothing", "smoother.layers.0.weight")],
 )
-def test_an_ablation_leaves_its_parameters_alone(scene, switch: str, untouched: str) -> None:
+def test_an_ablation_leaves_its_parameters_alone(balls, switch: str, untouched: str) -> None:
     config = replace(QUICK, iterations=3)
-    start = FieldTrainer(scene.gaussians, scene.codebook, config, seed=1).field.tensors()
-    on, off = (train(scene, replace(config, **{switch: value}), seed=1).tensors() for value in (True, False))
+    start = FieldTrainer(balls.gaussians, balls.codebook, config, seed=1).field.tensors()
+    on, off = (train(balls, replace(config, **{switch: value}), seed=1).tensors() for value in (True, False))
     assert torch.equal(off[untouched], start[untouched])
     assert not torch.equal(on[untouched], start[untouched])
 
 
-def test_without_uncertainty_the_cross_entropy_keeps_its_weight(scene) -> None:
+def test_without_uncertainty_the_cross_entropy_keeps_its_weight(balls) -> None:
     losses = {}
     for weight in (1.0, 0.5):
         config = replace(QUICK, use_uncertainty=False, use_smoothing=False, lambda_ce=weight)
-        trainer = FieldTrainer(scene.gaussians, scene.codebook, config, seed=1)
-        losses[weight] = trainer.step(scene.cameras["view0"], scene.code_maps["view0"])["loss"]
+        trainer = FieldTrainer(balls.gaussians, balls.codebook, config, seed=1)
+        losses[weight] = trainer.step(balls.cameras["view0"], balls.code_maps["view0"])["loss"]
     assert float(losses[0.5]) == pytest.approx(0.5 * float(losses[1.0]))
 
 
-def test_without_uncertainty_the_smoothing_has_its_least_weight(scene) -> None:
+def test_without_uncertainty_the_smoothing_has_its_least_weight(balls) -> None:
     config = replace(QUICK, use_uncertainty=False, smoothing_sample=0, min_smoothing_weight=0.25)
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, config, seed=1)
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, config, seed=1)
     with torch.no_grad():
         trainer.field.uncertainty_logits.fill_(5.0)  # a field that was tuned with uncertainties before
-        distance = trainer.field.smoother(scene.gaussians.means) - trainer.field.semantics
+        distance = trainer.field.smoother(balls.gaussians.means) - trainer.field.semantics
         expected = 1.25 * float(distance.norm(dim=1).mean())
-    losses = trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+    losses = trainer.step(balls.cameras["view0"], balls.code_maps["view0"])
     assert float(losses["smoothing"]) == pytest.approx(expected, rel=1e-5)
 
 
-def test_training_starts_as_the_paper_and_the_settings_say(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, replace(QUICK, num_frequencies=2))
+def test_training_starts_as_the_paper_and_the_settings_say(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, replace(QUICK, num_frequencies=2))
     assert trainer.field.smoother.num_frequencies == 2
     assert not trainer.field.normalize_rendering
-    assert trainer.field.uncertainties.tolist() == pytest.approx([0.01] * len(scene.gaussians))
+    assert trainer.field.uncertainties.tolist() == pytest.approx([0.01] * len(balls.gaussians))
     assert trainer.field.semantics.std().item() == pytest.approx(1, abs=0.1)  # N(0, 1)
     assert all(group["betas"] == (0.9, 0.999) for group in trainer.optimizer.param_groups)
 
 
-def test_every_part_has_its_learning_rate_and_its_decay(scene) -> None:
+def test_every_part_has_its_learning_rate_and_its_decay(balls) -> None:
     config = replace(
         QUICK, iterations=8, semantics_lr=0.1, uncertainty_lr=0.2, decoder_lr=0.3, smoothing_lr=0.4
     )
     config = replace(config, decoder_weight_decay=0.01, final_lr_factor=0.25)
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, config)
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, config)
     field = trainer.field
     firsts = [field.semantics, field.uncertainty_logits, field.decoder[0].weight]
     firsts.append(field.smoother.layers[0].weight)
@@ -231,14 +241,14 @@ def test_every_part_has_its_learning_rate_and_its_decay(scene) -> None:
     assert of_parts("weight_decay") == [0, 0, 0.01, 0]
     for iteration, factor in ((0, 1.0), (4, 0.5), (8, 0.25)):  # exponential: half way it is the root
         trainer.iteration = iteration
-        trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+        trainer.step(balls.cameras["view0"], balls.code_maps["view0"])
         assert of_parts("lr") == pytest.approx([factor * rate for rate in (0.1, 0.2, 0.3, 0.4)])
 
 
-def test_equations_12_and_15_weight_their_terms(scene) -> None:
+def test_equations_12_and_15_weight_their_terms(balls) -> None:
     config = replace(QUICK, lambda_ce=2.0, lambda_u=0.5, lambda_s=3.0, lambda_smo=0.25)
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, config)
-    found = trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, config)
+    found = trainer.step(balls.cameras["view0"], balls.code_maps["view0"])
     assert float(found["semantic"]) == pytest.approx(
         2.0 * float(found["cross_entropy"]) + 0.5 * float(found["uncertainty"])
     )
@@ -247,77 +257,77 @@ def test_equations_12_and_15_weight_their_terms(scene) -> None:
     )
 
 
-def test_smoothing_runs_every_so_many_steps(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, replace(QUICK, smoothing_every=3))
-    steps = [trainer.step(scene.cameras["view0"], scene.code_maps["view0"]) for _ in range(6)]
+def test_smoothing_runs_every_so_many_steps(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, replace(QUICK, smoothing_every=3))
+    steps = [trainer.step(balls.cameras["view0"], balls.code_maps["view0"]) for _ in range(6)]
     assert ["smoothing" in losses for losses in steps] == [True, False, False, True, False, False]
 
 
 @pytest.mark.parametrize("form", ["linear", "log"])
-def test_uncertainty_grows_where_views_disagree(scene, form: str) -> None:
+def test_uncertainty_grows_where_views_disagree(balls, form: str) -> None:
     rng = np.random.default_rng(0)
     code_maps = {}
-    for name, code_map in scene.code_maps.items():
+    for name, code_map in balls.code_maps.items():
         code_maps[name] = code_map.copy()
         ball = code_map == 1
-        code_maps[name][ball] = rng.integers(0, scene.codebook.num_codes, int(ball.sum()))
+        code_maps[name][ball] = rng.integers(0, balls.codebook.num_codes, int(ball.sum()))
     config = replace(QUICK, uncertainty_form=form, uncertainty_lr=0.1)
-    field = train_field(scene.gaussians, scene.cameras, code_maps, scene.codebook, config)
+    field = train_field(balls.gaussians, balls.cameras, code_maps, balls.codebook, config)
     u = field.uncertainties.numpy()
-    assert u[scene.labels == 1].mean() > 2 * u[scene.labels != 1].mean()
+    assert u[balls.labels == 1].mean() > 2 * u[balls.labels != 1].mean()
 
 
-def test_a_stronger_w_s_gives_smoother_semantics(scene) -> None:
+def test_a_stronger_w_s_gives_smoother_semantics(balls) -> None:
     rough = {}
     for weight in (0.0, 5.0):
-        field = train(scene, replace(QUICK, min_smoothing_weight=weight, use_uncertainty=False))
+        field = train(balls, replace(QUICK, min_smoothing_weight=weight, use_uncertainty=False))
         with torch.no_grad():
-            distance = field.semantics - field.smoother(scene.gaussians.means)
+            distance = field.semantics - field.smoother(balls.gaussians.means)
             rough[weight] = float((distance.norm(dim=1) / field.semantics.norm(dim=1).mean()).mean())
     assert rough[5.0] < rough[0.0]
 
 
-def test_ignored_views_teach_nothing_and_break_nothing(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, replace(QUICK, use_smoothing=False))
+def test_ignored_views_teach_nothing_and_break_nothing(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, replace(QUICK, use_smoothing=False))
     before = trainer.field.semantics.detach().clone()
-    losses = trainer.step(scene.cameras["view0"], np.full((3, 3), IGNORED, np.uint8))
+    losses = trainer.step(balls.cameras["view0"], np.full((3, 3), IGNORED, np.uint8))
     assert float(losses["loss"]) == 0
     assert torch.equal(trainer.field.semantics, before)
 
 
-def test_language_follows_density_control(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, QUICK)
-    trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+def test_language_follows_density_control(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, QUICK)
+    trainer.step(balls.cameras["view0"], balls.code_maps["view0"])
     old = trainer.field.semantics.detach().clone()
     moment = trainer.optimizer.state[trainer.field.semantics]["exp_avg"].clone()
     parents = torch.tensor([5, 5, 0, 299, 17])
-    trainer.replace_gaussians(scene.gaussians.select(parents), parents)
+    trainer.replace_gaussians(balls.gaussians.select(parents), parents)
     assert torch.equal(trainer.field.semantics, old[parents])
     assert torch.equal(trainer.optimizer.state[trainer.field.semantics]["exp_avg"], moment[parents])
-    trainer.step(scene.cameras["view1"], scene.code_maps["view1"])
+    trainer.step(balls.cameras["view1"], balls.code_maps["view1"])
     assert not torch.equal(trainer.field.semantics, old[parents])
 
 
-def test_clipping_bounds_the_decoders_gradient(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, replace(QUICK, clip_decoder_grad=1e-3))
-    trainer.step(scene.cameras["view0"], scene.code_maps["view0"])
+def test_clipping_bounds_the_decoders_gradient(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, replace(QUICK, clip_decoder_grad=1e-3))
+    trainer.step(balls.cameras["view0"], balls.code_maps["view0"])
     squares = sum(float(p.grad.square().sum()) for p in trainer.field.decoder.parameters())
     assert math.sqrt(squares) <= 1e-3 * (1 + 1e-3)
 
 
-def test_divergence_is_an_error_with_a_remedy(scene) -> None:
-    trainer = FieldTrainer(scene.gaussians, scene.codebook, QUICK)
+def test_divergence_is_an_error_with_a_remedy(balls) -> None:
+    trainer = FieldTrainer(balls.gaussians, balls.codebook, QUICK)
     with torch.no_grad():
         trainer.field.semantics.fill_(torch.nan)
     with pytest.raises(TrainingError, match="lower the learning rates"):
-        train(scene, replace(QUICK, iterations=25), trainer=trainer)
+        train(balls, replace(QUICK, iterations=25), trainer=trainer)
 
 
-def test_bad_input_is_refused(scene) -> None:
+def test_bad_input_is_refused(balls) -> None:
     with pytest.raises(ValueError, match="no training view"):
-        train_field(scene.gaussians, {}, {}, scene.codebook, QUICK)
-    code_maps = {name: value for name, value in scene.code_maps.items() if name != "view1"}
+        train_field(balls.gaussians, {}, {}, balls.codebook, QUICK)
+    code_maps = {name: value for name, value in balls.code_maps.items() if name != "view1"}
     with pytest.raises(ValueError, match="no index map for view1"):
-        train_field(scene.gaussians, scene.cameras, code_maps, scene.codebook, QUICK)
+        train_field(balls.gaussians, balls.cameras, code_maps, balls.codebook, QUICK)
     with pytest.raises(ValueError, match="must be positive"):
         TrainedConfig(render_downscale=0)

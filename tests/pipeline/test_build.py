@@ -17,16 +17,10 @@ from lexsplat.pipeline.build import STAGES, build
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.scenes.folder import SceneFolder
 
+pytestmark = pytest.mark.usefixtures("color_encoders")
+
 AVERAGED = replace(CONFIG, method="averaged", iterations=4)
 TRAINED = replace(CONFIG, iterations=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def colors():
-    """The color encoders in place of CLIP and DINO."""
-    with pytest.MonkeyPatch.context() as patch:
-        color_encoder.install(patch)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -50,13 +50,13 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 
 @pytest.fixture(scope="module")
-def scene(tiny_capture):
+def capture(tiny_capture):
     return load_capture(tiny_capture, downscale=3.0)
 
 
 @pytest.fixture(scope="module")
-def points(scene):
-    found = initial_points(scene)
+def points(capture):
+    found = initial_points(capture)
     return dataclasses.replace(found, points=found.points[::5], colors=found.colors[::5])
 
 
@@ -73,17 +73,17 @@ def devices(tensors):
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_a_reconstruction_on_the_gpu_sees_what_one_on_the_cpu_sees(pretended_gpu, scene, points, strategy):
+def test_a_reconstruction_on_the_gpu_sees_what_one_on_the_cpu_sees(pretended_gpu, capture, points, strategy):
     config = dataclasses.replace(GEOMETRY, strategy=strategy)
     found = {}
     for device in ("cpu", "cuda"):
-        trainer = Reconstructor(scene, config, points, device=device, seed=3)
+        trainer = Reconstructor(capture, config, points, device=device, seed=3)
         for _ in range(2):
             trainer.step()
-        found[device] = held_out_psnr(trainer, scene)
+        found[device] = held_out_psnr(trainer, capture)
     assert found["cuda"] == pytest.approx(found["cpu"], abs=0.05)
     saved = trainer.state_dict()
-    again = Reconstructor(scene, config, points, device="cuda", seed=4)
+    again = Reconstructor(capture, config, points, device="cuda", seed=4)
     again.load_state_dict(on_host(saved))
     for one in (trainer, again):
         one.run()
@@ -100,10 +100,10 @@ def on_host(state):
     return {name: tensor.cpu() for name, tensor in state.items()}
 
 
-def test_a_step_of_the_reconstruction_has_no_wait_of_our_own(pretended_gpu, scene, points):
+def test_a_step_of_the_reconstruction_has_no_wait_of_our_own(pretended_gpu, capture, points):
     config = dataclasses.replace(GEOMETRY, iterations=60, densify_min_every=1000, warm_up=0.0)
-    trainer = Reconstructor(scene, config, points, device="cuda")
-    for _ in range(len(scene.train_views) + 1):  # every photo is loaded by then
+    trainer = Reconstructor(capture, config, points, device="cuda")
+    for _ in range(len(capture.train_views) + 1):  # every photo is loaded by then
         trainer.step()
     while trainer.steps_done % 10:
         trainer.step()
@@ -128,9 +128,9 @@ def test_a_pose_gets_its_gradient_on_the_gpu(pretended_gpu, balls):
 # -- features and codes
 
 
-def test_features_and_codes_on_the_gpu(pretended_gpu, scene, clip_folder, tmp_path):
-    views = dict(list(scene.views.items())[:2])
-    few = dataclasses.replace(scene, views=views)
+def test_features_and_codes_on_the_gpu(pretended_gpu, capture, clip_folder, tmp_path):
+    views = dict(list(capture.views.items())[:2])
+    few = dataclasses.replace(capture, views=views)
     config = FeatureConfig(
         crop_sizes=(1.0,), crop_strides=(0.5,), map_cells=4, dino_short_side=16, dino_stride=8, dino_layer=1
     )
@@ -205,11 +205,11 @@ def test_a_step_of_the_language_training_never_waits_for_the_gpu(pretended_gpu, 
     assert not pretended_gpu, pretended_gpu
 
 
-def test_joint_training_on_the_gpu(pretended_gpu, scene, points):
-    cameras = {name: scene.views[name].camera for name in scene.train_names}
+def test_joint_training_on_the_gpu(pretended_gpu, capture, points):
+    cameras = {name: capture.views[name].camera for name in capture.train_names}
     code_maps = {name: np.random.default_rng(0).integers(0, 5, (6, 8), dtype=np.uint8) for name in cameras}
     codebook = make_scene(per_ball=2, views=1).codebook.to("cuda")
-    reconstructor = Reconstructor(scene, GEOMETRY, points, device="cuda")
+    reconstructor = Reconstructor(capture, GEOMETRY, points, device="cuda")
     joint = JointTrainer(reconstructor, cameras, code_maps, codebook, LANGUAGE)
     joint.run()
     gaussians, field = joint.result()
@@ -252,15 +252,15 @@ def test_a_scene_is_edited_on_the_gpu(on_gpu):
     scene.embed(WORDS)  # what comes after an edit is no scene that embeds words by itself
     editor = Editor(scene)
     count = len(ground_truth.labels)
-    editor.recolor(editor.select("ball 0"), (1.0, 0.0, 0.0), strength=0.5)
-    editor.move(editor.select("ball 1"), Motion(translation=(0.0, 0.0, 0.3), scale=1.1))
-    editor.duplicate(editor.select("ball 2"), Motion(translation=(0.0, 0.0, 2.0)))
-    editor.delete(editor.select("ball 3"))
+    editor.recolor(editor.scene.select("ball 0"), (1.0, 0.0, 0.0), strength=0.5)
+    editor.move(editor.scene.select("ball 1"), Motion(translation=(0.0, 0.0, 0.3), scale=1.1))
+    editor.duplicate(editor.scene.select("ball 2"), Motion(translation=(0.0, 0.0, 2.0)))
+    editor.delete(editor.scene.select("ball 3"))
     assert len(editor.scene.gaussians) == count
     assert devices(editor.scene.gaussians.tensors().values()) == {"cuda:0"}
     assert editor.undo()
     assert len(editor.scene.gaussians) == count + 20
-    editor.keep(editor.select("ball 4"))
+    editor.keep(editor.scene.select("ball 4"))
     assert len(editor.scene.gaussians) == 20
 
 
@@ -279,7 +279,7 @@ def test_the_viewer_answers_on_the_gpu(on_gpu):
     session.refine(question)
     for session.mode in MODES:
         assert session.colors().shape == (len(ground_truth.labels), 3)
-    view, _ = session.best_views(question.selection)[0]
+    view, _ = question.selection.view_shares[0]
     assert session.thumbnail(view, question.selection).dtype == np.uint8
     assert session.what_is(ground_truth.cameras[view], 48.0, 36.0) is not None
     for ending in (".ply", ".splat"):
@@ -313,9 +313,9 @@ def test_every_command_runs_with_device_cuda(pretended_gpu, built, tiny_capture,
 
 
 def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypatch):
-    from support.experiments import CONFIG
+    from support.experiments import CONFIG, compared
 
-    from lexsplat.evaluation import baselines
+    from lexsplat.evaluation import EvaluationConfig, baselines
     from lexsplat.evaluation import compare as comparison
 
     color_encoder.install(monkeypatch)
@@ -329,7 +329,7 @@ def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypa
     )  # fmt: skip
     capture = write_capture(tmp_path / "capture", views=5, width=40, height=30)
     plan = comparison.ComparisonPlan(methods=comparison.BASELINES)
-    evaluation = comparison.EvaluationConfig(lpips=False)
-    comparison.compare(capture, tmp_path / "out", config, plan, evaluation=evaluation)
+    evaluation = EvaluationConfig(lpips=False)
+    compared(capture, tmp_path / "out", config, plan, evaluation=evaluation)
     rows = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert set(comparison.BASELINES) <= set(json.dumps(rows).replace('"', " ").replace(",", " ").split())

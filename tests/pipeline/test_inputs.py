@@ -15,7 +15,6 @@ from support.rooms import (
     room_cameras,
     room_photo,
     save_as_phone,
-    texture,
 )
 from support.written_captures import save
 
@@ -31,10 +30,6 @@ pytestmark = pytest.mark.slow
 QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4"]
 
 
-def textures() -> list[np.ndarray]:
-    return [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
-
-
 def run(command: str, capture, output, *further: str) -> int:
     return cli.main([command, str(capture), "--output", str(output), *QUICK, *further])
 
@@ -44,7 +39,7 @@ def photos(tmp_path_factory):
     """The room as a phone stores it, with ground truth for one photo and a mask for another."""
     folder = tmp_path_factory.mktemp("phone")
     for index, camera in enumerate(room_cameras()):
-        save_as_phone(folder / f"{index}.jpg", room_photo(camera, textures()), 6 if index % 2 else 1)
+        save_as_phone(folder / f"{index}.jpg", room_photo(camera), 6 if index % 2 else 1)
     save(folder / "unrelated.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     save(folder / "segmentations" / "3" / "wall.png", np.ones((SIZE[1], SIZE[0])))
     mask = np.ones((SIZE[1], SIZE[0]))
@@ -54,26 +49,26 @@ def photos(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def scene(photos, tmp_path_factory):
+def scene_folder(photos, tmp_path_factory):
     output = tmp_path_factory.mktemp("scene") / "room"
     assert run("reconstruct", photos, output) == 0
     return output
 
 
-def test_photos_alone_become_a_scene_of_upright_views(photos, scene):
-    record = json.loads((scene / "scene.json").read_text())
+def test_photos_alone_become_a_scene_of_upright_views(photos, scene_folder):
+    record = json.loads((scene_folder / "scene.json").read_text())
     assert record["capture"] == str(photos)
     assert record["stages"]["poses"]["registered"] == COUNT
     assert record["stages"]["poses"]["unregistered"] == ["unrelated.png"]
-    views = SceneFolder.open(scene).read_cameras()
+    views = SceneFolder.open(scene_folder).read_cameras()
     assert {name: view.split for name, view in views.items()} == {
         f"{index}.jpg": "test" if index == 3 else "train" for index in range(COUNT)
     }, "the photo with ground truth is held out"
     assert_same_up_to_a_similarity([views[f"{index}.jpg"].camera for index in range(COUNT)], room_cameras())
 
 
-def test_reloading_finds_photos_ground_truth_and_masks(photos, scene, tmp_path):
-    capture = reload_capture(SceneFolder.open(scene))
+def test_reloading_finds_photos_ground_truth_and_masks(photos, scene_folder, tmp_path):
+    capture = reload_capture(SceneFolder.open(scene_folder))
     assert len(capture.views) == COUNT
     assert capture.test_names == ("3.jpg",)
     assert list(load_annotations(capture).masks["3.jpg"]) == ["wall"]
@@ -81,11 +76,11 @@ def test_reloading_finds_photos_ground_truth_and_masks(photos, scene, tmp_path):
     assert [name for name in valid if valid[name] is not None] == ["5.jpg"]
     assert 0.6 < valid["5.jpg"].mean() < 0.8
     moved = shutil.copytree(photos, tmp_path / "moved")
-    assert reload_capture(SceneFolder.open(scene), moved).root == moved
+    assert reload_capture(SceneFolder.open(scene_folder), moved).root == moved
 
 
-def test_photos_are_registered_once_until_a_setting_changes(photos, scene, tmp_path):
-    copy = shutil.copytree(scene, tmp_path / "copy")
+def test_photos_are_registered_once_until_a_setting_changes(photos, scene_folder, tmp_path):
+    copy = shutil.copytree(scene_folder, tmp_path / "copy")
     model = copy / "poses" / "sparse" / "0" / "images.bin"
     before = model.stat().st_mtime_ns
     assert run("reconstruct", photos, copy) == 0
@@ -105,7 +100,7 @@ def test_an_output_that_is_the_photos_folder_is_refused(photos, capsys):
 def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
     folder, output = tmp_path / "photos", tmp_path / "out"
     for index, camera in enumerate(room_cameras()):
-        save(folder / f"{index}.png", room_photo(camera, textures()))
+        save(folder / f"{index}.png", room_photo(camera))
 
     def stop(event: Event) -> None:
         if event.stage == "poses" and event.done == COUNT:
@@ -135,7 +130,7 @@ def test_a_video_becomes_a_scene_that_needs_the_video_no_more(tmp_path):
         stream = container.add_stream("mpeg4", rate=Fraction(10), options={"qscale": "2", "flags": "+qscale"})
         stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
         for camera in room_cameras():
-            pixels = (room_photo(camera, textures()) * 255).astype(np.uint8)
+            pixels = (room_photo(camera) * 255).astype(np.uint8)
             for _ in range(2):  # every picture twice: of the two, one is enough
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         container.mux(stream.encode())
@@ -153,7 +148,7 @@ def test_a_video_becomes_a_scene_that_needs_the_video_no_more(tmp_path):
 def test_photos_that_are_gone_are_told(tmp_path):
     folder = tmp_path / "photos"
     for index, camera in enumerate(room_cameras()[:5]):
-        save(folder / f"{index}.png", room_photo(camera, textures()))
+        save(folder / f"{index}.png", room_photo(camera))
     assert run("reconstruct", folder, tmp_path / "scene", "--test-every", "0") == 0
     shutil.rmtree(folder)
     with pytest.raises(SceneFolderError, match="--capture"):

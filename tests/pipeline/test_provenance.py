@@ -1,9 +1,13 @@
-"""What a scene remembers of the models it was made with."""
+"""What a scene remembers of its capture and of the models it was made with, and what counts as a change."""
 
+import dataclasses
 import json
+import os
 from pathlib import Path
 
-from support.written_captures import write_transforms
+import numpy as np
+import pytest
+from support.written_captures import save, write_transforms
 
 from lexsplat.captures import load_capture
 from lexsplat.pipeline.config import BuildConfig
@@ -33,3 +37,66 @@ def test_a_model_folder_is_identified_by_its_files(tmp_path, monkeypatch):
     assert any("config.json" in part for part in before)
     (tmp_path / "clip" / "config.json").write_text("{ }")
     assert model_identity("~/clip", "clip") != before
+    monkeypatch.undo()
+    os.utime(tmp_path / "clip" / "config.json", ns=(1, 1))
+    changed = model_identity(str(tmp_path / "clip"), "clip")
+    os.utime(tmp_path / "clip" / "config.json", ns=(1, 2))
+    assert model_identity(str(tmp_path / "clip"), "clip") != changed, "files of equal size and another time"
+
+
+def other_photo(capture, folder):
+    save(capture.views["b.png"].image_path, np.full((48, 64, 3), 0.9))
+    return capture
+
+
+def other_view(capture, **changes):
+    return dataclasses.replace(
+        capture, views={**capture.views, "b.png": dataclasses.replace(capture.views["b.png"], **changes)}
+    )
+
+
+def other_camera(capture, folder):
+    camera = capture.views["b.png"].camera
+    return other_view(capture, camera=dataclasses.replace(camera, K=camera.K * [[1.01], [1], [1]]))
+
+
+def other_mask(capture, folder):
+    save(folder / "mask.png", np.ones((48, 64, 3)))
+    return other_view(capture, ignore_path=folder / "mask.png")
+
+
+def other_split(capture, folder):
+    return dataclasses.replace(capture, test_names=("c.png",))
+
+
+@pytest.mark.parametrize("change", [other_photo, other_camera, other_mask, other_split])
+def test_the_fingerprint_follows_photos_cameras_masks_and_split(tmp_path, change):
+    write_transforms(tmp_path / "capture", ["a.png", "b.png", "c.png"])
+    capture, folder = load_capture(tmp_path / "capture", test_every=0), SceneFolder(tmp_path / "out")
+    before = write_provenance(folder, capture, BuildConfig())
+    assert write_provenance(folder, capture, BuildConfig(seed=3)) == before, (
+        "settings have fingerprints of their own"
+    )
+    assert write_provenance(folder, change(capture, tmp_path), BuildConfig()) != before
+
+
+def test_a_changed_mask_changes_the_fingerprint(tmp_path):
+    write_transforms(tmp_path / "capture", ["a.png", "b.png"])
+    folder, found = SceneFolder(tmp_path / "out"), []
+    for value in (0.0, 1.0):
+        capture = other_mask(load_capture(tmp_path / "capture"), tmp_path)
+        save(tmp_path / "mask.png", np.full((48, 64, 3), value))
+        found.append(write_provenance(folder, capture, BuildConfig()))
+    assert found[0] != found[1]
+
+
+def test_the_record_names_the_capture_but_not_photos_that_were_prepared(tmp_path):
+    write_transforms(tmp_path / "capture", ["a.png", "b.png"])
+    folder, capture = SceneFolder(tmp_path / "out"), load_capture(tmp_path / "capture")
+    write_provenance(folder, capture, BuildConfig(seed=7))
+    assert folder.record["capture"] == str(tmp_path / "capture")
+    assert folder.record["provenance"]["seed"] == 7
+    assert set(folder.record["provenance"]["sources"]) == {"a.png", "b.png"}
+    folder.record.update(images="photos", capture="what the user gave")
+    write_provenance(folder, capture, BuildConfig())
+    assert folder.record["capture"] == "what the user gave"

@@ -29,14 +29,14 @@ def tools_on_path():
 
 
 def labels():
-    from words import COLOURS, NAMES, OWNERS, Label
+    from words import COLORS, NAMES, OWNERS, Label
 
     finishes = {"table": "wooden", "wall": "brick", "cloth": "checkered", "floor": "tiled"}
     parts = {kind: [None] + [part for part, owners in OWNERS.items() if kind in owners] for kind in NAMES}
     return [
         Label(kind, color, finishes.get(kind), part)
         for kind in NAMES
-        for color in COLOURS
+        for color in COLORS
         for part in parts[kind]
     ]
 
@@ -55,12 +55,12 @@ def test_a_phrase_made_for_a_label_is_true_of_it(seed):
 @pytest.mark.parametrize(
     ("words", "wanted", "truth"),
     [
-        ("red mug", {"kind": "mug", "colour": "red"}, {"red mug": 1, "blue mug": 0, "red apple": 0}),
+        ("red mug", {"kind": "mug", "color": "red"}, {"red mug": 1, "blue mug": 0, "red apple": 0}),
         ("mug handle", {"kind": "mug", "part": "handle"}, {"red mug": 0, "red mug handle": 1}),
-        ("something red", {"colour": "red"}, {"red apple": 1, "red apple stalk": -1, "blue mug": 0}),
+        ("something red", {"color": "red"}, {"red apple": 1, "red apple stalk": -1, "blue mug": 0}),
         ("fruit", {"quality": "fruit"}, {"red apple": 1, "red apple stalk": 1, "orange pumpkin": 0}),
         ("metal", {"quality": "metal"}, {"gold ring": 1, "white candle saucer": 1, "white candle": 0}),
-        ("yellow thing", {"colour": "yellow"}, {"gold ring": -1}),
+        ("yellow thing", {"color": "yellow"}, {"gold ring": -1}),
     ],
 )  # fmt: skip
 def test_phrases_are_true_false_or_open_for_each_label(words, wanted, truth):
@@ -86,14 +86,14 @@ def test_bundled_scenes_contain_no_held_out_pair():
     from words import HELD_OUT_PAIRS
 
     for layout in LAYOUTS.values():
-        assert not HELD_OUT_PAIRS & {(place.kind, place.colour) for place in layout.placements}
+        assert not HELD_OUT_PAIRS & {(place.kind, place.color) for place in layout.placements}
 
 
 def test_the_scene_for_choosing_shares_no_thing_place_or_camera_with_the_demo():
     from layouts import SECOND, TABLETOP
 
     for what in (
-        lambda scene: {(place.kind, place.colour) for place in scene.placements},
+        lambda scene: {(place.kind, place.color) for place in scene.placements},
         lambda scene: {(place.x, place.y) for place in scene.placements},
         lambda scene: {scene.cloth[0], scene.wall, scene.key_light, scene.seed},
         lambda scene: {pose.tobytes() for pose in scene.path.poses(scene.views)},
@@ -101,16 +101,16 @@ def test_the_scene_for_choosing_shares_no_thing_place_or_camera_with_the_demo():
         assert not what(TABLETOP) & what(SECOND)
     # Words for one thing alone are of that scene alone; those of both mean other things in each.
     both = TABLETOP.prompts.keys() & SECOND.prompts.keys()
-    assert all(TABLETOP.prompts[words].kind not in ("name", "colour") for words in both)
+    assert all(TABLETOP.prompts[words].kind not in ("name", "color") for words in both)
 
 
 @pytest.mark.parametrize("scene", ["tabletop", "second"])
 def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
-    from words import COLOURS, NAMES, PARTS, QUALITIES
+    from words import COLORS, NAMES, PARTS, QUALITIES
 
     single = {
         w
-        for group in (NAMES, PARTS, COLOURS)
+        for group in (NAMES, PARTS, COLORS)
         for names in group.values()
         for name in names
         for w in name.split()
@@ -129,10 +129,10 @@ def test_no_training_phrase_names_a_held_out_pair(seed):
     from words import HELD_OUT_PAIRS, any_phrase, near_miss
 
     rng = np.random.default_rng(seed)
-    shown = [label for label in labels() if (label.kind, label.colour) not in HELD_OUT_PAIRS]
+    shown = [label for label in labels() if (label.kind, label.color) not in HELD_OUT_PAIRS]
     label = shown[int(rng.integers(len(shown)))]
     for phrase in (near_miss(label, rng), any_phrase(rng)):
-        assert (phrase.kind, phrase.colour) not in HELD_OUT_PAIRS, phrase
+        assert (phrase.kind, phrase.color) not in HELD_OUT_PAIRS, phrase
 
 
 def test_a_made_up_word_is_none_that_means_something():
@@ -175,7 +175,7 @@ def test_held_out_pairs_are_not_trained_as_negatives():
     crops = [cut(frame_of_two_halves(), left, 5.0, 20.0) for left in (0.0, 40.0)]
     phrases = [
         Phrase("bear", kind="teddy"), Phrase("something fluffy", quality="fluffy"), Phrase("red ball", kind="ball"),
-        Phrase("table", kind="table"), Phrase("red", colour="red"),
+        Phrase("table", kind="table"), Phrase("red", color="red"),
     ]  # fmt: skip
     truth = TruthTable(shown).of(phrases, crops)
     assert truth.tolist() == [[FALSE, FALSE, FALSE, FALSE, TRUE], [FALSE, FALSE, FALSE, TRUE, FALSE]]
@@ -209,7 +209,7 @@ def test_a_crop_shows_what_lies_around_its_middle():
     from words import FALSE, OPEN, TRUE, Label, Phrase
 
     table = TruthTable([Label("mug", "red"), Label("table", "blue")])
-    phrases = [Phrase("mug", kind="mug"), Phrase("blue table", kind="table", colour="blue")]
+    phrases = [Phrase("mug", kind="mug"), Phrase("blue table", kind="table", color="blue")]
     frame = frame_of_two_halves()
     crops = [cut(frame, left, 5.0, 20.0) for left in (0.0, 40.0, 17.0, 23.5)]
     assert table.of(phrases, crops).tolist() == [[TRUE, FALSE], [FALSE, TRUE], [TRUE, OPEN], [OPEN, TRUE]]
@@ -283,7 +283,7 @@ def test_a_thin_part_in_the_very_middle_counts_as_shown_if_asked_for():
     weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
     assert all(0.1 < weight < 0.25 for weight in weights)
     assert TruthTable(frames.labels).of(handle, crops).tolist() == [[OPEN], [OPEN]]
-    assert TruthTable(frames.labels, centre=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]
+    assert TruthTable(frames.labels, center=True).of(handle, crops).tolist() == [[TRUE], [OPEN]]
 
 
 def test_handles_are_drawn_as_many_times_as_often_as_any_other_part():
@@ -323,7 +323,7 @@ def test_crops_beside_a_part_can_be_negatives_of_the_part():
     weights = [dict(zip(crop.codes, crop.weights))[1] for crop in crops]
     assert 0.04 < weights[0] < weights[1] < BESIDE
     assert 0.04 < weights[3] < 0.1
-    usual, strict = (TruthTable(frames.labels, centre=True, **more) for more in ({}, {"beside": BESIDE}))
+    usual, strict = (TruthTable(frames.labels, center=True, **more) for more in ({}, {"beside": BESIDE}))
     assert usual.of(handle, crops).ravel().tolist() == [OPEN, OPEN, TRUE, OPEN]
     assert strict.of(handle, crops).ravel().tolist() == [FALSE, FALSE, TRUE, OPEN], (
         "in the middle it stays open"
@@ -387,7 +387,7 @@ def test_a_patch_shows_what_half_of_it_is_and_not_what_an_eighth_of_it_is():
         patch(0, 0, 0),
     ]
     patches.append(patch(0, 0, 0, 16))  # gold may be called yellow: what is possible is not false
-    phrases = [Phrase("mug", kind="mug"), Phrase("blue", colour="blue"), Phrase("yellow", colour="yellow")]
+    phrases = [Phrase("mug", kind="mug"), Phrase("blue", color="blue"), Phrase("yellow", color="yellow")]
     assert table.at_places(phrases, patches).tolist() == [
         [TRUE, TRUE, FALSE],
         [OPEN, TRUE, FALSE],
@@ -403,7 +403,7 @@ def place_questions():
     from words import Phrase
 
     return [
-        Phrase("mug handle", kind="mug", part="handle"), Phrase("mug", kind="mug"), Phrase("red", colour="red"),
+        Phrase("mug handle", kind="mug", part="handle"), Phrase("mug", kind="mug"), Phrase("red", color="red"),
         Phrase("table", kind="table"),
     ]  # fmt: skip
 
@@ -596,7 +596,7 @@ def test_training_and_encoder_compute_the_same_patch_embeddings(tmp_path, monkey
 def test_the_model_may_see_between_two_steps_without_a_trace():
     import torch
 
-    config = small_training(dense=1.0, grey=0.0, turned=0.0)
+    config = small_training(dense=1.0, gray=0.0, turned=0.0)
     batch = batch_of(config)
 
     def dense(before):

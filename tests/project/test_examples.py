@@ -1,52 +1,61 @@
 """Each example runs and prints the expected output."""
 
-import subprocess
+import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.tiny_capture import write_capture
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("built")]
+pytestmark = pytest.mark.slow
 
 
-def run(name: str, folder: Path, *arguments: object) -> str:
-    """Standard output of an example, run in a folder."""
-    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys) -> Callable[..., str]:
+    """Runs an example as a script in an empty folder; returns what it prints."""
+
+    def run_example(name: str, *arguments: object) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        capsys.readouterr()
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run_example
 
 
-def test_01_renders_a_ball(tmp_path):
-    assert "Gaussians are visible" in run("01_render.py", tmp_path)
+def test_01_renders_a_ball(run, tmp_path):
+    assert "Gaussians are visible" in run("01_render.py")
     assert (tmp_path / "output" / "examples" / "ball.png").stat().st_size > 1000
 
 
-def test_02_draws_a_heatmap_for_each_prompt(tmp_path):
-    output = run("02_search.py", tmp_path)
+def test_02_draws_a_heatmap_for_each_prompt(run, tmp_path):
+    output = run("02_search.py")
     assert output.count("of the image above") == 2
     assert (tmp_path / "output" / "examples" / "red_apple.png").exists()
 
 
-def test_02_searches_a_given_scene(built, tmp_path):
-    assert run("02_search.py", tmp_path, built, "blue ball").startswith("blue ball: best")
+def test_02_searches_a_given_scene(run, built):
+    assert run("02_search.py", built, "blue ball").startswith("blue ball: best")
 
 
-def test_03_cuts_out_an_object(tmp_path):
-    output = run("03_cut_out.py", tmp_path)
+def test_03_cuts_out_an_object(run, tmp_path):
+    output = run("03_cut_out.py")
     assert "Gaussians around" in output
     assert (tmp_path / "output" / "examples" / "cut_out.ply").exists()
 
 
-def test_04_labels_the_right_gaussians(tmp_path):
-    output = run("04_labels_into_gaussians.py", tmp_path)
+def test_04_labels_the_right_gaussians(run, tmp_path):
+    output = run("04_labels_into_gaussians.py")
     assert float(output.split("%")[0]) > 95
     assert "shows label 0" in output
 
 
-def test_05_builds_a_scene(tiny_capture, tmp_path):
-    output = run("05_build.py", tmp_path, tiny_capture, "scene", 20)
+def test_05_builds_a_scene(run, tmp_path):
+    write_capture(tmp_path / "capture", views=5)
+    output = run("05_build.py", "capture", "scene", 20)
     assert "reconstruct: 20 of 20" in output
     assert "blue ball: present" in output
     assert (tmp_path / "scene" / "language.safetensors").exists()

@@ -2,24 +2,13 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 from jsonschema import Draft202012Validator
+from support.schemas import SCHEMAS, validated
 
 from lexsplat import cli
 from lexsplat.scenes.folder import BUNDLED_SCENE
-
-SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
-pytestmark = pytest.mark.xdist_group("built")
-
-
-def validated(name: str, document: object) -> None:
-    schema = json.loads((SCHEMAS / f"{name}.json").read_text())
-    errors = [
-        f"{error.json_path}: {error.message}" for error in Draft202012Validator(schema).iter_errors(document)
-    ]
-    assert not errors, errors
 
 
 def answer(capsys, *arguments: str) -> dict:

@@ -66,9 +66,3 @@ def test_a_mask_is_outlined_and_the_rest_dimmed():
 def test_a_map_of_another_size_is_refused(draw):
     with pytest.raises(ValueError, match="differ in size"):
         draw(GRAY, np.zeros((5, 8)))
-
-
-def test_the_legend_runs_over_the_whole_scale():
-    found = heatmaps.legend(width=200)
-    np.testing.assert_array_equal(found[0, [0, -1]], heatmaps.color_scale()[[0, 255]])
-    assert found.shape == (34, 200, 3)

@@ -3,7 +3,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.question_scene import lifted_cloud, texts
+from support.question_scene import coded_cloud, texts
 
 from lexsplat.queries import relevancy as queries
 from lexsplat.queries.relevancy import QueryConfig, Question
@@ -28,8 +28,8 @@ def distributions(shape, seed, sharpness=3.0):
 
 
 @pytest.fixture(scope="module")
-def lifted():
-    return lifted_cloud()
+def cloud():
+    return coded_cloud()
 
 
 # Text
@@ -38,32 +38,29 @@ def lifted():
 @pytest.mark.parametrize("prompts", [[], [""], ["apple", "  \n"], ""])
 def test_an_empty_prompt_is_an_error_with_a_remedy(prompts):
     with pytest.raises(QueryError, match="red apple"):
-        queries.expand_templates(prompts)
+        queries.check_prompts(prompts)
 
 
-def test_templates_multiply_prompts_in_order():
-    found = queries.expand_templates(["  red   apple ", "cup {x}"], ["a {}", "the {}."])
-    assert found == ["a red apple", "the red apple.", "a cup {x}", "the cup {x}."]
-    with pytest.raises(ValueError, match="once"):
-        queries.expand_templates(["apple"], ["a photo"])
-
-
-def test_averaged_templates_are_mean_directions_whatever_the_lengths():
-    a, b = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 5.0]])
-    found = queries.average_templates(torch.cat([a, b, b, b]), 2)
-    torch.testing.assert_close(found, torch.tensor([[0.5**0.5, 0.5**0.5], [0.0, 1.0]]))
-
-
-def test_prompts_are_encoded_in_one_call():
+def test_prompts_in_all_templates_are_encoded_in_one_call():
     calls = []
 
     def encode(batch):
         calls.append(batch)
         return torch.tensor([[float(len(text)), 1.0] for text in batch])
 
-    found = queries.embed_prompts(["ab", "abcd"], encode, ("{}", "{}!"))
-    assert calls == [["ab", "ab!", "abcd", "abcd!"]]
+    found = queries.embed_prompts(["  red   apple ", "cup {x}"], encode, ("a {}", "the {}."))
+    assert calls == [["a red apple", "the red apple.", "a cup {x}", "the cup {x}."]]
     assert found.shape == (2, 2)
+    with pytest.raises(ValueError, match="once"):
+        queries.QueryConfig(templates=("a photo",))
+
+
+def test_templates_are_averaged_as_directions_whatever_the_lengths():
+    vectors = {"a": [1.0, 0.0], "a!": [0.0, 5.0], "b": [0.0, 5.0], "b!": [0.0, 5.0]}
+    found = queries.embed_prompts(
+        ["a", "b"], lambda texts: torch.tensor([vectors[t] for t in texts]), ("{}", "{}!")
+    )
+    torch.testing.assert_close(found, torch.tensor([[0.5**0.5, 0.5**0.5], [0.0, 1.0]]))
 
 
 # Relevancy
@@ -134,8 +131,8 @@ def test_what_is_not_covered_is_not_relevant(form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(lifted, form):
-    field, gaussians, camera = lifted
+def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(cloud, form):
+    field, gaussians, camera = cloud
     found = queries.render_relevancy(field, gaussians, camera, asked(form))
     probabilities = field.render_code_probabilities(gaussians, camera)
     expected = queries.probability_relevancy(probabilities, field.codebook.clip, asked(form))
@@ -144,10 +141,10 @@ def test_the_relevancy_of_a_view_is_that_of_its_rendered_distributions(lifted, f
     assert not found[:, 0, 0].any(), "the corner is empty"
 
 
-def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted):
+def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(cloud):
     from lexsplat.rendering import render
 
-    field, gaussians, camera = lifted
+    field, gaussians, camera = cloud
     scores = queries.gaussian_relevancy(field, asked())
     rendered = render(gaussians, camera, features=scores.T.contiguous(), color=False).features
     found = queries.render_relevancy(field, gaussians, camera, asked())
@@ -156,8 +153,8 @@ def test_in_the_code_form_a_view_is_the_rendering_of_the_gaussians_scores(lifted
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
-    field, _, _ = lifted
+def test_scores_of_gaussians_come_from_their_own_distributions(cloud, form):
+    field, _, _ = cloud
     found = queries.gaussian_relevancy(field, asked(form))
     dense = queries.probability_relevancy(field.code_probabilities(), field.codebook.clip, asked(form))
     torch.testing.assert_close(found, dense.T, rtol=0, atol=1e-6)
@@ -165,9 +162,9 @@ def test_scores_of_gaussians_come_from_their_own_distributions(lifted, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, monkeypatch):
+def test_scores_of_gaussians_never_hold_all_distributions(cloud, form, monkeypatch):
     """``[N, K]`` of millions of Gaussians would be gigabytes."""
-    field, _, _ = lifted
+    field, _, _ = cloud
     whole = queries.gaussian_relevancy(field, asked(form))
     most = []
 
@@ -184,8 +181,8 @@ def test_scores_of_gaussians_never_hold_all_distributions(lifted, form, monkeypa
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_prompts_do_not_influence_each_other(lifted, form):
-    field, gaussians, camera = lifted
+def test_prompts_do_not_influence_each_other(cloud, form):
+    field, gaussians, camera = cloud
     question = asked(form)
     together = queries.render_relevancy(field, gaussians, camera, question)
     for index in range(3):

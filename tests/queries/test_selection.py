@@ -10,21 +10,21 @@ from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")
-def scene():
+def balls():
     return make_scene(per_ball=200)
 
 
-def select(scene, mask, **options) -> Selection:
+def select(balls, mask, **options) -> Selection:
     mask = torch.as_tensor(np.asarray(mask))
-    return Selection(scene.gaussians, scene.cameras, mask, mask.float(), **options)
+    return Selection(balls.gaussians, balls.cameras, mask, mask.float(), **options)
 
 
-def ball(scene, *numbers) -> Selection:
-    return select(scene, np.isin(scene.labels, numbers))
+def ball(balls, *numbers) -> Selection:
+    return select(balls, np.isin(balls.labels, numbers))
 
 
-def test_each_ball_is_an_instance_where_it_stands(scene):
-    chosen = ball(scene, 0, 1, 4)
+def test_each_ball_is_an_instance_where_it_stands(balls):
+    chosen = ball(balls, 0, 1, 4)
     assert chosen.count == len(chosen.instances) == 3
     centers = sorted(tuple(instance.center.round(1)) for instance in chosen.instances)
     assert np.allclose(centers, sorted(map(tuple, CENTERS[[0, 1, 4]])), atol=0.1)
@@ -33,32 +33,32 @@ def test_each_ball_is_an_instance_where_it_stands(scene):
         assert instance.size == pytest.approx(2 * RADIUS * 0.95, abs=0.12)
 
 
-def test_specks_are_no_instances_and_can_be_left_out(scene):
-    mask = scene.labels == 0
-    mask[np.flatnonzero(scene.labels == 1)[:4]] = True
-    chosen = select(scene, mask)
+def test_specks_are_no_instances_and_can_be_left_out(balls):
+    mask = balls.labels == 0
+    mask[np.flatnonzero(balls.labels == 1)[:4]] = True
+    chosen = select(balls, mask)
     assert len(chosen) == 204
     assert len(chosen.instances) == 1
     assert len(chosen.without_specks()) == 200
     assert len(chosen.clusters()) > 1
 
 
-def test_only_instances_that_answer_about_as_well_as_the_best_convince(scene):
-    labels = torch.from_numpy(scene.labels)
+def test_only_instances_that_answer_about_as_well_as_the_best_convince(balls):
+    labels = torch.from_numpy(balls.labels)
     scores = torch.tensor([0.9, 0.6, 0.85, 0.1, 0.1])[labels]  # two apples, a duck's back, the rest
-    chosen = Selection(scene.gaussians, scene.cameras, scores >= 0.4, scores, threshold=0.4)
+    chosen = Selection(balls.gaussians, balls.cameras, scores >= 0.4, scores, threshold=0.4)
     assert len(chosen.instances) == 3
     kept = chosen.convincing()
     assert torch.equal(kept.mask, (labels == 0) | (labels == 2))
     assert len(kept.convincing()) == len(kept)
-    alone = Selection(scene.gaussians, scene.cameras, labels == 1, scores, threshold=0.4)
+    alone = Selection(balls.gaussians, balls.cameras, labels == 1, scores, threshold=0.4)
     assert len(alone.convincing()) == 200, "the best one is never left out"
 
 
-def test_operators_are_those_of_sets(scene):
+def test_operators_are_those_of_sets(balls):
     rng = np.random.default_rng(0)
-    a, b = (rng.random(len(scene.labels)) < 0.4 for _ in range(2))
-    first, second = select(scene, a), select(scene, b)
+    a, b = (rng.random(len(balls.labels)) < 0.4 for _ in range(2))
+    first, second = select(balls, a), select(balls, b)
     for combined, expected in [
         (first | second, a | b), (first & second, a & b), (first - second, a & ~b), (~first, ~a),
     ]:  # fmt: skip
@@ -66,43 +66,43 @@ def test_operators_are_those_of_sets(scene):
         assert len(combined) == combined.num_gaussians == expected.sum()
 
 
-def test_presence_of_combinations_is_that_of_the_words(scene):
-    yes, no = ball(scene, 0), select(scene, scene.labels == 1, present="no")
+def test_presence_of_combinations_is_that_of_the_words(balls):
+    yes, no = ball(balls, 0), select(balls, balls.labels == 1, present="no")
     assert [(yes | no).present, (yes & no).present, (yes - no).present, (no - yes).present] == [
         "yes", "no", "yes", "no",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.3, 1.2])
-def test_grow_and_shrink_go_by_distance(scene, distance):
-    means = scene.gaussians.means.numpy().astype(float)
-    inside = scene.labels == 0
+def test_grow_and_shrink_go_by_distance(balls, distance):
+    means = balls.gaussians.means.numpy().astype(float)
+    inside = balls.labels == 0
     apart = np.linalg.norm(means[:, None] - means[None], axis=-1)
     grown = apart[:, inside].min(1) <= distance
     shrunk = inside & (apart[:, ~inside].min(1) > distance)
-    assert np.array_equal(ball(scene, 0).grow(distance).mask.numpy(), grown)
-    assert np.array_equal(ball(scene, 0).shrink(distance).mask.numpy(), shrunk)
+    assert np.array_equal(ball(balls, 0).grow(distance).mask.numpy(), grown)
+    assert np.array_equal(ball(balls, 0).shrink(distance).mask.numpy(), shrunk)
 
 
-def test_growing_never_loses_and_shrinking_never_gains(scene):
-    chosen = ball(scene, 0, 2)
+def test_growing_never_loses_and_shrinking_never_gains(balls):
+    chosen = ball(balls, 0, 2)
     assert bool((chosen.grow().mask >= chosen.mask).all())
     assert bool((chosen.shrink().mask <= chosen.mask).all())
 
 
-def test_largest_is_the_ball_with_most(scene):
-    mask = (scene.labels == 0) | ((scene.labels == 1) & (np.arange(len(scene.labels)) % 2 == 0))
-    assert np.array_equal(select(scene, mask).largest().mask.numpy(), scene.labels == 0)
+def test_largest_is_the_ball_with_most(balls):
+    mask = (balls.labels == 0) | ((balls.labels == 1) & (np.arange(len(balls.labels)) % 2 == 0))
+    assert np.array_equal(select(balls, mask).largest().mask.numpy(), balls.labels == 0)
 
 
-def test_the_best_view_shows_the_ball_and_not_what_hides_it(scene):
+def test_the_best_view_shows_the_ball_and_not_what_hides_it(balls):
     for number in range(5):
-        counts = {name: int((codes == number).sum()) for name, codes in scene.code_maps.items()}
-        assert counts[ball(scene, number).best_view] >= 0.8 * max(counts.values())
+        counts = {name: int((codes == number).sum()) for name, codes in balls.code_maps.items()}
+        assert counts[ball(balls, number).best_view] >= 0.8 * max(counts.values())
 
 
-def test_an_empty_selection_has_no_box_but_answers_the_rest(scene):
-    empty = select(scene, np.zeros(len(scene.labels), bool))
+def test_an_empty_selection_has_no_box_but_answers_the_rest(balls):
+    empty = select(balls, np.zeros(len(balls.labels), bool))
     assert not empty
     assert (len(empty), empty.count, empty.instances, empty.best_view, len(empty.grow())) == (0, 0, [], "", 0)
     assert empty.to_dict()["instances"] == []
@@ -110,26 +110,26 @@ def test_an_empty_selection_has_no_box_but_answers_the_rest(scene):
         _ = empty.box
 
 
-def test_one_gaussian_is_an_instance(scene):
-    mask = np.zeros(len(scene.labels), bool)
+def test_one_gaussian_is_an_instance(balls):
+    mask = np.zeros(len(balls.labels), bool)
     mask[7] = True
-    assert len(select(scene, mask).instances) == 1
-    assert select(scene, mask).center == pytest.approx(scene.gaussians.means[7].numpy(), abs=1e-6)
+    assert len(select(balls, mask).instances) == 1
+    assert select(balls, mask).center == pytest.approx(balls.gaussians.means[7].numpy(), abs=1e-6)
 
 
-def test_masks_of_another_scene_are_refused(scene):
+def test_masks_of_another_scene_are_refused(balls):
     with pytest.raises(ValueError, match="mask must be bool"):
-        Selection(scene.gaussians, {}, torch.zeros(3, dtype=torch.bool), torch.zeros(3))
+        Selection(balls.gaussians, {}, torch.zeros(3, dtype=torch.bool), torch.zeros(3))
 
 
-def test_plain_data_counts_instances_and_lists_none_of_what_is_not_there(scene):
-    there = select(scene, np.isin(scene.labels, (0, 1)), phrase="ball").to_dict()
+def test_plain_data_counts_instances_and_lists_none_of_what_is_not_there(balls):
+    there = select(balls, np.isin(balls.labels, (0, 1)), phrase="ball").to_dict()
     assert (there["count"], len(there["instances"]), there["gaussians"]) == (2, 2, 400)
-    absent = select(scene, scene.labels == 0, phrase="giraffe", present="no").to_dict()
+    absent = select(balls, balls.labels == 0, phrase="giraffe", present="no").to_dict()
     assert (absent["present"], absent["count"], absent["instances"], absent["best_view"]) == ("no", 0, [], "")
     assert absent["gaussians"] == 200
 
 
-def test_the_representation_of_a_selection_is_one_line(scene):
-    text = repr(select(scene, scene.labels == 0, phrase="ball"))
+def test_the_representation_of_a_selection_is_one_line(balls):
+    text = repr(select(balls, balls.labels == 0, phrase="ball"))
     assert text == "Selection('ball', present='yes', gaussians=200, threshold=0.5)"

@@ -36,36 +36,36 @@ def traced(camera: Camera) -> GroundTruthView:
 
 
 @pytest.fixture(scope="module")
-def scene():
+def balls():
     return make_scene(per_ball=150, width=96, height=72)
 
 
 @pytest.fixture(scope="module")
-def views(scene):
-    return [traced(camera) for camera in scene.cameras.values()]
+def traced_views(balls):
+    return [traced(camera) for camera in balls.cameras.values()]
 
 
-def test_lifted_labels_are_those_of_the_balls(scene, views):
-    lifted = lift_labels(scene.gaussians, views, 6)
+def test_lifted_labels_are_those_of_the_balls(balls, traced_views):
+    lifted = lift_labels(balls.gaussians, traced_views, 6)
     seen = lifted.weights > 1
     assert seen.float().mean() > 0.8
-    right = lifted.labels[seen].numpy() == scene.labels[seen.numpy()] + 1
+    right = lifted.labels[seen].numpy() == balls.labels[seen.numpy()] + 1
     assert right.mean() > 0.95  # Gaussians at a silhouette may lie mostly outside the ball
     assert (lifted.purity[seen] > 0.5).float().mean() > 0.9
 
 
-def test_gaussians_behind_the_exact_surface_receive_no_label(scene, views):
-    inner = scene.gaussians.select(torch.arange(len(scene.labels)))
-    ball = scene.labels == 0
+def test_gaussians_behind_the_exact_surface_receive_no_label(balls, traced_views):
+    inner = balls.gaussians.select(torch.arange(len(balls.labels)))
+    ball = balls.labels == 0
     inner.means[ball] = torch.from_numpy(CENTERS[0]).float()  # hidden in the middle of the ball
-    lifted = lift_labels(inner, views, 6, tolerance=0.0)
+    lifted = lift_labels(inner, traced_views, 6, tolerance=0.0)
     assert (lifted.weights[torch.from_numpy(ball)] == 0).all()
     assert (lifted.labels[torch.from_numpy(ball)] == 0).all()
 
 
-def test_exact_points_lie_on_the_balls_and_their_boxes_have_the_balls_size(views):
+def test_exact_points_lie_on_the_balls_and_their_boxes_have_the_balls_size(traced_views):
     for number, center in enumerate(CENTERS, start=1):
-        points = surface_points(views, number, stride=1)
+        points = surface_points(traced_views, number, stride=1)
         assert np.linalg.norm(points - center, axis=1) == pytest.approx(RADIUS, abs=1e-6)
         box = true_box(points, np.array([0, 0, 1.0]))
         assert box.center[:2] == pytest.approx(center[:2], abs=0.06)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from support.question_scene import lifted_cloud, texts
+from support.question_scene import coded_cloud, texts
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.queries import relevancy as queries
@@ -13,8 +13,8 @@ from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")
-def lifted():
-    return lifted_cloud()
+def cloud():
+    return coded_cloud()
 
 
 def two_groups(share, low=0.2, high=0.6, spread=0.03, count=20_000):
@@ -95,8 +95,8 @@ def test_each_prompt_has_its_own_threshold():
     assert flat == 0.5
 
 
-def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(lifted):
-    field, gaussians, camera = lifted
+def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(cloud):
+    field, gaussians, camera = cloud
     question = Question(texts(3, 16, 5), texts(4, 16, 6))
 
     def relevancy(view):
@@ -111,9 +111,9 @@ def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(lifted):
 
 
 @pytest.mark.parametrize(("presence", "expected"), [("no", 0.5), ("unsure", 0.25), ("yes", 0.25)])
-def test_only_what_the_scene_does_not_hold_falls_back_to_half(lifted, presence, expected):
+def test_only_what_the_scene_does_not_hold_falls_back_to_half(cloud, presence, expected):
     maps = torch.tensor([[[0.1] * 90 + [0.4] * 10]] * 2)
-    found = thresholds.scene_thresholds(lambda _: maps, [lifted[2]], ["yes", presence])
+    found = thresholds.scene_thresholds(lambda _: maps, [cloud[2]], ["yes", presence])
     assert found.tolist() == pytest.approx([0.25, expected], abs=2e-3)
 
 

@@ -189,6 +189,15 @@ def test_mcmc_relocates_faint_gaussians_and_grows_by_a_twentieth():
     assert float(parameters["opacities"].detach().sigmoid().min()) >= 0.005 * (1 - 1e-5)
 
 
+def test_mcmc_moves_nothing_where_all_gaussians_are_faint():
+    parameters, optimizers = some_parameters(count=100)
+    with torch.no_grad():
+        parameters["opacities"].fill_(-8.0)
+    before = parameters["means"].detach().clone()
+    run(new_control("mcmc", noise=0.0), parameters, optimizers, range(5, 6))
+    assert torch.equal(parameters["means"], before)
+
+
 def test_mcmc_noise_follows_the_covariance_and_spares_opaque_gaussians():
     parameters, optimizers = some_parameters(count=4000)
     with torch.no_grad():
@@ -276,6 +285,11 @@ def test_short_and_long_trainings_have_the_same_number_of_mcmc_rounds():
     schedules = [config.density_schedule for config in configs]
     rounds = [(schedule.stop - schedule.start) // schedule.every for schedule in schedules]
     assert rounds == [245, 245]
+
+
+def test_a_short_mcmc_training_has_steps_between_its_rounds():
+    """Rounds after every step would halve opacities faster than steps can raise them, until all are faint."""
+    assert ReconstructionConfig(strategy="mcmc", iterations=400).density_schedule.every == 2
 
 
 @settings(max_examples=50, deadline=None)

@@ -18,7 +18,7 @@ from numba.core.caching import NullCache
 from support.rendering_reference import front_camera, random_gaussians
 
 from lexsplat.geometry.cameras import look_at
-from lexsplat.rendering import cpu_backend, pairs
+from lexsplat.rendering import Projection, cpu_backend, pairs
 from lexsplat.rendering.kernels import binning, blending, gradients, lanes
 from lexsplat.rendering.kernels.jit import parallel
 
@@ -133,6 +133,12 @@ def random_ellipses(count: int, width: int, height: int, rng: np.random.Generato
     return means, conics, opacities, reach.astype(np.float32), depths, radii
 
 
+def found_pairs(ellipses: tuple[np.ndarray, ...], width: int, height: int) -> pairs.TilePairs:
+    names = ("means2d", "conics", "opacities", "extents", "depths", "radii")
+    projection = Projection(**{name: torch.from_numpy(array) for name, array in zip(names, ellipses)})
+    return pairs.find_pairs(projection, width, height)
+
+
 @pytest.fixture
 def poisoned_memory(monkeypatch):
     """Fills the memory of np.empty with values that must never be read: NaN, or an index far out of range."""
@@ -151,7 +157,7 @@ def test_pair_lists_are_complete_permutations(poisoned_memory):
     for _ in range(1000):
         count, width, height = int(rng.integers(1, 120)), int(rng.integers(1, 90)), int(rng.integers(1, 90))
         means, conics, opacities, reach, depths, radii = random_ellipses(count, width, height, rng)
-        found = pairs.find_pairs(means, conics, opacities, reach, depths, radii, width, height)
+        found = found_pairs((means, conics, opacities, reach, depths, radii), width, height)
         total = int(found.tile_offsets[-1])
         # Sorted by depth, ties by index, visible Gaussians only.
         visible = np.flatnonzero(radii)
@@ -186,7 +192,7 @@ def test_no_uninitialized_memory_is_read(poisoned_memory):
             3 + int(rng.integers(6)),
         )
         projected = random_ellipses(count, width, height, rng)
-        found = pairs.find_pairs(*projected, width, height)
+        found = found_pairs(projected, width, height)
         values = rng.uniform(size=(len(found.order), channels)).astype(np.float32)
         lists = (found.ellipses, found.boxes, found.tile_offsets, found.members)
         image, alpha = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)

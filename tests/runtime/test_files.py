@@ -1,10 +1,100 @@
+"""Files are whole or not there, and what is read is what was written."""
+
+import json
 import os
 import stat
 
 import pytest
 import torch
 
-from lexsplat.runtime.files import atomic_path, read_tensors, write_json, write_tensors
+from lexsplat.runtime import files
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+    target = tmp_path / "a.json"
+    write_json(target, {"old": 1})
+
+    def cut_short() -> None:
+        with atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError):
+        cut_short()
+    assert read_json(target) == {"old": 1}
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_nan_never_reaches_a_json_file(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "a.json", {"psnr": float("nan")})
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_tensors_and_metadata_survive(tmp_path):
+    tensors = {"codes": torch.arange(6, dtype=torch.uint8).reshape(2, 3).T, "weights": torch.rand(3).half()}
+    write_tensors(tmp_path / "t.safetensors", tensors, {"method": "trained"})
+    back, metadata = read_tensors(tmp_path / "t.safetensors")
+    assert metadata == {"method": "trained"}
+    assert all(torch.equal(back[name], value) for name, value in tensors.items())
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04pickle", b"\xff" * 64])
+def test_files_other_than_safetensors_are_refused(tmp_path, content):
+    (tmp_path / "t.safetensors").write_bytes(content)
+    with pytest.raises(FileFormatError, match="safetensors"):
+        read_tensors(tmp_path / "t.safetensors")
+
+
+def test_a_truncated_safetensors_is_refused(tmp_path):
+    path = tmp_path / "t.safetensors"
+    write_tensors(path, {"a": torch.rand(10)}, {})
+    data = path.read_bytes()
+    for length in range(0, len(data), 7):
+        path.write_bytes(data[:length])
+        with pytest.raises(FileFormatError):
+            read_tensors(path)
+
+
+def test_a_file_gets_its_name_after_its_content_is_on_the_disk(tmp_path, monkeypatch):
+    calls = []
+    for name in ("fsync", "replace"):
+        original = getattr(os, name)
+        monkeypatch.setattr(
+            files.os,
+            name,
+            lambda *given, name=name, original=original: calls.append(name) or original(*given),
+        )
+    write_json(tmp_path / "a.json", {})
+    assert calls == ["fsync", "replace"]
+
+
+def test_temporary_files_of_processes_of_other_users_stay(tmp_path, monkeypatch):
+    def not_ours(process: int, signal: int) -> None:
+        raise PermissionError
+
+    left = tmp_path / ".a.json.123.1.tmp"
+    left.write_text("half")
+    monkeypatch.setattr(files.os, "kill", not_ours)
+    files.remove_left_overs(tmp_path)
+    assert left.exists()
+
+
+def test_json_with_a_byte_order_mark_is_read(tmp_path):
+    (tmp_path / "a.json").write_bytes(b"\xef\xbb\xbf" + json.dumps({"name": "Küche"}).encode())
+    assert read_json(tmp_path / "a.json") == {"name": "Küche"}
+
+
+def test_a_changed_bit_of_a_tensor_is_detected(tmp_path):
+    path = tmp_path / "t.safetensors"
+    write_tensors(path, {"a": torch.ones(4)}, {})
+    content = bytearray(path.read_bytes())
+    content[-2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="hash differs"):
+        read_tensors(path)
 
 
 def test_tensors_that_are_read_are_aligned(tmp_path):

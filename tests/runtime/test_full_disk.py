@@ -109,7 +109,7 @@ def test_a_scene_on_a_full_disk_stays_as_it_was(built, small_disk, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def limited():
+def run_limited():
     """Runs the command line so that no file can become larger than so many bytes: a full disk without a mount."""
     if not hasattr(resource, "RLIMIT_FSIZE") or not hasattr(signal, "SIGXFSZ"):
         pytest.skip("no limit of file sizes on this system")
@@ -127,12 +127,12 @@ def limited():
 
 @pytest.mark.parametrize("size", [200, 3_000, 60_000])
 def test_a_build_that_cannot_write_keeps_the_scene_that_was_there(
-    built, tiny_capture, tmp_path, limited, size
+    built, tiny_capture, tmp_path, run_limited, size
 ):
     scene = tmp_path / "scene"
     shutil.copytree(built, scene)
     before = content(scene)
-    done = limited(
+    done = run_limited(
         size, *build_arguments(tiny_capture, scene)
     )  # other settings: everything is to be done again
     assert_one_line(done)
@@ -146,17 +146,17 @@ def test_a_build_that_cannot_write_keeps_the_scene_that_was_there(
     open_scene(scene, device="cpu")
 
 
-def test_an_edit_and_an_export_that_cannot_write_leave_nothing_half_done(built, tmp_path, limited):
+def test_an_edit_and_an_export_that_cannot_write_leave_nothing_half_done(built, tmp_path, run_limited):
     before = content(built)
     for ending in ("ply", "splat", "glb"):
-        done = limited(2_000, "export", str(built), str(tmp_path / f"out.{ending}"))
+        done = run_limited(2_000, "export", str(built), str(tmp_path / f"out.{ending}"))
         assert_one_line(done)
         assert not (tmp_path / f"out.{ending}").exists()
     scene = tmp_path / "scene"
     shutil.copytree(built, scene)
     assert run("edit", str(scene), "delete", "--select", "red apple", "--threshold", "0.01").returncode == 0
     before_save = content(scene)
-    assert_one_line(limited(2_000, "edit", str(scene), "save", "--output", str(tmp_path / "edited")))
+    assert_one_line(run_limited(2_000, "edit", str(scene), "save", "--output", str(tmp_path / "edited")))
     assert content(scene) == before_save
     assert not (tmp_path / "edited").exists() or not (tmp_path / "edited" / "scene.json").exists()
     assert no_left_overs(tmp_path)

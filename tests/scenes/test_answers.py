@@ -1,82 +1,63 @@
-"""The command ``evaluate``: files it writes, words it can ask, and that the same seed gives the same numbers."""
+"""Answers as data: which instances an answer keeps, and what a query says about its views."""
 
-import json
-import shutil
-
+import numpy as np
 import pytest
 import torch
-from conftest import QUICK_BUILD
+from PIL import Image
+from support.viewer_scene import ball_scene
 
-from lexsplat import cli
-from lexsplat.runtime.files import read_tensors
+from lexsplat.scenes.answers import Answers, answer_queries, file_name
 
-pytestmark = pytest.mark.xdist_group("built")
-
-
-def without_times(result: dict) -> dict:
-    """``metrics.json`` without times and memory."""
-    size = {key: value for key, value in result["size"].items() if not key.startswith("peak_")}
-    return {**result, "speed": None, "size": size}
+PROMPTS = ["ball 0", "ball 3"]
 
 
-def test_the_same_seed_gives_the_same_metrics_except_for_times(built, tiny_capture, tmp_path):
-    again = tmp_path / "again"
-    # Features are the slow part and have no seed: they are shared, the rest is made anew.
-    shutil.copytree(built / "checkpoints" / "features", again / "checkpoints" / "features")
-    assert cli.main(["build", str(tiny_capture), "--output", str(again), *QUICK_BUILD]) == 0
-    results = []
-    for scene in (built, again):
-        assert cli.main(["evaluate", str(scene)]) == 0
-        results.append(without_times(json.loads((scene / "metrics.json").read_text())))
-    assert results[0] == results[1]
-    assert set(results[0]["language"]) >= {"strict", "official", "lerf_2d", "lerf_3d"}
+@pytest.fixture(scope="module")
+def scene():
+    return ball_scene(per_ball=80)[0]
 
 
-def test_trained_fields_are_bit_identical_for_the_same_seed(built, tiny_capture, tmp_path):
-    results, fields = [], []
-    for name in ("one", "two"):
-        scene = tmp_path / name
-        # Geometry and features are shared; codebook and language are made anew.
-        shutil.copytree(
-            built, scene, ignore=shutil.ignore_patterns("codes", "codebook.safetensors", "language*")
-        )
-        arguments = ["build", str(tiny_capture), "--output", str(scene), *QUICK_BUILD, "--method", "trained"]
-        assert cli.main(arguments) == 0
-        assert cli.main(["evaluate", str(scene)]) == 0
-        fields.append(read_tensors(scene / "language.safetensors")[0])
-        results.append(without_times(json.loads((scene / "metrics.json").read_text())))
-    assert fields[0].keys() == fields[1].keys()
-    assert all(torch.equal(tensor, fields[1][name]) for name, tensor in fields[0].items())
-    assert results[0] == results[1]
+@pytest.mark.parametrize(("automatic", "kept"), [(True, [0]), (False, [0, 1])])
+def test_only_an_automatic_threshold_leaves_out_what_convinces_less(automatic, kept):
+    scene, known = ball_scene(per_ball=80)
+    labels = torch.from_numpy(known.labels)
+    scores = torch.where(labels == 0, 0.9, torch.where(labels == 1, 0.55, 0.1))
+    answers = Answers(("ball",), scores[None], torch.tensor([0.5]), ("yes",), scene, automatic=automatic)
+    found = answers.selection(0)
+    assert np.array_equal(found.mask.numpy(), np.isin(known.labels, kept))
+    assert (found.threshold, found.phrase, found.present) == (0.5, "ball", "yes")
+    assert answers.to_dict() == {"answers": [found.to_dict()]}
 
 
-def test_evaluate_writes_rows_for_tables(built, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(built, copy)
-    assert cli.main(["evaluate", str(copy), "--protocols", "strict"]) == 0
-    result = json.loads((copy / "metrics.json").read_text())
-    assert "official" not in result["language"]
-    header, row = (copy / "metrics.csv").read_text().splitlines()
-    values = dict(zip(header.split(","), row.split(",")))
-    assert float(values["mIoU"]) == pytest.approx(result["language"]["strict"]["auto"]["mIoU"], abs=1e-6)
-    assert r"\begin{tabular}" in (copy / "metrics.tex").read_text()
+def test_a_query_states_the_peak_of_each_view_and_the_best_of_them(scene, tmp_path):
+    views = list(scene.views)[:3]
+    found = answer_queries(scene, PROMPTS, views, 0.4, tmp_path)
+    assert (found["scene"], found["form"]) == (None, scene.query.form)
+    maps = {view: scene.relevancy(PROMPTS, view).numpy() for view in views}
+    for number, answer in enumerate(found["prompts"]):
+        peaks = {view: float(values[number].max()) for view, values in maps.items()}
+        assert answer["best_view"] == max(peaks, key=peaks.get)
+        assert answer["peak"] == pytest.approx(max(peaks.values()))
+        assert answer["threshold"] == 0.4
+        for view, entry in answer["views"].items():
+            values = maps[view][number]
+            column, row = entry["peak_pixel"]
+            assert values[row, column] == values.max()
+            assert entry["peak"] == pytest.approx(peaks[view], abs=1e-4)
+            assert entry["mask_share"] == pytest.approx((values >= 0.4).mean(), abs=1e-5)
+            with Image.open(entry["mask"]) as mask:
+                assert np.array_equal(np.asarray(mask) > 0, values >= 0.4)
 
 
-def test_prompt_lists_apply_only_to_the_scenes_of_the_paper(built, tiny_capture, tmp_path, capsys):
-    copy = tmp_path / "copy"
-    shutil.copytree(built, copy)
-    assert cli.main(["evaluate", str(copy), "--prompt-list", "paper"]) == 1
-    assert "bonsai" in capsys.readouterr().err
-    bonsai = tmp_path / "bonsai"
-    shutil.copytree(tiny_capture, bonsai)
-    for folder in (bonsai / "segmentations").iterdir():
-        (folder / "red apple.png").rename(folder / "black stool.png")
-    arguments = ["evaluate", str(copy), "--prompt-list", "paper", "--capture", str(bonsai)]
-    assert cli.main(arguments) == 0
-    result = json.loads((copy / "metrics.json").read_text())
-    assert list(result["language"]["per_prompt"]) == ["black stool"], "the blue ball is in no list"
-    assert result["config"]["ground_truth"] == {
-        "folder": str(bonsai / "segmentations"), "layout": "segmentations", "prompt_list": "paper",
-    }  # fmt: skip
-    report = (copy / "report.html").read_text()
-    assert f"<td>ground truth</td><td>{bonsai / 'segmentations'}, prompts of the list paper</td>" in report
+def test_a_query_without_a_folder_has_the_same_numbers_and_no_images(scene, tmp_path):
+    plain, drawn = (answer_queries(scene, PROMPTS, [], None, folder) for folder in (None, tmp_path))
+    for left, right in zip(plain["prompts"], drawn["prompts"]):
+        for view, entry in right["views"].items():
+            assert left["views"][view] == {k: v for k, v in entry.items() if k not in ("heatmap", "mask")}
+
+
+@pytest.mark.parametrize(
+    ("prompt", "name"),
+    [("Red Apple!", "red_apple"), ("дом / сад", "дом_сад"), ("?!", "prompt"), ("a" * 99, "a" * 80)],
+)
+def test_a_prompt_makes_a_file_name_in_any_alphabet(prompt, name):
+    assert file_name(prompt) == name

@@ -15,11 +15,17 @@ from lexsplat.captures.images.reading import read_mask
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.encoders import load_clip
 from lexsplat.scenes.folder import BUNDLED_SCENE
+from lexsplat.scenes.records import read_record
 
 
 @pytest.fixture(scope="module")
 def scene():
     return open_scene("demo", device="cpu")
+
+
+def test_its_record_has_the_present_names():
+    path = BUNDLED_SCENE / "scene.json"
+    assert read_record(json.loads(path.read_text()), path) == json.loads(path.read_text())
 
 
 def snapshot() -> dict[str, int]:

@@ -149,16 +149,6 @@ def test_undo_and_redo_are_exact_inverses(base):
     assert not editor.redo(), "a new step forgets what was undone"
 
 
-def test_discarding_removes_all_edits(base, tmp_path):
-    scene, _ = base
-    editor = Editor(scene, tmp_path / "edits.jsonl")
-    editor.delete(choose(editor, 0))
-    assert (tmp_path / "edits.jsonl").exists()
-    editor.discard()
-    assert same(editor.scene, scene)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_incomplete_last_line_is_ignored(base, tmp_path, caplog):
     scene, _ = base
     journal = tmp_path / "edits.jsonl"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import QUICK_BUILD as QUICK
+from support.tiny_capture import QUICK_BUILD as QUICK
 
 from lexsplat import cli, open_scene
 from lexsplat.geometry.gaussians import Gaussians
@@ -19,8 +19,6 @@ from lexsplat.scenes.exporting import best_labels, export_gaussians
 from lexsplat.scenes.formats.ply import read_ply
 from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.formats.splat import write_splat
-
-pytestmark = pytest.mark.xdist_group("built")
 
 
 def export(*arguments) -> int:
@@ -148,7 +146,7 @@ def test_splats_of_another_program_receive_language_and_keep_their_geometry(
     assert len(foreign) == len(original)
     shutil.copytree(built / "checkpoints", scene / "checkpoints")
     arguments = ["language", str(tiny_capture), "--output", str(scene), "--splats", str(file)]
-    assert cli.main([*arguments, *QUICK, "--method", "trained"]) == 0
+    assert cli.main([*arguments, *QUICK]) == 0
     made = open_scene(scene)
     assert torch.equal(made.gaussians.means, foreign.means)
     assert "splats" in json.loads((scene / "scene.json").read_text())["stages"]["reconstruct"]

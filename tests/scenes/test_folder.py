@@ -1,81 +1,16 @@
 """Scene folder: whole files or none, stages that know what they were made from."""
 
-import dataclasses
 import json
 import multiprocessing
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from lexsplat.geometry.cameras import look_at
-from lexsplat.runtime.errors import FileFormatError, SceneFolderError
-from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
-from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.folder import SceneFolder
-
-
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
-    target = tmp_path / "a.json"
-    write_json(target, {"old": 1})
-
-    def cut_short() -> None:
-        with atomic_path(target) as temporary:
-            temporary.write_text("half")
-            raise RuntimeError("power cut")
-
-    with pytest.raises(RuntimeError):
-        cut_short()
-    assert read_json(target) == {"old": 1}
-    assert os.listdir(tmp_path) == ["a.json"]
-
-
-def test_nan_never_reaches_a_json_file(tmp_path):
-    with pytest.raises(ValueError):
-        write_json(tmp_path / "a.json", {"psnr": float("nan")})
-    assert not (tmp_path / "a.json").exists()
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    rate: float = 0.1
-    sizes: tuple[int, ...] = (1, 2)
-    folder: Path = Path("x")
-
-
-def test_fingerprints_change_with_any_field_and_with_nothing_else():
-    same = fingerprint(Settings(), {"b": 1, "a": 2})
-    assert same == fingerprint(Settings(), {"a": 2, "b": 1})
-    assert same != fingerprint(Settings(rate=0.2), {"b": 1, "a": 2})
-    assert same != fingerprint(Settings(sizes=(1, 3)), {"b": 1, "a": 2})
-    assert same != fingerprint({"b": 1, "a": 2}, Settings())
-
-
-def test_tensors_and_metadata_survive(tmp_path):
-    tensors = {"codes": torch.arange(6, dtype=torch.uint8).reshape(2, 3).T, "weights": torch.rand(3).half()}
-    write_tensors(tmp_path / "t.safetensors", tensors, {"method": "trained"})
-    back, metadata = read_tensors(tmp_path / "t.safetensors")
-    assert metadata == {"method": "trained"}
-    assert all(torch.equal(back[name], value) for name, value in tensors.items())
-
-
-@pytest.mark.parametrize("content", [b"", b"\x80\x04pickle", b"\xff" * 64])
-def test_files_other_than_safetensors_are_refused(tmp_path, content):
-    (tmp_path / "t.safetensors").write_bytes(content)
-    with pytest.raises(FileFormatError, match="safetensors"):
-        read_tensors(tmp_path / "t.safetensors")
-
-
-def test_a_truncated_safetensors_is_refused(tmp_path):
-    path = tmp_path / "t.safetensors"
-    write_tensors(path, {"a": torch.rand(10)}, {})
-    data = path.read_bytes()
-    for length in range(0, len(data), 7):
-        path.write_bytes(data[:length])
-        with pytest.raises(FileFormatError):
-            read_tensors(path)
 
 
 def test_a_stage_is_finished_only_for_the_same_inputs(tmp_path):

@@ -199,6 +199,26 @@ def test_a_folder_of_another_kind_is_refused_with_its_kind(tmp_path):
         open_scene(tmp_path)
 
 
+@pytest.mark.parametrize("wrong", [5, None, ["demo"], b"demo"])
+def test_a_folder_that_is_no_path_is_refused_in_one_line(wrong):
+    with pytest.raises(SceneFolderError, match="expected the path of a scene folder"):
+        open_scene(wrong)
+
+
+@pytest.mark.parametrize("wrong", [5, -4, 1.0, "ball 0", None])
+def test_an_answer_of_another_number_is_refused_in_one_line(scene, wrong):
+    with pytest.raises(QueryError, match="answer: expected a number from 0 to 2"):
+        scene.ask(BALLS, 0.5).selection(wrong)
+
+
+@pytest.mark.parametrize("wrong", ["x", -1, float("nan"), [1]])
+def test_a_distance_that_is_none_is_refused_in_one_line(scene, wrong):
+    found = scene.select("ball 0", 0.5)
+    for change in (found.grow, found.shrink):
+        with pytest.raises(QueryError, match="distance: expected a number from 0"):
+            change(wrong)
+
+
 def test_an_unknown_device_is_refused():
     for device in ("gpu", "cuda:1", "", "CPU"):
         with pytest.raises(ValueError, match="device must be auto, cpu or cuda"):

@@ -1,7 +1,8 @@
-"""Repeats a build in processes that are killed at random moments, until the scene is finished.
+"""Repeats a build in processes that are killed, until the scene is finished.
 
 test_killed_builds.py runs this module in a separate process. It imports everything once, and every attempt is a fork,
-so that fifty kills take a minute. No threads are started before the forks.
+so that thirty kills take a minute. No threads are started before the forks. The first kill of a scene strikes inside
+one of the stages, at a progress event; the others strike at random moments.
 """
 
 from __future__ import annotations
@@ -11,19 +12,40 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-KILLS_A_SCENE = 7
-SHORTEST_STAGE = 0.2
-"""Duration in seconds of the shortest stage, the codebook, on a fast machine: earlier kills hit the stage."""
+KILLS_A_SCENE = 4
 LONGEST_SECONDS = 1.2
-"""Maximum delay in seconds of the other kills."""
+"""Maximum delay in seconds of the kills at random moments."""
 
 
-def attempt(arguments: list[str], output: Path, seconds: float | None, after_stages: int = 0) -> str:
-    """Run the command line in a fork: "finished", "failed", or "killed" after stages and a delay."""
+def kill_inside(stage: str, share: float) -> None:
+    """Make this process kill itself when the named stage reports that it has done a share of its work, in 0..1."""
+    from lexsplat.cli.progress import ProgressBars
+
+    show = ProgressBars.__call__
+
+    def show_or_die(self, event):
+        if event.stage == stage and "kept" not in event.metrics and event.done >= share * event.total:
+            os.kill(os.getpid(), signal.SIGKILL)
+        show(self, event)
+
+    ProgressBars.__call__ = show_or_die
+
+
+def attempt(
+    arguments: list[str], seconds: float | None = None, prepare: Callable[[], None] | None = None
+) -> str:
+    """Run the command line in a fork: "finished", "failed" or "killed".
+
+    Args:
+        arguments: Of the command line.
+        seconds: Delay after which the fork is killed; None waits for its end.
+        prepare: What the fork does first.
+    """
     child = os.fork()
     if child == 0:
         status = 1
@@ -31,60 +53,49 @@ def attempt(arguments: list[str], output: Path, seconds: float | None, after_sta
             from lexsplat import cli
 
             sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-            status = cli.main([*arguments, "--output", str(output)])
+            if prepare is not None:
+                prepare()
+            status = cli.main(arguments)
         finally:
             os._exit(status)
-    deadline = None
+    deadline = None if seconds is None else time.monotonic() + seconds
     while True:
-        done, status = os.waitpid(child, os.WNOHANG)
+        done, status = os.waitpid(child, os.WNOHANG if deadline else 0)
         if done:
-            return "finished" if status == 0 else "failed"
-        if seconds is not None and deadline is None and stages_done(output) >= after_stages:
-            deadline = time.monotonic() + seconds
-        if deadline is not None and time.monotonic() > deadline:
+            return "killed" if os.WIFSIGNALED(status) else "finished" if status == 0 else "failed"
+        if deadline and time.monotonic() > deadline:
             os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return "killed"
+            deadline = None
         time.sleep(0.002)
 
 
-def stages_done(output: Path) -> int:
-    """Number of finished stages according to scene.json."""
-    try:
-        return len(json.loads((output / "scene.json").read_text())["stages"])
-    except FileNotFoundError:
-        return 0
-
-
 def main() -> None:
-    folder, kills, seed, stages, *arguments = sys.argv[1:]
+    folder, kills, seed, stages, *options = sys.argv[1:]
     import transformers.models.auto.tokenization_auto
     import transformers.models.clip.modeling_clip
     import transformers.models.vit.modeling_vit  # noqa: F401  (imported once, before the first fork)
 
-    rng = np.random.default_rng(int(seed))
-    killed: list[int] = []
-    finished: list[str] = []
-    while len(killed) < int(kills):
-        output = Path(folder) / f"scene_{len(finished)}"
-        # The first kill of a scene waits for one of its stages, so that all stages are hit; the others come as they
-        # come, most of them while the process starts or goes on with a training.
-        wanted = len(finished) % int(stages)
-        for number in range(KILLS_A_SCENE):
-            if number:
-                result = attempt(arguments, output, float(rng.uniform(0.0, LONGEST_SECONDS)))
-            else:
-                result = attempt(arguments, output, float(rng.uniform(0.0, SHORTEST_STAGE)), wanted)
+    rng, names = np.random.default_rng(int(seed)), stages.split(",")
+    report = {"killed_inside": [], "kills": 0, "finished": []}
+    while report["kills"] < int(kills):
+        output = Path(folder) / f"scene_{len(report['finished'])}"
+        arguments = [*options, "--output", str(output)]
+        stage, share = names[len(report["finished"]) % len(names)], float(rng.uniform())
+        result = attempt(arguments, prepare=lambda stage=stage, share=share: kill_inside(stage, share))
+        if result == "killed":
+            report["killed_inside"].append(stage)
+        for _ in range(KILLS_A_SCENE - 1):
             if result != "killed":
                 break
-            killed.append(stages_done(output))
+            report["kills"] += 1
+            result = attempt(arguments, float(rng.uniform(0.0, LONGEST_SECONDS)))
         if result == "killed":
-            result = attempt(arguments, output, None)
+            report["kills"] += 1
+            result = attempt(arguments)
         if result == "failed":
-            print(json.dumps({"failed": str(output)}))
-            return
-        finished.append(str(output))
-    report = {"killed_after_stages": killed, "finished": finished}
+            report["failed"] = str(output)
+            break
+        report["finished"].append(str(output))
     print(json.dumps(report))
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from support.rooms import SIZE, room_cameras, room_photo, texture
+from support.rooms import SIZE, room_cameras, room_photo
 
 LARGE = (2400, 1800)
 GIANT = (3600, 2700)
@@ -29,11 +29,10 @@ SAMPLE, DIMENSIONS, CODES = 40_000, 512, 8
 
 def write_photos(folder: Path) -> None:
     """Large photos of the room, with and without cameras, and a giant portrait photo with a mask."""
-    textures = [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
     (folder / "images").mkdir(parents=True)
     frames = []
     for index, camera in enumerate(room_cameras()):
-        small = Image.fromarray((room_photo(camera, textures) * 255).round().astype(np.uint8))
+        small = Image.fromarray((room_photo(camera) * 255).round().astype(np.uint8))
         small.resize(LARGE, Image.Resampling.BILINEAR).save(folder / "images" / f"{index}.jpg", quality=90)
         pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV to OpenGL axes
         frames.append({"file_path": f"images/{index}.jpg", "transform_matrix": pose.tolist()})
@@ -63,10 +62,10 @@ def place_photos(folder: Path, memory: int) -> str:
 
 def triangulate_points(folder: Path, memory: int) -> str:
     """Triangulation with known poses, with the feature size of the small photos."""
-    from lexsplat.captures import load_capture
+    from lexsplat.captures import PoseConfig, load_capture
     from lexsplat.captures.sfm import triangulation
 
-    triangulation.MAX_SIDE, triangulation.MAX_FEATURES = SIDE, FEATURES
+    triangulation.FEATURES = PoseConfig(max_side=SIDE, max_features=FEATURES)
     points, _ = triangulation.triangulate(load_capture(folder, test_every=0), memory=memory)
     return f"{len(points)} points"
 

@@ -15,7 +15,7 @@ def texts(count, dim, seed):
     )
 
 
-def lifted_cloud() -> tuple[CodeField, Gaussians, Camera]:
+def coded_cloud() -> tuple[CodeField, Gaussians, Camera]:
     """Gaussians in a cloud with random codes, some without a code, and a camera whose view extends beyond them."""
     rng = np.random.default_rng(0)
     gaussians = gaussians_from_points(

@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from lexsplat.evaluation import Metrics, PairResult, ViewPictures, precision_curves, summarize_language
-from lexsplat.evaluation.metrics import average_precision, threshold_counts
+from lexsplat.evaluation import Metrics, PairResult, ViewImages, precision_curves, summarize_language
+from lexsplat.evaluation.metrics import average_precision, mask_scores, threshold_counts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 from lexsplat.evaluation.report import Gallery
 
@@ -66,10 +66,12 @@ def evaluated(views=3):
         }
         photo, image = (rng.random((12, 16, 3)).astype(np.float32) for _ in range(2))
         automatic = dict.fromkeys(PROMPTS, 0.5)
-        gallery.add(ViewPictures(name, photo, image, maps, dict.fromkeys(PROMPTS, ground_truth), automatic))
+        gallery.add(ViewImages(name, photo, image, maps, dict.fromkeys(PROMPTS, ground_truth), automatic))
         pairs[name] = {
             prompt: PairResult(
-                threshold_counts(scores, ground_truth), average_precision(scores, ground_truth), 1.0,
+                threshold_counts(scores, ground_truth),
+                mask_scores(scores >= 0.5, ground_truth),
+                average_precision(scores, ground_truth), 1.0,
                 OfficialScores(0.5, 0.9, 0.6, 1.0), Lerf2dScores(0.3, True), 0.25,
             )
             for prompt, scores in maps.items()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from PIL import Image
 from scipy.ndimage import gaussian_filter
@@ -9,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from lexsplat.geometry.cameras import look_at
 
 
+@functools.cache
 def texture() -> np.ndarray:
     """Blobs of many sizes and colors ``[256, 256, 3]``, which yield many SIFT features."""
     rng = np.random.default_rng(0)
@@ -17,9 +20,12 @@ def texture() -> np.ndarray:
     return np.clip(0.5 + 0.25 * image / image.std(), 0, 1)
 
 
+def textures() -> list[np.ndarray]:
+    """The textures of the planes x = 0, y = 0 and z = 0."""
+    return [texture(), np.flip(texture(), 0), np.roll(texture(), 1, 2)]
+
+
 SIZE = (240, 180)
-
-
 COUNT = 9
 
 
@@ -36,7 +42,7 @@ def room_cameras() -> list:
     ]
 
 
-def room_photo(camera, textures: list[np.ndarray]) -> np.ndarray:
+def room_photo(camera) -> np.ndarray:
     """A corner of a room: the planes x = 0, y = 0 and z = 0, each with its texture over 2 units."""
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
@@ -46,7 +52,7 @@ def room_photo(camera, textures: list[np.ndarray]) -> np.ndarray:
     wall = distance.argmin(-1)
     hit = camera.position + rays * distance.min(-1)[..., None]
     image = np.zeros((SIZE[1], SIZE[0], 3))
-    for axis, pattern in enumerate(textures):
+    for axis, pattern in enumerate(textures()):
         on_axis = wall == axis
         u, v = np.abs(np.delete(hit, axis, -1)[on_axis].T) * 128
         low_u, low_v = np.minimum(u.astype(int), 254), np.minimum(v.astype(int), 254)

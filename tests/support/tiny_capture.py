@@ -14,6 +14,12 @@ SPHERES = {  # name: center, radius, color
     "red apple": ((-0.55, 0.1, 0.35), 0.35, (0.75, 0.1, 0.08)),
     "blue ball": ((0.55, -0.1, 0.35), 0.35, (0.1, 0.2, 0.8)),
 }
+QUICK_BUILD = [
+    "--clip", "bundled", "--dino", "bundled", "--device", "cpu", "--iterations", "120",
+    "--features.crop-sizes", "0.18", "0.36", "--features.crop-strides", "0.5", "0.5",
+    "--codebook.num-codes", "16", "--trained.iterations", "60",
+]  # fmt: skip
+"""Options of ``lexsplat build`` that make a small scene of the capture in seconds."""
 LIGHT = np.array([0.4, -0.5, 0.77])
 
 

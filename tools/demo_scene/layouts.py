@@ -1,4 +1,4 @@
-"""The two scenes that ship with lexsplat: what stands where, who looks from where, what is asked."""
+"""The layouts of the two demo scenes: objects, camera paths and prompts."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Placement:
-    """One thing: kind and colour, place on the table, turn in radians, scale."""
+    """One object: kind, color, position on the table, rotation in radians, scale."""
 
     kind: str
-    colour: str
+    color: str
     x: float
     y: float
     turn: float = 0.0
@@ -24,7 +24,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Sweeps to and fro before the table, each at a height of its own, without a jump between them.
+    """A continuous camera path: sweeps from side to side in front of the table, each at its own height.
 
     Args:
         sweeps: Elevation in degrees at the (start, end) of each sweep.
@@ -79,11 +79,11 @@ def look_from(position: NDArray, target: NDArray) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Prompt:
-    """A question about the scene.
+    """A prompt of the scene.
 
     Args:
-        kind: What the words use: name, colour (with a name), material, attribute or part.
-        selects: The things it means, by kind, or "KIND.PART" for a part alone.
+        kind: What the words name: name, color (with a name), material, attribute or part.
+        selects: The objects that match, by kind; "KIND.PART" for a part alone.
     """
 
     kind: str
@@ -103,9 +103,9 @@ class Layout:
     path: CameraPath
     placements: tuple[Placement, ...]
     cloth: tuple[str, float, float, float]
-    """Colour, x, y, turn."""
+    """Color, x, y, turn."""
     wall: tuple[str, str]
-    """Colour and surface."""
+    """Color and surface."""
     key_light: tuple[float, float, float]
     """Azimuth, watts, size."""
     fill_watts: float
@@ -116,7 +116,7 @@ class Layout:
         return [f"view_{number:03d}" for number in range(self.views)]
 
     def test_names(self) -> list[str]:
-        """Every so many views, never the first or the last: each lies between training views of the path."""
+        """Every ``test_every``-th view, never the first or last: each lies between training views of the path."""
         return self.names()[self.test_every // 2 :: self.test_every]
 
 
@@ -157,12 +157,12 @@ TABLETOP = Layout(
     fill_watts=110,
     sky=0.3,
     prompts={
-        "red apple": Prompt("colour", ("apple",)),
-        "blue mug": Prompt("colour", ("mug",)),
-        "white vase": Prompt("colour", ("vase",)),
-        "gold ring": Prompt("colour", ("ring",)),
-        "brown teddy bear": Prompt("colour", ("teddy",)),
-        "green bottle": Prompt("colour", ("bottle",)),
+        "red apple": Prompt("color", ("apple",)),
+        "blue mug": Prompt("color", ("mug",)),
+        "white vase": Prompt("color", ("vase",)),
+        "gold ring": Prompt("color", ("ring",)),
+        "brown teddy bear": Prompt("color", ("teddy",)),
+        "green bottle": Prompt("color", ("bottle",)),
         "rubber duck": Prompt("name", ("duck",)),
         "stack of books": Prompt("name", ("books",)),
         "traffic cone": Prompt("name", ("cone",)),
@@ -214,12 +214,12 @@ SECOND = Layout(
     fill_watts=110,
     sky=0.3,
     prompts={
-        "green apple": Prompt("colour", ("apple",)),
-        "red mug": Prompt("colour", ("mug",)),
-        "green bowl": Prompt("colour", ("bowl",)),
-        "silver ring": Prompt("colour", ("ring",)),
-        "blue toy car": Prompt("colour", ("car",)),
-        "purple candle": Prompt("colour", ("candle",)),
+        "green apple": Prompt("color", ("apple",)),
+        "red mug": Prompt("color", ("mug",)),
+        "green bowl": Prompt("color", ("bowl",)),
+        "silver ring": Prompt("color", ("ring",)),
+        "blue toy car": Prompt("color", ("car",)),
+        "purple candle": Prompt("color", ("candle",)),
         "teddy bear": Prompt("name", ("teddy",)),
         "striped ball": Prompt("name", ("ball",)),
         "wooden crate": Prompt("name", ("crate",)),

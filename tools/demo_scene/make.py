@@ -1,4 +1,4 @@
-"""Remakes the demo scenes from nothing: see README.md."""
+"""Generate the demo scenes (see README.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns a work folder of renders into a scene that ships: pictures, sparse model, masks and prompts.
+"""Make a bundled capture from a work folder of renderings: images, sparse model, masks and prompts.
 
 images/NAME.jpg
 sparse/0/*.bin                    COLMAP model, all views posed
@@ -30,7 +30,7 @@ MIN_PART_PIXELS = 40
 
 
 def mask_of(prompt: Prompt, index: NDArray[np.uint8], things: dict[str, dict]) -> NDArray[np.bool_]:
-    """Where a prompt's things or parts are visible ``[H, W]``."""
+    """Mask ``[H, W]`` of the visible objects or parts of a prompt."""
     mask = np.zeros(index.shape, bool)
     for selector in prompt.selects:
         kind, _, part = selector.partition(".")
@@ -46,7 +46,7 @@ def mask_of(prompt: Prompt, index: NDArray[np.uint8], things: dict[str, dict]) -
 
 
 def write_masks(layout: Layout, work: Path, output: Path) -> int:
-    """Masks of the held-out views; returns how many."""
+    """Write the masks of the held-out views; returns their number."""
     things = json.loads((work / "things.json").read_text())
     written = 0
     for name in layout.test_names():
@@ -63,7 +63,7 @@ def write_masks(layout: Layout, work: Path, output: Path) -> int:
 
 
 def write_sparse_model(layout: Layout, work: Path, output: Path, say: Callable[[str], None]) -> None:
-    """``sparse/0``, after a check of its points against the rendered depths."""
+    """Write ``sparse/0`` after a check of its points against the rendered depths."""
     cameras = json.loads((work / "cameras.json").read_text())
     camera = pinhole(cameras["width"], cameras["height"], cameras["K"])
     poses = {f"{name}.jpg": np.array(pose) for name, pose in cameras["camera_to_world"].items()}
@@ -85,11 +85,11 @@ def write_sparse_model(layout: Layout, work: Path, output: Path, say: Callable[[
 
 
 def pack(layout: Layout, work: Path, output: Path, *, truth: bool, say: Callable[[str], None]) -> None:
-    """Writes the scene folder ``output`` anew from the renders in ``work``."""
+    """Write the capture folder ``output`` from the renderings in ``work``; an existing one is replaced."""
     shutil.rmtree(output, ignore_errors=True)
     (output / "images").mkdir(parents=True)
     for name in layout.names():
-        picture = Image.open(work / "pictures" / f"{name}.png").convert("RGB")
+        picture = Image.open(work / "images" / f"{name}.png").convert("RGB")
         picture.save(output / "images" / f"{name}.jpg", quality=JPEG_QUALITY, progressive=True)
     (output / "test_views.json").write_text(json.dumps(layout.test_names(), indent=1) + "\n")
     kinds = {text: prompt.kind for text, prompt in layout.prompts.items()}
@@ -97,7 +97,7 @@ def pack(layout: Layout, work: Path, output: Path, *, truth: bool, say: Callable
     masks = write_masks(layout, work, output)
     write_sparse_model(layout, work, output, say)
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
-    say(f"{output.name}: {layout.views} pictures, {masks} masks, {size / 1e6:.2f} MB")
+    say(f"{output.name}: {layout.views} images, {masks} masks, {size / 1e6:.2f} MB")
     if truth:
         shutil.copytree(work / "truth", output / "truth")
         shutil.copy(work / "things.json", output / "truth" / "things.json")

@@ -1,4 +1,4 @@
-"""Blender floods standard output; this keeps it to what the tools say."""
+"""Suppress Blender's messages on standard output."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 def quiet_output() -> Callable[[str], None]:
-    """Sends standard output, Blender's flood, to nowhere; returns what still prints a line to the user."""
+    """Redirect standard output to the null device; returns a function that still prints a line to the user."""
     user = os.fdopen(os.dup(1), "w")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)

@@ -1,10 +1,10 @@
-"""Builds a layout in Blender and renders it: pictures, and per-pixel object indices and depths.
+"""Build a layout in Blender and render images, object indices and depths.
 
 Written to a work folder:
 
     cameras.json       width, height, K, and camera-to-world (OpenGL axes) of each view
     things.json        what the object indices mean
-    pictures/NAME.png  8-bit RGB
+    images/NAME.png    8-bit RGB
     truth/NAME.npz     index uint8 [H, W] (0 = nothing), depth float32 [H, W] along the viewing axis
 """
 
@@ -26,7 +26,7 @@ from things import Thing, make
 
 
 def build(layout: Layout) -> list[Thing]:
-    """An empty Blender file filled with the layout. Each thing draws from a generator of its own."""
+    """Fill an empty Blender file with the layout. Each object has its own random generator."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     number = 0
 
@@ -37,12 +37,12 @@ def build(layout: Layout) -> list[Thing]:
 
     things = []
     for place in layout.placements:
-        thing = make(place.kind, place.colour, *next_thing())
+        thing = make(place.kind, place.color, *next_thing())
         thing.place(place.x, place.y, place.z, place.turn, place.scale)
         things.append(thing)
     things.append(make_table(*next_thing()))
-    colour, x, y, turn = layout.cloth
-    things.append(make_cloth(colour, *next_thing(), x, y, turn))
+    color, x, y, turn = layout.cloth
+    things.append(make_cloth(color, *next_thing(), x, y, turn))
     things.append(make_wall(*layout.wall, *next_thing()))
     things.append(make_floor(*next_thing()))
     light_room(*layout.key_light, layout.fill_watts, layout.sky)
@@ -81,7 +81,7 @@ def set_up(layout: Layout, scratch: Path, threads: int) -> None:
         links.new(layers.outputs[output], files.inputs[slot])
 
 
-def use_picture_quality(samples: int) -> None:
+def use_image_quality(samples: int) -> None:
     """Path tracing with denoising."""
     cycles = bpy.context.scene.cycles
     cycles.device, cycles.samples = "CPU", samples
@@ -94,7 +94,7 @@ def use_picture_quality(samples: int) -> None:
 
 
 def use_truth_quality() -> None:
-    """One ray through the centre of every pixel, so that indices and depths are exact there."""
+    """One ray through the center of every pixel, so that indices and depths are exact there."""
     cycles = bpy.context.scene.cycles
     cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = 1, False, False
     cycles.max_bounces = 0
@@ -110,7 +110,7 @@ def shoot(pose: NDArray, picture: Path) -> None:
 
 
 def read_pass(path: Path) -> NDArray[np.float32]:
-    """A one-channel picture ``[H, W]``, top row first (Blender keeps the bottom row first)."""
+    """A one-channel image ``[H, W]``, top row first (Blender stores the bottom row first)."""
     image = bpy.data.images.load(str(path))
     width, height = image.size
     values = np.empty(width * height * image.channels, np.float32)
@@ -127,7 +127,7 @@ def intrinsics(layout: Layout) -> list[list[float]]:
 def render(
     layout: Layout, work: Path, *, samples: int, threads: int, say: Callable[[str], None], every: int = 1
 ) -> None:
-    """Renders the layout into ``work``; views that are there already are kept.
+    """Render the layout into ``work``; existing views are kept.
 
     Args:
         layout: The scene.
@@ -140,7 +140,7 @@ def render(
     things = build(layout)
     scratch = work / "scratch"
     set_up(layout, scratch, threads)
-    for folder in (scratch, work / "pictures", work / "truth"):
+    for folder in (scratch, work / "images", work / "truth"):
         folder.mkdir(parents=True, exist_ok=True)
     poses = layout.path.poses(layout.views)
     views = {name: pose.tolist() for name, pose in zip(layout.names(), poses)}
@@ -151,7 +151,7 @@ def render(
         "camera_to_world": views,
     }
     (work / "cameras.json").write_text(json.dumps(cameras, indent=1))
-    meaning = {t.number: {"kind": t.kind, "colour": t.colour, "parts": t.parts} for t in things}
+    meaning = {t.number: {"kind": t.kind, "color": t.color, "parts": t.parts} for t in things}
     (work / "things.json").write_text(json.dumps(meaning, indent=1))
 
     chosen = list(zip(layout.names(), poses))[::every]
@@ -162,9 +162,9 @@ def render(
             index = np.rint(read_pass(scratch / "index0001.exr")).astype(np.uint8)
             depth = read_pass(scratch / "depth0001.exr")
             np.savez_compressed(work / "truth" / f"{name}.npz", index=index, depth=depth)
-    use_picture_quality(samples)
+    use_image_quality(samples)
     for done, (name, pose) in enumerate(chosen, 1):
-        picture = work / "pictures" / f"{name}.png"
+        picture = work / "images" / f"{name}.png"
         if not picture.exists():
             start = time.perf_counter()
             bpy.context.scene.cycles.seed = int(name.rsplit("_", 1)[1])

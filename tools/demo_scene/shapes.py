@@ -1,6 +1,6 @@
 """Meshes from formulas: vertices ``[V, 3]`` and faces as tuples of vertex numbers. Needs numpy only.
 
-Lengths are in scene units (about 20 cm each), z is up, and a thing stands on z = 0 around the z axis.
+Lengths are in scene units (about 20 cm each), z is up, and an object stands on z = 0 around the z axis.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Mesh(NamedTuple):
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """One mesh out of several."""
+    """Several meshes joined to one."""
     faces: list[tuple[int, ...]] = []
     start = 0
     for mesh in meshes:
@@ -57,7 +57,7 @@ def grid_quads(rows: int, columns: int, *, wrap: bool) -> list[tuple[int, ...]]:
 
 
 def lathe(profile: ArrayLike, segments: int = 48, *, ribs: int = 0, rib_depth: float = 0.0) -> Mesh:
-    """A profile of (radius, height) turned about the z axis; ``ribs`` grooves, as of a pumpkin."""
+    """A surface of revolution: a profile of (radius, height) about the z axis, with ``ribs`` grooves (pumpkin)."""
     radius, height = np.asarray(profile, float).T
     angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     groove = 1 - rib_depth * np.abs(np.cos(angle * ribs / 2)) ** 6
@@ -90,10 +90,10 @@ def smooth_profile(points: ArrayLike, samples: int = 30) -> NDArray[np.float64]:
     return curve
 
 
-def ellipsoid(centre: ArrayLike, radii: ArrayLike, rows: int = 20, segments: int = 32) -> Mesh:
+def ellipsoid(center: ArrayLike, radii: ArrayLike, rows: int = 20, segments: int = 32) -> Mesh:
     latitude = np.linspace(1e-3, np.pi - 1e-3, rows)
     ball = lathe(np.stack([np.sin(latitude), -np.cos(latitude)], 1), segments)
-    return Mesh(ball.vertices * np.broadcast_to(radii, 3) + np.asarray(centre, float), ball.faces)
+    return Mesh(ball.vertices * np.broadcast_to(radii, 3) + np.asarray(center, float), ball.faces)
 
 
 def torus(major: float, minor: float, segments: int = 48, sides: int = 18, arc: float = 2 * np.pi) -> Mesh:
@@ -127,7 +127,7 @@ def tube(path: ArrayLike, radii: ArrayLike, sides: int = 16) -> Mesh:
     return Mesh(vertices.reshape(-1, 3), grid_quads(n, sides, wrap=True) + caps)
 
 
-def box(size: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
+def box(size: ArrayLike, center: ArrayLike = (0, 0, 0)) -> Mesh:
     corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces: list[tuple[int, ...]] = [
         (0, 1, 3, 2),
@@ -137,11 +137,11 @@ def box(size: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
         (0, 2, 6, 4),
         (1, 5, 7, 3),
     ]
-    return Mesh(corners * np.asarray(size, float) + np.asarray(centre, float), faces)
+    return Mesh(corners * np.asarray(size, float) + np.asarray(center, float), faces)
 
 
 def draped_sheet(half_width: float, half_depth: float, phases: ArrayLike, points: int = 60) -> Mesh:
-    """A cloth with low waves, lying on z = 0."""
+    """A cloth with low waves on z = 0."""
     a, b, c = np.asarray(phases, float)
     x, y = np.meshgrid(
         np.linspace(-half_width, half_width, points), np.linspace(-half_depth, half_depth, points)
@@ -151,7 +151,7 @@ def draped_sheet(half_width: float, half_depth: float, phases: ArrayLike, points
 
 
 def leaf(base: ArrayLike, azimuth: float, elevation: float, length: float, width: float) -> Mesh:
-    """A folded blade that starts at ``base`` and bends down under its weight (angles in radians)."""
+    """A folded leaf that starts at ``base`` and bends down (angles in radians)."""
     steps = 8
     outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])

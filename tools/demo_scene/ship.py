@@ -1,7 +1,8 @@
-"""Makes the finished scene that ships with the package: ``python tools/demo_scene/ship.py``.
+"""Build the bundled finished scene: ``python tools/demo_scene/ship.py``.
 
 Builds the demo scene as ``lexsplat demo`` does, but with spherical harmonics of degree 1 in place of 3, which
-halves the file, and keeps what questions need: cameras, Gaussians, language.
+halves the file, and keeps what questions need: cameras, Gaussians, language. ``--record`` builds nothing: it
+writes the scene.json that is there again, under the present names of its keys and without settings that are gone.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from lexsplat.cli.progress import ProgressBars
 from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
 from lexsplat.evaluation.scenes import evaluate_scene
 from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.files import to_json
 from lexsplat.scenes.folder import BUNDLED_SCENE
+from lexsplat.scenes.records import read_record
 from lexsplat.scenes.scene import open_scene
 
 KEPT = ("cameras.json", "gaussians.ply", "language.safetensors")
@@ -28,7 +32,12 @@ def main() -> None:
     parser.add_argument(
         "--work", type=Path, default=None, help="where to build; none takes a temporary folder"
     )
+    parser.add_argument("--record", action="store_true", help="only write scene.json again")
     options = parser.parse_args()
+    if options.record:
+        path = BUNDLED_SCENE / "scene.json"
+        write_record(read_record(json.loads(path.read_text()), path))
+        return
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary) / "scene"
         config = replace(
@@ -40,13 +49,25 @@ def main() -> None:
         BUNDLED_SCENE.mkdir(parents=True, exist_ok=True)
         for name in KEPT:
             shutil.copyfile(work / name, BUNDLED_SCENE / name)
-        record = json.loads(json.dumps(folder.record))
-        record["capture"] = None  # where the photos were on the machine that built it is nobody's business
-        (BUNDLED_SCENE / "scene.json").write_text(json.dumps(record, indent=1))
+        write_record(folder.record)
         size = sum(file.stat().st_size for file in BUNDLED_SCENE.iterdir())
         strict = quality["language"]["strict"]
         print(f"{BUNDLED_SCENE}: {size / 1e6:.2f} MB, PSNR {quality['quality']['psnr']:.2f} dB, "
               f"mIoU {strict['auto']['mIoU']:.3f}, mAP {strict['mAP']:.3f}")  # fmt: skip
+
+
+def write_record(record: dict) -> None:
+    """Write scene.json without the place of the photos, which is that of the machine that built it."""
+    config = known(record["config"], to_json(BuildConfig()))
+    content = {**record, "capture": None, "config": config}
+    (BUNDLED_SCENE / "scene.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
+def known(config: dict, settings: dict) -> dict:
+    """The part of a configuration that the settings still have."""
+    kept = {name: value for name, value in config.items() if name in settings}
+    parts = {name: known(kept[name], part) for name, part in settings.items() if isinstance(part, dict)}
+    return {**kept, **parts}
 
 
 if __name__ == "__main__":

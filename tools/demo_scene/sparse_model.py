@@ -1,7 +1,7 @@
-"""The sparse COLMAP model of rendered pictures: structure from motion with the poses known and held fixed.
+"""The sparse COLMAP model of rendered images: triangulation with known, fixed poses.
 
-Points come from the pictures alone: SIFT features of the training views, matched, verified and triangulated
-by pycolmap. Held-out views are posed, but nothing is seen in them.
+Points come from the images alone: SIFT features of the training views, matched, verified and triangulated
+by pycolmap. Held-out views have poses but no observations.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def empty_model(camera: pycolmap.Camera) -> pycolmap.Reconstruction:
 def triangulate(
     images: Path, train: Sequence[str], camera: pycolmap.Camera, poses: Mapping[str, NDArray], seed: int
 ) -> pycolmap.Reconstruction:
-    """Features, matches and points of the training views; intrinsics and poses stay as they are.
+    """Features, matches and points of the training views; intrinsics and poses stay fixed.
 
     Args:
-        images: Folder of pictures.
+        images: Folder of images.
         train: File names of the training views.
         camera: The one camera of all views.
         poses: Camera to world ``[4, 4]``, OpenGL axes, by file name.
@@ -68,7 +68,7 @@ def triangulate(
         )
         verification = pycolmap.TwoViewGeometryOptions(detect_watermark=False)
         verification.ransac.random_seed = seed
-        verification.ransac.max_error = 1.0  # pixels; pictures are free of distortion
+        verification.ransac.max_error = 1.0  # pixels; images are free of distortion
         pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
 
         model = empty_model(camera)
@@ -91,7 +91,7 @@ def triangulate(
 
 
 def image_numbers(database: Path) -> dict[str, int]:
-    """Image numbers by file name, as feature extraction gave them."""
+    """Image numbers by file name, as assigned by feature extraction."""
     with pycolmap.Database.open(database) as opened:
         return {image.name: image.image_id for image in opened.read_all_images()}
 
@@ -101,7 +101,7 @@ def slim_model(
     camera: pycolmap.Camera,
     poses: Mapping[str, NDArray],
 ) -> pycolmap.Reconstruction:
-    """The good points of a model, only the keypoints that see them, and every view of ``poses`` posed."""
+    """The good points of a model, only the keypoints that observe them, and every view of ``poses`` with its pose."""
     good = {
         number: point
         for number, point in model.points3D.items()
@@ -130,7 +130,7 @@ def slim_model(
 
 
 def depth_errors(model: pycolmap.Reconstruction, depths: Mapping[str, NDArray]) -> NDArray[np.float64]:
-    """How far each point lies from the rendered surface: |z - depth| / depth, median over its views ``[P]``.
+    """Relative distance of each point from the rendered surface: |z - depth| / depth, median over its views ``[P]``.
 
     The nearest depth within two pixels counts: a feature on an outline may lie on either side of it.
 

@@ -1,4 +1,4 @@
-"""What the things stand on and before, and the light. Needs Blender."""
+"""Table, cloth, wall, floor and light. Needs Blender."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import bpy
 import numpy as np
-from materials import COLOURS, material, varied
+from materials import COLORS, material, varied
 from mathutils import Vector
 from shapes import box, draped_sheet, joined
 from things import Thing
@@ -17,19 +17,19 @@ PLAIN_WALLS = {"white": (0.72, 0.7, 0.66), "blue": (0.28, 0.4, 0.55), "green": (
 def make_table(number: int, rng: np.random.Generator) -> Thing:
     """A wooden table whose top is z = 0."""
     table = Thing("table", "brown", number, rng)
-    colour = varied((0.36, 0.17, 0.065), rng, 0.1)
-    top = material(colour, rng, roughness=0.45, pattern="wood", scale=rng.uniform(2, 4), bump=0.12, coat=0.08)
+    color = varied((0.36, 0.17, 0.065), rng, 0.1)
+    top = material(color, rng, roughness=0.45, pattern="wood", scale=rng.uniform(2, 4), bump=0.12, coat=0.08)
     table.add(box((4.4, 3.2, 0.12), (0, 0, -0.06)), top, smooth=False, bevel=0.02)
     legs = joined([box((0.16, 0.16, 2.0), (x, y, -1.1)) for x in (-2, 2) for y in (-1.4, 1.4)])
     table.add(legs, material((0.25, 0.12, 0.05), rng, roughness=0.5, pattern="wood"), smooth=False)
     return table
 
 
-def make_cloth(colour: str, number: int, rng: np.random.Generator, x: float, y: float, turn: float) -> Thing:
+def make_cloth(color: str, number: int, rng: np.random.Generator, x: float, y: float, turn: float) -> Thing:
     """A checkered cloth on the table around (x, y)."""
-    cloth = Thing("cloth", colour, number, rng)
+    cloth = Thing("cloth", color, number, rng)
     fabric = material(
-        COLOURS[colour],
+        COLORS[color],
         rng,
         roughness=0.9,
         pattern="checker",
@@ -42,9 +42,9 @@ def make_cloth(colour: str, number: int, rng: np.random.Generator, x: float, y: 
     return cloth
 
 
-def make_wall(colour: str, surface: str, number: int, rng: np.random.Generator) -> Thing:
+def make_wall(color: str, surface: str, number: int, rng: np.random.Generator) -> Thing:
     """A wall behind the table: ``surface`` is "brick" or "plain"."""
-    wall = Thing("wall", colour, number, rng)
+    wall = Thing("wall", color, number, rng)
     if surface == "brick":
         finish = material(
             varied((0.36, 0.1, 0.06), rng),
@@ -56,7 +56,7 @@ def make_wall(colour: str, surface: str, number: int, rng: np.random.Generator) 
             bump=0.9,
         )
     else:
-        own = varied(PLAIN_WALLS[colour], rng, 0.1)
+        own = varied(PLAIN_WALLS[color], rng, 0.1)
         second = tuple(0.72 * channel for channel in own)
         finish = material(own, rng, roughness=0.85, pattern="plaster", second=second, scale=9, bump=0.3)
     wall.add(box((24, 0.2, 9), (0, 2.6, 1.5)), finish, smooth=False)
@@ -73,9 +73,9 @@ def make_floor(number: int, rng: np.random.Generator) -> Thing:
     return floor
 
 
-def _add_area_light(position: tuple[float, float, float], size: float, watts: float, colour: tuple) -> None:
+def _add_area_light(position: tuple[float, float, float], size: float, watts: float, color: tuple) -> None:
     data = bpy.data.lights.new("area", "AREA")
-    data.size, data.energy, data.color = size, watts, colour
+    data.size, data.energy, data.color = size, watts, color
     light = bpy.data.objects.new("area", data)
     bpy.context.scene.collection.objects.link(light)
     light.location = position

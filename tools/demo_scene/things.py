@@ -1,7 +1,7 @@
-"""The nameable things: 18 kinds, each a function that builds one from meshes and materials. Needs Blender.
+"""The 18 kinds of objects: each is a function that builds one from meshes and materials. Needs Blender.
 
-Every mesh carries an object index, which the renderer writes per pixel: ``10 * number`` for the body of
-thing ``number`` and ``10 * number + part`` for its named parts, so that a thing is ``index // 10``.
+Every mesh has an object index, which the renderer writes per pixel: ``10 * number`` for the body of object
+``number`` and ``10 * number + part`` for its named parts. The object of a pixel is ``index // 10``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from materials import COLOURS, Colour, colour_of, material, scaled, varied
+from materials import COLORS, Color, color_of, material, scaled, varied
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 from shapes import (
@@ -34,20 +34,20 @@ MAX_PARTS = 9
 
 @dataclass
 class Thing:
-    """Something with a name: its meshes, and the numbers of its named parts."""
+    """An object: its meshes, and the numbers of its named parts."""
 
     kind: str
-    colour: str
+    color: str
     number: int
     rng: np.random.Generator
     parts: dict[str, int] = field(default_factory=dict)
     objects: list[Any] = field(default_factory=list)
 
-    def paint(self, colour: Colour | None = None, *, vary: float = 0.07, **finish: Any) -> Any:
-        """A material in the thing's own colour, or in ``colour`` exactly."""
-        if colour is None:
-            colour = varied(colour_of(self.colour), self.rng, vary)
-        return material(colour, self.rng, **finish)
+    def paint(self, color: Color | None = None, *, vary: float = 0.07, **finish: Any) -> Any:
+        """A material in the color of the object, or in ``color`` exactly."""
+        if color is None:
+            color = varied(color_of(self.color), self.rng, vary)
+        return material(color, self.rng, **finish)
 
     def add(
         self,
@@ -58,7 +58,7 @@ class Thing:
         smooth: bool = True,
         bevel: float = 0.0,
     ) -> None:
-        """Adds a mesh; ``part`` names it as a part with an index of its own, ``bevel`` rounds its edges."""
+        """Add a mesh; ``part`` gives it its own index under this name, ``bevel`` rounds its edges."""
         if part is not None and part not in self.parts:
             if len(self.parts) == MAX_PARTS:
                 raise ValueError(f"{self.kind} has more than {MAX_PARTS} parts")
@@ -77,14 +77,14 @@ class Thing:
         self.objects.append(blender_object)
 
     def place(self, x: float, y: float, z: float = 0.0, rotation: float = 0.0, scale: float = 1.0) -> None:
-        """Stands the thing at (x, y, z), turned about the vertical by ``rotation`` radians."""
+        """Move the object to (x, y, z), rotated about the vertical by ``rotation`` radians."""
         pose = Matrix.Translation((x, y, z)) @ Matrix.Rotation(rotation, 4, "Z") @ Matrix.Scale(scale, 4)
         for blender_object in self.objects:
             blender_object.matrix_world = pose
 
 
 def open_vessel(outside: ArrayLike, thickness: float, lift: float) -> NDArray[np.float64]:
-    """The profile ``[n, 2]`` of a vessel, continued down its inside."""
+    """The profile ``[n, 2]`` of a vessel, outside and inside."""
     outside = np.asarray(outside, float)
     inside = np.maximum(outside - [thickness, 0], [TINY, -np.inf]) + np.array([0, lift])
     return np.concatenate([outside, inside[::-1]])
@@ -94,11 +94,11 @@ def apple(thing: Thing) -> None:
     profile = smooth_profile(
         [(0, 0.05), (0.1, 0), (0.24, 0.12), (0.3, 0.32), (0.22, 0.47), (0.08, 0.49), (0, 0.42)]
     )
-    mottle = tuple(0.6 * channel + 0.06 for channel in colour_of(thing.colour))
+    mottle = tuple(0.6 * channel + 0.06 for channel in color_of(thing.color))
     skin = thing.paint(roughness=0.35, pattern="noise", second=mottle, scale=6, coat=0.25)
     thing.add(lathe(profile), skin)
     stalk = tube([(0, 0, 0.42), (0.02, 0, 0.5), (0.05, 0, 0.57)], [0.014, 0.012, 0.016], 8)
-    thing.add(stalk, thing.paint(COLOURS["brown"], roughness=0.7), part="stalk")
+    thing.add(stalk, thing.paint(COLORS["brown"], roughness=0.7), part="stalk")
 
 
 def duck(thing: Thing) -> None:
@@ -106,11 +106,11 @@ def duck(thing: Thing) -> None:
     thing.add(ellipsoid((0, 0, 0.2), (0.32, 0.24, 0.2)), rubber)
     thing.add(ellipsoid((0.2, 0, 0.5), (0.17, 0.16, 0.17)), rubber)
     thing.add(ellipsoid((-0.3, 0, 0.34), (0.15, 0.1, 0.06)), rubber)
-    eye = thing.paint(COLOURS["black"], roughness=0.1)
+    eye = thing.paint(COLORS["black"], roughness=0.1)
     for side in (-1, 1):
         thing.add(ellipsoid((-0.02, side * 0.21, 0.24), (0.18, 0.06, 0.1)), rubber)
         thing.add(ellipsoid((0.33, side * 0.08, 0.56), (0.025, 0.025, 0.03)), eye)
-    beak = COLOURS["red" if thing.colour == "orange" else "orange"]
+    beak = COLORS["red" if thing.color == "orange" else "orange"]
     thing.add(ellipsoid((0.38, 0, 0.47), (0.1, 0.08, 0.03)), thing.paint(beak, roughness=0.35), part="beak")
 
 
@@ -136,11 +136,11 @@ def mug(thing: Thing) -> None:
 
 def books(thing: Thing) -> None:
     rng, bottom = thing.rng, 0.0
-    others = rng.choice([name for name in COLOURS if name != thing.colour], 3, replace=False)
-    for name in [thing.colour, *others][: rng.integers(2, 5)]:
+    others = rng.choice([name for name in COLORS if name != thing.color], 3, replace=False)
+    for name in [thing.color, *others][: rng.integers(2, 5)]:
         thickness, width, depth = rng.uniform(0.08, 0.13), rng.uniform(0.55, 0.7), rng.uniform(0.4, 0.48)
         turn = rng.uniform(-0.25, 0.25)
-        cover = thing.paint(varied(colour_of(str(name)), rng), roughness=0.5, bump=0.1)
+        cover = thing.paint(varied(color_of(str(name)), rng), roughness=0.5, bump=0.1)
         boards = [box((width, depth, 0.016), (0, 0, bottom + z)) for z in (0.008, thickness - 0.008)]
         spine = box((0.016, depth, thickness), (-width / 2, 0, bottom + thickness / 2))
         thing.add(joined([*boards, spine]).turned_about_z(turn), cover, smooth=False)
@@ -166,7 +166,7 @@ def ring(thing: Thing) -> None:
 
 
 def cone(thing: Thing) -> None:
-    own, white = thing.paint(roughness=0.4), thing.paint(COLOURS["white"], roughness=0.4)
+    own, white = thing.paint(roughness=0.4), thing.paint(COLORS["white"], roughness=0.4)
     foot, tip, height, base = 0.2, 0.04, 0.62, 0.04
 
     def point(z: float) -> tuple[float, float]:
@@ -201,7 +201,7 @@ def plant(thing: Thing) -> None:
         blades.append(
             leaf(base, azimuth, rng.uniform(0.35, 1.4), rng.uniform(0.3, 0.6), rng.uniform(0.05, 0.09))
         )
-    own = (0.06, 0.28, 0.04) if thing.colour == "green" else colour_of(thing.colour)
+    own = (0.06, 0.28, 0.04) if thing.color == "green" else color_of(thing.color)
     foliage = thing.paint(
         varied(own, rng, 0.3), roughness=0.4, pattern="noise", second=scaled(own, 0.5), scale=8
     )
@@ -211,7 +211,7 @@ def plant(thing: Thing) -> None:
 def lamp(thing: Thing) -> None:
     stand = smooth_profile([(TINY, 0), (0.18, 0), (0.17, 0.04), (0.05, 0.07), (0.025, 0.12), (0.025, 0.7)])
     thing.add(lathe(stand), thing.paint((0.3, 0.2, 0.08), roughness=0.45), part="stand")
-    own = (0.95, 0.78, 0.52) if thing.colour == "yellow" else colour_of(thing.colour)
+    own = (0.95, 0.78, 0.52) if thing.color == "yellow" else color_of(thing.color)
     shade = thing.paint(varied(own, thing.rng, 0.05), roughness=0.8, emission=0.9)
     thing.add(lathe([(0.3, 0.6), (0.16, 1.0)]), shade, part="shade")
     thing.add(ellipsoid((0, 0, 0.75), (0.06, 0.06, 0.08)), thing.paint((1, 0.8, 0.5), emission=12))
@@ -221,7 +221,7 @@ def banana(thing: Thing) -> None:
     angle = np.linspace(-0.9, 0.9, 22)
     path = np.stack([0.42 * np.sin(angle), 0 * angle, 0.5 - 0.42 * np.cos(angle)], 1)
     radii = 0.085 * np.clip(np.sin(np.linspace(0.12, 3.02, 22)), 0.1, 1) ** 0.55
-    own = colour_of(thing.colour)
+    own = color_of(thing.color)
     thing.add(
         tube(path, radii, 9), thing.paint(roughness=0.45, pattern="noise", second=scaled(own, 0.7), scale=7)
     )
@@ -233,10 +233,10 @@ def banana(thing: Thing) -> None:
 def teddy(thing: Thing) -> None:
     fur = thing.paint(roughness=0.95, pattern="noise", scale=25, bump=1.0)
     light = thing.paint((0.6, 0.42, 0.25), roughness=0.95, bump=0.8)
-    black = thing.paint(COLOURS["black"], roughness=0.2)
+    black = thing.paint(COLORS["black"], roughness=0.2)
 
-    def blob(centre: ArrayLike, radii: ArrayLike, finish: Any = fur, part: str | None = None) -> None:
-        thing.add(ellipsoid(centre, radii), finish, part=part)
+    def blob(center: ArrayLike, radii: ArrayLike, finish: Any = fur, part: str | None = None) -> None:
+        thing.add(ellipsoid(center, radii), finish, part=part)
 
     blob((0, 0, 0.27), (0.24, 0.26, 0.28))
     blob((0.03, 0, 0.67), 0.22)
@@ -252,8 +252,8 @@ def teddy(thing: Thing) -> None:
 
 
 def ball(thing: Thing) -> None:
-    second = colour_of(
-        str(thing.rng.choice([c for c in ("white", "blue", "yellow", "red") if c != thing.colour]))
+    second = color_of(
+        str(thing.rng.choice([c for c in ("white", "blue", "yellow", "red") if c != thing.color]))
     )
     scale = thing.rng.uniform(1.6, 2.6)
     rubber = thing.paint(roughness=0.35, pattern="stripes", second=second, scale=scale, coat=0.2)
@@ -269,7 +269,7 @@ def candle(thing: Thing) -> None:
     wax = [(TINY, 0), (0.1, 0), (0.1, 0.45), (0.085, 0.46), (TINY, 0.44)]
     thing.add(lathe(wax), thing.paint(roughness=0.5, subsurface=0.5))
     thing.add(
-        tube([(0, 0, 0.44), (0.005, 0, 0.5)], [0.008, 0.006], 6), thing.paint(COLOURS["black"], roughness=0.9)
+        tube([(0, 0, 0.44), (0.005, 0, 0.5)], [0.008, 0.006], 6), thing.paint(COLORS["black"], roughness=0.9)
     )
     flame = smooth_profile([(TINY, 0.49), (0.025, 0.52), (0.018, 0.57), (TINY, 0.63)], 12)
     thing.add(lathe(flame, 12), thing.paint((1, 0.55, 0.12), emission=8), part="flame")
@@ -281,7 +281,7 @@ def bottle(thing: Thing) -> None:
     profile = smooth_profile(
         [(TINY, 0), (0.13, 0), (0.145, 0.04), (0.145, 0.45), (0.06, 0.62), (0.05, 0.8)], 36
     )
-    tint = tuple(channel**0.5 for channel in colour_of(thing.colour))
+    tint = tuple(channel**0.5 for channel in color_of(thing.color))
     thing.add(lathe(profile), thing.paint(tint, roughness=0.08, transmission=0.75))
     cork = lathe([(0.055, 0.76), (0.055, 0.86), (TINY, 0.86)])
     thing.add(cork, thing.paint((0.5, 0.3, 0.15), roughness=0.8), part="cork")
@@ -291,7 +291,7 @@ def pumpkin(thing: Thing) -> None:
     profile = smooth_profile(
         [(0, 0.06), (0.15, 0.01), (0.3, 0.15), (0.32, 0.28), (0.2, 0.42), (0.05, 0.41), (0, 0.38)]
     )
-    skin = thing.paint(roughness=0.5, bump=0.1, pattern="noise", second=scaled(colour_of(thing.colour), 0.8))
+    skin = thing.paint(roughness=0.5, bump=0.1, pattern="noise", second=scaled(color_of(thing.color), 0.8))
     thing.add(lathe(profile, 90, ribs=9, rib_depth=0.14), skin)
     stalk = tube([(0, 0, 0.37), (0.01, 0, 0.45), (0.06, 0, 0.52)], [0.05, 0.03, 0.035], 8)
     thing.add(stalk, thing.paint((0.14, 0.18, 0.05), roughness=0.8), part="stalk")
@@ -300,7 +300,7 @@ def pumpkin(thing: Thing) -> None:
 def car(thing: Thing) -> None:
     lacquer = thing.paint(roughness=0.25, metallic=0.1, coat=0.5)
     glass = thing.paint((0.02, 0.03, 0.04), roughness=0.15)
-    tyre, hub = thing.paint(COLOURS["black"], roughness=0.8), thing.paint((0.6, 0.6, 0.6), roughness=0.4)
+    tyre, hub = thing.paint(COLORS["black"], roughness=0.8), thing.paint((0.6, 0.6, 0.6), roughness=0.4)
     lens = thing.paint((0.9, 0.9, 0.7), roughness=0.2)
     thing.add(box((0.7, 0.34, 0.15), (0, 0, 0.17)), lacquer, smooth=False, bevel=0.04)
     cabin = box((0.4, 0.3, 0.16), (-0.03, 0, 0.31)).tapered_above(0.3, (0.75, 0.88, 1))
@@ -318,7 +318,7 @@ def car(thing: Thing) -> None:
 
 
 def crate(thing: Thing) -> None:
-    own = (0.42, 0.24, 0.1) if thing.colour == "brown" else colour_of(thing.colour)
+    own = (0.42, 0.24, 0.1) if thing.color == "brown" else color_of(thing.color)
     wood = thing.paint(varied(own, thing.rng), roughness=0.6, pattern="wood", scale=5, bump=0.2)
     for z in (0.07, 0.21, 0.35):
         for side in (-1, 1):
@@ -331,10 +331,10 @@ def crate(thing: Thing) -> None:
 
 @dataclass(frozen=True)
 class Kind:
-    """A builder, the colours natural to the kind, and the radius of its footprint."""
+    """A builder, the natural colors of the kind, and the radius of its footprint."""
 
     build: Callable[[Thing], None]
-    colours: tuple[str, ...]
+    colors: tuple[str, ...]
     radius: float
 
 
@@ -360,15 +360,15 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def make(kind: str, colour: str, number: int, rng: np.random.Generator) -> Thing:
-    """A thing of ``kind``, standing at the origin.
+def make(kind: str, color: str, number: int, rng: np.random.Generator) -> Thing:
+    """An object of ``kind`` at the origin.
 
     Args:
         kind: Key of ``KINDS``.
-        colour: Key of ``COLOURS`` or ``METALS``.
+        color: Key of ``COLORS`` or ``METALS``.
         number: Its number in the scene, from 1.
         rng: For what differs from one such thing to the next: shade, leaves, book sizes.
     """
-    thing = Thing(kind, colour, number, rng)
+    thing = Thing(kind, color, number, rng)
     KINDS[kind].build(thing)
     return thing

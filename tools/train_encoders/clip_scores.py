@@ -1,4 +1,4 @@
-"""What the image-text encoder can do, measured on scenes that training did not see."""
+"""Scores of the image-text encoder on scenes outside the training set."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 import torch
 from crops import Crop
 from torch import Tensor
-from words import CANONICAL, COLOURS, FALSE, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
+from words import CANONICAL, COLORS, FALSE, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
 
 _METALS = ("gold", "silver", "copper")
-_MANY_COLOURED = ("books", "floor")
-"""Kinds whose colour is not asked."""
+_MANY_COLORED = ("books", "floor")
+"""Kinds whose color is not asked."""
 
 EncodeImages = Callable[[Sequence[Crop]], Tensor]
 EncodeText = Callable[[Sequence[str]], Tensor]
 
 
-def colour_is_asked(label: Label) -> bool:
-    """A matte thing in the colour of gold looks yellow: metal colours are asked of rings only."""
-    return label.kind not in _MANY_COLOURED and (label.colour not in _METALS or label.kind == "ring")
+def color_is_asked(label: Label) -> bool:
+    """Whether a color is tested for a kind: metal colors are, for rings only. Matte gold looks yellow."""
+    return label.kind not in _MANY_COLORED and (label.color not in _METALS or label.kind == "ring")
 
 
 def _top1(images: Tensor, texts: Tensor, owners: Sequence, truths: Sequence) -> float:
@@ -29,14 +29,14 @@ def _top1(images: Tensor, texts: Tensor, owners: Sequence, truths: Sequence) -> 
 
 
 def _questions(encode_text: EncodeText) -> tuple[list[str], Tensor, list[tuple[str, str]], Tensor]:
-    """All kinds and how they are asked for, and all pairs of kind and colour."""
+    """All kinds with their phrases, and all pairs of kind and color."""
     kinds = list(NAMES)
-    pairs = [(kind, colour) for kind in kinds for colour in COLOURS if colour_is_asked(Label(kind, colour))]
+    pairs = [(kind, color) for kind in kinds for color in COLORS if color_is_asked(Label(kind, color))]
     return (
         kinds,
         encode_text([f"a photo of a {NAMES[kind][0]}" for kind in kinds]),
         pairs,
-        encode_text([f"a photo of a {colour} {NAMES[kind][0]}" for kind, colour in pairs]),
+        encode_text([f"a photo of a {color} {NAMES[kind][0]}" for kind, color in pairs]),
     )
 
 
@@ -46,24 +46,24 @@ def zero_shot(
     encode_images: EncodeImages,
     encode_text: EncodeText,
 ) -> dict[str, float]:
-    """Top-1 accuracies; every question is "which of these does the crop show?".
+    """Top-1 accuracies of classifying crops.
 
     Args:
         seen: Dominated crops of scenes like those of training.
-        unseen: Dominated crops of pairs of kind and colour that no training scene holds.
+        unseen: Dominated crops of pairs of kind and color that no training scene holds.
         encode_images: Crops to unit vectors.
         encode_text: Texts to unit vectors.
     """
     kinds, usual, pair_keys, pair_texts = _questions(encode_text)
     images, labels = encode_images([crop for crop, _ in seen]), [label for _, label in seen]
     scores = {"kind": _top1(images, usual, kinds, [label.kind for label in labels])}
-    asked = [row for row, label in enumerate(labels) if colour_is_asked(label)]
-    truths = [(labels[row].kind, labels[row].colour) for row in asked]
-    scores["kind_and_colour"] = _top1(images[asked], pair_texts, pair_keys, truths)
+    asked = [row for row, label in enumerate(labels) if color_is_asked(label)]
+    truths = [(labels[row].kind, labels[row].color) for row in asked]
+    scores["kind_and_color"] = _top1(images[asked], pair_texts, pair_keys, truths)
     if unseen:
         new, news = encode_images([crop for crop, _ in unseen]), [label for _, label in unseen]
         scores["unseen_kind"] = _top1(new, usual, kinds, [label.kind for label in news])
-        scores["unseen_pair"] = _top1(new, pair_texts, pair_keys, [(la.kind, la.colour) for la in news])
+        scores["unseen_pair"] = _top1(new, pair_texts, pair_keys, [(la.kind, la.color) for la in news])
     never, known = [], []
     for kind, names in SYNONYMS.items():
         rows = [row for row, label in enumerate(labels) if label.kind == kind]
@@ -80,13 +80,13 @@ def zero_shot(
 def by_pair(
     unseen: Sequence[tuple[Crop, Label]], encode_images: EncodeImages, encode_text: EncodeText
 ) -> dict[str, tuple[float, float, int]]:
-    """Of each pair of kind and colour that training lacks: top-1 of the kind, of both, and the number of crops.
+    """For each held-out pair of kind and color: top-1 accuracy of the kind and of the pair, and the number of crops.
 
-    The questions are those of `zero_shot`.
+    The classes are those of `zero_shot`.
     """
     kinds, usual, pairs, pair_texts = _questions(encode_text)
     images = encode_images([crop for crop, _ in unseen])
-    asked = [(label.kind, label.colour) for _, label in unseen]
+    asked = [(label.kind, label.color) for _, label in unseen]
     found = {}
     for pair in sorted(set(asked)):
         rows = [row for row, other in enumerate(asked) if other == pair]
@@ -105,7 +105,7 @@ def calibration(
     *,
     temperature: float = 10.0,
 ) -> dict[str, float]:
-    """Whether right phrase > canonical phrases > wrong phrase, which relevancy at 0.5 rests on.
+    """How often right phrase > canonical phrases > wrong phrase, the assumption behind the relevancy threshold 0.5.
 
     Args:
         crops: Any crops.
@@ -137,7 +137,7 @@ def parts_found(
     encode_images: EncodeImages,
     encode_text: EncodeText,
 ) -> dict[str, float]:
-    """How often the name of a part beats the canonical phrases where it is true, and does not where it is false.
+    """How often the name of a part scores above the canonical phrases where it is true, and below where it is false.
 
     Args:
         crops: Of parts, and of the same things beside them.

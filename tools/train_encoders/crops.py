@@ -1,8 +1,7 @@
-"""Training frames in memory, and crops of them with what they show. Needs numpy and Pillow.
+"""Training frames in memory, and labeled crops of them. Needs numpy and Pillow.
 
-What a crop shows is what lies around its middle: every pixel's label counts by a Gaussian about the centre.
-An encoder trained so speaks for the middle of a crop, as one trained on photographs speaks for their subject,
-and that is what the crop pyramid (section 3.2 of the paper) asks of it.
+The labels of a crop are weighted by a Gaussian around its center. The embedding therefore describes the center of a
+crop, as the crop pyramid (section 3.2 of the paper) requires; encoders trained on photos describe their subject.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from words import Label
 GRID = 24
 """Samples along a side of a crop to find out what it shows."""
 SIGMA = 0.22
-"""Standard deviation of the weight about the centre, in sides of the crop."""
+"""Standard deviation of the weight about the center, in sides of the crop."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture and what each pixel shows.
+    """An image and the label of each pixel.
 
     Args:
         scene: Name of its scene; frames of one scene show the same things.
@@ -42,12 +41,12 @@ class Frame:
 
     @functools.cached_property
     def thing_boxes(self) -> dict[int, Box]:
-        """Pixels each thing spans: (left, top, right, bottom), the last two within."""
+        """Bounding box of each object in pixels: (left, top, right, bottom), inclusive."""
         return _boxes(self.things)
 
     @functools.cached_property
     def code_boxes(self) -> dict[int, Box]:
-        """The same for every code."""
+        """Bounding box of each code, as `thing_boxes`."""
         return _boxes(self.codes)
 
 
@@ -65,7 +64,7 @@ def _boxes(values: NDArray[np.integer]) -> dict[int, Box]:
 def _pixel_of(
     values: NDArray[np.integer], wanted: int, box: Box, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """A random pixel (x, y) with the wanted value, within its box."""
+    """A random pixel (x, y) with this value, within its box."""
     left, top, right, bottom = box
     for _ in range(40):
         x, y = int(rng.integers(left, right + 1)), int(rng.integers(top, bottom + 1))
@@ -77,7 +76,7 @@ def _pixel_of(
 
 
 class Frames:
-    """All frames of some folders, and the table of the labels that occur."""
+    """All frames of some folders, and the table of their labels."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self.labels: list[Label] = []
@@ -90,7 +89,7 @@ class Frames:
                 for number, thing in json.loads(description.read_text()).items():
                     by_part = {0: None, **{part: name for name, part in thing["parts"].items()}}
                     for part, name in by_part.items():
-                        label = Label(thing["kind"], thing["colour"], thing["finish"], name)
+                        label = Label(thing["kind"], thing["color"], thing["finish"], name)
                         lookup[10 * int(number) + part] = places.setdefault(label, len(places))
                 for picture in sorted(description.parent.glob(f"{description.stem}_*.png")):
                     index = np.load(picture.with_suffix(".npz"), allow_pickle=False)["index"]
@@ -105,7 +104,7 @@ class Frames:
 
     @functools.cached_property
     def of_parts(self) -> dict[str, list[tuple[Frame, int]]]:
-        """Where each part is seen: frames, and the part's code in them; eight pixels at least."""
+        """Frames that show each part with at least eight pixels, and the part's code in them."""
         found: dict[str, list[tuple[Frame, int]]] = {}
         for frame in self.frames:
             codes, counts = np.unique(frame.codes, return_counts=True)
@@ -116,7 +115,7 @@ class Frames:
         return found
 
 
-def centre_weights(grid: int = GRID) -> NDArray[np.float64]:
+def center_weights(grid: int = GRID) -> NDArray[np.float64]:
     """Weights ``[grid * grid]`` of the samples of a crop; they sum to 1."""
     position = (np.arange(grid) + 0.5) / grid - 0.5
     line = np.exp(-(position**2) / (2 * SIGMA**2))
@@ -124,12 +123,12 @@ def centre_weights(grid: int = GRID) -> NDArray[np.float64]:
     return weights / weights.sum()
 
 
-_WEIGHTS = centre_weights()
+_WEIGHTS = center_weights()
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of a frame: box (left, top, side) in pixels, and what it shows, label by label."""
+    """A square of a frame: box (left, top, side) in pixels, and its labels with their weights."""
 
     frame: Frame
     box: tuple[float, float, float]
@@ -162,7 +161,7 @@ def cut(frame: Frame, left: float, top: float, side: float) -> Crop:
 
 
 def patch_crop(crop: Crop, patch: int, count: int) -> Crop:
-    """One of the patches of a crop as a crop of its own, everything in it weighing the same.
+    """A patch of a crop as a crop with uniform weights.
 
     Args:
         crop: A whole crop.
@@ -182,7 +181,7 @@ def patch_crop(crop: Crop, patch: int, count: int) -> Crop:
 
 
 def random_crop(frames: Frames, rng: np.random.Generator) -> Crop:
-    """A crop of a random frame: around a thing, around a part, or anywhere; of any size."""
+    """A crop of a random frame, of any size: around an object, around a part, or anywhere."""
     frame = frames.frames[int(rng.integers(len(frames)))]
     height, width = frame.codes.shape
     draw = rng.random()
@@ -210,7 +209,7 @@ def random_crop(frames: Frames, rng: np.random.Generator) -> Crop:
 
 
 def _around(frame: Frame, x: float, y: float, side: float) -> Crop:
-    """The crop with this middle, moved into the frame where it would reach out of it."""
+    """The crop with this center, shifted to lie within the frame."""
     height, width = frame.codes.shape
     left = float(np.clip(x - side / 2, 0, width - side))
     top = float(np.clip(y - side / 2, 0, height - side))
@@ -222,9 +221,9 @@ def part_crops(
 ) -> list[Crop]:
     """Crops of a part, of the rest of the same thing, and of what is ``near``.
 
-    Anywhere in the frames a handle is seen in one crop of two hundred; and only a mug's body and the edge of a
-    table, cut out in the same size, say what a handle is not. Every part is drawn as often as any other, but handles,
-    which look most like what they are not, ``handles`` times as often.
+    A random crop shows a handle in one case of two hundred. Negatives of handles are crops of the same size, such
+    as a mug's body or the edge of a table. All parts are equally frequent, except handles, which are the most
+    ambiguous: ``handles`` times as frequent.
     """
     crops: list[Crop] = []
     parts = [part for part in frames.of_parts for _ in range(handles if part == "handle" else 1)]
@@ -247,9 +246,9 @@ def part_crops(
 
 
 def dominated_crops(frames: Frames, count: int, rng: np.random.Generator) -> list[tuple[Crop, Label]]:
-    """Crops of which one thing has at least half of the weight, with that thing's label, for the scores.
+    """Crops in which one object has at least half of the weight, with its label, for the scores.
 
-    Two thirds are cut around things, the rest anywhere, as in the prototype whose numbers are to be beaten.
+    Two thirds are cut around objects, the rest anywhere.
     """
     found = []
     while len(found) < count:
@@ -270,7 +269,7 @@ def dominated_crops(frames: Frames, count: int, rng: np.random.Generator) -> lis
         shares: dict[tuple[str, str, str | None], float] = {}
         for code, weight in zip(crop.codes, crop.weights):
             label = frames.labels[code]
-            key = (label.kind, label.colour, label.finish)
+            key = (label.kind, label.color, label.finish)
             shares[key] = shares.get(key, 0) + weight
         best = max(shares, key=lambda key: shares[key], default=None)
         if best is not None and shares[best] >= 0.5:

@@ -1,4 +1,4 @@
-"""How well dense features group what belongs together, measured on scenes that training did not see."""
+"""How well dense features cluster by object, on scenes outside the training set."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ CLUSTERS = 24
 
 
 def patch_things(frame: Frame) -> NDArray[np.int64]:
-    """The thing that fills most of each patch ``[H / 8, W / 8]``."""
+    """The object with the most pixels in each patch ``[H / 8, W / 8]``."""
     height, width = frame.things.shape
     patches = frame.things.reshape(height // PATCH, PATCH, width // PATCH, PATCH).swapaxes(1, 2)
     patches = patches.reshape(height // PATCH, width // PATCH, -1)
     return np.apply_along_axis(lambda patch: np.bincount(patch).argmax(), 2, patches)
 
 
-def mean_colours(frame: Frame) -> NDArray[np.float64]:
-    """Raw colour, what dense features have to beat: the mean of each patch ``[H / 8, W / 8, 3]``."""
+def mean_colors(frame: Frame) -> NDArray[np.float64]:
+    """Mean color of each patch ``[H / 8, W / 8, 3]``, the baseline of dense features."""
     pixels = np.asarray(frame.image, float) / 255
     height, width = frame.things.shape
     return pixels.reshape(height // PATCH, PATCH, width // PATCH, PATCH, 3).mean((1, 3))
 
 
 def grouping(frames: Frames, features: Callable[[Frame], NDArray], *, scenes: int = 10) -> dict[str, float]:
-    """Purity and normalised mutual information of k-means clusters with the things, scene by scene.
+    """Purity and normalized mutual information between k-means clusters and objects, for each scene.
 
     Args:
         frames: Frames; those of one scene are clustered together.

@@ -1,8 +1,8 @@
-"""Renders random scenes to training frames. Needs Blender.
+"""Render random scenes to training frames. Needs Blender.
 
 Written to a folder, for scene S and view V, every file whole or not at all:
 
-    S.json      what the indices mean: {number: {kind, colour, finish, parts: {name: part number}}}
+    S.json      what the indices mean: {number: {kind, color, finish, parts: {name: part number}}}
     S_V.png     picture, 8-bit RGB
     S_V.npz     index uint8 [H, W]: 10 * number of the thing + number of the part; 0 is nothing
 
@@ -30,10 +30,10 @@ WIDTH, HEIGHT = 320, 240
 def render_frames(
     folder: Path, scenes: list[int], *, views: int, samples: int, threads: int, say: Callable[[str], None]
 ) -> None:
-    """Renders the scenes with these seeds; those in the folder already are kept.
+    """Render the scenes with these seeds; existing ones are kept.
 
     Args:
-        folder: Made if needed. The name "unseen" asks for pairs of kind and colour that training leaves out.
+        folder: Made if needed. The name "unseen" asks for pairs of kind and color that training leaves out.
         scenes: Seeds.
         views: Pictures of each.
         samples: Paths a pixel; what they leave is denoised.
@@ -63,7 +63,7 @@ def render_frames(
         meaning = {
             thing.number: {
                 "kind": thing.kind,
-                "colour": thing.colour,
+                "color": thing.color,
                 "finish": scene.finishes.get(thing.number),
                 "parts": thing.parts,
             }

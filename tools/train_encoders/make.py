@@ -1,4 +1,4 @@
-"""Remakes the embedded encoders from nothing: see README.md."""
+"""Train the bundled encoders (see README.md)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TRAINING_SEED, SEEN_SEED, UNSEEN_SEED = 0, 800_000, 900_000
 
 
 def render(options: argparse.Namespace) -> None:
-    """Frames of all random scenes; those already there are kept."""
+    """Render the frames of all random scenes; existing ones are kept."""
     from frames import render_frames  # needs Blender
     from quiet import quiet_output
 
@@ -41,7 +41,7 @@ def render(options: argparse.Namespace) -> None:
 
 
 def train(options: argparse.Namespace) -> None:
-    """Both encoders; the last line of their logs in the work folder holds their scores."""
+    """Train both encoders; the last line of each log in the work folder has the scores."""
     from train_clip import PHASES, train_clip
     from train_dino import DinoTraining, train_dino
     from workers import run_workers
@@ -63,7 +63,7 @@ def train(options: argparse.Namespace) -> None:
 
 
 def score(options: argparse.Namespace) -> None:
-    """Prints what the encoders in the output folder score on the frames that training does not see."""
+    """Print the scores of the encoders in the output folder on the held-out frames."""
     from clip_scores import by_pair
     from crops import Frames
     from train_clip import ClipTraining, Examination, Trainer
@@ -78,7 +78,7 @@ def score(options: argparse.Namespace) -> None:
         for pair, (kind, both, count) in by_pair(
             questions.unseen, trainer.encode_images, trainer.encode_text
         ).items():
-            print(f"{pair:16s} kind {kind:.2f}  kind and colour {both:.2f}  of {count} crops")
+            print(f"{pair:16s} kind {kind:.2f}  kind and color {both:.2f}  of {count} crops")
     if "dino" in options.models:
         model = ViTModel.from_pretrained(options.output / "dino", add_pooling_layer=False)
         print(json.dumps({name: round(value, 4) for name, value in dense_scores(model, seen).items()}))

@@ -1,4 +1,4 @@
-"""Random table tops for training: any kind in any colour, any surface, light and camera. Needs Blender."""
+"""Random table tops for training: any kind in any color, any surface, light and camera. Needs Blender."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 # The recipes of the things are those of the demo scenes; make.py puts their folder on the path.
 from layouts import look_from
-from materials import COLOURS, METALS, material, scaled, varied
+from materials import COLORS, METALS, material, scaled, varied
 from numpy.typing import NDArray
 from shapes import box, draped_sheet, joined
 from surroundings import light_room, make_table
@@ -22,7 +22,7 @@ TOP = (1.75, 1.3)
 
 @dataclass
 class RandomScene:
-    """What stands in a random scene, and its views."""
+    """The objects of a random scene, and its views."""
 
     things: list[Thing]
     poses: list[NDArray[np.float64]]
@@ -33,7 +33,7 @@ class RandomScene:
 
 
 def random_scene(rng: np.random.Generator, views: int, *, held_out: bool) -> RandomScene:
-    """Fills the empty Blender file.
+    """Fill the empty Blender file.
 
     Args:
         rng: Decides everything.
@@ -44,13 +44,13 @@ def random_scene(rng: np.random.Generator, views: int, *, held_out: bool) -> Ran
     finishes: dict[int, str] = {}
     spots: list[tuple[float, float, float]] = []
     for _ in range(int(rng.integers(9, 14))):
-        kind, colour = _pair(rng, held_out)
+        kind, color = _pair(rng, held_out)
         scale = float(rng.uniform(0.8, 1.25))
         spot = _free_spot(spots, KINDS[kind].radius * scale, rng)
         if spot is None:
             continue
         spots.append((*spot, KINDS[kind].radius * scale))
-        thing = make(kind, colour, len(things) + 1, rng)
+        thing = make(kind, color, len(things) + 1, rng)
         lift = 0.03 if rng.random() < 0.7 else float(rng.uniform(0.0, 0.1))
         thing.place(*spot, lift, float(rng.uniform(0, 2 * math.pi)), scale)
         things.append(thing)
@@ -76,21 +76,21 @@ def random_scene(rng: np.random.Generator, views: int, *, held_out: bool) -> Ran
 
 
 def _pair(rng: np.random.Generator, held_out: bool) -> tuple[str, str]:
-    """A kind, and a colour: natural to the kind half the time, else any."""
+    """A kind and a color: in half of the cases a natural color of the kind, else any."""
     if held_out and rng.random() < 0.5:
         return sorted(HELD_OUT_PAIRS)[int(rng.integers(len(HELD_OUT_PAIRS)))]
     while True:
         kind = str(rng.choice(sorted(KINDS)))
         natural = rng.random() < 0.45
-        colour = str(rng.choice(KINDS[kind].colours if natural else [*COLOURS, *METALS]))
-        if (kind, colour) not in HELD_OUT_PAIRS:
-            return kind, colour
+        color = str(rng.choice(KINDS[kind].colors if natural else [*COLORS, *METALS]))
+        if (kind, color) not in HELD_OUT_PAIRS:
+            return kind, color
 
 
 def _free_spot(
     taken: list[tuple[float, float, float]], radius: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """A place on the table that overlaps little with what stands there."""
+    """A position on the table with little overlap with other objects."""
     for _ in range(40):
         x, y = (float(rng.uniform(-half, half)) for half in TOP)
         if all(math.hypot(x - a, y - b) > 0.85 * (radius + other) for a, b, other in taken):
@@ -99,7 +99,7 @@ def _free_spot(
 
 
 def _camera(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -> NDArray[np.float64]:
-    """A level camera before the table that looks near one of the things."""
+    """A level camera in front of the table that looks close to one of the objects."""
     x, y, _ = spots[int(rng.integers(len(spots)))]
     pull = rng.uniform(0.3, 1.0)
     target = np.array([x * pull, y * pull, rng.uniform(0.1, 0.45)])
@@ -118,29 +118,29 @@ def _camera(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -
 def _table(number: int, rng: np.random.Generator) -> tuple[Thing, str]:
     if rng.random() < 0.6:
         return make_table(number, rng), "wooden"
-    table = Thing("table", str(rng.choice([c for c in COLOURS if c != "brown"])), number, rng)
+    table = Thing("table", str(rng.choice([c for c in COLORS if c != "brown"])), number, rng)
     if rng.random() < 0.4:
         # Other woods keep the grain and the name.
-        table.colour, tone = "brown", varied((0.5, 0.3, 0.14), rng, 0.25)
+        table.color, tone = "brown", varied((0.5, 0.3, 0.14), rng, 0.25)
         top = material(tone, rng, roughness=0.5, pattern="wood", scale=rng.uniform(2, 5), bump=0.1)
     else:
         top = table.paint(vary=0.15, roughness=float(rng.uniform(0.3, 0.8)))
     table.add(box((4.4, 3.2, 0.12), (0, 0, -0.06)), top, smooth=False, bevel=0.02)
     legs = joined([box((0.16, 0.16, 2.0), (x, y, -1.1)) for x in (-2, 2) for y in (-1.4, 1.4)])
     table.add(legs, top, smooth=False)
-    return table, "wooden" if table.colour == "brown" else "painted"
+    return table, "wooden" if table.color == "brown" else "painted"
 
 
 def _cloth(number: int, rng: np.random.Generator) -> tuple[Thing, str]:
-    cloth = Thing("cloth", str(rng.choice([*COLOURS])), number, rng)
+    cloth = Thing("cloth", str(rng.choice([*COLORS])), number, rng)
     style = str(rng.choice(["checkered", "checkered", "plain", "striped"]))
     pattern = {"checkered": "checker", "plain": None, "striped": "stripes"}[style]
-    light = (0.74, 0.72, 0.68) if cloth.colour != "white" else (0.5, 0.48, 0.45)
+    light = (0.74, 0.72, 0.68) if cloth.color != "white" else (0.5, 0.48, 0.45)
     fabric = cloth.paint(
         roughness=0.9, pattern=pattern, second=light, scale=float(rng.uniform(5, 10)), bump=0.15
     )
     if style == "striped":
-        style = "plain"  # stripes run along z, which a cloth hardly has: what is seen is one colour
+        style = "plain"  # stripes run along z, which a cloth hardly has: what is seen is one color
     cloth.add(
         draped_sheet(float(rng.uniform(0.8, 1.2)), float(rng.uniform(0.5, 0.8)), rng.uniform(0, 6, 3)), fabric
     )
@@ -149,10 +149,10 @@ def _cloth(number: int, rng: np.random.Generator) -> tuple[Thing, str]:
 
 
 def _wall(number: int, rng: np.random.Generator) -> tuple[Thing, str]:
-    wall = Thing("wall", str(rng.choice([*COLOURS])), number, rng)
+    wall = Thing("wall", str(rng.choice([*COLORS])), number, rng)
     if rng.random() < 0.45:
-        wall.colour = str(rng.choice(["red", "red", "gray", "white", "brown"]))
-        tone = {"red": (0.36, 0.1, 0.06)}.get(wall.colour, COLOURS[wall.colour])
+        wall.color = str(rng.choice(["red", "red", "gray", "white", "brown"]))
+        tone = {"red": (0.36, 0.1, 0.06)}.get(wall.color, COLORS[wall.color])
         finish, style = (
             material(
                 varied(tone, rng),
@@ -166,7 +166,7 @@ def _wall(number: int, rng: np.random.Generator) -> tuple[Thing, str]:
             "brick",
         )
     else:
-        own = tuple(0.35 * channel + 0.22 for channel in COLOURS[wall.colour])  # walls are pale
+        own = tuple(0.35 * channel + 0.22 for channel in COLORS[wall.color])  # walls are pale
         second = scaled(own, 0.72)
         pattern = "plaster" if rng.random() < 0.6 else None
         finish, style = (

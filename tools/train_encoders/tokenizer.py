@@ -1,4 +1,4 @@
-"""A byte-pair tokenizer of CLIP's form, learnt from the phrases of `words.py`."""
+"""A byte-pair tokenizer of CLIP's form, learned from the phrases of `words.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, tr
 from transformers import CLIPTokenizer
 from words import (
     CANONICAL,
-    COLOURS,
+    COLORS,
     NAMES,
     PARTS,
     SYNONYMS,
@@ -26,11 +26,11 @@ _SPLIT = r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
 
 
 def learn_tokenizer(folder: Path, *, phrases: int = 60_000, seed: int = 0) -> CLIPTokenizer:
-    """Learns the tokens of a sample of phrases and saves the tokenizer."""
+    """Learn the tokens of a sample of phrases and save the tokenizer."""
     rng = np.random.default_rng(seed)
     sample = [in_sentence(any_phrase(rng), rng) for _ in range(phrases)]
     sample += [*CANONICAL, *UNKNOWN_TRAINED] * 50
-    for words in (NAMES, PARTS, COLOURS, SYNONYMS):
+    for words in (NAMES, PARTS, COLORS, SYNONYMS):
         sample += [word for group in words.values() for word in group] * 50
     model = Tokenizer(
         models.BPE(unk_token="<|endoftext|>", end_of_word_suffix="</w>", continuing_subword_prefix="")

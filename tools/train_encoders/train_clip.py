@@ -1,12 +1,12 @@
-"""Trains the image-text encoder: contrast between crops and phrases, and relevancy as LERF asks it.
+"""Train the image-text encoder: contrast between crops and phrases, and LERF's relevancy.
 
-Five losses on a batch of crops and phrases, of which `truth.py` knows which are true of which:
+Five losses on a batch of crops and phrases; `truth.py` states which phrase is true of which crop:
 
 - contrast: among all phrases, softmax of a crop's similarities falls on those that are true of it, and for a
   phrase on the crops it is true of (several right answers a row);
-- patches: every patch token tells kind, colour and part of what its middle shows, by linear heads that are
+- patches: every patch token tells kind, color and part of what its middle shows, by linear heads that are
   thrown away afterwards; 36 answers a crop instead of one make the image tower learn several times faster;
-- composition: the words of two kinds in two colours form a parallelogram, so pairs never seen have their place;
+- composition: the words of two kinds in two colors form a parallelogram, so pairs never seen have their place;
 - relevancy: sigmoid(10 (cos(crop, phrase) - max over the canonical phrases of cos(crop, canonical))), which is
   LERF's relevancy, is a probability: cross-entropy with the truth. So the right phrase comes to lie above
   "object", "things", "stuff", "texture", and a wrong one below them;
@@ -38,7 +38,7 @@ from transformers import CLIPConfig, CLIPImageProcessor, CLIPModel, CLIPTokenize
 from truth import BESIDE, LACKS_PART, TruthTable
 from words import (
     CANONICAL,
-    COLOURS,
+    COLORS,
     FALSE,
     HELD_OUT_PAIRS,
     HUES,
@@ -59,13 +59,13 @@ from words import (
 )
 from workers import average_gradients
 
-KINDS, TINTS, PART_NAMES = list(NAMES), list(COLOURS), [None, *PARTS]
+KINDS, TINTS, PART_NAMES = list(NAMES), list(COLORS), [None, *PARTS]
 PLACES = 8
 """Patches of a crop that are asked about."""
 UNKNOWN = -100
 """An answer that the loss leaves out."""
 NEAR_HUE = 25.0
-"""Degrees within which a turned hue may pass for a colour."""
+"""Degrees within which a turned hue may pass for a color."""
 MEAN = torch.tensor([0.48145466, 0.4578275, 0.40821073]).view(3, 1, 1)
 STD = torch.tensor([0.26862954, 0.26130258, 0.27577711]).view(3, 1, 1)
 
@@ -82,13 +82,13 @@ class ClipTraining:
         text_width, text_layers: Of the text tower.
         dim: Numbers of an embedding.
         temperature: Of the relevancy that is trained: that of queries.
-        grey: Share of the crops shown in grey, of which colour words are open.
-        turned: Share of the crops whose hues are turned, of which colour words are open too.
-        composition: Weight of the loss that makes colours add to kinds alike in all texts.
+        gray: Share of the crops shown in gray, of which color words are open.
+        turned: Share of the crops whose hues are turned, of which color words are open too.
+        composition: Weight of the loss that makes colors add to kinds alike in all texts.
         parts: Share of the crops that are of parts and of the rest of their things.
         near: Whether what is near the things belongs to these crops, and as many phrases ask for parts.
         handles: How often handles are among these, and asked for, for once any other part.
-        centre: Whether a part also counts as shown where it lies in the very middle (`truth.TruthTable`).
+        center: Whether a part also counts as shown where it lies in the very middle (`truth.TruthTable`).
         dense: Weight of the loss of what patches say by themselves, as MaskCLIP reads them.
         beside: Share of the weight below which a part beside the middle is not what a crop shows.
         light: Standard deviation of the logarithm of the light on a crop.
@@ -108,13 +108,13 @@ class ClipTraining:
     text_layers: int = 3
     dim: int = 128
     temperature: float = 10.0
-    grey: float = 0.12
+    gray: float = 0.12
     turned: float = 0.25
     composition: float = 1.0
     parts: float = 0.0
     near: bool = False
     handles: int = 1
-    centre: bool = False
+    center: bool = False
     dense: float = 0.0
     beside: float = LACKS_PART
     light: float = 0.2
@@ -124,12 +124,12 @@ class ClipTraining:
 
 
 REFINEMENT = ClipTraining(
-    steps=2000, rate=4e-4, grey=0.06, turned=0.15, parts=0.3, light=0.1, kept=1.0, heads_alone=150, seed=1
+    steps=2000, rate=4e-4, gray=0.06, turned=0.15, parts=0.3, light=0.1, kept=1.0, heads_alone=150, seed=1
 )
 """What follows on the first training: parts as often as things, whole crops, and light that changes less, or
 gray could not be told from white."""
 PARTS_AGAIN = dataclasses.replace(
-    REFINEMENT, steps=1200, rate=3e-4, parts=0.4, near=True, centre=True, seed=2
+    REFINEMENT, steps=1200, rate=3e-4, parts=0.4, near=True, center=True, seed=2
 )
 """Parts against what only looks like them."""
 DENSE = dataclasses.replace(PARTS_AGAIN, steps=1600, parts=0.45, handles=4, dense=1.0, seed=5)
@@ -150,12 +150,12 @@ PHASES = {
 @dataclass(frozen=True)
 class Batch:
     """Crops ``[B, 3, s, s]`` uint8, texts (the canonical phrases last), truth ``[B, T]`` of the others; kind,
-    colour and part of every patch ``[B, P, 3]``, -100 where unknown; kinds it is not asked about ``[B, P, 22]``."""
+    color and part of every patch ``[B, P, 3]``, -100 where unknown; kinds it is not asked about ``[B, P, 22]``."""
 
     pixels: Tensor
     texts: list[str]
     corners: list[str]
-    """Of parallelograms of kinds and colours, four and four."""
+    """Of parallelograms of kinds and colors, four and four."""
     truth: Tensor
     patches: Tensor
     left_out: Tensor
@@ -164,7 +164,7 @@ class Batch:
 
 
 def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.random.Generator) -> Batch:
-    """A phrase for every crop, a near miss for every second, and some about anything."""
+    """A true phrase for every crop, a near miss for every second one, and some arbitrary phrases."""
     of_parts = round(config.parts * config.batch)
     crops = [random_crop(frames, rng) for _ in range(config.batch - of_parts)]
     crops += part_crops(frames, of_parts, rng, near=config.near, handles=config.handles)
@@ -172,20 +172,20 @@ def make_batch(frames: Frames, table: TruthTable, config: ClipTraining, rng: np.
     truth = table.of(phrases, crops)
     pixels = np.stack([crop.pixels(config.image_size) for crop in crops])
     draw = rng.random(len(crops))
-    grey, turned = draw < config.grey, draw > 1 - config.turned
+    gray, turned = draw < config.gray, draw > 1 - config.turned
     angles = np.zeros(len(crops))
-    pixels[grey] = pixels[grey].mean(-1, keepdims=True).astype(np.uint8)
+    pixels[gray] = pixels[gray].mean(-1, keepdims=True).astype(np.uint8)
     for row in np.nonzero(turned)[0]:
         angles[row] = fair_angle([table.labels[code] for code in crops[row].codes], rng)
         pixels[row] = turned_hues(pixels[row], angles[row])
     leave_open(truth, phrases, crops, table.labels, angles)
-    colourless = grey | turned
-    open_colours(truth, phrases, colourless)
+    colorless = gray | turned
+    open_colors(truth, phrases, colorless)
     texts = [in_sentence(phrase, rng) for phrase in phrases] + list(CANONICAL)
     patches, left_out = patch_answers(crops, table.labels, angles, config)
-    patches[colourless, :, 1] = UNKNOWN
+    patches[colorless, :, 1] = UNKNOWN
     corners = [text for _ in range(config.batch // 12) for text in parallelogram(rng)]
-    places = place_truth(phrases, crops, table, angles, colourless, config, rng)
+    places = place_truth(phrases, crops, table, angles, colorless, config, rng)
     return Batch(
         torch.from_numpy(pixels).permute(0, 3, 1, 2),
         texts,
@@ -219,20 +219,20 @@ def place_truth(
     crops: list[Crop],
     table: TruthTable,
     angles: NDArray[np.float64],
-    colourless: NDArray[np.bool_],
+    colorless: NDArray[np.bool_],
     config: ClipTraining,
     rng: np.random.Generator,
 ) -> NDArray[np.int8]:
     """Truth of the phrases at up to ``PLACES`` patches of every crop, ``OPEN`` at the others.
 
-    Half of the patches are drawn anywhere, half so that everything a crop shows is asked about as often.
+    Half of the patches are drawn uniformly, half such that every label of a crop is covered equally often.
 
     Args:
         phrases: ``T`` of them.
         crops: ``B`` of them.
         table: Knows which labels a phrase is true of.
         angles: By which the hues of the crops are turned, degrees ``[B]``.
-        colourless: Crops of which no colour is asked ``[B]``.
+        colorless: Crops of which no color is asked ``[B]``.
         config: Says how large the patches are, and with `dense` whether they are asked at all.
         rng: Draws the patches.
 
@@ -253,26 +253,26 @@ def place_truth(
     cut = [patch_crop(crops[row], patch, count) for row, patch in zip(rows, patches)]
     found = table.at_places(phrases, cut)
     leave_open(found, phrases, cut, table.labels, angles[rows])
-    open_colours(found, phrases, colourless[rows])
+    open_colors(found, phrases, colorless[rows])
     truth = np.full((len(crops), count**2, len(phrases)), OPEN, np.int8)
     truth[rows, patches] = found
     return truth
 
 
 def middle_codes(crop: Crop, count: int) -> NDArray[np.int32]:
-    """What the middle of each of ``count`` x ``count`` patches shows ``[count * count]``, -1 where nothing is."""
+    """The label at the center of each of ``count`` x ``count`` patches ``[count * count]``; -1 for none."""
     middles = ((np.arange(count) + 0.5) * GRID / count).astype(int)
     return crop.grid[np.ix_(middles, middles)].ravel()
 
 
-def open_colours(truth: NDArray[np.int8], phrases: list[Phrase], colourless: NDArray[np.bool_]) -> None:
-    """Opens what phrases with a colour say of the rows ``[B]`` whose colours are not those of their labels."""
-    asks_colour = np.array([phrase.colour is not None for phrase in phrases])
-    truth[np.ix_(colourless, asks_colour)] = OPEN
+def open_colors(truth: NDArray[np.int8], phrases: list[Phrase], colorless: NDArray[np.bool_]) -> None:
+    """Set phrases with a color to open for the rows ``[B]`` whose colors differ from their labels."""
+    asks_color = np.array([phrase.color is not None for phrase in phrases])
+    truth[np.ix_(colorless, asks_color)] = OPEN
 
 
 def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
-    """A random angle by which hues may turn, degrees, that brings no kind near a colour held out for it; or 0."""
+    """A random rotation of hues in degrees that brings no kind close to a held-out color of it; 0 if none does."""
     for _ in range(20):
         angle = float(rng.uniform(30, 330))
         if not any(label.kind in looks_held_out(label, angle) for label in labels):
@@ -281,7 +281,7 @@ def fair_angle(labels: list[Label], rng: np.random.Generator) -> float:
 
 
 def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
-    """All hues turned by an angle in degrees ``[s, s, 3]``; the grey axis stays where it is."""
+    """All hues rotated by an angle in degrees ``[s, s, 3]``; the gray axis stays fixed."""
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     # Rodrigues' rotation about (1, 1, 1) / sqrt(3), which takes red to green at 120 degrees.
     across = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
@@ -290,14 +290,14 @@ def turned_hues(pixels: NDArray[np.uint8], angle: float) -> NDArray[np.uint8]:
 
 
 def looks_held_out(label: Label, angle: float = 0.0) -> set[str]:
-    """The kinds whose held-out colour a thing has, its hue turned by ``angle`` degrees."""
-    hue = HUES.get(label.colour)
+    """The kinds whose held-out color an object has after its hue is rotated by ``angle`` degrees."""
+    hue = HUES.get(label.color)
     if hue is None:
-        return {kind for kind, colour in HELD_OUT_PAIRS if colour == label.colour}
+        return {kind for kind, color in HELD_OUT_PAIRS if color == label.color}
     return {
         kind
-        for kind, colour in HELD_OUT_PAIRS
-        if colour in HUES and abs((hue + angle - HUES[colour] + 180) % 360 - 180) < NEAR_HUE
+        for kind, color in HELD_OUT_PAIRS
+        if color in HUES and abs((hue + angle - HUES[color] + 180) % 360 - 180) < NEAR_HUE
     }
 
 
@@ -308,10 +308,10 @@ def leave_open(
     labels: list[Label],
     angles: NDArray[np.float64],
 ) -> None:
-    """Opens, of what is false, whether a thing in a colour held out for some kind is of that kind.
+    """Opens, of what is false, whether a thing in a color held out for some kind is of that kind.
 
-    No blue bear is ever shown. If every blue thing still said "not a bear", blue would come to mean just that,
-    and a blue bear could not be told: what is kept from training must be kept from it both ways.
+    Training shows no blue bear. If every blue object were a negative of "bear", blue would imply "not a bear", and a
+    blue bear could not be recognized. Held-out pairs are therefore excluded in both directions.
     """
     means = [
         {phrase.kind} if phrase.kind else _KINDS_OF_QUALITY[phrase.quality] if phrase.quality else set()
@@ -333,11 +333,11 @@ _KINDS_OF_QUALITY = {
 def patch_answers(
     crops: list[Crop], labels: list[Label], angles: NDArray[np.float64], config: ClipTraining
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Kind, colour and part at the middle of every patch ``[B, P, 3]``, and the kinds that it is not asked about."""
+    """Kind, color and part at the middle of every patch ``[B, P, 3]``, and the kinds that it is not asked about."""
     count = config.image_size // config.patch
     codes = np.stack([middle_codes(crop, count) for crop in crops])
     answers = [
-        (KINDS.index(label.kind), TINTS.index(label.colour), PART_NAMES.index(label.part)) for label in labels
+        (KINDS.index(label.kind), TINTS.index(label.color), PART_NAMES.index(label.part)) for label in labels
     ]
     left_out = np.zeros((*codes.shape, len(KINDS)), np.bool_)
     for row, angle in enumerate(angles):
@@ -348,9 +348,9 @@ def patch_answers(
 
 
 def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batch]:
-    """Batches made ahead by a thread of their own; every process makes others."""
+    """Batches, prepared in a background thread; each process makes different ones."""
     ready: queue.Queue[Batch] = queue.Queue(4)
-    table = TruthTable(frames.labels, centre=config.centre, beside=config.beside)
+    table = TruthTable(frames.labels, center=config.center, beside=config.beside)
     rng = np.random.default_rng([config.seed, rank])
 
     def work() -> None:
@@ -364,7 +364,7 @@ def batches(frames: Frames, config: ClipTraining, rank: int) -> queue.Queue[Batc
 def mirrored(
     batch: Batch, config: ClipTraining, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Half of the crops mirrored, with what their patches show: pixels, patches, left out, places."""
+    """Half of the crops mirrored, together with the labels of their patches: pixels, patches, left out, places."""
     count = config.image_size // config.patch
     chosen = torch.rand(len(batch.pixels), generator=generator) < 0.5
     pixels = torch.where(chosen[:, None, None, None], batch.pixels.flip(-1), batch.pixels)
@@ -377,7 +377,7 @@ def mirrored(
 
 
 def jittered(pixels: Tensor, generator: torch.Generator, light: float) -> Tensor:
-    """Crops as the encoder takes them, in other light, with a little noise."""
+    """Crops as the encoder takes them, with changed light and a little noise."""
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator)
@@ -401,7 +401,7 @@ def contrastive_loss(logits: Tensor, truth: Tensor) -> Tensor:
 
 
 def patch_loss(answers: Tensor, truth: Tensor, left_out: Tensor) -> Tensor:
-    """Cross-entropy of kind, colour and part of the patches ``[B, P, 3]``; kinds left out are no answer."""
+    """Cross-entropy of kind, color and part of the patches ``[B, P, 3]``; kinds left out are no answer."""
     kinds, *others = answers.split([len(KINDS), len(TINTS), len(PART_NAMES)], dim=-1)
     split = [kinds.masked_fill(left_out, -torch.inf), *others]
     losses = [
@@ -411,7 +411,7 @@ def patch_loss(answers: Tensor, truth: Tensor, left_out: Tensor) -> Tensor:
 
 
 def composition_loss(corners: Tensor) -> Tensor:
-    """How far texts of kinds and colours are from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
+    """Deviation of texts of kinds and colors from parallelograms: |t(k, c) - t(k, d) - t(l, c) + t(l, d)|^2.
 
     Args:
         corners: Unit vectors ``[4 n, D]``, in the order of ``words.parallelogram``.
@@ -458,7 +458,7 @@ def asking_losses(
 
 
 def dense_loss(values: Tensor, texts: Tensor, places: Tensor, scale: Tensor, temperature: float) -> Tensor:
-    """What patches say by themselves: contrast and relevancy as of crops, of the patches that are asked.
+    """Contrast and relevancy of single patches, as for crops.
 
     Args:
         values: What the patches say ``[B, P, D]`` (`Trainer.see`), of any length.
@@ -474,7 +474,7 @@ def dense_loss(values: Tensor, texts: Tensor, places: Tensor, scale: Tensor, tem
 
 
 class Trainer:
-    """The model, its average over the steps, and what encodes with them."""
+    """The model, its average over the steps, and encoding with either."""
 
     def __init__(self, tokenizer: CLIPTokenizer, config: ClipTraining, start: Path | None = None) -> None:
         torch.manual_seed(config.seed)
@@ -501,7 +501,7 @@ class Trainer:
         return self.config.rate * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * along)))
 
     def step(self, batch: Batch) -> dict[str, float]:
-        """One step of the optimizer and of the average; what each loss was before it, by name."""
+        """One step of the optimizer and of the average; returns each loss before the step, by name."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate()
         losses = self.losses(batch)
@@ -520,7 +520,7 @@ class Trainer:
         return {name: round(value.item(), 3) for name, value in losses.items()}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """The losses by name, before they are weighed; ``dense`` only where it has a weight."""
+        """The losses by name, unweighted; ``dense`` only if its weight is not 0."""
         words = self.tokens([*batch.texts, *batch.corners])
         with torch.autocast("cpu", dtype=torch.bfloat16):
             pixels, patches, left_out, places = mirrored(batch, self.config, self.generator)
@@ -549,10 +549,10 @@ class Trainer:
         return losses
 
     def kept_patches(self, count: int) -> Tensor:
-        """Which patches the image tower sees ``[count, P]``: half of them at first, all at the end.
+        """The patches that the image tower receives ``[count, P]``: half of them at first, all at the end.
 
-        A crop seen in half takes little more than half of the time and still says what it shows; the last
-        quarter of the steps gets the tower used to whole crops.
+        Half of the patches take little more than half of the time and still show the object; the last quarter of
+        the steps uses whole crops.
         """
         patches = (self.config.image_size // self.config.patch) ** 2
         share = self.config.kept if self.done < 0.75 * self.config.steps else 1.0
@@ -633,13 +633,13 @@ def pooled(output: object) -> Tensor:
 
 
 class Examination:
-    """The crops and questions of the scores, drawn once."""
+    """The crops and phrases of the scores, drawn once."""
 
     def __init__(self, seen: Frames, unseen: Frames, *, seed: int = 7) -> None:
         rng = np.random.default_rng(seed)
         self.seen = dominated_crops(seen, 1500, rng)
         drawn = dominated_crops(unseen, 2500, rng)
-        self.unseen = [(crop, label) for crop, label in drawn if (label.kind, label.colour) in HELD_OUT_PAIRS]
+        self.unseen = [(crop, label) for crop, label in drawn if (label.kind, label.color) in HELD_OUT_PAIRS]
         self.crops = [random_crop(seen, rng) for _ in range(600)]
         self.phrases: list[Phrase] = []
         for crop in self.crops[:200]:
@@ -665,7 +665,7 @@ class Examination:
 
 
 def save(trainer: Trainer, folder: Path) -> None:
-    """An ordinary Hugging Face folder."""
+    """Save an ordinary Hugging Face folder."""
     size = trainer.config.image_size
     model = copy.deepcopy(trainer.average)
     model.config._attn_implementation = "sdpa"

@@ -1,8 +1,8 @@
-"""Trains the dense encoder: patches of one thing attract each other across views, patches of others repel.
+"""Train the dense encoder: patches of one object attract each other across views, patches of others repel.
 
-DINO finds by itself that the parts of a thing belong together, from a hundred million images. From a few
-thousand renders a small model does not: self-distillation alone grouped by colour (the prototype's purity was
-below that of raw colour). So positives are taken from what renders know: patches that show the same thing of
+DINO learns from a hundred million images that the parts of an object belong together. A small model does not learn
+it from a few thousand renderings: self-distillation alone grouped by color (the prototype's purity was
+below that of raw color). Positives are therefore taken from the renderings: patches that show the same thing of
 the same scene, in two views of it, seen in different light, cut and size. No words and no names of kinds are
 used, save that things of the same kind in different scenes neither attract nor repel.
 """
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from crops import Frame, Frames
-from dense_scores import grouping, mean_colours
+from dense_scores import grouping, mean_colors
 from numpy.typing import NDArray
 from torch import Tensor
 from train_clip import MEAN, STD, jittered
@@ -42,7 +42,7 @@ class DinoTraining:
         patch, width, layers: Of the model.
         rate: Largest learning rate.
         temperature: Of the contrast.
-        grey: Share of the crops shown in grey.
+        gray: Share of the crops shown in gray.
         seed: Of everything random.
     """
 
@@ -56,7 +56,7 @@ class DinoTraining:
     layers: int = 4
     rate: float = 1e-3
     temperature: float = 0.1
-    grey: float = 0.15
+    gray: float = 0.15
     seed: int = 0
 
 
@@ -73,7 +73,7 @@ class Batch:
 
 
 class Source:
-    """Batches, made ahead by a thread of their own."""
+    """Batches, prepared in a background thread."""
 
     def __init__(self, frames: Frames, config: DinoTraining, rank: int) -> None:
         self.config, self.frames = config, frames
@@ -207,8 +207,8 @@ def train_dino(
 
 def _loss(model: ViTModel, batch: Batch, config: DinoTraining, generator: torch.Generator) -> Tensor:
     images = jittered(batch.pixels, generator)
-    grey = torch.rand(len(images), generator=generator) < config.grey
-    images[grey] = images[grey].mean(1, keepdim=True)
+    gray = torch.rand(len(images), generator=generator) < config.gray
+    images[gray] = images[gray].mean(1, keepdim=True)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         features = tokens_of(model, images)
     return grouping_loss(features[batch.crop, batch.place], batch, config.temperature)
@@ -229,7 +229,7 @@ def model_config(config: DinoTraining) -> ViTConfig:
 
 
 def save(model: ViTModel, folder: Path, config: DinoTraining) -> None:
-    """An ordinary Hugging Face folder."""
+    """Save an ordinary Hugging Face folder."""
     model.save_pretrained(folder)
     size = {"height": config.side, "width": config.side}
     mean, std = MEAN.flatten().tolist(), STD.flatten().tolist()
@@ -237,7 +237,7 @@ def save(model: ViTModel, folder: Path, config: DinoTraining) -> None:
 
 
 def dense_scores(model: ViTModel, seen: Frames) -> dict[str, float]:
-    """Grouping by the model's tokens, and by raw colour."""
+    """Grouping by the model's tokens, and by raw color."""
 
     @torch.inference_mode()
     def features(frame: Frame) -> NDArray:
@@ -249,5 +249,5 @@ def dense_scores(model: ViTModel, seen: Frames) -> dict[str, float]:
         return found.reshape(rows, columns, -1).numpy()
 
     own = grouping(seen, features)
-    colour = grouping(seen, mean_colours)
-    return {**own, "colour_purity": colour["purity"], "colour_nmi": colour["nmi"]}
+    color = grouping(seen, mean_colors)
+    return {**own, "color_purity": color["purity"], "color_nmi": color["nmi"]}

@@ -1,4 +1,4 @@
-"""Which phrases are true of which crops: labels around the middle, weighed. Needs numpy only."""
+"""Which phrases are true of which crops, from the weighted labels of the crops. Needs numpy only."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ BESIDE = 0.15
 
 
 class TruthTable:
-    """Truth of phrases over the labels of some frames; equal meanings are worked out once.
+    """Truth of phrases for the labels of some frames; equal meanings are computed once.
 
     Args:
         labels: All labels that occur.
-        centre: Whether a part is also true of a crop whose middle it is, with ``CENTRE`` of the weight. A handle
+        center: Whether a part is also true of a crop whose middle it is, with ``CENTRE`` of the weight. A handle
             is thin: in a crop that also shows what it belongs to, it never has a quarter of the weight.
         beside: A part with less of the weight, and not in the middle, is false of a crop instead of open. Where
             it is open, what lies around a part answers like the part itself, and the best place is any of these.
     """
 
-    def __init__(self, labels: Sequence[Label], *, centre: bool = False, beside: float = LACKS_PART) -> None:
+    def __init__(self, labels: Sequence[Label], *, center: bool = False, beside: float = LACKS_PART) -> None:
         self.labels = list(labels)
-        self.centre, self.beside = centre, beside
+        self.center, self.beside = center, beside
         self._known: dict[tuple, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
 
     def _columns(self, phrase: Phrase) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of which labels the phrase is true, of which it is not false."""
-        meaning = (phrase.kind, phrase.colour, phrase.quality, phrase.part, phrase.unknown)
+        """The labels for which the phrase is true, and those for which it is not false."""
+        meaning = (phrase.kind, phrase.color, phrase.quality, phrase.part, phrase.unknown)
         if meaning not in self._known:
             answers = np.array([phrase.of(label) for label in self.labels])
             self._known[meaning] = (answers == TRUE, answers != FALSE)
@@ -71,12 +71,12 @@ class TruthTable:
         is_part = np.array([phrase.part is not None for phrase in phrases])
         shows = np.where(is_part, SHOWS_PART, SHOWS)
         lacks = np.where(is_part, LACKS_PART, LACKS)
-        if self.centre:
+        if self.center:
             middle = np.array([crop.grid[GRID // 2, GRID // 2] for crop in crops])
             answers = np.stack([self._columns(phrase)[0] for phrase in phrases], 1)
-            centred = is_part & answers[middle] & (middle >= 0)[:, None]
-            shows = np.where(centred, CENTRE, shows)
-            lacks = np.where(is_part & ~centred, self.beside, lacks)
+            centerd = is_part & answers[middle] & (middle >= 0)[:, None]
+            shows = np.where(centerd, CENTRE, shows)
+            lacks = np.where(is_part & ~centerd, self.beside, lacks)
         return np.where(true >= shows, TRUE, np.where(possible < lacks, FALSE, OPEN)).astype(np.int8)
 
     def at_places(self, phrases: Sequence[Phrase], patches: Sequence[Crop]) -> NDArray[np.int8]:

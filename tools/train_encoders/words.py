@@ -1,7 +1,7 @@
-"""The language of the embedded encoder: phrases, and of what each is true. Needs numpy only.
+"""The language of the bundled encoder: phrases, and the labels for which each is true. Needs numpy only.
 
 A phrase is true, false, or open (neither: training skips it) of a `Label`, which is what a pixel shows: a
-thing's kind, colour and finish, and which part of it. Whether a phrase names what a crop shows follows from
+thing's kind, color and finish, and which part of it. Whether a phrase names what a crop shows follows from
 the pixels around the crop's middle, see `crops.py`.
 """
 
@@ -94,10 +94,10 @@ OWNERS = {
     "wheels": ("car",),
 }
 """Which kinds have the part."""
-_IN_ITS_COLOUR = {"handle", "ears", "leaves", "shade"}
-"""Parts in the colour of their thing; that of the others is open."""
+_IN_ITS_COLOR = {"handle", "ears", "leaves", "shade"}
+"""Parts in the color of their thing; that of the others is open."""
 
-COLOURS: dict[str, tuple[str, ...]] = {
+COLORS: dict[str, tuple[str, ...]] = {
     "red": ("red",),
     "green": ("green",),
     "blue": ("blue",),
@@ -116,22 +116,22 @@ COLOURS: dict[str, tuple[str, ...]] = {
 _NEAR = {frozenset(pair) for pair in (("gold", "yellow"), ("gold", "orange"), ("silver", "gray"), ("silver", "white"),
                                       ("copper", "orange"), ("copper", "brown"), ("gray", "white"),
                                       ("gold", "brown"), ("copper", "gold"), ("copper", "pink"))}  # fmt: skip
-"""Colours that a look cannot tell apart with certainty: of each other they are open."""
+"""Colors that a look cannot tell apart with certainty: of each other they are open."""
 HUES = {
     "red": 0, "copper": 20, "brown": 25, "orange": 30, "gold": 45, "yellow": 55, "green": 120, "blue": 220,
     "purple": 275, "pink": 340,
 }  # fmt: skip
-"""Degrees on the colour circle; black, white, gray and silver have none."""
-_NO_ONE_COLOUR = {"books", "floor"}
-"""Kinds of which colour words are open: several colours at once."""
+"""Degrees on the color circle; black, white, gray and silver have none."""
+_NO_ONE_COLOR = {"books", "floor"}
+"""Kinds of which color words are open: several colors at once."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """What a pixel shows."""
+    """The label of a pixel."""
 
     kind: str
-    colour: str
+    color: str
     finish: str | None = None
     part: str | None = None
 
@@ -267,7 +267,7 @@ TRUE, FALSE, OPEN = 1, 0, -1
 _KNOWN_WORDS = frozenset(
     word
     for group in (
-        NAMES, SYNONYMS, PARTS, COLOURS, {"": OTHER_WORDS},
+        NAMES, SYNONYMS, PARTS, COLORS, {"": OTHER_WORDS},
         {key: (*quality.phrases, *quality.adjectives) for key, quality in QUALITIES.items()},
     )
     for phrases in group.values()
@@ -278,12 +278,12 @@ _KNOWN_WORDS = frozenset(
 
 @dataclass(frozen=True)
 class Phrase:
-    """Words and what they ask for; what is None is not asked for.
+    """Words and their meaning; None means anything.
 
     Args:
         words: As a user would type them.
         kind: Key of ``NAMES``.
-        colour: Key of ``COLOURS``.
+        color: Key of ``COLORS``.
         quality: Key of ``QUALITIES``.
         part: Key of ``PARTS``.
         unknown: Whether it names something that no scene holds.
@@ -291,7 +291,7 @@ class Phrase:
 
     words: str
     kind: str | None = None
-    colour: str | None = None
+    color: str | None = None
     quality: str | None = None
     part: str | None = None
     unknown: bool = False
@@ -307,10 +307,10 @@ class Phrase:
             answers.append(TRUE if self.part == label.part else FALSE)
         if self.quality is not None:
             answers.append(_has_quality(QUALITIES[self.quality], label))
-        if self.colour is not None:
-            # A name with a colour is about the whole thing; a colour alone is about what is seen.
+        if self.color is not None:
+            # A name with a color is about the whole thing; a color alone is about what is seen.
             whole = self.kind is not None and self.part is None
-            answers.append(_has_colour(self.colour, label, whole))
+            answers.append(_has_color(self.color, label, whole))
         if FALSE in answers:
             return FALSE
         return OPEN if OPEN in answers else TRUE
@@ -323,18 +323,18 @@ def _has_quality(quality: Quality, label: Label) -> int:
     return OPEN if terms & set(quality.open) else FALSE
 
 
-def _has_colour(colour: str, label: Label, whole: bool) -> int:
-    if label.kind in _NO_ONE_COLOUR:
+def _has_color(color: str, label: Label, whole: bool) -> int:
+    if label.kind in _NO_ONE_COLOR:
         return OPEN
-    if not whole and label.part is not None and label.part not in _IN_ITS_COLOUR:
+    if not whole and label.part is not None and label.part not in _IN_ITS_COLOR:
         return OPEN
     if not whole and label.kind in ("plant", "lamp") and label.part is None:
         return OPEN  # soil and bulb
-    if colour == label.colour:
+    if color == label.color:
         return TRUE
-    if frozenset((colour, label.colour)) in _NEAR:
+    if frozenset((color, label.color)) in _NEAR:
         return OPEN
-    if label.kind in ("ball", "cloth", "cone", "wall"):  # a second colour shows
+    if label.kind in ("ball", "cloth", "cone", "wall"):  # a second color shows
         return FALSE if whole else OPEN
     return FALSE
 
@@ -358,52 +358,52 @@ def in_sentence(phrase: Phrase, rng: np.random.Generator, plain: float = 0.5) ->
 def phrase_for(label: Label, rng: np.random.Generator) -> Phrase:
     """A phrase that is true of the label."""
     for _ in range(20):
-        phrase = _random_phrase(label.kind, label.colour, label.part, rng)
+        phrase = _random_phrase(label.kind, label.color, label.part, rng)
         if phrase.of(label) == TRUE:
             return phrase
     return Phrase(_pick(NAMES[label.kind], rng), kind=label.kind)
 
 
 def near_miss(label: Label, rng: np.random.Generator) -> Phrase:
-    """A phrase about something like the label, but not it: other colour, other kind, or another part."""
+    """A phrase that is close to the label but false: another color, kind or part."""
     draw = rng.random()
-    kind, colour, part = label.kind, label.colour, label.part
+    kind, color, part = label.kind, label.color, label.part
     if draw < 0.4:
-        colour = _pick(tuple(c for c in COLOURS if (kind, c) not in HELD_OUT_PAIRS), rng)
-        return coloured(kind, colour, rng)
+        color = _pick(tuple(c for c in COLORS if (kind, c) not in HELD_OUT_PAIRS), rng)
+        return colored(kind, color, rng)
     if draw < 0.7:
-        kind = _pick(tuple(k for k in NAMES if (k, colour) not in HELD_OUT_PAIRS), rng)
-        return coloured(kind, colour, rng)
+        kind = _pick(tuple(k for k in NAMES if (k, color) not in HELD_OUT_PAIRS), rng)
+        return colored(kind, color, rng)
     if draw < 0.85:
         parts = tuple(known for known, owners in OWNERS.items() if kind in owners)
         if parts:
             return _part_phrase(kind, _pick(parts, rng), rng)
-    return _random_phrase(kind, _pick(tuple(COLOURS), rng), part, rng)
+    return _random_phrase(kind, _pick(tuple(COLORS), rng), part, rng)
 
 
 def any_phrase(rng: np.random.Generator) -> Phrase:
-    """Any phrase, of something that may be in no picture."""
+    """Any phrase, also of objects that no image shows."""
     if rng.random() < 0.3:
         word = _pick(UNKNOWN_TRAINED, rng) if rng.random() < 0.6 else _made_up_word(rng)
-        colour = f"{_pick(tuple(COLOURS), rng)} " if rng.random() < 0.4 else ""
-        return Phrase(colour + word, unknown=True)
-    return _random_phrase(_pick(tuple(NAMES), rng), _pick(tuple(COLOURS), rng), None, rng)
+        color = f"{_pick(tuple(COLORS), rng)} " if rng.random() < 0.4 else ""
+        return Phrase(color + word, unknown=True)
+    return _random_phrase(_pick(tuple(NAMES), rng), _pick(tuple(COLORS), rng), None, rng)
 
 
-def coloured(kind: str, colour: str, rng: np.random.Generator) -> Phrase:
-    """A name of the kind after a word for the colour."""
-    words = f"{_pick(COLOURS[colour], rng)} {_pick(NAMES[kind], rng)}"
-    return Phrase(words, kind=kind, colour=colour)
+def colored(kind: str, color: str, rng: np.random.Generator) -> Phrase:
+    """A name of the kind after a word for the color."""
+    words = f"{_pick(COLORS[color], rng)} {_pick(NAMES[kind], rng)}"
+    return Phrase(words, kind=kind, color=color)
 
 
 def parallelogram(rng: np.random.Generator) -> list[str]:
-    """Two kinds in two colours, as texts (k c, k d, l c, l d): what sets colours apart should not hang on the kind.
+    """Two kinds in two colors, as texts (k c, k d, l c, l d): what sets colors apart should not hang on the kind.
 
-    Pairs that training pictures lack are among them: their words may be read, what they look like may not be seen.
+    Pairs that training images lack are among them: their words may be read, what they look like may not be seen.
     """
-    kind, other = rng.choice([name for name in NAMES if name not in _NO_ONE_COLOUR], 2, replace=False)
-    colour, tint = rng.choice(list(COLOURS), 2, replace=False)
-    return [f"{c} {NAMES[str(k)][0]}" for k in (kind, other) for c in (colour, tint)]
+    kind, other = rng.choice([name for name in NAMES if name not in _NO_ONE_COLOR], 2, replace=False)
+    color, tint = rng.choice(list(COLORS), 2, replace=False)
+    return [f"{c} {NAMES[str(k)][0]}" for k in (kind, other) for c in (color, tint)]
 
 
 def _part_phrase(kind: str, part: str, rng: np.random.Generator) -> Phrase:
@@ -426,7 +426,7 @@ _VOWELS, _CODAS = (*"aeiou", "ea", "oo", "ai"), tuple("nrltkms")
 
 
 def _made_up_word(rng: np.random.Generator) -> str:
-    """Syllables that are most likely no word: what was never read should match nothing."""
+    """A made-up word: unknown words should match nothing."""
     while True:
         count = int(rng.integers(1, 4))
         word = "".join(_pick(_ONSETS, rng) + _pick(_VOWELS, rng) for _ in range(count)) + _pick(_CODAS, rng)
@@ -434,23 +434,23 @@ def _made_up_word(rng: np.random.Generator) -> str:
             return word
 
 
-def _random_phrase(kind: str, colour: str, part: str | None, rng: np.random.Generator) -> Phrase:
+def _random_phrase(kind: str, color: str, part: str | None, rng: np.random.Generator) -> Phrase:
     """A phrase of a random form about these."""
-    name, tint = _pick(NAMES[kind], rng), _pick(COLOURS[colour], rng)
+    name, tint = _pick(NAMES[kind], rng), _pick(COLORS[color], rng)
     if part is None and rng.random() < 0.08:
         parts = [known for known, owners in OWNERS.items() if kind in owners]
         part = _pick(tuple(parts), rng) if parts else None
     if part is not None and part in PARTS and rng.random() < 0.7:
         return _part_phrase(kind, part, rng)
     form = rng.random()
-    if form < 0.3 or (form < 0.66 and (kind, colour) in HELD_OUT_PAIRS):
+    if form < 0.3 or (form < 0.66 and (kind, color) in HELD_OUT_PAIRS):
         # As the name of a held-out pair could only be wrong, it would be learnt as the name of nothing.
         return Phrase(name, kind=kind)
     if form < 0.66:
-        return Phrase(f"{tint} {name}", kind=kind, colour=colour)
+        return Phrase(f"{tint} {name}", kind=kind, color=color)
     if form < 0.75:
         words = _pick((f"something {tint}", tint, f"{tint} thing", f"{tint} object"), rng)
-        return Phrase(words, colour=colour)
+        return Phrase(words, color=color)
     quality = _pick(tuple(QUALITIES), rng)
     mine = [
         key

@@ -1,7 +1,7 @@
 """Training by several processes of one thread each, whose gradients are averaged.
 
-On small models two processes with a thread each are about 1.6 times faster than one process with two threads:
-most operations are too short to be shared out.
+For small models, two processes with one thread each are about 1.6 times faster than one process with two threads:
+most operations are too short for several threads.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def _worker(rank: int, work: Callable[..., None], count: int, meeting: str, argu
 
 
 def average_gradients(parameters: Iterable[Tensor]) -> None:
-    """Makes the gradients of all processes the same: their mean."""
+    """Replace the gradients of all processes by their mean."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     flat = torch.cat([gradient.flatten() for gradient in gradients])
     torch.distributed.all_reduce(flat)

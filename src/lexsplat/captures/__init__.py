@@ -8,8 +8,9 @@ The path of a photo, file by file:
 - `images/`: reading, masking and undistorting the pixels of a view; `ground_truth/`: annotations for evaluation.
 
 To add a reader of camera files: write ``readers/FORMAT.py`` with ``find_FORMAT(root) -> Path | None`` and
-``read_FORMAT(path) -> CameraFiles`` (take names and poses through `checked_name` and `checked_pose`), call both in
-``loading._read_camera_files`` and ``loading.is_photo_folder``, and add a valid file to ``tests/support/hostile``.
+``read_FORMAT(path) -> CameraFiles`` (take names, lenses and poses through `checked_name`, `checked_lens` and
+`checked_pose`), call both in ``loading._read_camera_files`` and ``loading.is_photo_folder``, and add a valid file to
+``tests/support/hostile``.
 To add a layout of ground truth, see ``ground_truth/layouts.py``.
 """
 

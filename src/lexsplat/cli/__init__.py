@@ -16,6 +16,7 @@ from typing import NamedTuple, NoReturn
 
 from lexsplat import __version__
 from lexsplat.runtime.errors import STOPPED, LexsplatError
+from lexsplat.runtime.progress import NOTE
 
 
 class CommandEntry(NamedTuple):
@@ -56,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         SystemExit: With status 2 after wrong usage, with status 0 after the help page of a command.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    logging.getLogger("lexsplat").setLevel(NOTE)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = _run(words)

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds, print_json_file
-from lexsplat.language.methods import MethodName
+from lexsplat.cli.experiments import open_bench, print_table
+from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds
+from lexsplat.language.methods import VARIANTS, MethodName
 from lexsplat.pipeline.config import BuildConfig
+
+if TYPE_CHECKING:
+    from lexsplat.evaluation.ablate import AblationPlan
+
+    VariantName = str
+else:
+    VariantName = Literal[VARIANTS]
 
 
 @dataclasses.dataclass
@@ -32,25 +40,14 @@ class Ablate:
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         forms: How codes and text are compared, measured side by side. The paper's form is "feature".
         as_in_paper: Fit and train as long as the paper (30,000 steps).
-        json: Print ablation.json on standard output.
+        json: Print ablation.json on standard output (docs/schemas/ablation.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
     capture: CaptureArgument
     output: Path
     seeds: tuple[int, ...] = (0, 1, 2)
-    variants: tuple[
-        Literal[
-            "w/o DINO",
-            "w/o L_lb",
-            "w/o u_G",
-            "w/o MLP",
-            "w/o u_G & MLP",
-            "one code",
-            "full",
-        ],
-        ...,
-    ] = ()
+    variants: tuple[VariantName, ...] = ()
     methods: tuple[MethodName, ...] = ()
     wrong_labels: float = 0.0
     masks: Path | None = None
@@ -71,33 +68,22 @@ class Ablate:
     def check(self) -> None:
         """Refuse invalid options."""
         check_seeds(self.seeds)
-        if not self.forms:
-            raise ValueError("--forms needs at least one of segment, code, feature")
-        if not 0 <= self.wrong_labels <= 1:
-            raise ValueError(f"--wrong-labels must be in 0..1, got {self.wrong_labels:g}")
+        self._plan()
+
+    def _plan(self) -> AblationPlan:
+        from lexsplat.evaluation.ablate import AblationPlan
+
+        methods = self.methods or (self.settings.method,)
+        return AblationPlan(self.seeds, self.variants, methods, self.wrong_labels, self.forms)
 
     def run(self) -> None:
         """Measure and print the table."""
-        from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation import GroundTruthSource
         from lexsplat.evaluation import ablate as ablation
-        from lexsplat.evaluation.report import format_rows
 
         capture, settings = capture_and_settings(self.capture, self.settings)
         if self.as_in_paper:
             settings = ablation.as_in_paper(settings)
-        plan = ablation.AblationPlan(self.seeds, self.variants, self.methods, self.wrong_labels, self.forms)
-        with ProgressBars() as bars:
-            rows = ablation.ablate(
-                capture,
-                self.output,
-                settings,
-                plan,
-                ground_truth=GroundTruthSource(self.masks, self.prompt_list),
-                listener=bars,
-            )
-        if self.json:
-            print_json_file(self.output / "ablation.json")
-            return
-        print(format_rows(rows, ablation.COLUMNS))
-        print(f"{self.output}: ablation.json, ablation.csv, ablation.tex, ablation.html")
+        evaluation = ablation.paper_evaluation()
+        with open_bench(capture, settings, evaluation, self) as bench:
+            rows = ablation.ablate(bench, self._plan())
+        print_table(self, "ablation", rows, ablation.COLUMNS)

@@ -32,7 +32,12 @@ ESSENTIAL_SETTINGS = (
 )  # fmt: skip
 """Settings of a build that people use."""
 
-_PLACEHOLDERS = {"clip": "NAME", "dino": "NAME", "memory": "SIZE", "up": "X,Y,Z", "height_of": "PHRASE"}
+_PLACEHOLDERS = {
+    "clip": "NAME", "dino": "NAME", "view": "NAME", "test_views": "NAME", "name": "NAME", "host": "ADDRESS",
+    "select": "PHRASE", "height_of": "PHRASE", "between": "PHRASE PHRASE", "negatives": "PHRASE",
+    "template": "SENTENCE", "points": "X,Y,Z X,Y,Z", "up": "X,Y,Z", "memory": "SIZE",
+}  # fmt: skip
+"""Placeholders by name of option; that of an option with any number of values is followed by an ellipsis."""
 _SETTINGS_DEFAULTS = {
     "downscale": "chosen for the device",
     "iterations": "chosen for the device",
@@ -123,7 +128,7 @@ def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
             hint = Annotated[page, tyro.conf.arg(name="")]  # as `options.Settings`
             factory = _maker(page, values)
         elif get_origin(hint) is not Annotated:
-            hint = Annotated[hint, _in_words(field.name, default, defaults)]
+            hint = Annotated[hint, _in_words(field.name, hint, default, defaults)]
         if field.name in hidden:
             hint = Annotated[hint, tyro.conf.Suppress]
         fields.append((field.name, hint, dataclasses.field(default=default, default_factory=factory)))
@@ -144,13 +149,15 @@ def _maker(page: type, values: dict[str, Any]) -> Any:
     return lambda: page(**values)
 
 
-def _in_words(name: str, default: Any, defaults: dict[str, str]) -> Any:
-    hint = None
+def _in_words(name: str, kind: Any, default: Any, defaults: dict[str, str]) -> Any:
+    hint, placeholder = None, _PLACEHOLDERS.get(name)
+    if placeholder and get_origin(kind) is tuple and Ellipsis in get_args(kind):
+        placeholder += " ..."
     if default is None or default == ():
         hint = f"(default: {defaults.get(name, 'none')})"
     elif default is False or default is True:
         hint = ""
-    return tyro.conf.arg(metavar=_PLACEHOLDERS.get(name), help_behavior_hint=hint)
+    return tyro.conf.arg(metavar=placeholder, help_behavior_hint=hint)
 
 
 @REGISTRY.primitive_rule

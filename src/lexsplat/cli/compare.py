@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
+from lexsplat.cli.experiments import open_bench, print_table
 from lexsplat.cli.options import (
     ALL_PROTOCOLS,
     CaptureArgument,
@@ -15,9 +16,14 @@ from lexsplat.cli.options import (
     ProtocolName,
     Settings,
     check_seeds,
-    print_json_file,
 )
+from lexsplat.evaluation.compare import COMPARED, ComparisonPlan
 from lexsplat.pipeline.config import BuildConfig
+
+if TYPE_CHECKING:
+    ComparedName = str
+else:
+    ComparedName = Literal[COMPARED]
 
 
 @dataclasses.dataclass
@@ -37,18 +43,13 @@ class Compare:
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
         lpips: Measure LPIPS if it is installed; --no-lpips leaves it out.
-        json: Print comparison.json on standard output.
+        json: Print comparison.json on standard output (docs/schemas/comparison.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
 
     capture: CaptureArgument
     output: Path
-    methods: tuple[
-        Literal[
-            "averaged", "averaged-code", "averaged-feature", "trained", "trained-code", "trained-feature", "dff", "lerf", "3dovs", "nearest",
-        ],
-        ...,
-    ] = ("averaged", "averaged-code", "trained-feature", "dff", "lerf", "3dovs", "nearest")  # fmt: skip
+    methods: tuple[ComparedName, ...] = tuple(ComparisonPlan.methods)
     seeds: tuple[int, ...] = (0,)
     masks: Path | None = None
     prompt_list: PromptListName | None = None
@@ -66,27 +67,15 @@ class Compare:
     def check(self) -> None:
         """Refuse invalid options."""
         check_seeds(self.seeds)
+        ComparisonPlan(self.methods, self.seeds)
 
     def run(self) -> None:
         """Measure and print the table."""
-        from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
-        from lexsplat.evaluation.compare import ComparisonPlan, compare
-        from lexsplat.evaluation.report import format_rows
+        from lexsplat.evaluation import EvaluationConfig
+        from lexsplat.evaluation.compare import compare
 
         capture, settings = capture_and_settings(self.capture, self.settings)
-        with ProgressBars() as bars:
-            rows = compare(
-                capture,
-                self.output,
-                settings,
-                ComparisonPlan(self.methods, self.seeds),
-                evaluation=EvaluationConfig(lpips=self.lpips, protocols=self.protocols),
-                ground_truth=GroundTruthSource(self.masks, self.prompt_list),
-                listener=bars,
-            )
-        if self.json:
-            print_json_file(self.output / "comparison.json")
-            return
-        print(format_rows(rows))
-        print(f"{self.output}: comparison.json, comparison.csv, comparison.tex, comparison.html")
+        evaluation = EvaluationConfig(lpips=self.lpips, protocols=self.protocols)
+        with open_bench(capture, settings, evaluation, self) as bench:
+            rows = compare(bench, ComparisonPlan(self.methods, self.seeds))
+        print_table(self, "comparison", rows)

@@ -33,7 +33,7 @@ class Evaluate:
         form: How codes and text are compared (see lexsplat query --help).
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
-        json: Print metrics.json on standard output.
+        json: Print metrics.json on standard output (docs/schemas/metrics.json).
     """
 
     scene: SceneArgument

@@ -13,7 +13,7 @@ class Info:
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
-        json: Print one JSON document on standard output.
+        json: Print one JSON document on standard output (docs/schemas/info.json).
     """
 
     scene: SceneArgument

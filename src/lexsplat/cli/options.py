@@ -78,11 +78,6 @@ def print_json(document: Any) -> None:
     print(json.dumps(document, indent=2, ensure_ascii=False))
 
 
-def print_json_file(path: Path) -> None:
-    """Print a JSON document that a command has written."""
-    print_json(json.loads(path.read_text(encoding="utf-8")))
-
-
 def print_evaluation(result: dict, folder: Path) -> None:
     """Print the table of one evaluated scene and the path of its report."""
     from lexsplat.evaluation.report import format_table

@@ -97,7 +97,7 @@ class Query:
             return
         for answer in answers["prompts"]:
             print(
-                f"{answer['prompt']}: best {answer['peak']:.2f} in {answer['best_view']}, "
+                f"{answer['prompt']}: best {answer['peak']:.2f} in {answer['peak_view']}, "
                 f"threshold {answer['threshold']:.2f}, {answer['gaussians']} Gaussians"
                 f"{PRESENCE[answer['present']]}"
             )

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene
+
+if TYPE_CHECKING:
+    from lexsplat.viewer.server import ViewerConfig
 
 
 @dataclasses.dataclass
@@ -37,17 +40,19 @@ class View:
 
     def check(self) -> None:
         """Refuse invalid options."""
-        if not 0 <= self.port <= 65535:
-            raise ValueError(f"port must be in 0..65535, got {self.port}")
-        if self.splats < 1:
-            raise ValueError(f"splats must be positive, got {self.splats}")
+        self._config()
+
+    def _config(self) -> ViewerConfig:
+        from lexsplat.viewer.server import ViewerConfig
+
+        return ViewerConfig(self.host, self.port, self.name, self.splats)
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from lexsplat.viewer.server import ViewerConfig, ViewerServer
+        from lexsplat.viewer.server import ViewerServer
 
         scene = open_scene(self.scene, self.device, self.clip)
-        viewer = ViewerServer(scene, ViewerConfig(self.host, self.port, self.name, self.splats))
+        viewer = ViewerServer(scene, self._config())
         print(f"{self.scene} is shown at {viewer.url} (Ctrl-C stops the server)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             wait_for_interrupt()

@@ -135,9 +135,9 @@ class Codebook:
 
 def _blocks(feature_map: Any, device: torch.device, use_dino: bool) -> Iterator[tuple[Tensor, Tensor | None]]:
     clip = torch.as_tensor(feature_map.clip).flatten(0, 1)
-    if use_dino and feature_map.dino is None:
-        raise ValueError("the codebook was fitted with DINO features, but the feature map has none")
-    dino = torch.as_tensor(feature_map.dino).flatten(0, 1) if use_dino else None
+    dino = (
+        torch.as_tensor(feature_map.dino).flatten(0, 1) if use_dino and feature_map.dino is not None else None
+    )
     for start in range(0, len(clip), BLOCK_ROWS):
         rows = slice(start, start + BLOCK_ROWS)
         yield (

@@ -11,27 +11,18 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.evaluation import EvaluationConfig, GroundTruthSource
-from lexsplat.evaluation.experiments import Bench, Results
+from lexsplat.evaluation import EvaluationConfig
+from lexsplat.evaluation.experiments import Bench, Row
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import QueryForm
-from lexsplat.runtime.progress import Listener, silent
-
-VARIANTS = tuple(
-    dict.fromkeys(chain.from_iterable(METHODS[name].variants for name in ("trained", "averaged")))
-)
-"""Names of the variants of all methods: the rows of the paper's Table 2 in its order, and "one code"."""
 
 log = logging.getLogger("lexsplat")
 
@@ -90,116 +81,82 @@ class AblationPlan:
     Args:
         seeds: Seeds of codebook and language.
         variants: Names out of `VARIANTS`; empty takes all of each method.
-        methods: Names of methods; empty takes that of the settings. Rows of several are named "METHOD: VARIANT".
+        methods: Names of methods. Rows of several are named "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
         forms: How codes and text are compared: "feature" as in the paper, "code". Names of rows end in the form if
             there are several.
 
     Raises:
-        ValueError: If there is no seed or form, or the share is not within 0..1.
+        ValueError: If there is no seed, form or method, the share is not within 0..1, a method is unknown, or no
+            method has a variant.
     """
 
     seeds: Sequence[int] = (0, 1, 2)
     variants: Sequence[str] = ()
-    methods: Sequence[MethodName] = ()
+    methods: Sequence[MethodName] = ("trained",)
     wrong_labels: float = 0.0
     forms: Sequence[QueryForm] = ("feature",)
 
     def __post_init__(self) -> None:
-        if not self.seeds or not self.forms:
-            raise ValueError("an ablation needs at least one seed and one form")
-        with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share before any work
+        if not self.seeds or not self.forms or not self.methods:
+            raise ValueError("an ablation needs at least one seed, one form and one method")
+        with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share
+        unknown = [name for name in self.methods if name not in METHODS]
+        if unknown:
+            raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")
+        known = {variant: None for method in self.methods for variant in METHODS[method].variants}
+        missing = [variant for variant in self.variants if variant not in known]
+        if missing:
+            methods = " and ".join(self.methods)
+            raise ValueError(f"variants of {methods} are {', '.join(known)}; got {', '.join(missing)}")
 
 
-def ablate(
-    source: Path,
-    output: Path,
-    config: BuildConfig,
-    plan: AblationPlan | None = None,
-    *,
-    evaluation: EvaluationConfig | None = None,
-    ground_truth: GroundTruthSource | None = None,
-    listener: Listener = silent,
-) -> list[dict[str, Any]]:
-    """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
-
-    An interrupted command resumes where it stopped; the tables are rewritten after every run.
+def ablate(bench: Bench, plan: AblationPlan | None = None) -> list[dict[str, Any]]:
+    """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).
 
     Args:
-        source: Folder with photos, cameras and masks.
-        output: Folder for everything that is written.
-        config: Settings of the full method; ``config.seed`` is the seed of the Gaussians.
-        plan: The rows and seeds; None takes all variants of the method of the settings.
-        evaluation: How to measure; None takes `paper_evaluation`.
-        ground_truth: Where the ground truth is read from; None takes the capture's.
-        listener: Receives progress events.
+        bench: Where they are made and measured; its settings are those of the full methods.
+        plan: The rows and seeds; None takes all variants of the paper's method.
 
     Returns:
         Rows as `report.table_rows` makes them.
-
-    Raises:
-        ValueError: If a method or variant is unknown, or no method has a variant.
-        CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
-    plan = plan or AblationPlan()
-    seeds, forms, wrong_labels = plan.seeds, plan.forms, plan.wrong_labels
-    variants = _variants(config, list(plan.methods) or [config.method], plan.variants)
-    measure = in_form(evaluation or paper_evaluation(), forms[0])
-    bench = Bench(source, output, config, measure, ground_truth, listener)
-    names = [_row(name, form, forms) for name, _, _ in variants for form in forms]
-    results = Results(bench, "ablation", names, seeds, COLUMNS)
-    for seed in seeds:  # seed by seed, so that an interrupted run leaves complete tables of fewer seeds
-        for name, method, variant in variants:
-            settings = replace(changed(replace(bench.config, method=method), variant), seed=seed)
-            made_from = [*language_settings(settings), *([wrong_labels] if wrong_labels else [])]
-            make = partial(make_language, bench, settings, wrong_labels)
-            for form in forms:
-                bench.evaluation = in_form(measure, form)
-                row = _row(name, form, forms)
-                results.add(bench.run(row, seed, made_from, make, pictures=seed == seeds[0]))
-    return results.rows()
-
-
-def _variants(
-    config: BuildConfig, methods: Sequence[MethodName], variants: Sequence[str]
-) -> list[tuple[str, MethodName, str]]:
-    """Name, method and variant of every row. What some methods lack is named in a warning.
-
-    Raises:
-        ValueError: If a method or variant is unknown, or no method has a variant.
-    """
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown:
-        raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")
-    for variant in variants:
-        if not any(variant in METHODS[method].variants for method in methods):
-            if len(methods) == 1:
-                changed(replace(config, method=methods[0]), variant)  # raises with the variants of the method
-            raise ValueError(
-                f"{' and '.join(methods)} have no variant {variant!r}; variants are {', '.join(VARIANTS)}"
-            )
-    rows: list[tuple[str, MethodName, str]] = []
-    for method in methods:
-        for variant in variants or METHODS[method].variants:
-            if variant in METHODS[method].variants:
-                rows.append((variant if len(methods) == 1 else f"{method}: {variant}", method, variant))
-            else:
+    plan, rows = plan or AblationPlan(), []
+    for method in plan.methods:
+        for variant in plan.variants or METHODS[method].variants:
+            if variant not in METHODS[method].variants:
                 log.warning("%s has no variant %r: the row is left out", method, variant)
-    return rows
-
-
-def _row(name: str, form: QueryForm, forms: Sequence[QueryForm]) -> str:
-    return name if len(forms) == 1 else f"{name}, {form}"
-
-
-def in_form(evaluation: EvaluationConfig, form: QueryForm) -> EvaluationConfig:
-    """The same evaluation with another form of comparing codes and text."""
-    return replace(evaluation, query=replace(evaluation.query, form=form))
+                continue
+            config = changed(replace(bench.config, method=method), variant)
+            name = variant if len(plan.methods) == 1 else f"{method}: {variant}"
+            for form in plan.forms:
+                row = name if len(plan.forms) == 1 else f"{name}, {form}"
+                rows.append(language_row(bench, row, config, form, plan.wrong_labels))
+    return bench.measure("ablation", rows, plan.seeds, COLUMNS)
 
 
 def paper_evaluation() -> EvaluationConfig:
     """Strict and official protocol, without LPIPS, which does not depend on language."""
     return EvaluationConfig(lpips=False, timing_views=1, protocols=("strict", "official"))
+
+
+def language_row(
+    bench: Bench, name: str, config: BuildConfig, form: QueryForm, wrong_labels: float = 0.0
+) -> Row:
+    """The row of a method of ours.
+
+    Args:
+        bench: Where its language is made.
+        name: Name of the row.
+        config: Settings of the method; the seed is that of the run.
+        form: How codes and text are compared.
+        wrong_labels: See `AblationPlan`.
+    """
+    settings = [config.method, *(getattr(config, part) for part in METHODS[config.method].settings)]
+    settings += [wrong_labels] if wrong_labels else []
+    return Row(
+        name, settings, lambda seed: make_language(bench, replace(config, seed=seed), wrong_labels), form
+    )
 
 
 def make_language(
@@ -227,8 +184,3 @@ def make_language(
     run = FitRun(seed=config.seed, memory=bench.memory, scratch=scratch, listener=bench.listener)
     field = method.fit(bench.gaussians, views, config, run)
     return field, {**seconds, "language": time.perf_counter() - start}
-
-
-def language_settings(config: BuildConfig) -> list[Any]:
-    """Everything a language depends on beside Gaussians, features and seed."""
-    return [config.method, *(getattr(config, part) for part in METHODS[config.method].settings)]

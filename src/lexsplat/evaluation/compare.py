@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from lexsplat.evaluation import EvaluationConfig, GroundTruthSource, baselines
-from lexsplat.evaluation.ablate import in_form, language_settings, make_language
-from lexsplat.evaluation.experiments import Bench, Made, Results
+from lexsplat.evaluation import baselines
+from lexsplat.evaluation.ablate import language_row
+from lexsplat.evaluation.experiments import Bench, Made, Row
 from lexsplat.evaluation.methods import Method
-from lexsplat.language import methods as language
-from lexsplat.pipeline.config import BuildConfig
+from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.queries.relevancy import QueryForm, embed_prompts
-from lexsplat.runtime.progress import Listener, silent
-
-OURS = language.names()
-"""Our methods. With the suffix "-code" they answer by single Gaussians, with "-feature" in the paper's form."""
 
 BASELINES = ("dff", "lerf", "3dovs", "nearest")
 """The methods that the paper compares with, and "nearest", a lower bound without 3D."""
 
-FORMS: tuple[QueryForm, ...] = ("code", "feature")
-"""Suffixes of our methods."""
-
-METHODS = (*OURS, *(f"{name}-{form}" for name in OURS for form in FORMS), *BASELINES)
-"""Everything that can be compared."""
+COMPARED = (*METHODS, *(f"{name}-{form}" for name in METHODS for form in ("code", "feature")), *BASELINES)
+"""Everything that can be compared. With "-code", our methods answer by single Gaussians; with "-feature", in the
+paper's form of relevancy."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +27,7 @@ class ComparisonPlan:
     """The rows of a comparison, and how often each is measured.
 
     Args:
-        methods: Names out of `METHODS`.
+        methods: Names out of `COMPARED`.
         seeds: Seeds of codebook and language; one is enough for deterministic methods.
 
     Raises:
@@ -46,61 +38,33 @@ class ComparisonPlan:
     seeds: Sequence[int] = (0,)
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.methods if name not in METHODS]
+        unknown = [name for name in self.methods if name not in COMPARED]
         if unknown or not self.methods or not self.seeds:
-            raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown) or 'too few'}")
+            raise ValueError(f"methods are {', '.join(COMPARED)}; got {', '.join(unknown) or 'too few'}")
 
 
-def compare(
-    source: Path,
-    output: Path,
-    config: BuildConfig,
-    plan: ComparisonPlan | None = None,
-    *,
-    evaluation: EvaluationConfig | None = None,
-    ground_truth: GroundTruthSource | None = None,
-    listener: Listener = silent,
-) -> list[dict[str, Any]]:
-    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` into ``output``.
+def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, Any]]:
+    """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).
 
-    An interrupted command resumes where it stopped; the tables are rewritten after every run. Memory is the peak of
-    the process while a method's language is made (Linux only); storage is what a scene must keep to answer;
-    training time is reconstruction, features and language.
+    Memory is the peak of the process while a method's language is made (Linux only); storage is what a scene must
+    keep to answer; training time is reconstruction, features and language.
 
     Args:
-        source: Folder with photos, cameras and masks.
-        output: Folder for everything that is written.
-        config: Settings; ``config.seed`` is the seed of the Gaussians.
+        bench: Where they are made and measured.
         plan: The rows and seeds; None takes the defaults.
-        evaluation: How to measure; None takes the defaults: all protocols.
-        ground_truth: Where the ground truth is read from; None takes the capture's.
-        listener: Receives progress events.
 
     Returns:
         Rows as `report.table_rows` makes them.
-
-    Raises:
-        CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
     plan = plan or ComparisonPlan()
-    shared = evaluation or EvaluationConfig()
-    bench = Bench(source, output, config, shared, ground_truth, listener)
-    results = Results(bench, "comparison", plan.methods, plan.seeds)
-    for seed in plan.seeds:
-        for name in plan.methods:
-            forms = [form for form in FORMS if name.endswith(f"-{form}")]
-            bench.evaluation = in_form(shared, forms[0]) if forms else shared
-            settings, make = _method(bench, name, seed)
-            results.add(bench.run(name, seed, settings, make, pictures=seed == plan.seeds[0]))
-    return results.rows()
+    return bench.measure("comparison", [_row(bench, name) for name in plan.methods], plan.seeds)
 
 
-def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[], Made]]:
-    """The settings a method depends on, and a function that makes its language."""
-    own = name.removesuffix("-feature").removesuffix("-code")
-    if own in OURS:
-        config = replace(bench.config, method=own, seed=seed)  # type: ignore[arg-type]
-        return language_settings(config), lambda: make_language(bench, config)
+def _row(bench: Bench, name: str) -> Row:
+    own, _, form = name.partition("-")
+    if own in METHODS:
+        config = replace(bench.config, method=cast(MethodName, own))
+        return language_row(bench, name, config, cast(QueryForm, form or "segment"))
     settings = {
         "dff": baselines.DffConfig(),
         "lerf": baselines.LerfConfig(),
@@ -108,27 +72,23 @@ def _method(bench: Bench, name: str, seed: int) -> tuple[list[Any], Callable[[],
         "nearest": None,
     }[name]
     prompts = list(bench.ground_truth.prompts()) if name == "3dovs" else []
-    return [name, settings, prompts], lambda: _baseline(bench, name, settings, seed)
+    return Row(name, [name, settings, prompts], lambda seed: _baseline(bench, name, settings, seed))
 
 
 def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
     views, maps = bench.capture.views, bench.maps
-    training: Mapping[str, Any] = {name: views[name].camera for name in bench.capture.train_names}
-    memory = bench.memory
+    training = {view.name: view.camera for view in bench.capture.train_views}
     data = baselines.TrainingData(bench.gaussians, training, maps, bench.level_maps)
+    budget: dict[str, Any] = {"memory": bench.memory, "listener": bench.listener}
     start = time.perf_counter()
     found: Method
     if name == "dff":
-        found = baselines.distill(data, settings, seed=seed, memory=memory, listener=bench.listener)
+        found = baselines.distill(data, settings, seed=seed, **budget)
     elif name == "lerf":
-        found = baselines.fit_lerf(data, settings, memory=memory, listener=bench.listener)
+        found = baselines.fit_lerf(data, settings, **budget)
     elif name == "3dovs":
-        classes = embed_prompts(
-            bench.ground_truth.prompts(), bench.encode_text, bench.evaluation.query.templates
-        )
-        found = baselines.fit_3dovs(
-            data, classes, settings, seed=seed, memory=memory, listener=bench.listener
-        )
+        classes = embed_prompts(bench.ground_truth.prompts(), bench.encode_text)
+        found = baselines.fit_3dovs(data, classes, settings, seed=seed, **budget)
     else:
         found = baselines.ViewFeatures({view: v.camera for view, v in views.items()}, maps)
     return found, {name: time.perf_counter() - start}

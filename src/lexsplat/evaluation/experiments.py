@@ -1,4 +1,4 @@
-"""Many languages on the same Gaussians and features: what ``ablate`` and ``compare`` share.
+"""A bench for several methods or variants on the same Gaussians and features: what ``ablate`` and ``compare`` share.
 
 Gaussians and features are made once (``OUTPUT/scene``, a scene folder that ``build`` can resume), codebooks once for
 each setting and seed. Every measured run is kept, so that an interrupted command resumes where it stopped.
@@ -6,35 +6,33 @@ each setting and seed. Every measured run is kept, so that an interrupted comman
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.captures import Annotations, check_ground_truth_options, load_annotations
+from lexsplat.captures import check_ground_truth_options, load_annotations
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
     EvaluationConfig,
     GroundTruth,
     GroundTruthSource,
+    Method,
+    MethodScene,
     Metrics,
-    Subject,
-    ViewPictures,
     evaluate,
     forget_peak_memory,
     peak_gpu_memory,
     peak_memory,
 )
-from lexsplat.evaluation.methods import Method
 from lexsplat.evaluation.report import (
     Comparison,
     Gallery,
@@ -45,26 +43,26 @@ from lexsplat.evaluation.report import (
 )
 from lexsplat.evaluation.results import plain
 from lexsplat.features import FeatureMaps, TextCache, load_level_maps
-from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import MaskedCodeMaps
 from lexsplat.language.fields import LanguageField
-from lexsplat.language.methods import METHODS, MethodName
+from lexsplat.language.methods import METHODS
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, feature_maps
 from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.queries.relevancy import QueryConfig, QueryForm
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.environment import code_identity, machine_facts
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.files import read_json, read_tensors, to_json, write_json, write_tensors
-from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.scene import Scene
 
 log = logging.getLogger("lexsplat")
 
-PICTURE_WIDTH = 240
+IMAGE_WIDTH = 240
 """Width in pixels of the images kept of a run."""
 
 Peaks = dict[str, int | None]
@@ -75,24 +73,37 @@ Made = tuple[LanguageField | Method, dict[str, float]]
 
 
 @dataclass(frozen=True)
+class Row:
+    """One row of a table.
+
+    Args:
+        name: Name of the method or variant.
+        settings: Everything the language depends on beside seed and shared stages: dataclasses and plain data.
+        make: Makes the language of a seed.
+        form: How codes and text are compared.
+    """
+
+    name: str
+    settings: Sequence[Any]
+    make: Callable[[int], Made]
+    form: QueryForm = QueryConfig.form
+
+
+@dataclass(frozen=True)
 class MeasuredRun:
     """One measured run.
 
     Args:
-        name: Name of the variant or method.
-        seed: Seed of the language; the Gaussians are shared.
         result: The content of its ``metrics.json``.
         kept: Whether it was measured by an earlier command.
         detail: "curves" and "cases" as `report.MeasuredMethod` has them.
-        pictures: File of its images; None if none were kept.
+        images: File of its images; None if none were kept.
     """
 
-    name: str
-    seed: int
     result: dict[str, Any]
     kept: bool
     detail: dict[str, Any] = field(default_factory=dict)
-    pictures: Path | None = None
+    images: Path | None = None
 
 
 class Bench:
@@ -103,11 +114,11 @@ class Bench:
         output: Folder for everything that is written.
         config: Settings; ``config.seed`` is the seed of the Gaussians.
         evaluation: How runs are measured.
-        ground_truth: Where the ground truth is read from.
+        ground_truth: Where the ground truth is read from; None takes the capture's.
         listener: Receives progress events.
 
     Raises:
-        CaptureError: If there is no ground truth of held-out views.
+        CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
     """
 
     def __init__(
@@ -119,35 +130,22 @@ class Bench:
         ground_truth: GroundTruthSource | None = None,
         listener: Listener = silent,
     ) -> None:
-        ground_truth = ground_truth or GroundTruthSource()
-        masks, prompt_list = ground_truth.masks, ground_truth.prompt_list
-        check_ground_truth_options(source, masks, prompt_list)
-        self.output, self.listener = output, listener
+        self.origin = ground_truth or GroundTruthSource()
+        check_ground_truth_options(source, self.origin.masks, self.origin.prompt_list)
+        self.output, self.listener, self.evaluation = output, listener, evaluation
         # Features are shared by methods that use DINO and others that do not, so they are made with both encoders.
-        every = config if METHODS[config.method].uses_dino else replace(config, method=_method_with_dino())
-        self.folder: SceneFolder = build(source, output / "scene", every, until="features", listener=listener)
+        with_dino: Any = next(name for name, method in METHODS.items() if method.uses_dino)
+        every = config if METHODS[config.method].uses_dino else replace(config, method=with_dino)
+        self.folder = build(source, output / "scene", every, until="features", listener=listener)
         self.device = choose_device(config.device)
         self.capture = reload_capture(self.folder)
         sizes = [view.capture_size for view in self.capture.views.values()]
         self.config = config.resolved(self.device, max(sizes, key=lambda size: size[0] * size[1]))
         self.memory = parse_bytes(config.memory)
-        self.evaluation = evaluation
-        self.prompt_list = prompt_list
-        self.ground_truth: Annotations = load_annotations(self.capture, masks, prompt_list)
-        held_out = set(self.capture.test_names)
-        if not any(prompts for view, prompts in self.ground_truth.masks.items() if view in held_out):
-            remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
-            if masks is not None:
-                remedy = "hold out the views that have masks: list them in test_views.json of the capture"
-            if prompt_list is not None:
-                remedy = "leave the prompt list out, or name the masks as the released code does"
-            raise CaptureError(
-                masks or source,
-                expected="masks of held-out views to measure against",
-                found=f"none in the words of the list {prompt_list!r}" if prompt_list else "none",
-                remedy=remedy,
-            )
-        self.gaussians: Gaussians = self.folder.read_gaussians().to(self.device)
+        self.ground_truth = load_annotations(self.capture, self.origin.masks, self.origin.prompt_list)
+        if not any(self.ground_truth.masks.get(name) for name in self.capture.test_names):
+            raise _no_ground_truth(source, self.origin)
+        self.gaussians = self.folder.read_gaussians().to(self.device)
         self._encoders = Encoders(config.clip, config.dino, self.device)
         self._maps: FeatureMaps | None = None
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
@@ -190,16 +188,16 @@ class Bench:
         Returns:
             The codebook, index maps by view, and the seconds they took when they were made.
         """
-        key = fingerprint(self._stage("features"), settings, seed, code_identity())
+        key = fingerprint(self._stages()[1], settings, seed, code_identity())
         path = self.output / "codebooks" / f"{key}.safetensors"
-        names = self.capture.train_names
+        names, views = self.capture.train_names, self.capture.views
         if path.is_file():
             try:
                 tensors, facts = read_tensors(path)
                 maps = {name: tensors.pop(f"codes/{name}").numpy() for name in names}
-                maps = dict(MaskedCodeMaps(maps, self.capture.views))
                 self._codebook_peaks = json.loads(facts.get("peaks", "{}"))
-                return Codebook.from_tensors(tensors).to(self.device), maps, float(facts["seconds"])
+                codebook = Codebook.from_tensors(tensors).to(self.device)
+                return codebook, dict(MaskedCodeMaps(maps, views)), float(facts["seconds"])
             except (FileFormatError, KeyError, ValueError) as error:
                 log.warning("%s is damaged and is computed again (%s)", path, error)
         start = time.perf_counter()
@@ -212,62 +210,91 @@ class Bench:
             memory=self.memory,
             listener=self.listener,
         )
-        assigned = assign_code_maps(self.maps, codebook, names, listener=self.listener)
+        maps = assign_code_maps(self.maps, codebook, names, listener=self.listener)
         seconds = time.perf_counter() - start
-        stored = {f"codes/{name}": torch.from_numpy(codes) for name, codes in assigned.items()}
+        stored = {f"codes/{name}": torch.from_numpy(codes) for name, codes in maps.items()}
         self._codebook_peaks = self._peaks()
         facts = {"seconds": f"{seconds:.3f}", "peaks": json.dumps(self._codebook_peaks)}
         write_tensors(path, {**codebook.tensors(), **stored}, facts)
-        return codebook.to(self.device), dict(MaskedCodeMaps(assigned, self.capture.views)), seconds
+        return codebook.to(self.device), dict(MaskedCodeMaps(maps, views)), seconds
 
-    def _stage(self, name: str) -> str:
-        return str(self.folder.record["stages"][name]["fingerprint"])
+    def _stages(self) -> list[str]:
+        """Fingerprints of the shared stages."""
+        stages = self.folder.record["stages"]
+        return [str(stages[name]["fingerprint"]) for name in ("reconstruct", "features")]
 
     # -- runs
 
-    def run(
-        self,
-        name: str,
-        seed: int,
-        settings: Sequence[Any],
-        make: Callable[[], Made],
-        *,
-        pictures: bool = False,
-    ) -> MeasuredRun:
-        """Make a language and measure it, unless it was measured before with the same settings and the same code.
+    def measure(
+        self, stem: str, rows: Sequence[Row], seeds: Sequence[int], columns: Sequence[str] = ()
+    ) -> list[dict[str, Any]]:
+        """Measure every row with every seed, and write the files of `write_results` after each run.
+
+        Seed by seed, so that an interrupted command leaves complete tables of fewer seeds.
 
         Args:
-            name: Name of the variant or method.
-            seed: Seed of the language.
-            settings: Everything the language depends on beside the shared stages: dataclasses and plain data.
-            make: Makes the language.
-            pictures: Whether to keep images of every prompt in every view.
+            stem: "comparison" or "ablation".
+            rows: The rows, in the order of the table.
+            seeds: Seeds of codebook and language; images are kept of the first.
+            columns: Keys of the table; empty takes those of the paper's Table 1 and ours.
+
+        Returns:
+            Rows as `report.table_rows` makes them.
         """
-        stages = [self._stage("reconstruct"), self._stage("features")]
-        measured = (asdict(self.evaluation), self._ground_truth_identity, code_identity())
-        made_from = fingerprint(stages, list(settings), seed, *measured)
-        path = self.output / "runs" / _folder_name(name) / f"seed-{seed}.json"
-        drawn = path.with_name(f"seed-{seed}.pictures.safetensors")
+        runs: dict[str, list[MeasuredRun]] = {}
+        table: list[dict[str, Any]] = []
+        for seed in seeds:
+            for row in rows:
+                run = self.run(row, seed, keep_images=seed == seeds[0])
+                runs.setdefault(row.name, []).append(run)
+                table = write_results(self, stem, runs, columns)
+        return table
+
+    def run(self, row: Row, seed: int, *, keep_images: bool = False) -> MeasuredRun:
+        """Make and measure a language, unless the same settings, code and ground truth were measured before.
+
+        Args:
+            row: What to make, and how to ask it.
+            seed: Seed of the language.
+            keep_images: Whether to keep images of every prompt in every view.
+        """
+        query, settings = QueryConfig(form=row.form), list(row.settings)
+        measured = (asdict(self.evaluation), asdict(query), self._ground_truth_identity, code_identity())
+        inputs = fingerprint(self._stages(), settings, seed, *measured)
+        path = self.output / "runs" / _folder_name(row.name) / f"seed-{seed}.json"
+        images = path.with_name(f"seed-{seed}.images.safetensors")
         if path.is_file():
             try:
                 stored = read_json(path)
-                if stored["fingerprint"] == made_from:
-                    shown = drawn if drawn.is_file() else None
-                    return MeasuredRun(name, seed, stored["metrics"], True, stored.get("detail", {}), shown)
+                if stored["fingerprint"] == inputs:
+                    detail = stored.get("detail", {})
+                    return MeasuredRun(stored["metrics"], True, detail, images if images.is_file() else None)
             except (FileFormatError, KeyError, TypeError) as error:
                 log.warning("%s is damaged and is measured again (%s)", path, error)
-        language, seconds, peaks = self._made(fingerprint(stages, list(settings), seed), make)
-        gallery = Gallery(width=PICTURE_WIDTH)
-        metrics = self._measure(name, language, seconds, gallery.add if pictures else None)
-        result = metrics.to_json()
+        language, seconds, peaks = self._made(
+            fingerprint(self._stages(), settings, seed), lambda: row.make(seed)
+        )
+        gallery = Gallery(width=IMAGE_WIDTH)
+        shared = self.folder.stage_seconds()
+        metrics = evaluate(
+            self.capture,
+            self._scene_of(language, query),
+            self.evaluation,
+            ground_truth=GroundTruth(self.ground_truth.masks, self.ground_truth.boxes),
+            observer=gallery.add if keep_images else None,
+            listener=self.listener,
+        ).with_facts(
+            stage_seconds={stage: shared[stage] for stage in ("reconstruct", "features")} | seconds,
+            settings={"name": row.name, "seed": seed},
+            machine=machine_facts(),
+        )
+        result, detail = metrics.to_json(), detail_of(metrics)
         result["size"] |= peaks
-        result["config"]["seed"] = seed
-        if pictures:
-            write_tensors(drawn, gallery.tensors(), {"fingerprint": made_from})
-        detail = detail_of(metrics)
-        stored = {"fingerprint": made_from, "name": name, "seed": seed, "metrics": result, "detail": detail}
+        if keep_images:
+            write_tensors(images, gallery.tensors(), {"fingerprint": inputs})
+        stored = {"fingerprint": inputs, "name": row.name, "seed": seed, "metrics": result, "detail": detail}
         write_json(path, stored)
-        return MeasuredRun(name, seed, result, False, detail, drawn if pictures else None)
+        return MeasuredRun(result, False, detail, images if keep_images else None)
 
     def _made(
         self, key: str, make: Callable[[], Made]
@@ -288,27 +315,12 @@ class Bench:
     def _peaks(self) -> Peaks:
         return {"peak_rss_bytes": peak_memory(), "peak_gpu_bytes": peak_gpu_memory(self.device)}
 
-    def _measure(
-        self,
-        name: str,
-        language: LanguageField | Method,
-        seconds: dict[str, float],
-        observer: Callable[[ViewPictures], None] | None,
-    ) -> Metrics:
-        shared = self.folder.stage_seconds()
-        stages = {stage: shared[stage] for stage in ("reconstruct", "features")}
-        return evaluate(
-            self.capture,
-            Subject(self.gaussians, language, self.encode_text),
-            self.evaluation,
-            ground_truth=GroundTruth(self.ground_truth.masks, self.ground_truth.boxes),
-            observer=observer,
-            listener=self.listener,
-        ).with_facts(
-            stage_seconds={**stages, **seconds},
-            settings={"name": name},
-            machine=machine_facts(),
-        )
+    def _scene_of(self, language: LanguageField | Method, query: QueryConfig) -> Scene | MethodScene:
+        if isinstance(language, Method):
+            cameras = [view.camera for view in self.capture.train_views]
+            return MethodScene(self.gaussians, language, cameras, self.encode_text, query)
+        views, clip = self.folder.read_cameras(), self.config.clip
+        return Scene(self.gaussians, language, views, clip, query, self.folder, self.encode_text)
 
     @cached_property
     def _ground_truth_identity(self) -> list[Any]:
@@ -320,99 +332,84 @@ class Bench:
         return [masks, self.ground_truth.boxes]
 
 
-class Results:
-    """The runs of an experiment as they finish, and the files written from them.
+def write_results(
+    bench: Bench, stem: str, runs: Mapping[str, Sequence[MeasuredRun]], columns: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Write ``STEM.json``, ``.csv``, ``.tex`` and ``.html`` of the runs so far; returns the rows of the table.
 
     Args:
-        bench: The bench on which they are measured.
-        stem: "comparison" or "ablation", the stem of the file names.
-        names: Names of all rows, in the order of the table.
-        seeds: Seeds of all runs; images are kept of the first.
-        columns: Keys of the table; empty takes those of the paper's Table 1 and ours.
+        bench: The bench on which they were measured.
+        stem: "comparison" or "ablation".
+        runs: The runs of each row, in the order of the table.
+        columns: See `Bench.measure`.
     """
+    folder = bench.output
+    rows = table_rows({name: [run.result for run in done] for name, done in runs.items()})
+    languages = {name: [run.result["language"] for run in done] for name, done in runs.items()}
+    config, machine = to_json(bench.config), machine_facts()
+    facts = {
+        "seeds": sorted({run.result["config"]["seed"] for done in runs.values() for run in done}),
+        "evaluation": to_json(bench.evaluation),
+        "ground_truth": bench.ground_truth.origin_facts(bench.origin.prompt_list),
+    }
+    content = {
+        "rows": rows,
+        "config": config,
+        **facts,
+        "machine": machine,
+        "forms": {name: done[0]["form"] for name, done in languages.items()},
+        "runs": {name: [language["strict"] for language in done] for name, done in languages.items()},
+        "per_prompt": {
+            name: [language["per_prompt"] for language in done] for name, done in languages.items()
+        },
+    }
+    write_rows(folder, stem, rows, columns)
+    write_json(folder / f"{stem}.json", content)
+    comparison = Comparison(
+        [_with_images(name, done) for name, done in runs.items()],
+        title=f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {bench.capture.root.name}",
+        columns=columns,
+        config={**config, **facts},
+        machine=machine,
+    )
+    write_comparison(folder / f"{stem}.html", comparison)
+    return rows
 
-    def __init__(
-        self, bench: Bench, stem: str, names: Sequence[str], seeds: Sequence[int], columns: Sequence[str] = ()
-    ) -> None:
-        self.bench, self.stem, self.columns = bench, stem, tuple(columns)
-        self.names, self.seeds = list(names), list(seeds)
-        self.runs: dict[str, list[MeasuredRun]] = {}
-        self.evaluation = bench.evaluation
 
-    def add(self, run: MeasuredRun) -> None:
-        """Add a run and rewrite all files, so that an interrupted experiment leaves complete tables."""
-        self.runs.setdefault(run.name, []).append(run)
-        rows, folder = self.rows(), self.bench.output
-        write_rows(folder, self.stem, rows, self.columns)
-        write_json(folder / f"{self.stem}.json", self._content(rows))
-        comparison = Comparison(
-            [self._measured(name) for name in self.names if name in self.runs],
-            title=f"lexsplat {'ablate' if self.stem == 'ablation' else 'compare'}: {self.bench.capture.root.name}",
-            subtitle="The same Gaussians and the same features, measured on held-out views",
-            columns=self.columns,
-            config={
-                **to_json(self.bench.config),
-                "seeds": self.seeds,
-                "evaluation": to_json(self.evaluation),
-                "ground_truth": self._ground_truth(),
-            },
-            machine=machine_facts(),
-        )
-        write_comparison(folder / f"{self.stem}.html", comparison)
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Rows of the table so far (`report.table_rows`)."""
-        found = {name: [run.result for run in self.runs[name]] for name in self.names if name in self.runs}
-        return table_rows(found)
-
-    def _content(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
-        words = {name: [run.result["language"] for run in runs] for name, runs in self.runs.items()}
-        return {
-            "rows": rows,
-            "seeds": self.seeds,
-            "config": to_json(self.bench.config),
-            "evaluation": to_json(self.evaluation),
-            "ground_truth": self._ground_truth(),
-            "machine": machine_facts(),
-            "runs": {name: [language["strict"] for language in found] for name, found in words.items()},
-            "per_prompt": {
-                name: [language["per_prompt"] for language in found] for name, found in words.items()
-            },
-        }
-
-    def _ground_truth(self) -> dict[str, Any]:
-        return self.bench.ground_truth.origin_facts(self.bench.prompt_list)
-
-    def _measured(self, name: str) -> MeasuredMethod:
-        runs = self.runs[name]
-        first, gallery = runs[0], Gallery()
-        if first.pictures is not None:
-            try:
-                gallery = Gallery.from_tensors(read_tensors(first.pictures)[0])
-            except (FileFormatError, ValueError) as error:
-                log.warning("%s is damaged and is left out of the report (%s)", first.pictures, error)
-        detail = first.detail
-        results = [run.result for run in runs]
-        return MeasuredMethod(name, results, detail.get("curves", {}), detail.get("cases", {}), gallery)
+def _with_images(name: str, runs: Sequence[MeasuredRun]) -> MeasuredMethod:
+    """The runs of a row with the images and details of the first one."""
+    first, gallery = runs[0], Gallery()
+    if first.images is not None:
+        try:
+            gallery = Gallery.from_tensors(read_tensors(first.images)[0])
+        except (FileFormatError, ValueError) as error:
+            log.warning("%s is damaged and is left out of the report (%s)", first.images, error)
+    curves, cases = (first.detail.get(part, {}) for part in ("curves", "cases"))
+    return MeasuredMethod(name, [run.result for run in runs], curves, cases, gallery)
 
 
 def detail_of(metrics: Metrics) -> dict[str, Any]:
     """Curves and numbers of every prompt in every view, for the report."""
-    return {
-        "curves": {prompt: [round(float(v), 4) for v in curve] for prompt, curve in metrics.curves.items()},
-        "cases": {
-            view: {
-                prompt: plain(
-                    {
-                        "IoU": pair.counts.at(metrics.thresholds[prompt]["auto"]).iou,
-                        "AP": pair.average_precision,
-                    }
-                )
-                for prompt, pair in prompts.items()
-            }
-            for view, prompts in metrics.pairs.items()
-        },
+    cases = {
+        view: {p: plain({"IoU": pair.auto.iou, "AP": pair.average_precision}) for p, pair in prompts.items()}
+        for view, prompts in metrics.pairs.items()
     }
+    curves = {prompt: [round(float(v), 4) for v in curve] for prompt, curve in metrics.curves.items()}
+    return {"curves": curves, "cases": cases}
+
+
+def _no_ground_truth(source: Path, origin: GroundTruthSource) -> CaptureError:
+    remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
+    if origin.masks is not None:
+        remedy = "hold out the views that have masks: list them in test_views.json of the capture"
+    if origin.prompt_list is not None:
+        remedy = "leave the prompt list out, or name the masks as the released code does"
+    return CaptureError(
+        origin.masks or source,
+        expected="masks of held-out views to measure against",
+        found=f"none in the words of the list {origin.prompt_list!r}" if origin.prompt_list else "none",
+        remedy=remedy,
+    )
 
 
 def _larger(peak: int | None, other: int | None) -> int | None:
@@ -422,15 +419,9 @@ def _larger(peak: int | None, other: int | None) -> int | None:
 def _digest(mask: Path | np.ndarray) -> str:
     """Hash of a mask: of its file, or of the shape and values of an array."""
     if isinstance(mask, Path):
-        return hashlib.blake2b(mask.read_bytes(), digest_size=12).hexdigest()
-    content = repr(mask.shape).encode() + np.ascontiguousarray(mask).tobytes()
-    return hashlib.blake2b(content, digest_size=12).hexdigest()
+        return file_hash(mask)
+    return fingerprint(mask.shape, np.packbits(mask).tobytes().hex())
 
 
 def _folder_name(name: str) -> str:
     return "".join(character if character.isalnum() or character in "+-" else "_" for character in name)
-
-
-def _method_with_dino() -> MethodName:
-    """A method whose features include those of DINO."""
-    return next(name for name in get_args(MethodName) if METHODS[name].uses_dino)

@@ -1,7 +1,7 @@
 """Measuring a scene on its held-out views: images, language, speed and size, as in the paper's Table 1.
 
 Nothing is chosen on the views it is reported on. Three thresholds are reported side by side: ``fixed`` (0.5, the
-paper), ``auto`` (per prompt, as for users: `lexsplat.evaluation.methods.automatic_answers`) and ``oracle`` (per
+paper), ``auto`` (per prompt, that of `lexsplat.scenes.scene.Scene.ask`, from training views) and ``oracle`` (per
 prompt, the best one for the ground truth: an upper bound, never a result).
 
 Relevancy is rendered at the size of the ground truth, so that neither is resized. Only for masks larger than
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,31 +24,31 @@ from torch import Tensor
 from lexsplat.captures.ground_truth.layouts import load_ground_truth
 from lexsplat.evaluation.ground_truth import GroundTruth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
-from lexsplat.evaluation.methods import FieldMethod, Method, automatic_answers
+from lexsplat.evaluation.methods import MethodScene
 from lexsplat.evaluation.metrics import (
     THRESHOLDS,
     Perceptual,
     average_precision,
     load_lpips,
     localization,
+    mask_scores,
     psnr,
     resize_scores,
     ssim,
     threshold_counts,
 )
 from lexsplat.evaluation.protocols import PROTOCOLS, lerf_2d_scores, official_scores, silhouette_iou
-from lexsplat.evaluation.results import Metrics, PairResult, ViewPictures
+from lexsplat.evaluation.results import Metrics, PairResult, ViewImages
 from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kinds, summarize_language
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.presence import REFERENCE_PHRASES
-from lexsplat.queries.relevancy import QueryConfig, Question, TextEncoder, embed_prompts
+from lexsplat.rendering import render
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
-    from lexsplat.language.fields import LanguageField
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,12 @@ class EvaluationConfig:
     """Settings of an evaluation.
 
     Args:
-        query: How text is compared with the scene; its ``threshold`` is the fixed one.
         timing_views: Held-out views on which speed is measured, at most.
         max_pixels: Largest rendering at the size of the ground truth, in pixels.
         lpips: Whether to measure LPIPS, if it is installed.
         protocols: Names out of `PROTOCOLS`; "strict" is always measured.
     """
 
-    query: QueryConfig = field(default_factory=QueryConfig)
     timing_views: int = 4
     max_pixels: int = 2_000_000
     lpips: bool = True
@@ -77,35 +75,20 @@ class EvaluationConfig:
             raise ValueError("timing_views and max_pixels must be positive")
 
 
-@dataclass(frozen=True)
-class Subject:
-    """What is measured.
-
-    Args:
-        gaussians: The reconstruction.
-        language: Its language field or another method; None measures images only.
-        encode_text: Texts to embeddings; needed if there are both masks and a language.
-    """
-
-    gaussians: Gaussians
-    language: LanguageField | Method | None = None
-    encode_text: TextEncoder | None = None
-
-
 def evaluate(
     capture: Capture,
-    subject: Subject,
+    scene: Scene | MethodScene,
     config: EvaluationConfig | None = None,
     *,
     ground_truth: GroundTruth | None = None,
-    observer: Callable[[ViewPictures], None] | None = None,
+    observer: Callable[[ViewImages], None] | None = None,
     listener: Listener = silent,
 ) -> Metrics:
     """Measure a scene on its held-out views, with one view in memory at a time.
 
     Args:
         capture: Photos, cameras and the split.
-        subject: Gaussians, language and text encoder.
+        scene: What is measured; the fixed threshold is that of its ``query``.
         config: Settings.
         ground_truth: What the language is measured against; None takes masks and boxes of the capture
             (`lexsplat.captures.load_annotations`).
@@ -114,9 +97,6 @@ def evaluate(
 
     Returns:
         What was measured; `Metrics.with_facts` adds what is known of build and machine.
-
-    Raises:
-        ValueError: If there are masks and a language but no text encoder.
     """
     config = config or EvaluationConfig()
     if ground_truth is None:
@@ -124,22 +104,24 @@ def evaluate(
 
         found = load_annotations(capture)
         ground_truth = GroundTruth(found.masks, found.boxes)
-    language = subject.language
-    method = language if language is None or isinstance(language, Method) else FieldMethod(language)
-    run = _Evaluation(capture, subject.gaussians, method, config, ground_truth)
-    if run.prompts:
-        run.embed(subject.encode_text)
+    run = _Evaluation(capture, scene, config, ground_truth)
     quality = run.run(observer, listener)
     words = summarize_language(run.pairs, run.thresholds)
-    if words is not None and method is not None:
-        words = {"form": config.query.form, "method": method.method, **words}
+    if words is not None:
+        words = {"form": scene.query.form, "method": scene.field.method, **words}
         words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, ground_truth.prompt_kinds)
     return Metrics(
         quality=quality,
         language=words,
         speed={**run.speed(), "stage_seconds": {}},
-        size=_sizes(subject.gaussians, method),
-        config={"evaluation": asdict(config)},
+        size={
+            "gaussians": len(scene.gaussians),
+            "language_bytes": _bytes(scene.field.tensors()),
+            "gaussian_bytes": _bytes(scene.gaussians.tensors()),
+            "peak_rss_bytes": peak_memory(),
+            "peak_gpu_bytes": peak_gpu_memory(scene.gaussians.device),
+        },
+        config={"evaluation": {"query": asdict(scene.query), **asdict(config)}},
         curves=precision_curves(run.pairs),
         thresholds=run.thresholds,
         pairs=run.pairs,
@@ -152,51 +134,34 @@ class _Evaluation:
     def __init__(
         self,
         capture: Capture,
-        gaussians: Gaussians,
-        method: Method | None,
+        scene: Scene | MethodScene,
         config: EvaluationConfig,
         ground_truth: GroundTruth,
     ) -> None:
-        self.capture, self.gaussians, self.method, self.config = capture, gaussians, method, config
+        self.capture, self.scene, self.config = capture, scene, config
         masks, self.boxes = ground_truth.masks, ground_truth.boxes
         self.views: list[View] = [capture.views[name] for name in capture.test_names]
-        self.masks = {view.name: masks[view.name] for view in self.views if method and masks.get(view.name)}
+        self.masks = {view.name: masks[view.name] for view in self.views if masks.get(view.name)}
         self.prompts = sorted({prompt for prompts in self.masks.values() for prompt in prompts})
-        self.texts: dict[str, Tensor] = {}
-        self.negatives = torch.empty(0)
         self.selected: dict[str, Gaussians] = {}
         self.thresholds: dict[str, dict[str, float]] = {}
-        self.per_view: dict[str, dict[str, float | None]] = {}
         self.pairs: dict[str, dict[str, PairResult]] = {}
+        if not self.prompts:
+            return
+        answers = scene.ask(self.prompts)
+        for prompt, value in zip(self.prompts, answers.thresholds.tolist()):
+            self.thresholds[prompt] = {"auto": value, "fixed": scene.query.threshold}
+        if "lerf-3d" in config.protocols and answers.scores is not None:
+            for prompt, row in zip(self.prompts, answers.scores):
+                self.selected[prompt] = scene.gaussians.select(row >= self.thresholds[prompt]["auto"])
 
-    def embed(self, encode_text: TextEncoder | None) -> None:
-        """Embed the prompts and choose their automatic thresholds."""
-        if encode_text is None or self.method is None:
-            raise ValueError("a scene with masks and language needs encode_text")
-        query = self.config.query
-        embeddings = embed_prompts(self.prompts, encode_text, query.templates)
-        self.texts = dict(zip(self.prompts, embeddings))
-        self.negatives = embed_prompts(query.negatives, encode_text, query.templates)
-        references = embed_prompts(REFERENCE_PHRASES, encode_text, query.templates)
-        scores, found = automatic_answers(
-            self.method,
-            self.gaussians,
-            [view.camera for view in self.capture.train_views or self.views],
-            Question(embeddings, self.negatives, query),
-            Question(references, self.negatives, query),
-        )
-        for prompt, value in zip(self.prompts, found.tolist()):
-            self.thresholds[prompt] = {"auto": round(value, 3), "fixed": query.threshold}
-        if "lerf-3d" in self.config.protocols:
-            for prompt, row in zip(self.prompts, scores if scores is not None else ()):
-                self.selected[prompt] = self.gaussians.select(row >= self.thresholds[prompt]["auto"])
-
-    def run(self, observer: Callable[[ViewPictures], None] | None, listener: Listener) -> dict[str, Any]:
+    def run(self, observer: Callable[[ViewImages], None] | None, listener: Listener) -> dict[str, Any]:
         """Render and score every held-out view; returns the quality section."""
         perceptual: Perceptual | None = None
         reason: str | None = "switched off" if self.views else "no held-out views"
         if self.config.lpips and self.views:
-            perceptual, reason = load_lpips(str(self.gaussians.device))
+            perceptual, reason = load_lpips(str(self.scene.gaussians.device))
+        per_view: dict[str, dict[str, float | None]] = {}
         for done, view in enumerate(self.views, start=1):
             photo, image = view.load_image(), self._render_image(view.camera)
             valid = view.load_valid()
@@ -204,46 +169,38 @@ class _Evaluation:
                 image = np.where(valid[..., None], image, photo)
             counted = 1.0 if valid is None else max(float(valid.mean()), 1e-6)
             structure = ssim(image, photo) if min(image.shape[:2]) >= 11 else None
-            scores: dict[str, float | None] = {
+            scores = per_view[view.name] = {
                 "psnr": psnr(image, photo) if valid is None else psnr(image[valid], photo[valid]),
                 "ssim": None if structure is None else 1 - (1 - structure) / counted,
                 "lpips": perceptual(image, photo) if perceptual else None,
             }
-            self.per_view[view.name] = scores
             relevancy, ground_truth = self._score_language(view)
             if observer is not None:
                 automatic = {prompt: self.thresholds[prompt]["auto"] for prompt in ground_truth}
-                observer(ViewPictures(view.name, photo, image, relevancy, ground_truth, automatic))
+                observer(ViewImages(view.name, photo, image, relevancy, ground_truth, automatic))
             listener(Event("evaluate", done, len(self.views), {"psnr": scores["psnr"] or 0.0}))
         for prompt in self.prompts:
             curves = [prompts[prompt].counts.iou for prompts in self.pairs.values() if prompt in prompts]
             self.thresholds[prompt]["oracle"] = float(THRESHOLDS[np.argmax(np.mean(curves, axis=0))])
+        names = ("psnr", "ssim", "lpips")
         quality: dict[str, Any] = {
-            name: mean_of([scores[name] for scores in self.per_view.values()])
-            for name in ("psnr", "ssim", "lpips")
+            name: mean_of([scores[name] for scores in per_view.values()]) for name in names
         }
-        return quality | ({} if perceptual else {"lpips_reason": reason}) | {"per_view": self.per_view}
+        return quality | ({} if perceptual else {"lpips_reason": reason}) | {"per_view": per_view}
 
+    @torch.no_grad()
     def _render_image(self, camera: Camera) -> NDArray[np.float32]:
-        from lexsplat.rendering import render
-
-        device = self.gaussians.device
-        background = torch.tensor(self.capture.background, dtype=torch.float32, device=device)
-        with torch.no_grad():
-            image = render(self.gaussians, camera, background=background).image
-        return image.clamp(0, 1).cpu().numpy()
+        gaussians = self.scene.gaussians
+        background = torch.tensor(self.capture.background, dtype=torch.float32, device=gaussians.device)
+        return render(gaussians, camera, background=background).image.clamp(0, 1).cpu().numpy()
 
     def _relevancy(self, camera: Camera, prompts: Sequence[str]) -> dict[str, NDArray[np.float32]]:
-        positives = torch.stack([self.texts[prompt] for prompt in prompts])
-        if self.method is None:
-            raise ValueError("this scene has no language")
-        question = Question(positives, self.negatives, self.config.query)
-        maps = self.method.relevancy(self.gaussians, camera, question)
-        return dict(zip(prompts, maps.cpu().numpy()))
+        return dict(zip(prompts, self.scene.relevancy(prompts, camera).cpu().numpy()))
 
     def _score_language(
         self, view: View
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.bool_]]]:
+        """The maps and the ground truth of a view by prompt, both at the size of the ground truth."""
         sources = sorted(self.masks.get(view.name, {}).items())
         ground_truth = {prompt: load_ground_truth(view, source) for prompt, source in sources}
         if not ground_truth:
@@ -267,31 +224,28 @@ class _Evaluation:
         working: NDArray[np.float32],
         mask: NDArray[np.bool_],
     ) -> PairResult:
-        """One prompt in one view under every protocol: maps at the size of the ground truth and at the
-        working size.
-        """
-        asked = self.config.protocols
+        """One prompt in one view: ``relevancy`` at the size of the ground truth, ``working`` at the working size."""
+        asked, thresholds = self.config.protocols, self.thresholds[prompt]
         boxes = self.boxes.get(view.name, {}).get(prompt)
         return PairResult(
             threshold_counts(relevancy, mask),
+            mask_scores(relevancy >= thresholds["auto"], mask),
             average_precision(relevancy, mask),
             localization(relevancy, mask),
-            official_scores(working, mask, self.config.query.threshold) if "official" in asked else None,
+            official_scores(working, mask, thresholds["fixed"]) if "official" in asked else None,
             lerf_2d_scores(relevancy, mask, boxes) if "lerf-2d" in asked and mask.any() else None,
             self._silhouette(view.camera, prompt, mask) if prompt in self.selected else None,
         )
 
+    @torch.no_grad()
     def _silhouette(self, camera: Camera, prompt: str, mask: NDArray[np.bool_]) -> float:
         """IoU of the Gaussians selected for a prompt, rendered alone."""
-        from lexsplat.rendering import render
-
         height, width = mask.shape
-        small = height * width > self.config.max_pixels
-        camera = camera if small else camera.resized(width, height)
+        if height * width <= self.config.max_pixels:
+            camera = camera.resized(width, height)
         alpha = np.zeros((camera.height, camera.width), np.float32)
         if len(self.selected[prompt]):
-            with torch.no_grad():
-                alpha = render(self.selected[prompt], camera).alpha.cpu().numpy()
+            alpha = render(self.selected[prompt], camera).alpha.cpu().numpy()
         return silhouette_iou(resize_scores(alpha, width, height), mask)
 
     def _at_size(
@@ -326,14 +280,5 @@ class _Evaluation:
         return max(time.perf_counter() - start, 1e-9) / len(cameras)
 
 
-def _sizes(gaussians: Gaussians, method: Method | None) -> dict[str, int | None]:
-    def size(tensors: Mapping[str, Tensor]) -> int:
-        return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
-
-    return {
-        "gaussians": len(gaussians),
-        "language_bytes": size(method.tensors()) if method else 0,
-        "gaussian_bytes": size(gaussians.tensors()),
-        "peak_rss_bytes": peak_memory(),
-        "peak_gpu_bytes": peak_gpu_memory(gaussians.device),
-    }
+def _bytes(tensors: Mapping[str, Tensor]) -> int:
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())

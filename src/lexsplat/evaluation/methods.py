@@ -1,32 +1,22 @@
-"""The interface that evaluation needs of a method: relevancy maps, and scores of Gaussians if it has any.
-
-Language fields (`lexsplat.language.fields.LanguageField`) are one kind of method; the rebuilt methods of
-`lexsplat.evaluation.baselines` are others.
-"""
+"""What an evaluation measures: a `Scene`, or a rebuilt method on the same Gaussians (`MethodScene`)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.presence import PresenceClassifier
-from lexsplat.queries.relevancy import Question
-from lexsplat.queries.scoring import Classify, render_scored, score_prompts
-from lexsplat.queries.segments import SEGMENT_THRESHOLD
+from lexsplat.queries.relevancy import QueryConfig, Question, TextEncoder, embed_prompts
 from lexsplat.queries.thresholds import scene_thresholds
-
-if TYPE_CHECKING:
-    from lexsplat.language.fields import LanguageField
 
 
 @runtime_checkable
 class Method(Protocol):
-    """A method that answers prompts with relevancy maps."""
+    """A method without codes that answers prompts with relevancy maps (`lexsplat.evaluation.baselines`)."""
 
     method: str
 
@@ -43,55 +33,52 @@ class Method(Protocol):
         ...
 
 
-class FieldMethod:
-    """A language field as a `Method`.
+@dataclass(frozen=True)
+class MethodAnswers:
+    """What `MethodScene.ask` answers, as `lexsplat.scenes.answers.Answers` has it.
 
     Args:
-        field: The language of the scene.
+        scores: Relevancy of every Gaussian ``[P, N]``; None for a method without 3D.
+        thresholds: The automatic threshold of each prompt ``[P]``.
     """
 
-    def __init__(self, field: LanguageField) -> None:
-        self.field = field
-        self.method = field.method
-        self.classify: Classify | None = None
-
-    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
-        """See `lexsplat.queries.scoring.render_scored`."""
-        return render_scored(self.field, gaussians, camera, question, self.classify)
-
-    def gaussian_scores(self, question: Question) -> Tensor | None:
-        """See `lexsplat.queries.scoring.score_prompts`."""
-        return score_prompts(self.field, question, self.classify).scores
-
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors of the field."""
-        return self.field.tensors()
+    scores: Tensor | None
+    thresholds: Tensor
 
 
-def automatic_answers(
-    method: Method,
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    question: Question,
-    references: Question,
-) -> tuple[Tensor | None, Tensor]:
-    """Scores ``[P, N]`` of the Gaussians, if the method has any, and automatic thresholds ``[P]``, as for its users.
+@dataclass(frozen=True)
+class MethodScene:
+    """A method that is asked like a `lexsplat.scenes.scene.Scene`; it does not decide about presence.
 
     Args:
-        method: The method. A language field learns here what decides presence.
-        gaussians: The reconstruction.
-        cameras: The training views.
-        question: The embedded prompts.
-        references: The embedded `lexsplat.queries.presence.REFERENCE_PHRASES`.
+        gaussians: Geometry and appearance.
+        field: The method.
+        cameras: The training views, from which thresholds are found.
+        encode_text: Texts to embeddings.
+        query: How text is compared.
     """
 
-    def maps(camera: Camera) -> Tensor:
-        return method.relevancy(gaussians, camera, question)
+    gaussians: Gaussians
+    field: Method
+    cameras: Sequence[Camera]
+    encode_text: TextEncoder
+    query: QueryConfig
 
-    if not isinstance(method, FieldMethod):
-        return method.gaussian_scores(question), scene_thresholds(maps, cameras)
-    method.classify = PresenceClassifier(gaussians, method.field, references).classify
-    scored = score_prompts(method.field, question, method.classify)
-    if scored.by_segments:
-        return scored.scores, torch.full((len(question),), SEGMENT_THRESHOLD)
-    return scored.scores, scene_thresholds(maps, cameras, scored.presences)
+    def ask(self, prompts: Sequence[str]) -> MethodAnswers:
+        """Scores and threshold of each prompt."""
+        question = self._question(prompts)
+        thresholds = scene_thresholds(
+            lambda camera: self.field.relevancy(self.gaussians, camera, question), self.cameras
+        )
+        return MethodAnswers(self.field.gaussian_scores(question), thresholds)
+
+    def relevancy(self, prompts: Sequence[str], view: Camera) -> Tensor:
+        """Maps ``[P, H, W]`` of the prompts in a view, in 0..1."""
+        return self.field.relevancy(self.gaussians, view, self._question(prompts))
+
+    def _question(self, prompts: Sequence[str]) -> Question:
+        positives, negatives = (
+            embed_prompts(texts, self.encode_text, self.query.templates)
+            for texts in (prompts, self.query.negatives)
+        )
+        return Question(positives, negatives, self.query)

@@ -189,16 +189,10 @@ class ThresholdCounts:
         return np.where(union > 0, self.hits / np.maximum(union, 1), 1.0)
 
     def at(self, threshold: float) -> MaskScores:
-        """Strict scores of the mask at one threshold, rounded down to the next of `THRESHOLDS`."""
+        """Strict scores of the mask at one of `THRESHOLDS`; others are rounded down to the next of them."""
         index = int(np.searchsorted(THRESHOLDS, threshold, side="right")) - 1
-        hits, alarms = int(self.hits[index]), int(self.false_alarms[index])
-        positives, pixels = int(self.hits[0]), int(self.hits[0] + self.false_alarms[0])
-        found = hits + alarms
-        return MaskScores(
-            iou=float(self.iou[index]),
-            accuracy=(pixels - alarms - (positives - hits)) / pixels,
-            precision=hits / found if found else float(positives == 0),
-        )
+        counts = self.hits[index], self.false_alarms[index], self.hits[0], self.false_alarms[0]
+        return _scores_of_counts(*map(int, counts))
 
     @property
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -206,6 +200,22 @@ class ThresholdCounts:
         found = self.hits + self.false_alarms
         keep = np.flatnonzero(found)[::-1]
         return self.hits[keep] / found[keep], self.hits[keep] / max(int(self.hits[0]), 1)
+
+
+def mask_scores(predicted: NDArray[np.bool_], ground_truth: NDArray[np.bool_]) -> MaskScores:
+    """Strict scores of a mask."""
+    hits, positives = (int(np.count_nonzero(mask)) for mask in (predicted & ground_truth, ground_truth))
+    alarms = int(np.count_nonzero(predicted)) - hits
+    return _scores_of_counts(hits, alarms, positives, ground_truth.size - positives)
+
+
+def _scores_of_counts(hits: int, alarms: int, positives: int, negatives: int) -> MaskScores:
+    found, union = hits + alarms, positives + alarms
+    return MaskScores(
+        iou=hits / union if union else 1.0,
+        accuracy=(hits + negatives - alarms) / (positives + negatives),
+        precision=hits / found if found else float(positives == 0),
+    )
 
 
 def threshold_counts(scores: ArrayLike, ground_truth: ArrayLike) -> ThresholdCounts:

@@ -127,10 +127,7 @@ class Lerf2dScores:
 
 
 def lerf_2d_scores(
-    relevancy: ArrayLike,
-    ground_truth: ArrayLike,
-    boxes: ArrayLike | None = None,
-    threshold: float = LERF_2D_THRESHOLD,
+    relevancy: ArrayLike, ground_truth: ArrayLike, boxes: ArrayLike | None = None
 ) -> Lerf2dScores:
     """LangSplat's evaluation of one map: localization and IoU.
 
@@ -144,7 +141,6 @@ def lerf_2d_scores(
         relevancy: ``[H, W]`` at the size of the ground truth.
         ground_truth: Boolean mask ``[H, W]``.
         boxes: Boxes ``[B, 4]`` as x0, y0, x1, y1 in pixels; None: those of the connected parts (`mask_boxes`).
-        threshold: In -1..1.
 
     Raises:
         ValueError: If shapes differ.
@@ -164,7 +160,7 @@ def lerf_2d_scores(
     blended = np.float32(0.5) * (blurred + values)
     stretched = blended - blended.min()
     stretched = stretched / (stretched.max() + np.float32(1e-9)) * 2 - 1
-    predicted = _majority(np.clip(stretched, 0, 1) > threshold)
+    predicted = _majority(np.clip(stretched, 0, 1) > LERF_2D_THRESHOLD)
     union = np.count_nonzero(predicted | mask)
     return Lerf2dScores(np.count_nonzero(predicted & mask) / union if union else math.nan, hit)
 
@@ -193,7 +189,7 @@ def _majority(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 # LERF-OVS in 3D
 
 
-def silhouette_iou(alpha: ArrayLike, ground_truth: ArrayLike, threshold: float = SILHOUETTE_ALPHA) -> float:
+def silhouette_iou(alpha: ArrayLike, ground_truth: ArrayLike) -> float:
     """IoU of the silhouette of the selected Gaussians with the ground truth; 0 if both are empty.
 
     The Gaussians are rendered alone, so other objects do not occlude them.
@@ -201,12 +197,11 @@ def silhouette_iou(alpha: ArrayLike, ground_truth: ArrayLike, threshold: float =
     Args:
         alpha: Opacity of the selected Gaussians ``[H, W]`` in 0..1.
         ground_truth: Boolean mask ``[H, W]``.
-        threshold: Opacity above which a pixel belongs to the silhouette.
 
     Raises:
         ValueError: If shapes differ.
     """
-    found, mask = np.asarray(alpha) > threshold, np.asarray(ground_truth, dtype=bool)
+    found, mask = np.asarray(alpha) > SILHOUETTE_ALPHA, np.asarray(ground_truth, dtype=bool)
     if found.shape != mask.shape:
         raise ValueError(
             f"alpha {list(found.shape)} and ground truth {list(mask.shape)} must have the same size"

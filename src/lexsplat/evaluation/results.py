@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.evaluation.metrics import ThresholdCounts
+from lexsplat.evaluation.metrics import MaskScores, ThresholdCounts
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 
 THRESHOLD_KINDS = ("auto", "fixed", "oracle")
@@ -22,7 +22,8 @@ class PairResult:
     """One prompt in one view.
 
     Args:
-        counts: Pixel counts at every threshold; ``counts.at(threshold)`` has IoU, accuracy and precision.
+        counts: Pixel counts at 1001 thresholds; ``counts.at(threshold)`` has IoU, accuracy and precision.
+        auto: Scores of the mask at the automatic threshold, which is not rounded.
         average_precision: Strict, in 0..1; NaN if the ground truth is empty.
         localization: 1 if the highest relevancy lies on the object, else 0; NaN if the ground truth is empty.
         official: Scores of the authors' protocol, if requested.
@@ -31,6 +32,7 @@ class PairResult:
     """
 
     counts: ThresholdCounts
+    auto: MaskScores
     average_precision: float
     localization: float
     official: OfficialScores | None = None
@@ -43,7 +45,7 @@ Pairs = Mapping[str, Mapping[str, PairResult]]
 
 
 @dataclass(frozen=True)
-class ViewPictures:
+class ViewImages:
     """The images of one view, passed to an observer; arrays must not be changed.
 
     Args:

@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lexsplat.captures.capture import Capture
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.evaluation.ground_truth import GroundTruth
-from lexsplat.evaluation.measuring import EvaluationConfig, Subject, evaluate
+from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
 from lexsplat.evaluation.report.page import write_report
 from lexsplat.evaluation.report.tables import table_rows, write_rows
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
-from lexsplat.runtime.errors import CaptureError, SceneFolderError
+from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, read_json, write_json
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import file_name
@@ -59,20 +58,14 @@ def evaluate_scene(
         raise ValueError("only a scene opened from a folder can be evaluated")
     folder, record = scene.folder, scene.folder.record
     require_current(folder)
-    if folder.is_bundled:
-        raise SceneFolderError(
-            "demo",
-            expected="a scene folder of your own, for the results",
-            found="the bundled scene",
-            remedy="make your own copy of it with: lexsplat demo",
-        )
-    photos = load_photos(scene, capture)
+    folder.refuse_bundled()
+    photos = reload_capture(folder, capture)
     found = load_annotations(photos, masks, prompt_list)
     gallery = Gallery()
     metrics = evaluate(
         photos,
-        Subject(scene.gaussians, scene.field, scene.encode_text),
-        EvaluationConfig(query=scene.query, protocols=tuple(protocols)),
+        scene,
+        EvaluationConfig(protocols=tuple(protocols)),
         ground_truth=GroundTruth(found.masks, found.boxes, _prompt_kinds(photos.root)),
         observer=gallery.add,
         listener=listener,
@@ -109,27 +102,3 @@ def _prompt_kinds(root: Path) -> dict[str, str]:
     if not isinstance(content, dict) or not all(isinstance(kind, str) for kind in content.values()):
         raise CaptureError(path, expected="a JSON object {prompt: kind}", found=type(content).__name__)
     return content
-
-
-def load_photos(scene: Scene, capture: Path | None) -> Capture:
-    """The capture of a scene, with the views, sizes and split of the build.
-
-    Args:
-        scene: A scene opened from a folder.
-        capture: Where the photos are; None takes the place where the build found them.
-
-    Raises:
-        SceneFolderError: If a photo is missing there.
-    """
-    if scene.folder is None:
-        raise ValueError("only a scene opened from a folder knows its photos")
-    photos = reload_capture(scene.folder, capture)
-    missing = set(scene.views) - set(photos.views)
-    if missing:
-        raise SceneFolderError(
-            photos.root,
-            expected=f"the {len(scene.views)} photos of the build",
-            found=f"{len(missing)} missing, such as {min(missing)}",
-            remedy="put them back or build again",
-        )
-    return photos

@@ -35,13 +35,13 @@ def summarize_language(pairs: Pairs, thresholds: Thresholds) -> dict[str, Any] |
     if not pairs:
         return None
 
-    def masks(kind: str) -> dict[str, dict[str, MaskScores]]:
-        return {
-            view: {prompt: pair.counts.at(thresholds[prompt][kind]) for prompt, pair in prompts.items()}
-            for view, prompts in pairs.items()
-        }
+    def scores_of(pair: PairResult, prompt: str, kind: str) -> MaskScores:
+        return pair.auto if kind == "auto" else pair.counts.at(thresholds[prompt][kind])
 
-    scores = {kind: masks(kind) for kind in THRESHOLD_KINDS}
+    scores = {
+        kind: {v: {p: scores_of(pair, p, kind) for p, pair in ps.items()} for v, ps in pairs.items()}
+        for kind in THRESHOLD_KINDS
+    }
     strict: dict[str, Any] = {
         kind: {name: _average(scores[kind], field_name) for name, field_name in _MASK_NAMES.items()}
         for kind in THRESHOLD_KINDS

@@ -6,7 +6,6 @@ computed by a few small matrix products. For DINO, it holds the encoder's grid. 
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +22,7 @@ from torch import Tensor
 from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
-from lexsplat.runtime.fingerprints import file_hash
+from lexsplat.runtime.fingerprints import digest
 
 FORMAT_VERSION = "1"
 
@@ -113,12 +112,7 @@ class FeatureMaps(Mapping[str, FeatureMap]):
 def hash_of(*parts: Any) -> str:
     """Hash of JSON-like values, 32 hex digits: the cache keys. Changing it invalidates every cache."""
     text = json.dumps(parts, sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-
-
-def hash_file(path: Path) -> str:
-    """Hash of a file's bytes, 32 hex digits: part of cache keys."""
-    return file_hash(path, digest_size=16)
+    return digest([text.encode()], 16)
 
 
 def write_crops(

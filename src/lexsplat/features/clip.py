@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,6 @@ from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
     normalization,
-    precision,
     resize_images,
 )
 from lexsplat.runtime.errors import ModelError
@@ -33,14 +34,19 @@ _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.2613
 _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
 _FEW_PATCHES = 64
+_SAME = 1e-5  # distance of two unit vectors that are equal but for rounding
+_PADDING = 128  # vocabularies are padded to a multiple of at most this
+
+UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
+"""Words that every encoder tells apart."""
 
 
 class ClipEncoder(PretrainedModel):
     """A CLIP-like model of transformers: CLIP, SigLIP, SigLIP 2, and others with both ``get_*_features``."""
 
-    def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
-        from transformers import AutoTokenizer
+    tower = "clip"
 
+    def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         super().__init__(folder, name, device)
         config = self._model.config
         if not (hasattr(self._model, "get_image_features") and hasattr(config, "vision_config")):
@@ -55,18 +61,15 @@ class ClipEncoder(PretrainedModel):
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
         self._mean, self._std = normalization(folder, default, self.device)
         self._patches = _PatchReader(self._model) if config.model_type == "clip" else None
-        try:
-            self._tokenizer = AutoTokenizer.from_pretrained(
-                folder, local_files_only=True, trust_remote_code=False
+        self._tokenizer = _load_tokenizer(folder, name, config)
+        words = self.encode_text(UNLIKE_WORDS)
+        self.dim = int(words.shape[-1])
+        if F.pdist(words).min() < _SAME:
+            raise self._refusal(
+                "unlike words with unlike embeddings",
+                "fetch the whole model again, or choose another model",
+                f"the same embedding for {', '.join(UNLIKE_WORDS[:3])} ...",
             )
-        except Exception as error:  # tokenizers raise a different type for each missing file
-            raise ModelError(
-                f"model {name}",
-                expected="a tokenizer beside the weights",
-                found=str(error)[:120],
-                remedy="fetch it again",
-            ) from error
-        self.dim = int(self.encode_text(["object"]).shape[-1])
 
     @torch.inference_mode()
     def encode_images(self, images: Tensor) -> Tensor:
@@ -74,8 +77,8 @@ class ClipEncoder(PretrainedModel):
         check_images(images)
         images = resize_images(images.to(self.device, torch.float32), self.image_size, self.image_size)
         pixels = (images - self._mean) / self._std
-        with precision(self.device, crops=True):
-            features = _pooled(self._model.get_image_features(**self._vision_inputs(pixels)))
+        inputs = self._vision_inputs(pixels)
+        features = self._finite(lambda: _pooled(self._model.get_image_features(**inputs)), crops=True)
         return F.normalize(features.float(), dim=-1).cpu()
 
     @property
@@ -107,10 +110,10 @@ class ClipEncoder(PretrainedModel):
                 "a model of CLIP's architecture for patch-level embeddings",
                 "use image-level embeddings only: `--features.crop-tokens class`",
             )
-        with self._patches.captured() as tokens:
+        reader = self._patches
+        with reader.captured() as tokens:
             whole = self.encode_images(images)
-        with precision(self.device, crops=True):
-            values = self._patches.read(tokens[0])
+        values = self._finite(lambda: reader.read(tokens[-1]), crops=True)
         side = math.isqrt(values.shape[1])
         return whole, F.normalize(values.float(), dim=-1).cpu().unflatten(1, (side, side))
 
@@ -127,7 +130,10 @@ class ClipEncoder(PretrainedModel):
             list(prompts[start : start + _TEXT_BATCH]) for start in range(0, len(prompts), _TEXT_BATCH)
         ]
         features = [_pooled(self._model.get_text_features(**self._text_inputs(batch))) for batch in batches]
-        return F.normalize(torch.cat(features).float(), dim=-1).cpu()
+        found = F.normalize(torch.cat(features).float(), dim=-1).cpu()
+        if not bool(found.isfinite().all()):
+            raise self._refusal("finite text embeddings", "choose another model", "NaN or infinity")
+        return found
 
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask
@@ -170,6 +176,43 @@ class ClipEncoder(PretrainedModel):
             "pixel_attention_mask": torch.ones(patches.shape[:2], dtype=torch.int32, device=pixels.device),
             "spatial_shapes": torch.full((len(pixels), 2), side, dtype=torch.long, device=pixels.device),
         }
+
+
+def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
+    """The tokenizer of a model.
+
+    Raises:
+        ModelError: If it cannot be loaded, or its vocabulary is not the model's.
+    """
+    from transformers import AutoTokenizer
+
+    refusal = functools.partial(ModelError, f"model {name}")
+    size = int(config.text_config.vocab_size)
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+    except Exception as error:  # tokenizers raise a different type for each missing file
+        found, remedy = str(error)[:120], "fetch it again"
+        if list(folder.glob("*.model")) and not all(map(_is_installed, ("sentencepiece", "google.protobuf"))):
+            found, remedy = (
+                "one of SentencePiece, which is not installed",
+                'run: pip install "lexsplat[siglip]"',
+            )
+        raise refusal(expected="a tokenizer beside the weights", found=found, remedy=remedy) from error
+    tokenizer.padding_side = "right"  # as in training; transformers' default for SigLIP 2 is "left"
+    if not size - _PADDING < len(tokenizer) <= size:
+        raise refusal(
+            expected=f"a tokenizer with the {size:,} words of the model",
+            found=f"{len(tokenizer):,} words",
+            remedy=f"fetch the model again with its tokenizer files; they are read from {folder}",
+        )
+    return tokenizer
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # not even the package around it
+        return False
 
 
 def check_patches(folder: Path, name: str) -> None:

@@ -16,7 +16,6 @@ from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
     normalization,
-    precision,
     resize_images,
 )
 
@@ -30,6 +29,9 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 class DinoEncoder(PretrainedModel):
     """A vision transformer: DINO (``vit``), DINOv2 with or without registers, DINOv3."""
+
+    tower = "dino"
+    _spare = r"(^|\.)(pooler\.|mask_token$|position_ids$)"
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         super().__init__(folder, name, device)
@@ -137,10 +139,12 @@ class DinoEncoder(PretrainedModel):
         """Patch features ``[rows, cols, D]`` of one forward pass on ``[1, 3, H, W]``."""
         rows, cols = pixels.shape[-2] // self.patch_size, pixels.shape[-1] // self.patch_size
         self._caught.layer = self._keys[-1 if layer is None else layer] if facet == "key" else None
-        with precision(self.device):
+
+        def compute() -> Tensor:
             tokens = self._model(pixel_values=pixels, **self._options).last_hidden_state
-        if facet == "key":
-            tokens = self._caught.__dict__.pop("keys").reshape(1, -1, self.dim)
+            return self._caught.__dict__.pop("keys").reshape(1, -1, self.dim) if facet == "key" else tokens
+
+        tokens = self._finite(compute)
         # The class token and registers come first in all these models; the patches are the last rows * cols.
         return tokens[0, -rows * cols :].reshape(rows, cols, self.dim).float().cpu()
 

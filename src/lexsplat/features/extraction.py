@@ -18,7 +18,6 @@ from torch import Tensor
 from lexsplat.features.cache import (
     FeatureMap,
     FeatureMaps,
-    hash_file,
     hash_of,
     is_stored,
     read_crops,
@@ -40,6 +39,7 @@ from lexsplat.features.pyramid import (
 )
 from lexsplat.features.settings import GRID_SETTINGS, RANDOM_SETTINGS, FeatureConfig
 from lexsplat.runtime import memory as budget
+from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
@@ -174,8 +174,8 @@ class _Entry:
         map_size = max(1, round(width * cells)), max(1, round(height * cells))
         # Everything the pixels depend on: file, lens, background, size and mask.
         lens = dataclasses.asdict(view.lens)
-        masked = [] if view.ignore_path is None else [hash_file(view.ignore_path)]
-        pixels = hash_of(hash_file(view.image_path), lens, list(view.background), image_size, *masked)
+        masked = [] if view.ignore_path is None else [file_hash(view.ignore_path, 16)]
+        pixels = hash_of(file_hash(view.image_path, 16), lens, list(view.background), image_size, *masked)
         settings = dataclasses.asdict(config)
         crops = {
             name: settings[name]
@@ -308,12 +308,6 @@ class _Extraction:
         if config.mode == "grid":
             return grid_levels(width, height, config.crop_sizes, config.crop_strides)
         smallest, largest = config.random_sizes
-        return random_levels(
-            width,
-            height,
-            crops=config.random_crops,
-            levels=config.random_levels,
-            smallest=smallest,
-            largest=largest,
-            rng=np.random.default_rng(entry.seed),
-        )
+        fractions = np.linspace(smallest, largest, config.random_levels).tolist()
+        rng = np.random.default_rng(entry.seed)
+        return random_levels(width, height, fractions, config.random_crops, rng)

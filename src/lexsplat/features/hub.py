@@ -1,28 +1,38 @@
 """Finds the folder of a model: in the package, a given folder, the hub's cache, or on the hub.
 
-Only safetensors are loaded. Encoders are built from a local folder, so their code is the same with and without
-internet.
+Encoders are built from a local folder, so their code is the same with and without internet.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
-import re
+import shutil
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
+from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, weight_files
 from lexsplat.runtime.errors import FileFormatError, ModelError
 from lexsplat.runtime.files import read_json
+from lexsplat.runtime.progress import NOTE
 
 log = logging.getLogger("lexsplat")
 
 BUNDLED_ENCODERS = Path(__file__).resolve().parent.parent / "demo" / "encoders"
 """Folder of the bundled encoders."""
 
-_WANTED_FILES = ["*.json", "*.txt", "*.model", "model*.safetensors"]
+PINNED = {"laion/CLIP-ViT-B-16-laion2B-s34B-b88K": "7288da5a0d6f0b51c4a2b27c624837a9236d0112"}
+"""Revisions of models on the hub that are looked for before ``main``. This one is pinned by public projects, which
+read its ``open_clip_model.safetensors``. No test of lexsplat downloads it."""
+
+_PREPROCESSING = ("preprocessor_config.json", "processor_config.json")
+_VOCABULARIES = (
+    "tokenizer.json", "vocab.json", "vocab.txt", "spiece.model", "tokenizer.model", "sentencepiece.bpe.model",
+)  # fmt: skip
+_TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
-_CONVERSION_BOT = "SFconvertbot"  # opens pull requests with safetensors on repositories without them
 
 
 def model_folder(name: str, tower: str) -> Path:
@@ -30,42 +40,73 @@ def model_folder(name: str, tower: str) -> Path:
 
     Args:
         name: A folder, a name on the Hugging Face Hub, or "bundled".
-        tower: Which of the bundled encoders "bundled" is: "clip" or "dino".
+        tower: What the model is used as: "clip" or "dino".
 
     Returns:
-        A folder with ``config.json`` and safetensors.
+        A folder with a configuration, weights, and for "clip" a tokenizer.
 
     Raises:
-        ModelError: If the model is not available locally and cannot be downloaded.
+        ModelError: If the folder lacks one of them, or the model is neither in the hub's cache nor can be downloaded.
     """
     if name in ("bundled", "embedded"):  # "embedded" is an alias
         return BUNDLED_ENCODERS / tower
     folder = Path(name).expanduser()
     if folder.is_dir():
-        if not is_model_folder(folder):
+        lacking = missing_part(folder, tower)
+        if lacking:
             raise ModelError(
                 name,
-                expected="a Hugging Face model folder (config.json and model.safetensors)",
+                expected=f"a model folder with {lacking}",
                 found=_contents(folder),
-                remedy=f"give a folder saved with save_pretrained, a model name, or `--{tower} bundled`",
+                remedy=_remedy_for(lacking, name, tower),
             )
         return folder
-    cached = _cached_folder(name)
-    return cached if cached is not None else _download(name, tower)
+    cached, lacking = _cached_folder(name, tower)
+    return cached if cached is not None else _download(name, tower, lacking)
 
 
-def is_model_folder(folder: Path) -> bool:
-    """Whether a folder holds a configuration and all shards of its safetensors."""
+def missing_part(folder: Path, tower: str) -> str:
+    """What a folder lacks to be a model, in words; "" if nothing."""
     if not (folder / "config.json").is_file():
-        return False
-    index = folder / "model.safetensors.index.json"
-    if index.is_file():
-        table = read_config(index).get("weight_map")
-        shards = list(table.values()) if isinstance(table, dict) else []
-        # Only files of the folder itself: shard names are not paths.
-        plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in shards)
-        return bool(shards) and plain and all((folder / shard).is_file() for shard in set(shards))
-    return (folder / "model.safetensors").is_file()
+        return "config.json"
+    if not weight_files(folder):
+        return "all shards of model.safetensors" if (folder / INDEX).is_file() else "model.safetensors"
+    if tower == "clip" and not _vocabulary(folder):
+        return "a tokenizer (tokenizer.json)"
+    return ""
+
+
+def _vocabulary(folder: Path) -> list[Path]:
+    """The files of the tokenizer's vocabulary; empty if there are none."""
+    found = [folder / name for name in _VOCABULARIES if (folder / name).is_file()]
+    if found and found[0].name == "vocab.json":  # byte-pair encoding also needs its merges
+        return [*found, folder / "merges.txt"] if (folder / "merges.txt").is_file() else []
+    models = [path for path in found if path.suffix == ".model"]  # read even where there is a tokenizer.json
+    return [found[0], *(path for path in models if path != found[0])] if found else []
+
+
+def loaded_files(folder: Path, tower: str) -> list[Path]:
+    """The files of a model folder on which its output depends, sorted."""
+    settings = [path for name in _PREPROCESSING if (path := folder / name).is_file()][:1]
+    if tower == "clip":
+        tokenizer = [path for name in _TOKENIZER_SETTINGS if (path := folder / name).is_file()]
+        settings += [*_vocabulary(folder), *tokenizer]
+    index = [folder / INDEX] if (folder / INDEX).is_file() and len(weight_files(folder)) > 1 else []
+    return sorted([folder / "config.json", *weight_files(folder), *index, *settings])
+
+
+def preprocessing(folder: Path) -> dict[str, Any]:
+    """The settings of the image preprocessor; empty without a file of them.
+
+    Raises:
+        ModelError: If the file is damaged.
+    """
+    for name in _PREPROCESSING:
+        if (folder / name).is_file():
+            content = read_config(folder / name)
+            inner = content.get("image_processor", content)
+            return inner if isinstance(inner, dict) else {}
+    return {}
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -85,16 +126,14 @@ def read_config(path: Path) -> dict[str, Any]:
     return content
 
 
-def content_hash(folder: Path) -> str:
-    """Hash of everything a model's output depends on: weights, configuration, tokenizer. 32 hex digits."""
+def content_hash(folder: Path, tower: str) -> str:
+    """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits."""
     digest = hashlib.blake2b(digest_size=16)
-    for path in sorted(folder.glob("*")):
-        # Weights in other formats, which are not loaded, and documents such as model cards are skipped.
-        if path.suffix in (".json", ".txt", ".model") or path.match("model*.safetensors"):
-            digest.update(path.name.encode())
-            with path.open("rb") as stream:
-                while block := stream.read(1 << 20):
-                    digest.update(block)
+    for path in loaded_files(folder, tower):
+        digest.update(path.name.encode())
+        with path.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
     return digest.hexdigest()
 
 
@@ -103,64 +142,175 @@ def _contents(folder: Path) -> str:
     return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "") if names else "an empty folder"
 
 
-def _cached_folder(name: str) -> Path | None:
-    """Folder of a model in the hub's cache; does not use the network."""
-    from huggingface_hub import constants, snapshot_download
+def _remedy_for(lacking: str, name: str, tower: str) -> str:
+    if "tokenizer" in lacking:
+        return (
+            f"copy the tokenizer files of its repository to {name}, or write them there with save_pretrained"
+        )
+    return f"give a folder written by save_pretrained, a model name, or `--{tower} bundled`"
+
+
+# -- the hub
+
+
+def _revisions(name: str) -> list[str]:
+    return [*([PINNED[name]] if name in PINNED else []), "main"]
+
+
+def _cached_folder(name: str, tower: str) -> tuple[Path | None, str]:
+    """Folder of a model in the hub's cache, or None, and what a cached copy lacks; does not use the network."""
+    from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
 
-    refs = Path(constants.HF_HUB_CACHE) / ("models--" + name.replace("/", "--")) / "refs" / "refs" / "pr"
-    revisions = ["main", *(f"refs/pr/{path.name}" for path in sorted(refs.glob("*")))]
-    for revision in revisions:
+    lacking = ""
+    for revision in _revisions(name):
         try:
-            folder = Path(
-                snapshot_download(
-                    name, revision=revision, local_files_only=True, allow_patterns=_WANTED_FILES
-                )
-            )
+            folder = Path(snapshot_download(name, revision=revision, local_files_only=True))
         except (OSError, HFValidationError):
             continue
-        if is_model_folder(folder):
-            return folder
-    return None
+        lacking = missing_part(folder, tower)
+        if not lacking:
+            return folder, ""
+    return None, lacking
 
 
-def _download(name: str, tower: str) -> Path:
-    """Download a model from the hub; uses the conversion bot's pull request if main has no safetensors."""
-    from huggingface_hub import HfApi, snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+def _download(name: str, tower: str, lacking: str) -> Path:
+    """Download a model from the hub; logs its license and size first.
 
-    fetch: dict[str, Any] = {"allow_patterns": _WANTED_FILES, "etag_timeout": _HUB_TIMEOUT}
+    Args:
+        name: The name.
+        tower: See `model_folder`.
+        lacking: What a copy in the cache lacks, in words; "" without a copy.
+
+    Raises:
+        ModelError: For each cause with a remedy of its own.
+    """
+    from huggingface_hub import HfApi, constants, snapshot_download
+
+    cache = Path(constants.HF_HUB_CACHE)
     try:
-        folder = Path(snapshot_download(name, **fetch))
-        if is_model_folder(folder):
-            return folder
-        for discussion in HfApi().get_repo_discussions(
-            name, discussion_type="pull_request", author=_CONVERSION_BOT
-        ):
-            folder = Path(snapshot_download(name, revision=discussion.git_reference, **fetch))
-            if is_model_folder(folder):
-                log.info("%s: safetensors taken from %s", name, discussion.git_reference)
-                return folder
-    except HFValidationError as error:
-        raise _missing(name, tower, "neither a folder nor a valid model name") from error
-    except HfHubHTTPError as error:
-        status = getattr(getattr(error, "response", None), "status_code", None)
-        raise _missing(name, tower, f"the hub responded with {status or 'an error'}") from error
+        facts = _repository(HfApi(), name)
+        sizes = {file.rfilename: file.size or 0 for file in facts.siblings or []}
+        files = _wanted(sizes, tower)
+        _check_complete(name, tower, sizes, files)
+        size = sum(sizes[file] for file in files)
+        card = facts.card_data or {}
+        license_name = card.get("license_name") or card.get("license") or "unknown, see its page"
+        log.log(
+            NOTE, "%s: %s are downloaded once to %s; license: %s", name, _megabytes(size), cache, license_name
+        )
+        _check_space(name, size, cache)
+        folder = snapshot_download(name, revision=facts.sha, allow_patterns=files, etag_timeout=_HUB_TIMEOUT)
+    except ModelError:
+        raise
     except (
         Exception
     ) as error:  # a missing network raises many types, depending on the HTTP library and the proxy
-        raise _missing(
-            name, tower, f"no local copy, and the hub cannot be reached ({type(error).__name__})"
-        ) from error
-    raise _missing(name, tower, "no safetensors in its repository")
+        raise _refusal(name, tower, error, cache, lacking) from error
+    return Path(folder)
 
 
-def _missing(name: str, tower: str, found: str) -> ModelError:
-    return ModelError(
-        f"model {name}",
-        expected="a downloaded model",
-        found=found,
-        remedy=f"either connect to the internet and run again (it is downloaded once), or give a folder "
-        f"that holds it (`--{tower} FOLDER`), or use the small encoder that ships with lexsplat "
-        f"(`--{tower} bundled`)",
-    )
+def _repository(api: Any, name: str) -> Any:
+    """The hub's description of a model, at its pinned revision if it has one."""
+    from huggingface_hub.errors import RevisionNotFoundError
+
+    for revision in _revisions(name):
+        try:
+            return api.model_info(name, revision=revision, files_metadata=True, timeout=_HUB_TIMEOUT)
+        except RevisionNotFoundError:
+            if revision == "main":
+                raise
+            log.warning("%s: the hub has no revision %s; main is taken", name, revision[:8])
+    raise AssertionError("the last revision is main")
+
+
+def _wanted(names: Collection[str], tower: str) -> list[str]:
+    """The files of a repository that are needed, of those that it has."""
+    weights = first_weights(names)
+    shards = [name for name in names if name.startswith("model-") and name.endswith(".safetensors")]
+    wanted = {"config.json", *_PREPROCESSING, weights, *(shards if weights == INDEX else [])}
+    if tower == "clip":
+        wanted |= {*_VOCABULARIES, "merges.txt", *_TOKENIZER_SETTINGS}
+    return sorted(name for name in names if name in wanted)
+
+
+def _check_complete(name: str, tower: str, names: Collection[str], wanted: Collection[str]) -> None:
+    if "config.json" not in wanted:
+        others = "config.json of transformers", "a repository of another library"
+    elif not set(WEIGHTS) & set(wanted):
+        others = f"one of {', '.join(WEIGHTS)}", "none of them"
+    elif tower == "clip" and not set(_VOCABULARIES) & set(names):
+        others = "a tokenizer", "none in its repository"
+    else:
+        return
+    raise ModelError(f"model {name}", expected=others[0], found=others[1], remedy=_choices(tower))
+
+
+def _check_space(name: str, size: int, cache: Path) -> None:
+    place = next(path for path in (cache, *cache.parents) if path.exists())
+    free = shutil.disk_usage(place).free
+    if free < size:
+        raise _no_space(name, cache, f"{_megabytes(size)} of free space", _megabytes(free))
+
+
+def _no_space(name: str, cache: Path, expected: str, found: str) -> ModelError:
+    remedy = "free some space, or set HF_HOME to a folder on another disk"
+    return ModelError(f"model {name}: {cache}", expected=expected, found=found, remedy=remedy)
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:,.0f} MB"
+
+
+def _choices(tower: str) -> str:
+    return f"give another model, a folder (`--{tower} FOLDER`), or the small bundled encoder (`--{tower} bundled`)"
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and what it was raised from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str) -> ModelError:
+    """The error for a failed download, by its cause."""
+    from huggingface_hub import errors as hub
+
+    def refuse(expected: str, found: str, remedy: str) -> ModelError:
+        return ModelError(f"model {name}", expected=expected, found=found, remedy=remedy)
+
+    numbers = {getattr(cause, "errno", None) for cause in _causes(error)}
+    if errno.ENOSPC in numbers or errno.EDQUOT in numbers:
+        return _no_space(name, cache, "free space for the download", "a full disk")
+    if numbers & {errno.EACCES, errno.EPERM, errno.EROFS}:
+        remedy = "allow writing there, or set HF_HOME to a folder of your own"
+        return ModelError(
+            f"model {name}: {cache}",
+            expected="a folder that can be written",
+            found="no permission",
+            remedy=remedy,
+        )
+    if isinstance(error, hub.GatedRepoError):
+        page = f"https://huggingface.co/{name}"
+        remedy = f"accept the license on {page}, run `hf auth login`, and run again; or {_choices(tower)}"
+        return refuse(
+            "access to its files", "a gated model whose license this account has not accepted", remedy
+        )
+    if isinstance(error, hub.RepositoryNotFoundError):
+        remedy = f"check the spelling (a private model needs `hf auth login`); or {_choices(tower)}"
+        return refuse(
+            "a folder or the name of a model on the hub", "no such folder and no such model", remedy
+        )
+    if isinstance(error, hub.HFValidationError):
+        return refuse("a folder or a model name", "neither a folder nor a valid model name", _choices(tower))
+    found = f"no local copy, and the hub cannot be reached ({type(error).__name__})"
+    if isinstance(error, hub.OfflineModeIsEnabled):
+        found = "no local copy, and HF_HUB_OFFLINE is set"
+    elif isinstance(error, hub.HfHubHTTPError):
+        status = getattr(getattr(error, "response", None), "status_code", None)
+        found = f"the hub responded with {status or 'an error'}"
+    if lacking:
+        found = f"a copy in {cache} without {lacking}; {found.removeprefix('no local copy, and ')}"
+    remedy = f"connect to the internet and run again (it is downloaded once); or {_choices(tower)}"
+    return refuse("a downloaded model", found, remedy)

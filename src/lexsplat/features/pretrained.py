@@ -5,17 +5,20 @@ Resizing and normalization are done in torch, without an image library.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash, read_config
+from lexsplat.features.hub import content_hash, preprocessing
+from lexsplat.features.weights import build_model
 from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
@@ -30,44 +33,60 @@ class PretrainedModel:
         device: Device of the model.
 
     Raises:
-        ModelError: If transformers cannot load the folder.
+        ModelError: If transformers cannot load the folder, or a weight is missing.
     """
+
+    tower: ClassVar[str]
+    """What the model is used as: "clip" or "dino"."""
+    _spare: ClassVar[str] = r"(position_ids|logit_scale|logit_bias)$"
+    """Pattern of tensors that are not used, so that they may be missing."""
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         self.name, self.device = name, torch.device(device)
-        self.content_hash = content_hash(folder)
-        self._model = _load_model(folder, name, self.device)
+        self.content_hash = content_hash(folder, self.tower)
+        with _quiet_transformers():
+            model = build_model(folder, name, self._spare)
+        self._model = model.eval().requires_grad_(False).to(self.device)
+        self._full_precision = False
 
-    def _refusal(self, expected: str, remedy: str) -> ModelError:
-        """The error for a model of another architecture."""
-        found = f"a {self._model.config.model_type!r} model"
+    def _refusal(self, expected: str, remedy: str, found: str = "") -> ModelError:
+        """The error for a model of another architecture, or with other outputs."""
+        found = found or f"a {self._model.config.model_type!r} model"
         return ModelError(f"model {self.name}", expected=expected, found=found, remedy=remedy)
 
+    def _finite(self, compute: Callable[[], Tensor], *, crops: bool = False) -> Tensor:
+        """Features in half precision where that is faster, or in full precision from the first overflow on.
 
-def _load_model(folder: Path, name: str, device: torch.device) -> Any:
-    from transformers import AutoModel
+        Raises:
+            ModelError: If they are not finite in full precision either.
+        """
+        if not self._full_precision:
+            with precision(self.device, crops=crops):
+                features = compute()
+            if bool(features.isfinite().all()):
+                return features
+            self._full_precision = True
+        features = compute()
+        if not bool(features.isfinite().all()):
+            raise self._refusal("finite features", "choose another model", "NaN or infinity")
+        return features
+
+
+@contextlib.contextmanager
+def _quiet_transformers() -> Iterator[None]:
+    """Without the reports and progress bars of transformers."""
     from transformers.utils import logging as transformers_logging
 
     verbosity = transformers_logging.get_verbosity()
-    transformers_logging.set_verbosity_error()  # it lists every unused head
     bars = transformers_logging.is_progress_bar_enabled()
+    transformers_logging.set_verbosity_error()
     transformers_logging.disable_progress_bar()
     try:
-        model = AutoModel.from_pretrained(
-            folder, local_files_only=True, use_safetensors=True, trust_remote_code=False
-        )
-    except Exception as error:  # KeyError, OSError, ValueError, SafetensorError, RuntimeError ...
-        raise ModelError(
-            f"model {name}",
-            expected="a model that transformers can load",
-            found=str(error)[:160],
-            remedy="fetch it again, or choose another model",
-        ) from error
+        yield
     finally:
         transformers_logging.set_verbosity(verbosity)
         if bars:
             transformers_logging.enable_progress_bar()
-    return model.float().eval().requires_grad_(False).to(device)  # some models are stored in half precision
 
 
 def precision(device: torch.device, *, crops: bool = False) -> AbstractContextManager:
@@ -78,6 +97,8 @@ def precision(device: torch.device, *, crops: bool = False) -> AbstractContextMa
     """
     if device.type == "cuda":
         return torch.autocast("cuda", dtype=torch.float16)
+    if device.type != "cpu":
+        return nullcontext()
     return torch.autocast("cpu", dtype=torch.bfloat16) if crops and _computes_in_bfloat16() else nullcontext()
 
 
@@ -90,19 +111,13 @@ def _computes_in_bfloat16() -> bool:
 
 def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation ``[3, 1, 1]`` from the model's preprocessing file, or ``default``."""
-    mean, std = default
-    for file in ("preprocessor_config.json", "processor_config.json"):
-        if not (folder / file).is_file():
-            continue
-        content = read_config(folder / file)
-        content = content.get("image_processor", content)
-        if "image_mean" in content and "image_std" in content:
-            mean, std = content["image_mean"], content["image_std"]
-            break
-    else:
+    settings = preprocessing(folder)
+    if "image_mean" not in settings or "image_std" not in settings:
         log.warning(
-            "%s: no preprocessing file; using the default image normalization of its family", folder.name
+            "%s: no image mean in a preprocessing file; the default of the model's family is used",
+            folder.name,
         )
+    mean, std = settings.get("image_mean", default[0]), settings.get("image_std", default[1])
     return tuple(torch.tensor(v, dtype=torch.float32, device=device).reshape(3, 1, 1) for v in (mean, std))  # type: ignore[return-value]
 
 

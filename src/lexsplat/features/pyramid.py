@@ -40,9 +40,6 @@ class CropLevel:
         tops: Top edges in pixels: ``[ny]`` of the rows of a grid, or ``[n]`` of the random crops.
         grid: Whether the crops are all pairs of rows and columns (row-major), or single ones.
         patches: Patches along a side of each crop, if each has its own embedding; 0 if the crop has one.
-
-    Raises:
-        ValueError: If random crops have patches.
     """
 
     size: int
@@ -50,10 +47,6 @@ class CropLevel:
     tops: NDArray[np.int32]
     grid: bool
     patches: int = 0
-
-    def __post_init__(self) -> None:
-        if self.patches and not self.grid:
-            raise ValueError("patches need a grid of crops")
 
     @property
     def boxes(self) -> NDArray[np.int32]:
@@ -83,15 +76,7 @@ def grid_levels(
         sizes: Sides as fractions of the image's short side.
         strides: Largest distance between neighbors for each size, as a fraction of the crop's side.
 
-    Raises:
-        ValueError: If there is no size, the numbers of sizes and strides differ, or one is not positive.
     """
-    if not sizes or len(sizes) != len(strides):
-        raise ValueError(
-            f"needs one stride for each crop size, got {len(sizes)} sizes and {len(strides)} strides"
-        )
-    if min(sizes) <= 0 or min(strides) <= 0:
-        raise ValueError("crop sizes and strides must be positive")
     levels = []
     for fraction, stride in zip(sizes, strides):
         size = _crop_side(fraction, width, height)
@@ -104,37 +89,21 @@ def grid_levels(
 
 
 def random_levels(
-    width: int,
-    height: int,
-    *,
-    crops: int,
-    levels: int,
-    smallest: float,
-    largest: float,
-    rng: np.random.Generator,
+    width: int, height: int, sizes: Sequence[float], crops: int, rng: np.random.Generator
 ) -> tuple[CropLevel, ...]:
-    """Random crops, the same number for each of several sizes.
+    """Random crops, the same number for each size.
 
     Args:
         width: Image width in pixels.
         height: Image height in pixels.
+        sizes: Sides as fractions of the image's short side.
         crops: Total number of crops, divided evenly; at least one per size.
-        levels: Number of sizes, evenly spaced.
-        smallest: Smallest side as a fraction of the image's short side.
-        largest: Largest side as a fraction of the image's short side.
         rng: Random generator of the positions.
-
-    Raises:
-        ValueError: If a number is not positive or the sizes are in the wrong order.
     """
-    if crops < 1 or levels < 1 or not 0 < smallest <= largest:
-        raise ValueError(
-            f"bad random crops: {crops} crops, {levels} levels, sizes {smallest:g} to {largest:g}"
-        )
     found = []
-    for index, fraction in enumerate(np.linspace(smallest, largest, levels)):
+    for index, fraction in enumerate(sizes):
         size = _crop_side(float(fraction), width, height)
-        count = max(1, crops * (index + 1) // levels - crops * index // levels)
+        count = max(1, crops * (index + 1) // len(sizes) - crops * index // len(sizes))
         lefts = rng.integers(0, width - size + 1, count).astype(np.int32)
         tops = rng.integers(0, height - size + 1, count).astype(np.int32)
         found.append(CropLevel(size, lefts, tops, grid=False))
@@ -325,42 +294,31 @@ def encode_stream(
     Yields:
         Each key with its embeddings ``[n, ...]``, in the order of the jobs.
     """
-    waiting: deque[tuple[Key, list[Tensor]]] = deque()  # images with crops that are not encoded yet
-    owners: deque[tuple[list[Tensor], int]] = deque()  # owners of the buffered crops, in order
-    buffer: list[Tensor] = []
-    buffered = 0
+    waiting: deque[tuple[Key, int]] = deque()  # images that are cut, and their numbers of crops
+    buffer: list[Tensor] = []  # crops that are not encoded yet
+    ready: list[Tensor] = []  # embeddings in the order of the crops, without those that were yielded
 
-    def flush(limit: int) -> None:
-        nonlocal buffered
-        crops = torch.cat(buffer)
-        embeddings = encode(crops[:limit])
-        buffer[:] = [crops[limit:]] if len(crops) > limit else []
-        buffered = len(crops) - len(embeddings)
-        while len(embeddings):
-            parts, count = owners.popleft()
-            parts.append(embeddings[:count])
-            if count > len(embeddings):
-                owners.appendleft((parts, count - len(embeddings)))
-            embeddings = embeddings[count:]
+    def finished() -> Iterator[tuple[Key, Tensor]]:
+        while waiting and sum(map(len, ready)) >= waiting[0][1]:
+            key, count = waiting.popleft()
+            embeddings = torch.cat(ready)
+            ready[:] = [embeddings[count:]]
+            yield key, embeddings[:count]
 
     for key, chunks in jobs:
-        parts: list[Tensor] = []
-        waiting.append((key, parts))
+        count = 0
         for chunk in chunks:
             buffer.append(chunk)
-            buffered += len(chunk)
-            owners.append((parts, len(chunk)))
-            while buffered >= batch_size:
-                flush(batch_size)
-        pending = {id(owner) for owner, _ in owners}
-        while waiting and id(waiting[0][1]) not in pending:
-            done, finished = waiting.popleft()
-            yield done, torch.cat(finished)
-    if buffered:
-        flush(batch_size)
-    while waiting:
-        done, finished = waiting.popleft()
-        yield done, torch.cat(finished)
+            count += len(chunk)
+            while sum(map(len, buffer)) >= batch_size:
+                crops = torch.cat(buffer)
+                ready.append(encode(crops[:batch_size]))
+                buffer[:] = [crops[batch_size:]]
+        waiting.append((key, count))
+        yield from finished()
+    if sum(map(len, buffer)):
+        ready.append(encode(torch.cat(buffer)))
+    yield from finished()
 
 
 def batch_size_for(memory: int, image_size: int) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import Tensor
 from lexsplat.features.encoders import ImageTextEncoder
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import digest
 
 log = logging.getLogger("lexsplat")
 
@@ -83,5 +83,5 @@ class TextCache:
 
     def _write(self, content_hash: str, known: dict[str, Tensor]) -> None:
         # Tensors are named by hashes: prompts may contain any character, and "__metadata__" is reserved.
-        keys = {hashlib.blake2b(prompt.encode(), digest_size=16).hexdigest(): prompt for prompt in known}
+        keys = {digest([prompt.encode()], 16): prompt for prompt in known}
         write_tensors(self._path(content_hash), {key: known[prompt] for key, prompt in keys.items()}, keys)

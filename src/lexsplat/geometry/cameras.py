@@ -18,7 +18,7 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Flips the y and z axes of the camera: OpenGL looks along -z with y up, OpenCV along +z with y down."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Camera:
     """A pinhole camera without distortion.
 
@@ -51,6 +51,10 @@ class Camera:
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise ValueError(f"focal lengths must be positive, got {self.K[0, 0]:g}, {self.K[1, 1]:g}")
 
+    def __repr__(self) -> str:
+        x, y, z = self.position
+        return f"Camera({self.width}x{self.height}, focal {self.K[0, 0]:.4g}, at ({x:.3g}, {y:.3g}, {z:.3g}))"
+
     @property
     def position(self) -> NDArray[np.float64]:
         """Center of projection in world coordinates ``[3]``."""
@@ -71,17 +75,6 @@ class Camera:
         if not factor > 0:
             raise ValueError(f"downscale must be positive, got {factor:g}")
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
-
-
-def camera_from_opengl(width: int, height: int, K: NDArray, camera_to_world: NDArray) -> Camera:
-    """A camera from a NeRF-style pose: camera to world ``[4, 4]``, OpenGL axes."""
-    pose = np.asarray(camera_to_world, dtype=np.float64) @ OPENGL_TO_OPENCV
-    return Camera(width, height, K, invert_pose(pose))
-
-
-def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of a rigid or similarity transform ``[4, 4]``."""
-    return np.asarray(np.linalg.inv(pose), dtype=np.float64)
 
 
 def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height: int, fov_y: float) -> Camera:

@@ -115,17 +115,10 @@ class Gaussians:
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
                 return f"NaN or Inf in {name}"
-        limits = {
-            "means": LARGEST,
-            "quats": LARGEST,
-            "log_scales": math.log(LARGEST),
-            "sh0": LARGEST,
-            "shN": LARGEST,
-        }
-        for name, limit in limits.items():
+        for name in ("means", "quats", "log_scales", "sh0", "shN"):
             values = getattr(self, name)
-            low = -math.inf if name == "log_scales" else -limit
-            if values.numel() and not bool(((values <= limit) & (values >= low)).all()):
+            size, limit = (values, math.log(LARGEST)) if name == "log_scales" else (values.abs(), LARGEST)
+            if not bool((size <= limit).all()):
                 return f"numbers out of range in {name}"
         return ""
 
@@ -167,14 +160,12 @@ def gaussians_from_points(
     if not 0 < opacity < 1:
         raise ValueError(f"opacity must be between 0 and 1, got {opacity:g}")
     count = len(points)
+    spacing = np.ones(1)
     if count > 1:
-        neighbors = min(4, count)
-        distances, _ = cKDTree(points).query(points, k=neighbors, workers=-1)
+        distances, _ = cKDTree(points).query(points, k=min(4, count), workers=-1)
         spacing = distances[:, 1:].mean(1)
         typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
         spacing = np.clip(spacing, 1e-3 * typical, 1e2 * typical)
-    else:
-        spacing = np.ones(1)
     log_scales = torch.from_numpy(np.log(spacing).astype(np.float32))[:, None].repeat(1, 3)
     rgb = torch.from_numpy(np.asarray(colors, dtype=np.float32))
     quats = torch.zeros(count, 4)

@@ -5,6 +5,8 @@ Functions on tensors are differentiable and take batches; functions on arrays co
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,13 +15,17 @@ from torch import Tensor
 
 def matrices_from_quaternions(quats: Tensor) -> Tensor:
     """Rotation matrices ``[N, 3, 3]`` of quaternions ``[N, 4]``, wxyz of any length but 0."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
+    entries = _entries(*torch.nn.functional.normalize(quats, dim=-1).unbind(-1))
+    return torch.stack(entries, -1).reshape(-1, 3, 3)
+
+
+def _entries(w: Any, x: Any, y: Any, z: Any) -> list[Any]:
+    """The nine entries of the rotation matrix of a unit quaternion, row by row."""
+    return [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
@@ -82,14 +88,7 @@ def quaternion_from_matrix(rotation: NDArray) -> NDArray[np.float64]:
 def matrix_from_quaternion(quaternion: NDArray) -> NDArray[np.float64]:
     """Rotation matrix ``[3, 3]`` of a quaternion wxyz ``[4]``; NaN for one of length 0."""
     q = np.asarray(quaternion, dtype=np.float64)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(_entries(*(q / np.linalg.norm(q)))).reshape(3, 3)
 
 
 def rotation_about(axis: NDArray, degrees: float) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ distance in the scene has been given (``lexsplat scale``). Both are stored in ``
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import numpy as np
 from lexsplat.geometry.boxes import Up, gravity_up
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.fingerprints import digest
 
 Source = Literal["cameras", "user"]
 
@@ -122,11 +122,8 @@ def stored_world(world: World, cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def _poses_of(cameras: Mapping[str, Camera]) -> str:
-    digest = hashlib.blake2b(digest_size=12)
-    for name in sorted(cameras):
-        digest.update(name.encode("utf-8", "surrogatepass"))
-        digest.update((np.round(cameras[name].viewmat, 6) + 0.0).tobytes())
-    return digest.hexdigest()
+    poses = ((name, np.round(cameras[name].viewmat, 6) + 0.0) for name in sorted(cameras))
+    return digest(name.encode("utf-8", "surrogatepass") + pose.tobytes() for name, pose in poses)
 
 
 def parse_vector(text: str) -> tuple[float, float, float]:

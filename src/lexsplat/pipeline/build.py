@@ -199,17 +199,17 @@ class _Builder:
         )
 
     def _run_stage(self, name: str, stage: _Stage) -> None:
-        made_from = self.fingerprints[name] = self._fingerprint(stage)
+        key = self.fingerprints[name] = self._fingerprint(stage)
         if self._is_finished(name, stage):
             self.listener(Event(name, 1, 1, {"kept": 1.0}))
             return
         self.folder.reopen(name)
         start = time.perf_counter()
         path = self._checkpoints / f"{name}.training.safetensors"
-        self.checkpoint = Checkpoint(path, made_from, every=self.config.checkpoint_seconds)
+        self.checkpoint = Checkpoint(path, key, every=self.config.checkpoint_seconds)
         facts = stage.work()
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
-        self.folder.finish(name, made_from, seconds, **facts)
+        self.folder.finish(name, key, seconds, **facts)
         self.checkpoint.remove()
         if self._maps is not None:
             self._maps.forget()  # the next stage needs the memory of the features kept so far

@@ -72,10 +72,10 @@ def _registered_images(
 ) -> str:
     """Run structure from motion unless its result is up to date; returns the folder of the images that have poses."""
     poses, memory = folder.root / "poses", parse_bytes(config.memory)
-    made_from = _photos_fingerprint(source, photos, folder.root, config)
+    key = _photos_fingerprint(source, photos, folder.root, config)
     images = folder.record["stages"].get("poses", {}).get("images")
     kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()
-    if kept and folder.is_finished("poses", made_from):
+    if kept and folder.is_finished("poses", key):
         return str(images)
     start = time.perf_counter()
     folder.reopen("poses")
@@ -92,7 +92,7 @@ def _registered_images(
         "unregistered": list(found.unregistered),
         "images": images,
     }
-    folder.finish("poses", made_from, time.perf_counter() - start, **facts)
+    folder.finish("poses", key, time.perf_counter() - start, **facts)
     return images
 
 
@@ -120,11 +120,12 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
         source: Folder of the capture if it has been moved since the build.
 
     Raises:
-        SceneFolderError: If the photos are not where the build found them.
+        SceneFolderError: If a photo is not where the build found it.
         CaptureError: If they cannot be used.
     """
     record = folder.record
-    held_out = [name for name, view in folder.read_cameras().items() if view.split == "test"]
+    views = folder.read_cameras()
+    held_out = [name for name, view in views.items() if view.split == "test"]
     downscale = record.get("config", {}).get("downscale") or 1.0
     images = record.get("images")
     recorded = record.get("capture")
@@ -137,13 +138,22 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
             found="no such folder",
             remedy="give their folder with --capture",
         )
-    if images is None or place is None:
-        return load_capture(place or folder.root / "poses", downscale=downscale, test_names=held_out)
     poses = folder.root / "poses"
-    return load_capture(
-        poses,
-        images=photo_folder(source) if source is not None and not owned else folder.root / images,
-        beside=place if place.is_dir() else poses,
-        downscale=downscale,
-        test_names=held_out,
-    )
+    if images is None or place is None:
+        found = load_capture(place or poses, downscale=downscale, test_names=held_out)
+    else:
+        found = load_capture(
+            poses,
+            images=photo_folder(source) if source is not None and not owned else folder.root / images,
+            beside=place if place.is_dir() else poses,
+            downscale=downscale,
+            test_names=held_out,
+        )
+    if missing := set(views) - set(found.views):
+        raise SceneFolderError(
+            found.root,
+            expected=f"the {len(views)} photos of the build",
+            found=f"{len(missing)} missing, such as {min(missing)}",
+            remedy="put them back or build again",
+        )
+    return found

@@ -73,7 +73,7 @@ def model_place(name: str) -> str:
 def model_identity(name: str, kind: str) -> list[str]:
     """What identifies a model: its name; for a folder also sizes and times of its files; a hash if it is bundled."""
     if name == "bundled":  # its files differ between versions of lexsplat, and their times mean nothing
-        return [name, content_hash(model_folder(name, kind))]
+        return [name, content_hash(model_folder(name, kind), kind)]
     folder = Path(name).expanduser()
     if not folder.is_dir():
         return [name]

@@ -1,4 +1,4 @@
-"""Relevancy in color: a perceptually uniform scale, overlays on images, and a legend.
+"""Relevancy in color: a perceptually uniform scale, and overlays on images.
 
 The scale is a path through the Oklab space whose lightness rises in equal steps from near black over violet and
 orange to pale yellow, as saturated as sRGB allows. Equal differences in relevancy look about equally large, and the
@@ -11,7 +11,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 _LIGHTNESS = (0.16, 0.96)
 _HUES = (285.0, 465.0)
@@ -65,40 +64,30 @@ def colorize(values: ArrayLike, low: float = 0.0, high: float = 1.0) -> NDArray[
     return color_scale()[(_unit(values, low, high) * 255).round().astype(np.uint8)]
 
 
-def overlay_heatmap(
-    image: ArrayLike,
-    relevancy: ArrayLike,
-    low: float = 0.0,
-    high: float | None = None,
-    strength: float = 0.85,
-) -> NDArray[np.uint8]:
+def overlay_heatmap(image: ArrayLike, relevancy: ArrayLike) -> NDArray[np.uint8]:
     """An image faded to gray, with relevancy drawn over it in color.
+
+    The peak of the map has the full color, but at least `PEAK_FLOOR`: a map without relevant pixels stays dark.
 
     Args:
         image: ``[H, W, 3]``, bytes or floats in 0..1.
         relevancy: ``[H, W]`` in 0..1.
-        low: Relevancy that is not marked.
-        high: Relevancy in full color. None takes the peak of the map, but at least `PEAK_FLOOR` above ``low``, so
-            that a map without relevant pixels stays dark.
-        strength: Opacity of the full color in 0..1.
 
     Returns:
         ``[H, W, 3]`` bytes.
 
     Raises:
-        ValueError: If the sizes disagree or ``low`` is not below ``high``.
+        ValueError: If the sizes disagree.
     """
     pixels, values = np.asarray(image), np.asarray(relevancy, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.shape[:2] != values.shape:
         raise ValueError(f"image {list(pixels.shape)} and relevancy {list(values.shape)} differ in size")
     scale = 1 / 255 if pixels.dtype == np.uint8 else 1.0
     colors = np.clip(pixels.astype(np.float32) * scale, 0, 1)
-    if high is None:
-        high = max(float(values.max()), low + PEAK_FLOOR)
-    amount = _unit(values, low, high)
+    amount = _unit(values, 0.0, max(float(values.max()), PEAK_FLOOR))
     gray = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
     backdrop = 0.55 * (0.65 * gray[..., None] + 0.35 * colors) + 0.06
-    weight = (strength * amount**0.8)[..., None]
+    weight = (0.85 * amount**0.8)[..., None]
     blended = (1 - weight) * backdrop + weight * (colorize(amount).astype(np.float32) / 255)
     return (np.clip(blended, 0, 1) * 255).round().astype(np.uint8)
 
@@ -121,19 +110,6 @@ def overlay_mask(
     eroded = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     result[inside & ~eroded] = tint
     return np.clip(result, 0, 255).round().astype(np.uint8)
-
-
-def legend(
-    low: float = 0.0, high: float = 1.0, width: int = 256, label: str = "relevancy"
-) -> NDArray[np.uint8]:
-    """A color bar with its limits and a label below, on a dark background: ``[34, width, 3]`` bytes."""
-    bar = color_scale()[np.linspace(0, 255, width).round().astype(int)]
-    image = Image.new("RGB", (width, 34), (18, 18, 22))
-    image.paste(Image.fromarray(np.repeat(bar[None], 14, axis=0)), (0, 0))
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default()
-    for text, x, anchor in ((f"{low:.2f}", 3, 0.0), (label, width / 2, 0.5), (f"{high:.2f}", width - 3, 1.0)):
-        draw.text((x - anchor * draw.textlength(text, font=font), 18), text, fill=(220, 220, 226), font=font)
-    return np.asarray(image)
 
 
 def _unit(values: ArrayLike, low: float, high: float) -> NDArray[np.float32]:

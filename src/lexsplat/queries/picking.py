@@ -97,7 +97,6 @@ def select_hit(
     gaussians: Gaussians,
     field: LanguageField,
     cameras: Mapping[str, Camera],
-    similarity: float | None = None,
     world: World | None = None,
 ) -> Selection:
     """The connected Gaussians around a hit that mean the same.
@@ -107,23 +106,17 @@ def select_hit(
         gaussians: The scene.
         field: Its language.
         cameras: Its views by name.
-        similarity: Smallest similarity in language, in 0..1; None derives it from the scene.
         world: Up and scale of the scene; None takes up from the cameras.
     """
     scores = similarity_to(hit, field)
-    if similarity is None:
-        own = float((scores[hit.indices] * hit.weights).sum() / hit.weights.sum().clamp_min(1e-12))
-        two_classes = float(automatic_threshold(scores[None], gaussians.opacities.detach())[0])
-        similarity = max(two_classes, _SIMILAR * own)
-    chosen = Selection(
-        gaussians, cameras, scores >= similarity, scores, similarity, "yes", "what was clicked", world
-    )
+    own = float((scores[hit.indices] * hit.weights).sum() / hit.weights.sum().clamp_min(1e-12))
+    two_classes = float(automatic_threshold(scores[None], gaussians.opacities.detach())[0])
+    limit = max(two_classes, _SIMILAR * own)
+    chosen = Selection(gaussians, cameras, scores >= limit, scores, limit, "yes", "what was clicked", world)
     if not chosen:
         return chosen
-    means = gaussians.means.detach().cpu().numpy()
+    place = torch.from_numpy(hit.point).to(gaussians.means)
     return min(
         chosen.clusters(),
-        key=lambda cluster: float(
-            np.linalg.norm(means[cluster.mask.cpu().numpy()] - hit.point, axis=1).min()
-        ),
+        key=lambda cluster: float((gaussians.means[cluster.mask] - place).norm(dim=1).min()),
     )

@@ -35,14 +35,6 @@ CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
 NO_TEMPLATE = ("{}",)
 """The prompt as it is, as in the paper."""
 
-PHOTO_TEMPLATES = (
-    "a photo of {}",
-    "a photo of a {}",
-    "a close-up photo of the {}",
-    "there is a {} in the scene",
-)
-"""A small prompt ensemble; its embeddings are averaged."""
-
 _CHUNK = 1 << 13  # pixels per block; small enough for a block to stay in the cache
 _GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
 
@@ -79,6 +71,8 @@ class QueryConfig:
             raise ValueError(f"form must be one of {', '.join(get_args(QueryForm))}, got {self.form!r}")
         if not self.negatives:
             raise ValueError("negatives must hold at least one phrase")
+        if not self.templates:
+            raise ValueError("templates must hold at least one sentence with {}")
         for template in self.templates:
             if template.count("{}") != 1:
                 raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
@@ -151,34 +145,17 @@ def check_prompts(prompts: str | Sequence[str]) -> list[str]:
     return cleaned
 
 
-def expand_templates(prompts: str | Sequence[str], templates: Sequence[str] = NO_TEMPLATE) -> list[str]:
-    """Every prompt in every template, prompts outermost: ``P * len(templates)`` texts.
-
-    Raises:
-        QueryError: If a prompt is empty.
-        ValueError: If there is no template, or one does not contain ``{}`` exactly once.
-    """
-    if not templates:
-        raise ValueError("templates must hold at least one sentence with {}")
-    for template in templates:
-        if template.count("{}") != 1:
-            raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
-    return [template.replace("{}", prompt) for prompt in check_prompts(prompts) for template in templates]
-
-
-def average_templates(embeddings: Tensor, num_templates: int) -> Tensor:
-    """Mean direction over each prompt's templates: ``[P * num_templates, D]`` to unit rows ``[P, D]``."""
-    if num_templates < 1 or embeddings.ndim != 2 or len(embeddings) % num_templates:
-        raise ValueError(f"{list(embeddings.shape)} embeddings do not divide into {num_templates} templates")
-    unit = torch.nn.functional.normalize(embeddings.float(), dim=-1)
-    return torch.nn.functional.normalize(unit.view(-1, num_templates, unit.shape[-1]).mean(1), dim=-1)
-
-
 def embed_prompts(
     prompts: str | Sequence[str], encode_text: TextEncoder, templates: Sequence[str] = NO_TEMPLATE
 ) -> Tensor:
-    """Unit embeddings ``[P, D]`` of prompts, averaged over templates, in one call of the encoder."""
-    return average_templates(encode_text(expand_templates(prompts, templates)), len(templates))
+    """Unit embeddings ``[P, D]`` of prompts, in one call of the encoder: the mean direction over the templates.
+
+    Raises:
+        QueryError: If there is no prompt, or one is empty.
+    """
+    texts = [template.replace("{}", prompt) for prompt in check_prompts(prompts) for template in templates]
+    unit = torch.nn.functional.normalize(encode_text(texts).float(), dim=-1)
+    return torch.nn.functional.normalize(unit.unflatten(0, (-1, len(templates))).mean(1), dim=-1)
 
 
 # Relevancy
@@ -274,12 +251,6 @@ def render_relevancy(
     field: LanguageField, gaussians: Gaussians, camera: Camera, question: Question
 ) -> Tensor:
     """Relevancy of every prompt at every pixel of a view (supplement B).
-
-    Args:
-        field: The language of the scene.
-        gaussians: Its geometry.
-        camera: The view.
-        question: Embeddings of the prompts.
 
     Returns:
         ``[P, H, W]`` in 0..1, on the device of the Gaussians.

@@ -73,10 +73,11 @@ def check_gaussians(config: ReconstructionConfig, device: torch.device | str, me
     Raises:
         MemoryBudgetError: With the number of Gaussians that fits.
     """
-    cap = config.cap(torch.device(device))
-    if torch.device(device).type != "cpu":
+    device = torch.device(device)
+    if device.type != "cpu":
         return
+    cap = config.cap(device)
     room = memory // 2 // budget.GAUSSIAN_BYTES
-    need = 2 * budget.gaussian_bytes(cap)
+    need = 2 * cap * budget.GAUSSIAN_BYTES
     what, remedy = f"{cap:,} Gaussians beside the photos", f"reconstruction.max-gaussians {room}"
     budget.require("reconstruct", need, memory, what, remedy)

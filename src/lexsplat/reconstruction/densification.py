@@ -112,7 +112,11 @@ class DensityControl:
         subjects = theirs, {GSPLAT_NAMES.get(name, name): value for name, value in optimizers.items()}
         with self._own_randomness(), _operators_for(self._device):
             if self.config.strategy == "mcmc":
-                self._strategy.step_post_backward(*subjects, self._state, step, {}, lr=means_learning_rate)
+                # gsplat moves faint Gaussians to others and fails if there are none: such a round is skipped.
+                changed = changed and bool((theirs["opacities"].sigmoid() > self.config.min_opacity).any())
+                self._strategy.step_post_backward(
+                    *subjects, self._state, step if changed else 0, {}, lr=means_learning_rate
+                )
             elif step < self.schedule.stop:
                 self._accumulate(means2d, radii, image_size)
                 if changed:

@@ -36,7 +36,7 @@ class SSIMTarget:
 
 
 def ssim_target(image: Tensor) -> SSIMTarget:
-    """Prepare a photo ``[H, W, 3]`` (float32, 0..1) for `ssim` and `photometric_loss`.
+    """Prepare a photo ``[H, W, 3]`` (float32, 0..1) for `photometric_loss`.
 
     Raises:
         ValueError: If the shape is wrong or a side has fewer than 6 pixels.
@@ -56,24 +56,6 @@ def ssim_target(image: Tensor) -> SSIMTarget:
     return SSIMTarget(image, mean, variance)
 
 
-def l1_loss(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of two images ``[H, W, 3]``."""
-    return (image - target).abs().mean()
-
-
-def ssim(image: Tensor, target: SSIMTarget) -> Tensor:
-    """Mean structural similarity in -1..1 (Wang et al. 2004), data range 1.
-
-    Args:
-        image: RGB ``[H, W, 3]``.
-        target: The photo, prepared by `ssim_target`.
-    """
-    _check_same_shape(image, target)
-    if _has_kernel(image):
-        return 1.0 - _PhotometricOnCPU.apply(image, target, 0.0, 1.0)
-    return _ssim_in_torch(image, target)
-
-
 def photometric_loss(image: Tensor, target: SSIMTarget, ssim_weight: float = 0.2) -> Tensor:
     """``(1 - w) L1 + w (1 - SSIM)``, the loss of 3DGS.
 
@@ -85,20 +67,12 @@ def photometric_loss(image: Tensor, target: SSIMTarget, ssim_weight: float = 0.2
     Raises:
         ValueError: If the shapes differ.
     """
-    _check_same_shape(image, target)
-    if _has_kernel(image):
-        return _PhotometricOnCPU.apply(image, target, 1.0 - ssim_weight, ssim_weight)
-    absolute = l1_loss(image, target.image)
-    return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - _ssim_in_torch(image, target))
-
-
-def _has_kernel(image: Tensor) -> bool:
-    return image.device.type == "cpu" and image.dtype == torch.float32
-
-
-def _check_same_shape(image: Tensor, target: SSIMTarget) -> None:
     if image.shape != target.image.shape:
         raise ValueError(f"image is {list(image.shape)} but its photo {list(target.image.shape)}")
+    if image.device.type == "cpu" and image.dtype == torch.float32:
+        return _PhotometricOnCPU.apply(image, target, 1.0 - ssim_weight, ssim_weight)
+    absolute = (image - target.image).abs().mean()
+    return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - _ssim_in_torch(image, target))
 
 
 def _ssim_in_torch(image: Tensor, target: SSIMTarget) -> Tensor:

@@ -139,8 +139,9 @@ class ReconstructionConfig:
     def density_schedule(self) -> DensitySchedule:
         """The schedule of 3DGS (or of MCMC) for 30,000 iterations, scaled to ``iterations``."""
         scale = self.iterations / REFERENCE_ITERATIONS
-        # "mcmc" adds a twentieth per round at random and would never reach its cap in few rounds.
-        least, stop = (self.densify_min_every, 15_000) if self.strategy == "default" else (1, 25_000)
+        # "mcmc" adds a twentieth per round at random and would never reach its cap in few rounds. Rounds after every
+        # step would leave no step in which the moved Gaussians regain opacity.
+        least, stop = (self.densify_min_every, 15_000) if self.strategy == "default" else (2, 25_000)
         return DensitySchedule(
             start=round(500 * scale),
             stop=round(stop * scale),

@@ -201,30 +201,13 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
 
 def find_tiles(projection: Projection, camera: Camera) -> TilePairs:
     """The (tile, Gaussian) pairs of a projection, sorted by depth."""
-    p = projection
-    return find_pairs(
-        _array(p.means2d),
-        _array(p.conics),
-        _array(p.opacities),
-        _array(_present(p.extents)),
-        _array(p.depths),
-        _array(p.radii),
-        camera.width,
-        camera.height,
-    )
+    return find_pairs(projection, camera.width, camera.height)
 
 
 def shade(gaussians: Gaussians, camera: Camera, projection: Projection, degree: int) -> Tensor:
     """RGB ``[N, 3]`` of the visible Gaussians as seen from the camera: max(0, SH + 0.5)."""
     eye = np.ascontiguousarray(camera.position)
-    means = _present(projection.means)
-    return _Shade.apply(means, gaussians.sh0, gaussians.shN, projection.radii, eye, degree)
-
-
-def _present(tensor: Tensor | None) -> Tensor:
-    if tensor is None:
-        raise ValueError("the projection was made by another backend")
-    return tensor
+    return _Shade.apply(projection.means, gaussians.sh0, gaussians.shN, projection.radii, eye, degree)
 
 
 def blend(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lexsplat.rendering.kernels import binning
 from lexsplat.rendering.kernels.jit import parallel
+from lexsplat.rendering.results import Projection
 
 STRIPS = 16
 """Number of parts in which Gaussians are counted and listed."""
@@ -60,29 +61,19 @@ class TilePairs:
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
 
 
-# Eight parameters: the arrays of a projection, as the kernels take them.
-def find_pairs(
-    means2d: NDArray[np.float32],
-    conics: NDArray[np.float32],
-    opacities: NDArray[np.float32],
-    extents: NDArray[np.float32],
-    depths: NDArray[np.float32],
-    radii: NDArray[np.int32],
-    width: int,
-    height: int,
-) -> TilePairs:
-    """Sort by depth, then count and list the pairs of each tile.
+def find_pairs(projection: Projection, width: int, height: int) -> TilePairs:
+    """Sort by depth, then count and list the pairs of each tile of an image of ``width`` x ``height`` pixels.
 
-    Args:
-        means2d: Centers ``[N, 2]`` in pixels.
-        conics: Inverse covariances ``[N, 3]`` (xx, xy, yy) in 1 / square pixels.
-        opacities: Effective opacities ``[N]``.
-        extents: Half sizes of the box outside of which alpha is below its threshold ``[N, 2]`` in pixels.
-        depths: Positive depths ``[N]``.
-        radii: 0 for Gaussians that are not drawn ``[N]``.
-        width: Image width in pixels.
-        height: Image height in pixels.
+    Raises:
+        ValueError: If the projection was made by another backend.
     """
+    p = projection
+    if p.extents is None:
+        raise ValueError("the projection was made by another backend")
+    means2d, conics, opacities, extents, depths, radii = (
+        t.detach().contiguous().numpy()
+        for t in (p.means2d, p.conics, p.opacities, p.extents, p.depths, p.radii)
+    )
     count = len(depths)
     buffer, scratch = np.empty(count, np.int32), np.empty(count, np.int32)
     visible = binning.sort_visible(depths.view(np.uint32), radii, buffer, scratch)
@@ -101,7 +92,8 @@ def find_pairs(
     tiles_x, tiles_y = -(-width // binning.TILE), -(-height // binning.TILE)
     histogram = np.zeros((STRIPS, tiles_x * tiles_y), np.int64)
     tile_offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
-    parallel(binning.count_pairs, STRIPS, 1, boxes, tiles_x, STRIPS, histogram)
+    lists = boxes, tiles_x, histogram, pair_offsets, members, pairs
+    parallel(binning.list_pairs, STRIPS, 1, True, *lists)
     binning.offsets_of(histogram, tile_offsets)
-    parallel(binning.fill_pairs, STRIPS, 1, boxes, tiles_x, STRIPS, histogram, pair_offsets, members, pairs)
+    parallel(binning.list_pairs, STRIPS, 1, False, *lists)
     return TilePairs(width, height, count, order, ellipses, boxes, pair_offsets, tile_offsets, members, pairs)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from lexsplat.runtime.fingerprints import digest
 
 
 def machine_facts() -> dict[str, Any]:
@@ -39,11 +40,9 @@ def versions() -> dict[str, str]:
 @functools.cache
 def code_identity() -> str:
     """Hash of lexsplat's source code; stored measurements are valid for one version of it."""
-    package, digest = Path(__file__).parents[1], hashlib.sha256()
-    for file in sorted(package.rglob("*.py")):
-        digest.update(file.relative_to(package).as_posix().encode() + b"\0")
-        digest.update(file.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
+    package = Path(__file__).parents[1]
+    files = sorted(package.rglob("*.py"))
+    return digest(f.relative_to(package).as_posix().encode() + b"\0" + f.read_bytes() + b"\0" for f in files)
 
 
 def _cpu_name() -> str:

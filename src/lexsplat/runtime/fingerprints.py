@@ -12,16 +12,25 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from lexsplat.runtime.files import to_json
 
 
+def digest(contents: Iterable[bytes], size: int = 12) -> str:
+    """Hash of the concatenated contents, ``2 * size`` hex digits."""
+    found = hashlib.blake2b(digest_size=size)
+    for content in contents:
+        found.update(content)
+    return found.hexdigest()
+
+
 def fingerprint(*parts: Any) -> str:
     """A short hash of JSON-like values and dataclasses; equal content has equal hashes in every process."""
     text = json.dumps([to_json(part) for part in parts], sort_keys=True, ensure_ascii=False)
-    return hashlib.blake2b(text.encode("utf-8"), digest_size=12).hexdigest()
+    return digest([text.encode("utf-8")])
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
@@ -32,8 +41,5 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 def file_hash(path: Path, digest_size: int = 12) -> str:
     """Hash of a file's content, ``2 * digest_size`` hex digits."""
-    digest = hashlib.blake2b(digest_size=digest_size)
     with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+        return digest(iter(lambda: file.read(1 << 20), b""), digest_size)

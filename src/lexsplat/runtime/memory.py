@@ -79,9 +79,8 @@ def extraction_bytes(
     """
     pixels = photo[0] * photo[1]
     reduced = pixels * min(1.0, max_side / max(photo)) ** 2
-    waiting = (
-        (threads + 2) * pixels * (5 if masked else 4)
-    )  # photos in decoding, in the queue and in reduction
+    # Photos in decoding, in the queue and in reduction.
+    waiting = (threads + 2) * pixels * (5 if masked else 4)
     return int(waiting + threads * (reduced * SIFT_BYTES + max_features * 2 * FEATURE_BYTES + THREAD_BYTES))
 
 
@@ -91,12 +90,7 @@ def matching_bytes(features: int, photos: int, threads: int) -> int:
 
 
 def mapping_bytes(features: int, matches: int) -> int:
-    """Memory of incremental mapping: correspondence graph, model and bundle adjustment.
-
-    Args:
-        features: Total number of features.
-        matches: Total number of verified matches.
-    """
+    """Memory of incremental mapping: correspondence graph, model and bundle adjustment; arguments are totals."""
     observations = min(features, 2 * matches)
     return features * 120 + matches * 48 + observations * 900
 
@@ -131,18 +125,8 @@ def require_sample(
     require(stage, math.ceil(need / share), memory, what, f"codebook.sample-size {fewer}")
 
 
-def gaussian_bytes(count: int) -> int:
-    """Memory to train ``count`` Gaussians on the CPU."""
-    return count * GAUSSIAN_BYTES
-
-
 def most_within(memory: int, need_of: dict[int, int]) -> int:
-    """The largest option that fits into the budget, or the option of smallest need if none fits.
-
-    Args:
-        memory: Budget in bytes.
-        need_of: Need in bytes by option.
-    """
+    """The largest option whose need in bytes fits into the budget, or the option of smallest need if none fits."""
     fitting = [choice for choice, need in need_of.items() if need <= memory]
     return max(fitting) if fitting else min(need_of)
 

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+
+NOTE = 25
+"""Level of log records that every user of the command line sees and that are no warnings: licenses, estimates."""
+
+logging.addLevelName(NOTE, "note")
 
 
 @dataclass(frozen=True)

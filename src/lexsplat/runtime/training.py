@@ -252,8 +252,7 @@ class DivergenceGuard:
         self._steps += 1
         if not finished and self._steps - self._kept_at < self._every:
             return
-        invalid = self._training.find_invalid()
-        if invalid:
+        if invalid := self._training.find_invalid():
             raise TrainingError(
                 self._name, expected="finite numbers", found=invalid, remedy="lower the learning rates"
             )

@@ -19,6 +19,7 @@ from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.phrases import parse
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Presence, Selection
+from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.folder import SceneFolder
@@ -62,7 +63,12 @@ class Answers:
 
         With an automatic threshold, instances that score far worse than the best one are left out as well
         (`Selection.convincing`).
+
+        Raises:
+            QueryError: If there is no prompt of this number.
         """
+        if type(index) is not int or not -len(self) <= index < len(self):
+            raise QueryError("answer", expected=f"a number from 0 to {len(self) - 1}", found=repr(index)[:40])
         scores, threshold = self.scores[index], float(self.thresholds[index])
         selection = Selection(
             self.scene.gaussians,
@@ -98,8 +104,8 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "best_view", "gaussians",
-        "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
+        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
+        highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
 
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
@@ -112,7 +118,7 @@ def answer_queries(
             "prompt": prompt,
             "threshold": round(limit, 4),
             "peak": 0.0,
-            "best_view": names[0],
+            "peak_view": names[0],
             "gaussians": len(found.selection(number)),
             "present": present,
             "views": {},
@@ -125,7 +131,7 @@ def answer_queries(
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(folder, answer["prompt"], name, image, values, limit)
             if values.max() > answer["peak"]:
-                answer["peak"], answer["best_view"] = float(values.max()), name
+                answer["peak"], answer["peak_view"] = float(values.max()), name
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         "form": scene.query.form,

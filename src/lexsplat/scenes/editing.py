@@ -177,25 +177,15 @@ class Motion:
     center: Sequence[float] | None = None
 
     def values(self, chosen: Selection) -> dict[str, Any]:
-        """The numbers of a `Step` that moves ``chosen``; checked by a trial.
-
-        Raises:
-            ValueError: If the rotation is not a rotation or the scale is not positive.
-        """
-        middle = np.zeros(3)
-        if self.center is not None:
-            middle = np.asarray(self.center, float)
-        elif chosen:
-            middle = chosen.center
-        turn = np.eye(3) if self.rotation is None else np.asarray(self.rotation, float)
-        shift = np.asarray(self.translation, float)
-        transformed(chosen.selected, rotation=turn, scale=self.scale, translation=shift, center=middle)
-        return {
-            "rotation": turn.tolist(),
-            "scale": float(self.scale),
-            "translation": shift.tolist(),
-            "center": middle.tolist(),
+        """The numbers of a `Step` that moves ``chosen``."""
+        place: Any = chosen.center if chosen else np.zeros(3)
+        vectors = {
+            "rotation": np.eye(3) if self.rotation is None else self.rotation,
+            "translation": self.translation,
+            "center": place if self.center is None else self.center,
         }
+        numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
+        return {**numbers, "scale": float(self.scale)}
 
 
 class Editor:
@@ -229,10 +219,6 @@ class Editor:
 
     # -- steps
 
-    def select(self, phrase: str, threshold: float | None = None) -> Selection:
-        """The Gaussians that match a phrase in the edited scene."""
-        return self.scene.select(phrase, threshold)
-
     def delete(self, chosen: Selection) -> None:
         """Remove a selection."""
         self._do("delete", chosen)
@@ -243,7 +229,6 @@ class Editor:
 
     def recolor(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
         """Give a selection another color, RGB in 0..1, with its old shading (`recolored`)."""
-        recolored(chosen.selected, color, strength)  # raises before the journal changes
         self._do("recolor", chosen, color=[float(c) for c in color], strength=float(strength))
 
     def move(self, chosen: Selection, motion: Motion) -> None:
@@ -278,12 +263,6 @@ class Editor:
         self._advance(self.undone.pop())
         self._write({"redo": True})
         return True
-
-    def discard(self) -> None:
-        """Drop all steps and delete the journal."""
-        self.steps, self.undone, self.scene = [], [], self.original
-        if self.journal is not None:
-            self.journal.unlink(missing_ok=True)
 
     def save(self, output: Path) -> SceneFolder:
         """Write the edited scene into a new folder; its ``scene.json`` lists the steps.

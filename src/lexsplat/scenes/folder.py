@@ -114,6 +114,20 @@ class SceneFolder:
         """Whether this is the bundled scene, which is never written."""
         return self.root.resolve() == BUNDLED_SCENE
 
+    def refuse_bundled(self) -> None:
+        """Refuse to write into the bundled scene.
+
+        Raises:
+            SceneFolderError: If this is the bundled scene.
+        """
+        if self.is_bundled:
+            raise SceneFolderError(
+                "demo",
+                expected="a scene folder of your own",
+                found="the bundled scene",
+                remedy="make your own copy of it with: lexsplat demo",
+            )
+
     @property
     def _record_path(self) -> Path:
         return self.content / "scene.json"

@@ -19,14 +19,7 @@ _ATTEMPTS = 5
 
 @dataclass(frozen=True)
 class SceneContent:
-    """One version of a scene.
-
-    Args:
-        folder: Where it was read.
-        views: The views by name.
-        gaussians: Geometry and appearance.
-        field: Their language.
-    """
+    """One version of a scene."""
 
     folder: SceneFolder
     views: dict[str, StoredView]

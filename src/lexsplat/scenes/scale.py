@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from lexsplat.geometry.world import World, stored_world, world_of
 from lexsplat.queries.selection import Selection
-from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import Scene
 
@@ -67,13 +67,7 @@ def store_world(
         SceneFolderError: If the scene is the bundled one, or another process builds there.
         ValueError: If a number is invalid.
     """
-    if root.is_bundled:
-        raise SceneFolderError(
-            "demo",
-            expected="a scene folder of your own",
-            found="the bundled scene",
-            remedy="make your own copy of it with: lexsplat demo",
-        )
+    root.refuse_bundled()
     with root.locked():
         folder = SceneFolder.open(root.root)
         cameras = {name: view.camera for name, view in folder.read_cameras().items()}

@@ -29,6 +29,7 @@ from lexsplat.queries.relations import answer
 from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,
+    TextEncoder,
     check_prompts,
     embed_prompts,
     render_relevancy,
@@ -39,7 +40,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.device import choose_device
-from lexsplat.runtime.errors import ModelError, QueryError
+from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import Answers
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.reading import read_scene
@@ -61,6 +62,7 @@ class Scene:
         clip: Name or folder of the text encoder that belongs to the language.
         query: How text is compared with the scene.
         folder: The folder that the scene was opened from, if any.
+        encode_text: Texts to embeddings, in place of the encoder that ``clip`` names.
     """
 
     def __init__(
@@ -71,10 +73,12 @@ class Scene:
         clip: str,
         query: QueryConfig | None = None,
         folder: SceneFolder | None = None,
+        encode_text: TextEncoder | None = None,
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.folder = clip, folder
         self.query = query or QueryConfig()
+        self._given_encode_text = encode_text
         self._encoder: ImageTextEncoder | None = None
         self._cache: TextCache | None = None
         self._texts: dict[str, Tensor] = {}
@@ -97,7 +101,9 @@ class Scene:
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
-        other = Scene(gaussians, field, self.views, self.clip, self.query, self.folder)
+        other = Scene(
+            gaussians, field, self.views, self.clip, self.query, self.folder, self._given_encode_text
+        )
         other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
         return other
 
@@ -124,6 +130,8 @@ class Scene:
         Raises:
             ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
         """
+        if self._given_encode_text is not None:
+            return self._given_encode_text(texts)
         known = self._encoder_hash
         writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
         if self.folder is None or known is None or not writable:
@@ -254,22 +262,19 @@ class Scene:
 
         return answer(parsed, lambda text: answers.selection(things.index(text)), viewer)
 
-    def click(
-        self, view: str | StoredView | Camera, x: float, y: float, *, similarity: float | None = None
-    ) -> Selection:
+    def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
         """The surface at a pixel, and what is connected to it and means the same.
 
         Args:
             view: The view that was clicked.
             x: Pixels from the left; the first pixel's center is 0.5.
             y: Pixels from the top.
-            similarity: Smallest similarity in language, in 0..1; None derives it from the scene.
 
         Raises:
             QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
         hit = surface_at(self.gaussians, self.camera(view), x, y)
-        return select_hit(hit, self.gaussians, self.field, self.cameras, similarity, self.world)
+        return select_hit(hit, self.gaussians, self.field, self.cameras, self.world)
 
     @property
     def presence_classifier(self) -> PresenceClassifier:
@@ -384,6 +389,10 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         ValueError: If the device is not one of the three.
     """
     place = choose_device(device)
+    if not isinstance(path, (str, os.PathLike)):
+        raise SceneFolderError(
+            repr(path)[:60], expected="the path of a scene folder", found=type(path).__name__
+        )
     found = read_scene(Path(path), place)
     clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
     return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder)

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField, LanguageField
 from lexsplat.queries.heatmaps import PEAK_FLOOR, colorize
 from lexsplat.queries.thresholds import automatic_threshold
+from lexsplat.scenes.formats.tables import colors_of
 
 Mode = Literal["photo", "relevancy", "language", "codes", "uncertainty", "depth"]
 MODES: tuple[Mode, ...] = get_args(Mode)
@@ -106,22 +107,11 @@ def quick_threshold(scores: NDArray[np.float32], opacities: NDArray[np.float32])
     return float(automatic_threshold(values[None], weights)[0])
 
 
-def photo_colors(gaussians: Gaussians) -> NDArray[np.uint8]:
-    """The view-independent color of every Gaussian ``[N, 3]``."""
-    rgb = (gaussians.sh0[:, 0] * SH_C0 + 0.5).clamp(0, 1)
-    return (rgb * 255).round().to(torch.uint8).cpu().numpy()
-
-
 class Coloring:
-    """Colors of all Gaussians of a scene in every mode.
-
-    Args:
-        gaussians: The scene.
-        language: The language field of the scene.
-    """
+    """Colors of all Gaussians of a scene in every mode."""
 
     def __init__(self, gaussians: Gaussians, language: LanguageField) -> None:
-        self.photo = photo_colors(gaussians)
+        self.photo = colors_of(gaussians)
         self._means = gaussians.means.detach().cpu().numpy()
         self._language = language
         self._fixed: dict[str, NDArray[np.uint8]] = {}

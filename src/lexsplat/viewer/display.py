@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.rotations import quaternion_from_matrix
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
-from lexsplat.viewer.recording import looking_at, orbit
+from lexsplat.viewer.recording import orbit
 from lexsplat.viewer.splats import BYTES_PER_SPLAT, SplatBlocks
 
 if TYPE_CHECKING:
@@ -28,13 +28,7 @@ _FRAME_TIMEOUT = 60.0
 
 
 class Display:
-    """Draws a scene in viser.
-
-    Args:
-        server: viser's server.
-        scene: The scene.
-        budget: Maximum number of Gaussians that are drawn.
-    """
+    """Draws a scene in viser."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene, budget: int) -> None:
         self.server, self.scene = server, scene
@@ -163,14 +157,7 @@ class Display:
     def orbit_frames(
         self, client: viser.ClientHandle, frames: int, height: int, listener: Callable[[int], None]
     ) -> list[NDArray[np.uint8]]:
-        """Images of one orbit around the look-at point of a page, at the height of its camera.
-
-        Args:
-            client: The page, which renders them.
-            frames: Number of images.
-            height: Rows of each image.
-            listener: Receives the number of finished images.
-        """
+        """Images of one orbit around the look-at point of a page, at the height of its camera."""
         camera = client.camera
         images = []
         seen_from = [view.camera.position for view in self.scene.views.values()]
@@ -203,13 +190,7 @@ def page_camera(client: viser.ClientHandle) -> Camera:
     """The camera of a page; its size is that of the page's canvas in pixels."""
     camera = client.camera
     height, width = int(camera.image_height), int(camera.image_width)
-    focal = 0.5 * height / math.tan(0.5 * camera.fov)
-    viewmat = np.eye(4)
-    rotation = looking_at(camera.position, camera.look_at, camera.up_direction)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ np.asarray(camera.position, dtype=np.float64)
-    K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(width, height, K, viewmat)
+    return look_at(camera.position, camera.look_at, camera.up_direction, width, height, camera.fov)
 
 
 def _spacing(cameras: list[Camera]) -> float:

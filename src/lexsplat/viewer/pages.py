@@ -82,12 +82,7 @@ def view_counts(
 
 
 def page_script(title: str, example: str) -> str:
-    """JavaScript that sets the page title, accessible names of the controls, and an example in the search box.
-
-    Args:
-        title: The title.
-        example: A prompt.
-    """
+    """JavaScript that sets the page title, accessible names of the controls, and an example in the search box."""
     return _render("page.js", title=title, placeholder=f"{example}, ...")
 
 

@@ -29,11 +29,6 @@ class Panels:
 
     Fast changes are applied at once under a lock. Slow work runs in the background, and is skipped if newer work
     about the same subject is waiting.
-
-    Args:
-        server: viser's server.
-        session: The state that the panels show and change.
-        display: The scene on the page.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, display: Display) -> None:

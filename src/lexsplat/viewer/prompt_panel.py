@@ -18,12 +18,7 @@ _REMOVE, _REMOVE_ALL = "Remove", "Remove all"
 
 
 class PromptPanel:
-    """Controls of one prompt, and the opacity of all marks.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Controls of one prompt, and the opacity of all marks."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._panels, self._session = panels, panels.session

@@ -54,7 +54,7 @@ def orbit(
     poses = []
     for angle in turns:
         place = target + np.cos(angle) * flat + np.sin(angle) * side + height * axis
-        poses.append((place, looking_at(place, np.asarray(target, dtype=np.float64), axis)))
+        poses.append((place, looking_along(target - place, axis).T))
     return poses
 
 
@@ -75,11 +75,6 @@ def _turns(seen: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
     if half < 1e-9:
         return np.zeros(frames)
     return np.asarray(middle + half * np.sin(times + np.arcsin(np.clip(-middle / half, -1, 1))))
-
-
-def looking_at(position: NDArray, target: NDArray, up: NDArray) -> NDArray[np.float64]:
-    """Camera-to-world rotation ``[3, 3]`` with OpenCV axes of a camera that looks at ``target``."""
-    return looking_along(target - position, up).T
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

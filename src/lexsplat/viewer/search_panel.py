@@ -20,12 +20,7 @@ NO_PROMPT = "-"
 
 
 class SearchPanel:
-    """Search box with completions and history, error message, mode and legend.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Search box with completions and history, error message, mode and legend."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._panels, self._session = panels, panels.session

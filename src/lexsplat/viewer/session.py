@@ -26,7 +26,6 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
-from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.exporting import export_gaussians
 from lexsplat.scenes.scene import Scene
@@ -37,9 +36,6 @@ from lexsplat.viewer.vocabulary import MAX_LENGTH
 MAX_QUESTIONS = len(PROMPT_COLORS)
 CLICKED_COLOR = (0, 168, 150)
 EXPORT_ENDINGS = (".ply", ".glb", ".splat", ".spz", ".points.ply")
-_CANDIDATE_VIEWS = 16
-_MANY_GAUSSIANS = 500_000
-"""From this size on, `Session.best_views` tries fewer views, because each render is slow."""
 
 
 @dataclass(eq=False)  # compared by identity: the same prompt can be removed and asked again
@@ -252,29 +248,10 @@ class Session:
         """The selection of the current question; None until `refine`."""
         return self.current.selection if self.current else None
 
-    def best_views(self, selection: Selection, count: int = 3) -> list[tuple[str, float]]:
-        """The views that show most of a selection, with the share of the image it covers; best first."""
-        if not selection:
-            return []
-        tried = _CANDIDATE_VIEWS if len(self.scene.gaussians) < _MANY_GAUSSIANS else _CANDIDATE_VIEWS // 4
-        names = evenly(list(self.scene.views), tried)
-        if selection.best_view and selection.best_view not in names:
-            names.append(selection.best_view)
-        mask = selection.mask.float()[:, None]
-        shares = []
-        for name in names:
-            camera = self.scene.views[name].camera
-            small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 96))
-            with torch.no_grad():
-                drawn = render(self.scene.gaussians, small, features=mask, color=False).features
-            shares.append((name, float(drawn.mean())))
-        shares.sort(key=lambda entry: -entry[1])
-        return [entry for entry in shares[:count] if entry[1] > 0]
-
-    def thumbnail(self, name: str, selection: Selection, long_side: int = 280) -> NDArray[np.uint8]:
+    def thumbnail(self, name: str, selection: Selection) -> NDArray[np.uint8]:
         """A view ``[h, w, 3]`` with the selection tinted and the rest dimmed."""
         camera = self.scene.view(name).camera
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
+        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 280))
         with torch.no_grad():
             drawn = render(self.scene.gaussians, small, features=selection.mask.float()[:, None])
         image = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
@@ -284,10 +261,6 @@ class Session:
 
     def export(self, selection: Selection, ending: str = ".ply") -> tuple[str, bytes]:
         """File name and content of an export of the selected Gaussians.
-
-        Args:
-            selection: The Gaussians to export.
-            ending: One of `EXPORT_ENDINGS`.
 
         Raises:
             ValueError: If the ending is not one of them.
@@ -310,12 +283,6 @@ def answer_prompt(
     """The scene's answer to a prompt: scores, threshold, presence and selection.
 
     All final answers of the viewer come from here. Phrases with relations are answered by `Scene.find`.
-
-    Args:
-        scene: The scene.
-        prompt: A thing or a phrase with relations.
-        threshold: See `Scene.select`.
-        viewpoint: See `Session.refine`.
     """
     if is_plain(prompt):
         return scene.select(prompt, threshold)

@@ -24,12 +24,7 @@ _ORBIT = {"frames": 60, "height": 480, "fps": 20}
 
 
 class SelectionPanel:
-    """Facts, download and best views of the current selection.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Facts, download and best views of the current selection."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._session = panels.session
@@ -50,7 +45,8 @@ class SelectionPanel:
         selection = current.selection if current else None
         self._facts.content = pages.selection_facts(current)
         self._download.disabled = not selection
-        best = self._session.best_views(selection, _THUMBNAILS) if selection else []
+        shares = selection.view_shares[:_THUMBNAILS] if selection else []
+        best = [(name, share) for name, share in shares if share > 0]
         self._go_to.visible = bool(best)
         self._go_to.options = tuple(name for name, _ in best) or ("",)
         for number, handle in enumerate(self._thumbnails):
@@ -68,12 +64,7 @@ class SelectionPanel:
 
 
 class ClickPanel:
-    """ "What is this?": names for the clicked object, and the vocabulary they come from.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """ "What is this?": names for the clicked object, and the vocabulary they come from."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._panels, self._history = panels, panels.session.history
@@ -106,12 +97,7 @@ class ClickPanel:
 
 
 class CamerasPanel:
-    """Jumps to the views of the capture, and their frustums.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Jumps to the views of the capture, and their frustums."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         views = panels.session.scene.views
@@ -127,12 +113,7 @@ class CamerasPanel:
 
 
 class SavePanel:
-    """Screenshot and orbit video.
-
-    Args:
-        gui: Where the controls are added.
-        panels: The panels of the page.
-    """
+    """Screenshot and orbit video."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._display = panels.display

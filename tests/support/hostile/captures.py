@@ -196,10 +196,10 @@ def points_cache() -> Reader:
     def check(result: Any) -> None:
         if result is not None:
             finite(*result)
-            assert result[0].shape == result[1].shape
+            assert result[0].shape == result[1].shape == (5, 3)
 
     return Reader(
-        lambda folder: _write_cache(folder / "points.npz", grid(5, 3), grid(5, 3)),
-        lambda folder: _read_cache(folder / "points.npz"), check,
-        {"points.npz": lambda content, rng: mutate.binary(content, rng, 150, 200)},
+        lambda folder: _write_cache(folder / "points.safetensors", grid(5, 3), grid(5, 3)),
+        lambda folder: _read_cache(folder / "points.safetensors"), check,
+        {"points.safetensors": lambda content, rng: mutate.binary(content, rng, 150, 200)},
     )  # fmt: skip

@@ -49,46 +49,31 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with _BoundedFile(path) as file, Image.open(file) as image:
                 yield image
-    except Image.DecompressionBombError as error:
-        raise CaptureError(
-            path,
-            expected=f"at most {MAX_PIXELS:,} pixels",
-            found="more",
-            remedy="scale the image down before building",
-        ) from error
-    except Image.UnidentifiedImageError as error:
-        raise CaptureError(
-            path,
-            expected="an image",
-            found=f"{path.stat().st_size} bytes that are not an image format Pillow supports",
-            remedy="replace it with a JPEG or PNG, or remove it from the capture",
-        ) from error
     except CaptureError:
         raise
-    except MemoryError as error:
-        raise CaptureError(
-            path,
-            expected="an image that fits into memory",
-            found="a larger one",
-            remedy="scale the image down before building",
-        ) from error
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        LookupError,
-        TypeError,
-        ArithmeticError,
-        struct.error,
-    ) as error:
-        # The types that Pillow's decoders raise on damaged files; the block contains only decoding.
-        raise CaptureError(
-            path,
-            expected="a complete image",
-            found=f"damaged data ({error or type(error).__name__})",
-            remedy="copy the file again, or remove it from the capture",
-        ) from error
+    except _UNREADABLE as error:  # the block contains only decoding
+        raise _unreadable(path, error) from error
+
+
+_UNREADABLE = (
+    Image.DecompressionBombError,
+    MemoryError,
+    # The other types that Pillow's decoders raise on damaged files.
+    *(OSError, SyntaxError, ValueError, EOFError, LookupError, TypeError, ArithmeticError, struct.error),
+)
+
+
+def _unreadable(path: Path, error: BaseException) -> CaptureError:
+    expected, remedy = "a complete image", "copy the file again, or remove it from the capture"
+    found = f"damaged data ({error or type(error).__name__})"
+    if isinstance(error, Image.UnidentifiedImageError):
+        expected, remedy = "an image", "replace it with a JPEG or PNG, or remove it from the capture"
+        found = f"{path.stat().st_size} bytes that are not an image format Pillow supports"
+    elif isinstance(error, (Image.DecompressionBombError, MemoryError)):
+        many = isinstance(error, Image.DecompressionBombError)
+        expected = f"at most {MAX_PIXELS:,} pixels" if many else "an image that fits into memory"
+        found, remedy = "more", "scale the image down before building"
+    return CaptureError(path, expected=expected, found=found, remedy=remedy)
 
 
 class _BoundedFile(io.BufferedReader):

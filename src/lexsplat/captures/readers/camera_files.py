@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -88,6 +89,30 @@ def _can_be_a_file(parts: tuple[str, ...]) -> bool:
     lengths = [len(part.encode("utf-8", "replace")) for part in parts]
     odd = any(unicodedata.category(letter) in ("Cc", "Cs") for part in parts for letter in part)
     return bool(parts) and max(lengths) <= 250 and sum(lengths) < 3000 and not odd
+
+
+def checked_lens(model: str, size: tuple[int, int], params: Iterable[float], name: str, origin: Path) -> Lens:
+    """The lens of a camera.
+
+    Args:
+        model: Name of the model in COLMAP.
+        size: Width and height of its images in pixels.
+        params: The parameters of the model.
+        name: The camera in the message.
+        origin: The file in the message.
+
+    Raises:
+        CaptureError: If the parameters are not those of a perspective camera.
+    """
+    try:
+        return Lens(model, *size, tuple(float(value) for value in params))
+    except ValueError as error:
+        raise CaptureError(
+            origin,
+            expected=f"a perspective camera {name}",
+            found=str(error),
+            remedy="correct the camera in the file, or estimate it again with another camera model",
+        ) from error
 
 
 def checked_pose(viewmat: NDArray[np.float64], name: str, origin: Path) -> NDArray[np.float64]:

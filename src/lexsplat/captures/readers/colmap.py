@@ -11,6 +11,7 @@ not needed, because images still contain their full pose.
 
 from __future__ import annotations
 
+import re
 import struct
 from array import array
 from collections.abc import Iterator
@@ -25,11 +26,12 @@ from lexsplat.captures.readers.camera_files import (
     MAX_COORDINATE,
     CameraFiles,
     Photo,
+    checked_lens,
     checked_name,
     checked_pose,
 )
 from lexsplat.geometry.rotations import matrix_from_quaternion
-from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.errors import FileFormatError
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", ".")
 """Folders of a capture that are searched for a model, in this order."""
@@ -70,14 +72,6 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFi
         )
     entries = list(_read_images(images_file))
     names = [checked_name(entry.name, images_file) for entry in entries]
-    doubled = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else set()
-    if doubled:
-        raise CaptureError(
-            images_file,
-            expected="every image once",
-            found=f"{sorted(doubled)[0]} twice",
-            remedy="remove one of the two from the model",
-        )
     folder = _image_folder(root, names) if images is None else images
     photos, missing = [], []
     for name, entry in zip(names, entries):
@@ -136,18 +130,6 @@ def _viewmat(
         viewmat[:3, :3] = matrix_from_quaternion(np.array(quaternion))
     viewmat[:3, 3] = translation
     return checked_pose(viewmat, name, origin)
-
-
-def _make_lens(file: Path, camera_id: int, model: str, width: int, height: int, params: tuple) -> Lens:
-    try:
-        return Lens(model, width, height, tuple(float(p) for p in params))
-    except ValueError as error:
-        raise CaptureError(
-            file,
-            expected=f"a perspective camera {camera_id}",
-            found=str(error),
-            remedy="correct the camera, or run COLMAP again with another camera model",
-        ) from error
 
 
 def _damaged(file: Path, expected: str, found: str) -> FileFormatError:
@@ -232,34 +214,28 @@ def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     if file.suffix == ".txt":
-        for line in _records(file):
+        for line in _records(file, _lines(file)):
             words = line.split()
             try:
-                values = int(words[0]), words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:]))
+                camera_id, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+                params = tuple(map(float, words[4:]))
             except (ValueError, IndexError) as error:
                 raise _damaged(file, "ID MODEL WIDTH HEIGHT PARAMS", repr(line[:60])) from error
-            yield values[0], _make_lens(file, *values)
+            yield camera_id, checked_lens(model, (width, height), params, str(camera_id), file)
         return
     models = {
         int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"
     }
-    sizes = {name: len(_example_params(name)) for name in models.values()}
     content = _Bytes(file)
     for _ in range(content.count(_CAMERA.size, "cameras")):
-        camera_id, model, width, height = content.take(_CAMERA, "a camera")
-        if model not in models:
-            raise _damaged(file, "a camera model of COLMAP", f"model number {model}")
-        name = models[model]
-        params = content.take(struct.Struct(f"<{sizes[name]}d"), f"{name} parameters")
-        yield camera_id, _make_lens(file, camera_id, name, width, height, params)
+        camera_id, number, width, height = content.take(_CAMERA, "a camera")
+        if number not in models:
+            raise _damaged(file, "a camera model of COLMAP", f"model number {number}")
+        model = models[number]
+        count = len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2).params)
+        params = content.take(struct.Struct(f"<{count}d"), f"{model} parameters")
+        yield camera_id, checked_lens(model, (width, height), params, str(camera_id), file)
     content.finish()
-
-
-def _example_params(model: str) -> list[float]:
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
-
-    camera_id, focal, width, height = 1, 1.0, 2, 2
-    return list(pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height).params)
 
 
 def _read_images(file: Path) -> Iterator[_ImageEntry]:
@@ -278,12 +254,7 @@ def _read_images(file: Path) -> Iterator[_ImageEntry]:
 
 def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
     lines = _lines(file)
-    found = 0
-    promised = None
-    for line in lines:
-        if line.startswith("#") or not line.strip():
-            promised = _promised_count(line, promised)
-            continue
+    for line in _records(file, lines):
         words = line.strip().split(maxsplit=9)
         try:
             pose = tuple(float(word) for word in words[1:8])
@@ -295,9 +266,7 @@ def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
         if observations is None or not _are_observations(observations):
             instead = "the end of the file" if observations is None else repr(observations[:60])
             raise _damaged(file, f"a line of observations after image {name}", instead)
-        found += 1
         yield _ImageEntry(name, camera_id, pose[:4], pose[4:])
-    _check_promise(file, promised, found, "images")
 
 
 def _are_observations(line: str) -> bool:
@@ -331,7 +300,7 @@ def _point_rows_binary(file: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _point_rows_text(file: Path) -> Iterator[tuple[float, ...]]:
-    for line in _records(file):
+    for line in _records(file, _lines(file)):
         words = line.split(maxsplit=8)
         try:
             row = tuple(float(word) for word in words[1:7])
@@ -356,28 +325,16 @@ def _lines(file: Path) -> Iterator[str]:
     return iter(text.replace("\r\n", "\n").split("\n"))
 
 
-def _records(file: Path) -> Iterator[str]:
-    """Lines with content. Raises at the end if the header announces more."""
-    promised, found = None, 0
-    for line in _lines(file):
+def _records(file: Path, lines: Iterator[str]) -> Iterator[str]:
+    """Lines with content. Raises at the end if a comment ``# Number of images: 12, ...`` announces more."""
+    promised, found = 0, 0
+    for line in lines:
         if line.startswith("#") or not line.strip():
-            promised = _promised_count(line, promised)
+            if match := re.match(r"# Number of [^:]*:\s*([0-9]{1,18})\s*(,|$)", line):
+                promised = int(match[1])
             continue
         found += 1
         yield line
-    _check_promise(file, promised, found, file.stem)
-
-
-def _promised_count(line: str, before: int | None) -> int | None:
-    """The count in a comment such as ``# Number of images: 12, mean observations ...``."""
-    head, colon, rest = line.partition(":")
-    if not (colon and head.startswith("# Number of ")):
-        return before
-    digits = rest.split(",")[0].strip()
-    return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 19 else before
-
-
-def _check_promise(file: Path, promised: int | None, found: int, what: str) -> None:
     # Only a shortfall is damage: people add lines by hand and leave the comment unchanged.
-    if promised is not None and found < promised:
-        raise _damaged(file, f"{promised} {what}, as its header states", f"{found}")
+    if found < promised:
+        raise _damaged(file, f"{promised} {file.stem}, as its header states", f"{found}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,14 @@ from numpy.typing import NDArray
 
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size
 from lexsplat.captures.images.undistortion import Lens
-from lexsplat.captures.readers.camera_files import CameraFiles, Photo, checked_name, checked_pose
-from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, invert_pose
+from lexsplat.captures.readers.camera_files import (
+    CameraFiles,
+    Photo,
+    checked_lens,
+    checked_name,
+    checked_pose,
+)
+from lexsplat.geometry.cameras import OPENGL_TO_OPENCV
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.files import read_json
 
@@ -27,18 +34,19 @@ SPLIT_FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
 
 MAX_FRAMES = 1_000_000
 
-_MODELS = {
-    # camera_model of nerfstudio -> COLMAP model with all of its distortion parameters
-    "PINHOLE": "FULL_OPENCV",
-    "SIMPLE_PINHOLE": "FULL_OPENCV",
-    "PERSPECTIVE": "FULL_OPENCV",
-    "SIMPLE_RADIAL": "FULL_OPENCV",
-    "RADIAL": "FULL_OPENCV",
-    "OPENCV": "FULL_OPENCV",
-    "FULL_OPENCV": "FULL_OPENCV",
-    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
-    "FISHEYE": "OPENCV_FISHEYE",
-}
+_PERSPECTIVE = (
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "PERSPECTIVE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+)
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+_MODELS = dict.fromkeys(_PERSPECTIVE, "FULL_OPENCV") | dict.fromkeys(_FISHEYE, "OPENCV_FISHEYE")
+"""COLMAP model, with all distortion parameters, of each ``camera_model`` of nerfstudio."""
+
 _UNSUPPORTED_LENSES = ("equirectangular", "is_equirectangular", "latlong", "ftheta_p0", "orthographic")
 
 
@@ -168,7 +176,11 @@ class _Reader:
         value = frame.get(key, self.document.get(key, default))
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not abs(value) <= sys.float_info.max
+        ):
             raise CaptureError(
                 self.file,
                 expected=f'a finite number for "{key}"',
@@ -203,16 +215,8 @@ class _Reader:
             distortion = (k1, k2, p1, p2, k3, k4, k5, k6)
             if not any(distortion):
                 model, distortion = "PINHOLE", ()
-        try:
-            params = tuple(float(p) for p in (focal_x, focal_y, *center, *distortion) if p is not None)
-            return Lens(model, round(width), round(height), params)
-        except ValueError as error:
-            raise CaptureError(
-                self.file,
-                expected=f"a perspective camera for image {name}",
-                found=str(error),
-                remedy="correct the intrinsics in the file",
-            ) from error
+        params = [p for p in (focal_x, focal_y, *center, *distortion) if p is not None]
+        return checked_lens(model, (round(width), round(height)), params, f"for image {name}", self.file)
 
     def _focal(self, frame: Mapping[str, Any], key: str, angle_key: str, side: float) -> float | None:
         """Focal length in pixels from its own key or from the angle of view; keys of the frame take precedence."""
@@ -260,14 +264,7 @@ class _Reader:
         camera_to_world = np.eye(4)
         camera_to_world[:3, :3] = rotation
         camera_to_world[:3, 3] = pose[:3, 3]
-        return invert_pose(camera_to_world @ OPENGL_TO_OPENCV)
+        return np.asarray(np.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV), dtype=np.float64)
 
     def _wrong(self, expected: str, found: str) -> CaptureError:
         return CaptureError(self.file, expected=expected, found=found, remedy="correct the file")
-
-
-def _is_finite(value: int | float) -> bool:
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond the range of a float
-        return False

@@ -8,7 +8,6 @@ change from the previous one on small gray copies; the second pass writes the ch
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 import json
 import os
@@ -24,6 +23,7 @@ from PIL import Image
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import Event, Listener, silent
 
 STAGE = "video"
@@ -282,10 +282,9 @@ def _identity(video: Path) -> list[Any]:
     """Name, size and a hash of the first and last MiB: identifies a video without reading all of it."""
     size = video.stat().st_size
     with open(video, "rb") as file:
-        digest = hashlib.blake2b(file.read(1 << 20), digest_size=12)
+        first = file.read(1 << 20)
         file.seek(max(0, size - (1 << 20)))
-        digest.update(file.read(1 << 20))
-    return [video.name, size, digest.hexdigest()]
+        return [video.name, size, digest([first, file.read(1 << 20)])]
 
 
 def _written_before(folder: Path, inputs: dict[str, Any]) -> list[str] | None:

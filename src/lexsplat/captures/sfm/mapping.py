@@ -8,13 +8,14 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from PIL import Image
 
 from lexsplat.captures.images.reading import image_size
-from lexsplat.captures.sfm.feature_budget import check_mapping, extraction_threads, matching_plan
+from lexsplat.captures.sfm.feature_budget import extraction_threads, matching_plan
 from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.pycolmap_import import pycolmap
 from lexsplat.runtime import memory as budget
@@ -30,6 +31,38 @@ BATCH = 8
 
 MAX_LEFTOVER_PAIRS = 20_000
 """Most pairs that are matched to register photos which sequential matching left unregistered."""
+
+SMALL_ANGLE = 4.0
+"""Smallest triangulation angle of the first pair of "small angles", in degrees; pycolmap's default is 16.
+Forward-facing photos rarely reach that."""
+
+MIN_MATCHES = 15
+"""Fewest verified matches of a pair, and fewest inliers of a photo in "small angles" (pycolmap: 30)."""
+
+HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
+
+Mapper = Literal["incremental", "small angles", "global"]
+"""How models are found: photo by photo, the same from pairs with small angles, or all photos at once (GLOMAP)."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The largest model that a mapper finds.
+
+    Args:
+        mapper: The mapper.
+        model: The model, without mis-registered photos.
+        models: Number of models that could not be joined.
+    """
+
+    mapper: Mapper
+    model: pycolmap.Reconstruction
+    models: int
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Larger is better: the number of registered photos, then a small reprojection error."""
+        return self.model.num_reg_images(), -self.model.compute_mean_reprojection_error()
 
 
 def extract_features(
@@ -149,58 +182,74 @@ def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
 
 
 def map_photos(
-    database: Path,
-    photos: PreparedPhotos,
-    config: PoseConfig,
-    seed: int,
-    memory: int,
-    another: Callable[[], None],
-) -> list[pycolmap.Reconstruction]:
-    """The models of all verified matches, the one with the most photos first, on a tie that with the most points.
+    database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int, another: Callable[[], None]
+) -> Attempt | None:
+    """The largest model of all verified matches, or None if no photo can be registered.
 
     Args:
         database: Features and matches.
         photos: The photos.
-        config: The mapper.
+        mapper: How models are found.
         seed: Seed for pycolmap.
-        memory: Bytes of host memory available.
         another: Called for each registered photo.
     """
-    check_mapping(database, memory)
     models = database.parent / "models"
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
-    if config.mapper == "global":
-        # GLOMAP needs focal lengths: those that are guesses are calibrated from the pairs first.
-        pycolmap.calibrate_view_graph(database, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+    if mapper == "global":
+        # GLOMAP needs focal lengths: those that are guesses are calibrated from the pairs first, in a copy.
+        calibrated = Path(shutil.copyfile(database, database.with_name("calibrated.db")))
+        pycolmap.calibrate_view_graph(calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
         options = pycolmap.GlobalPipelineOptions(random_seed=seed, min_model_size=3)
-        found = pycolmap.global_mapping(database, photos.images, models, options)
+        found = pycolmap.global_mapping(calibrated, photos.images, models, options)
     else:
         found = pycolmap.incremental_mapping(
             database,
             photos.images,
             models,
-            _mapper_options(seed),
+            _mapper_options(mapper, seed),
             initial_image_pair_callback=another,
             next_image_callback=another,
         )
     ordered = [found[key] for key in sorted(found)]
-    return sorted(ordered, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+    if not ordered:
+        return None
+    largest = max(ordered, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    return Attempt(mapper, _without_misregistered(largest, database, photos, mapper, seed), len(found))
 
 
-def _mapper_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
-    return pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3)
+def _mapper_options(mapper: Mapper, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed, min_model_size=3)
+    if mapper == "small angles":
+        options.mapper.init_min_tri_angle = SMALL_ANGLE
+        options.mapper.abs_pose_min_num_inliers = MIN_MATCHES
+    return options
 
 
-def without_misregistered(
-    model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, seed: int
+def _without_misregistered(
+    model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int
 ) -> pycolmap.Reconstruction:
     """The model with its mis-registered photos registered again, or removed."""
     with pycolmap.Database.open(database) as opened:
         wrong = misregistered(model, opened)
-    if not wrong:
-        return model
-    return register_again(model, wrong, database, photos.images, _mapper_options(seed))
+    options = _mapper_options(mapper, seed)
+    return register_again(model, wrong, database, photos.images, options) if wrong else model
+
+
+def unregistered(names: Iterable[str], attempt: Attempt | None) -> tuple[str, ...]:
+    """Names of the photos without a pose, sorted."""
+    model = None if attempt is None else attempt.model
+    registered = set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
+    return tuple(sorted(set(names) - registered))
+
+
+def matched(database: Path) -> set[str]:
+    """Names of the photos with verified matches with another photo: no mapper can register the others."""
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        pairs = zip(*opened.read_two_view_geometries())
+        kept = [pair for pair, geometry in pairs if len(geometry.inlier_matches) >= MIN_MATCHES]
+    return {names[number] for pair in kept for number in pycolmap.pair_id_to_image_pair(pair)}
 
 
 def write_model(model: pycolmap.Reconstruction, output: Path) -> None:

@@ -12,10 +12,12 @@ from __future__ import annotations
 import contextlib
 import itertools
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from lexsplat.captures.sfm.feature_budget import check_mapping
 from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
@@ -24,7 +26,7 @@ from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+    from lexsplat.captures.sfm.mapping import Attempt, Mapper
 
 __all__ = ["PhotoPoses", "PoseConfig", "find_photos", "photo_folder", "poses_from_photos"]
 
@@ -40,8 +42,9 @@ class PoseConfig:
     """Settings of structure from motion.
 
     Args:
-        mapper: "incremental" registers one photo after the other. "global" (GLOMAP) registers all at once: it is
-            faster on many photos, and more sensitive to wrong matches.
+        mapper: The mapper that runs first. "incremental" registers one photo after the other. "global" (GLOMAP)
+            registers all at once: it is faster on many photos, and more sensitive to wrong matches. Where photos
+            remain unregistered, other mappers follow, and the model with the most photos is kept.
         pairs: Which pairs of photos are matched. "exhaustive": all. "sequential": each photo with the next ones by
             name, and with those 2, 4, 8, ... further on, for videos and walks. "auto": exhaustive up to 80 photos;
             beyond, sequential, and then all pairs of the unregistered photos.
@@ -81,6 +84,7 @@ class PhotoPoses:
         unregistered: Names of the photos without a pose, sorted.
         points: Number of triangulated points.
         models: Number of models that could not be joined; the largest is kept.
+        mapper: How the model was found.
         notes: Remarks for the user, one line each.
     """
 
@@ -90,6 +94,7 @@ class PhotoPoses:
     unregistered: tuple[str, ...]
     points: int
     models: int
+    mapper: Mapper = "incremental"
     notes: tuple[str, ...] = ()
 
     @property
@@ -104,6 +109,8 @@ class PhotoPoses:
         line = f"{len(self.registered)} of {total} photos registered, {self.points:,} points"
         if self.models > 1:
             line = f"{line}, the largest of {self.models} models"
+        if self.mapper != "incremental":
+            line = f'{line}, found by the mapper "{self.mapper}"'
         return line if not self.unregistered else f"{line}; unregistered: {', '.join(self.unregistered)}"
 
 
@@ -145,21 +152,13 @@ def poses_from_photos(
     def tell(done: int) -> None:
         listener(Event(STAGE, min(done, total - 1), total))
 
-    def models() -> list[pycolmap.Reconstruction]:
-        registered = itertools.count(len(names) + 2)
-        return mapping.map_photos(database, photos, config, seed, memory, lambda: tell(next(registered)))
-
     with quiet_pycolmap(seed):
         tell(0)
         mapping.extract_features(database, photos, config, memory, tell)
         mapping.match_photos(database, len(names), config, seed, memory)
         tell(len(names) + 1)
-        found = models()
-        leftover = _unregistered(names, found)
-        if leftover and config.pairs == "auto" and not config.compares_all(len(names)):
-            mapping.match_leftover(database, names, leftover, seed, memory)
-            found = models() or found
-        if not found:
+        best = _best_attempt(database, photos, config, seed, memory, tell)
+        if best is None:
             _discard(work, output)
             raise CaptureError(
                 folder,
@@ -167,33 +166,76 @@ def poses_from_photos(
                 found=f"{len(names)} photos, none of which could be registered",
                 remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
             )
-        best = mapping.without_misregistered(found[0], database, photos, seed)
-        unregistered = _unregistered(names, [best])
-        mapping.write_model(best, output)
+        unregistered = mapping.unregistered(names, best)
+        mapping.write_model(best.model, output)
     _discard(work, output)
     registered = tuple(sorted(set(names) - set(unregistered)))
     listener(Event(STAGE, total, total, {"registered": len(registered), "photos": len(names)}))
+    points = best.model.num_points3D()
     return PhotoPoses(
-        output, photos.images, registered, unregistered, best.num_points3D(), len(found), photos.notes
+        output, photos.images, registered, unregistered, points, best.models, best.mapper, photos.notes
     )
 
 
-def _check_mapper(config: PoseConfig) -> None:
-    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+# Database, photos, settings, seed, memory and progress belong to no common value.
+def _best_attempt(
+    database: Path,
+    photos: PreparedPhotos,
+    config: PoseConfig,
+    seed: int,
+    memory: int,
+    tell: Callable[[int], None],
+) -> Attempt | None:
+    """The mapper that registers the most photos, with the least error on a tie.
 
-    if config.mapper == "global" and not hasattr(pycolmap, "global_mapping"):
+    The mappers run one after the other, from the strictest to the most lenient, until every photo that has matches is
+    registered. All photos at once are mapped only where more than a tenth is missing, because that takes long and is
+    sensitive to wrong matches. Photos that sequential matching left unregistered are matched with all others.
+    """
+    from lexsplat.captures.sfm import mapping
+
+    names, best = photos.names, None
+    every_pair = config.pairs != "auto" or config.compares_all(len(names))
+    mappers: tuple[mapping.Mapper, ...] = ("incremental", "small angles", "global")
+    for mapper in sorted(mappers, key=lambda name: name != config.mapper):
+        missing = mapping.unregistered(names, best)
+        if mapper == "global" != config.mapper and (
+            len(missing) <= len(names) / 10 or not mapping.HAS_GLOBAL
+        ):
+            continue
+        check_mapping(database, memory)
+        found = _attempt(database, photos, mapper, seed, tell)
+        missing = mapping.unregistered(names, found)
+        if missing and not every_pair:
+            every_pair = True
+            mapping.match_leftover(database, names, missing, seed, memory)
+            check_mapping(database, memory)
+            found = _attempt(database, photos, mapper, seed, tell) or found
+        best = max(filter(None, (best, found)), key=lambda attempt: attempt.rank, default=None)
+        if mapping.matched(database).isdisjoint(mapping.unregistered(names, best)):
+            break
+    return best
+
+
+def _attempt(
+    database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int, tell: Callable[[int], None]
+) -> Attempt | None:
+    from lexsplat.captures.sfm.mapping import map_photos
+
+    done = itertools.count(len(photos.names) + 2)
+    return map_photos(database, photos, mapper, seed, lambda: tell(next(done)))
+
+
+def _check_mapper(config: PoseConfig) -> None:
+    from lexsplat.captures.sfm.mapping import HAS_GLOBAL, pycolmap
+
+    if config.mapper == "global" and not HAS_GLOBAL:
         raise BackendError(
             "the global mapper",
             expected="pycolmap 4 or later",
             found=pycolmap.__version__,
             remedy="pip install --upgrade pycolmap, or use the incremental mapper",
         )
-
-
-def _unregistered(names: tuple[str, ...], models: list[pycolmap.Reconstruction]) -> tuple[str, ...]:
-    """The photos that are not in the first of the models."""
-    registered = {model.image(number).name for model in models[:1] for number in model.reg_image_ids()}
-    return tuple(sorted(set(names) - registered))
 
 
 def _work_folder(output: Path, photos: PreparedPhotos, config: PoseConfig, seed: int) -> Path:

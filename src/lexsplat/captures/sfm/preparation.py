@@ -97,20 +97,17 @@ def find_photos(folder: Path, without: Path | None = None) -> list[str]:
     found = (
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and apart.isdisjoint(_all_parents(path))
+        if path.suffix.lower() in IMAGE_SUFFIXES
+        and path.is_file()
+        and apart.isdisjoint([*path.parents, *path.resolve().parents])
     )
     return sorted(path.relative_to(folder).as_posix() for path in found)
 
 
-def _all_parents(path: Path) -> set[Path]:
-    return {*path.parents, *path.resolve().parents}
-
-
 def mask_places(folder: Path) -> list[Path]:
     """Where masks of the photos in a folder may be: ``masks/`` in it, or beside it if it is named ``images``."""
-    return [
-        place / IGNORE_FOLDER for place in (folder, *([folder.parent] if folder.name == "images" else []))
-    ]
+    places = [folder, folder.parent] if folder.name == "images" else [folder]
+    return [place / IGNORE_FOLDER for place in places]
 
 
 def prepare_photos(
@@ -140,8 +137,10 @@ def prepare_photos(
     found, strays = find_ignore_masks(mask_places(folder), names)
     notes += strays
     images, renamed = folder, {name: name for name in names}
-    if not all(photo.plain and photo.orientation == 1 for photo in photos):
+    unready = not all(photo.plain and photo.orientation == 1 for photo in photos)
+    if unready or found:
         _refuse_output_among_photos(folder, output)
+    if unready:
         images = output / "images"
         renamed = _new_names(photos)
         _copy_photos(photos, folder, images, renamed, listener)
@@ -150,7 +149,7 @@ def prepare_photos(
         notes.append(f"{turned} photos rotated upright and {converted} converted to JPEG or PNG in {images}")
     masks = None
     if found:
-        masks = _write_masks(photos, found, renamed, folder, output)
+        masks = _write_masks(photos, found, renamed, output)
         notes.append(f"{len(found)} of {len(names)} photos are masked")
     groups: dict[tuple[Any, ...], list[str]] = {}
     for photo in photos:
@@ -173,28 +172,22 @@ def _checked_names(folder: Path, output: Path) -> list[str]:
             remedy="take 30 or more photos around the place",
         )
     for name in names:
-        _check_name(folder, name)
+        if not _can_be_listed(folder, name):
+            raise CaptureError(
+                str(folder).encode("utf-8", "backslashreplace").decode("utf-8"),
+                expected="names in UTF-8, without control characters and backslashes",
+                found=ascii(name)[:100],
+                remedy="rename the file and its folders",
+            )
     return names
 
 
-def _check_name(folder: Path, name: str) -> None:
-    """Refuse a name that camera files cannot hold.
-
-    Raises:
-        CaptureError: If the name or the folder's is not UTF-8, or contains a control character or a backslash.
-    """
+def _can_be_listed(folder: Path, name: str) -> bool:
+    """Whether camera files can hold a name."""
     try:
-        str(folder).encode("utf-8")
-        plain = checked_name(name, folder) == name
+        return bool(str(folder).encode("utf-8")) and checked_name(name, folder) == name
     except (CaptureError, UnicodeEncodeError):
-        plain = False
-    if not plain:
-        raise CaptureError(
-            str(folder).encode("utf-8", "backslashreplace").decode("utf-8"),
-            expected="names in UTF-8, without control characters and backslashes",
-            found=ascii(name)[:100],
-            remedy="rename the file and its folders",
-        )
+        return False
 
 
 def _look_at(folder: Path, name: str) -> _Photo:
@@ -302,21 +295,15 @@ def _write_upright(photo: _Photo, source: Path, target: Path) -> None:
 
 
 def _write_masks(
-    photos: Sequence[_Photo],
-    found: dict[str, Path],
-    renamed: dict[str, str],
-    folder: Path,
-    output: Path,
+    photos: Sequence[_Photo], found: dict[str, Path], renamed: dict[str, str], output: Path
 ) -> Path:
     """Write masks in COLMAP's layout: ``NAME.png``, black and white, upright, of the photo's size."""
-    _refuse_output_among_photos(folder, output)
     place = output / IGNORE_FOLDER
     shutil.rmtree(place, ignore_errors=True)
     for photo in photos:
         if photo.name not in found:
             continue
-        mask = read_mask(found[photo.name], nonzero=True)
-        mask = _fitted_mask(mask, photo, found[photo.name])
+        mask = _fitted_mask(read_mask(found[photo.name], nonzero=True), photo, found[photo.name])
         with atomic_path(place / f"{renamed[photo.name]}.png") as temporary:
             Image.fromarray(mask.astype(np.uint8) * 255).save(temporary, format="PNG")
     return place

@@ -8,21 +8,24 @@ of the known poses are dropped, and the rest is triangulated with fixed poses.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
 from lexsplat.captures.capture import Capture, View
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
+from lexsplat.captures.sfm.feature_budget import check_mapping
 from lexsplat.captures.sfm.photos import PoseConfig
 from lexsplat.captures.sfm.preparation import PreparedPhotos
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -123,22 +126,20 @@ def triangulate(
     empty = np.zeros((0, 3), np.float32)
     if len(views) < 2:
         return empty, empty
-    cached = None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.npz"
+    cached = (
+        None if cache_dir is None else Path(cache_dir) / f"triangulated-{_cache_key(views, seed)}.safetensors"
+    )
     if cached is not None and (known := _read_cache(cached)) is not None:
         return known
     from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 
     total = len(views) + 3
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
-        folder = Path(temporary)
-        sizes = []
-        for done, view in enumerate(views):
+
+        def tell(done: int) -> None:
             listener(Event(STAGE, done, total))
-            sizes.append(_write_image(view, folder / "images" / _file_name(done)))
-            valid = view.load_valid(sizes[-1])
-            if valid is not None:
-                _save(valid.astype(np.uint8) * 255, folder / "masks" / f"{_file_name(done)}.png")
-        points, colors = _run_pycolmap(views, sizes, folder, seed, memory, total, listener)
+
+        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, tell)
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
         _write_cache(cached, points, colors)
@@ -248,48 +249,52 @@ def _file_name(index: int) -> str:
     return f"{index:06d}.png"
 
 
-def _write_image(view: View, path: Path) -> tuple[int, int]:
-    """Write the undistorted photo for pycolmap; returns its width and height."""
+def _working_size(view: View) -> tuple[int, int]:
+    """Width and height of the undistorted photo for feature extraction."""
     width, height = view.capture_size
     shrink = max(1.0, max(width, height) / FEATURES.max_side)
-    size = max(1, round(width / shrink)), max(1, round(height / shrink))
-    _save((view.load_image(size) * 255.0).round().astype(np.uint8), path)
-    return size
+    return max(1, round(width / shrink)), max(1, round(height / shrink))
 
 
-def _save(pixels: NDArray[np.uint8], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path, compress_level=1)
+def _write_photo(view: View, folder: Path, name: str) -> None:
+    """Write the undistorted photo and its mask, if it has one, for pycolmap."""
+    size = _working_size(view)
+    valid = view.load_valid(size)
+    images = {"images": (view.load_image(size) * 255.0).round().astype(np.uint8)}
+    if valid is not None:
+        images["masks"] = valid.astype(np.uint8) * 255
+    for kind, pixels in images.items():
+        (folder / kind).mkdir(exist_ok=True)
+        Image.fromarray(pixels).save(
+            folder / kind / (name if kind == "images" else f"{name}.png"), compress_level=1
+        )
 
 
 def _run_pycolmap(
-    views: tuple[View, ...],
-    sizes: list[tuple[int, int]],
-    folder: Path,
-    seed: int,
-    memory: int,
-    total: int,
-    listener: Listener,
+    views: tuple[View, ...], folder: Path, seed: int, memory: int, tell: Callable[[int], None]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Extract and match features, verify matches with the known poses, triangulate."""
     from lexsplat.captures.sfm import mapping
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
-    database, images = folder / "database.db", folder / "images"
-    done, names = len(views), tuple(_file_name(index) for index in range(len(views)))
-    listener(Event(STAGE, done, total))
-    masks = folder / "masks" if (folder / "masks").is_dir() else None
-    largest = max(sizes, key=lambda size: size[0] * size[1])
-    photos = PreparedPhotos(images, names, tuple((name,) for name in names), masks, largest)
+    names = tuple(_file_name(index) for index in range(len(views)))
+    for done, (view, name) in enumerate(zip(views, names)):
+        tell(done)
+        _write_photo(view, folder, name)
+    tell(len(views))
+    database, images, masks = folder / "database.db", folder / "images", folder / "masks"
+    largest = max(map(_working_size, views), key=lambda size: size[0] * size[1])
+    lenses = tuple((name,) for name in names)
+    photos = PreparedPhotos(images, names, lenses, masks if masks.is_dir() else None, largest)
     mapping.extract_features(database, photos, FEATURES, memory, lambda _: None, camera_model="PINHOLE")
-    known = _known_reconstruction(database, views, sizes)
-    listener(Event(STAGE, done + 1, total))
+    known = _known_reconstruction(database, views)
+    tell(len(views) + 1)
     pairs = [(names[first], names[second]) for first, second in matching_pairs(views)]
     mapping.match_pairs(database, pairs, memory, seed=None)
     # Drops matches that violate the epipolar geometry of the known poses; estimates nothing.
     pycolmap.guided_geometric_verification(known, database)
-    mapping.check_mapping(database, memory)
-    listener(Event(STAGE, done + 2, total))
+    check_mapping(database, memory)
+    tell(len(views) + 2)
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
     (folder / "model").mkdir()
     try:
@@ -304,18 +309,15 @@ def _run_pycolmap(
     return _points_of(result)
 
 
-def _known_reconstruction(
-    database_path: Path, views: tuple[View, ...], sizes: list[tuple[int, int]]
-) -> pycolmap.Reconstruction:
+def _known_reconstruction(database_path: Path, views: tuple[View, ...]) -> pycolmap.Reconstruction:
     """The views' cameras and poses with the ids of the database, whose cameras are updated to match."""
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
     known = pycolmap.Reconstruction()
-    database = pycolmap.Database.open(database_path)
-    try:
+    with pycolmap.Database.open(database_path) as database:
         entries = {entry.name: entry for entry in database.read_all_images()}
-        for index, (view, (width, height)) in enumerate(zip(views, sizes)):
-            entry = entries[_file_name(index)]
+        for index, view in enumerate(views):
+            entry, (width, height) = entries[_file_name(index)], _working_size(view)
             K = view.camera.resized(width, height).K
             camera = pycolmap.Camera(
                 camera_id=entry.camera_id,
@@ -329,8 +331,6 @@ def _known_reconstruction(
             known.add_camera_with_trivial_rig(camera)
             image = pycolmap.Image(name=entry.name, camera_id=entry.camera_id, image_id=entry.image_id)
             known.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.camera.viewmat[:3]))
-    finally:
-        database.close()
     return known
 
 
@@ -360,19 +360,13 @@ def _cache_key(views: tuple[View, ...], seed: int) -> str:
 
 
 def _read_cache(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Cached points; None where there are none or the file is damaged."""
+    """Cached points and colors; None where there are none or the file is damaged."""
     try:
-        with np.load(file, allow_pickle=False) as content:
-            points, colors = content["points"], content["colors"]
-    except Exception:  # numpy raises many types on damaged archives; the points are triangulated again
+        tensors, _ = read_tensors(file)
+        return tensors["points"].numpy(), tensors["colors"].numpy()
+    except (FileFormatError, KeyError):  # the points are triangulated again
         return None
-    sound = points.ndim == 2 and points.shape[1:] == (3,) and points.shape == colors.shape
-    if not sound or not (np.isfinite(points).all() and np.isfinite(colors).all()):
-        return None
-    return points.astype(np.float32), colors.astype(np.float32)
 
 
 def _write_cache(file: Path, points: NDArray[np.float32], colors: NDArray[np.float32]) -> None:
-    """Cache points atomically."""
-    with atomic_path(file) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, points=points, colors=colors)
+    write_tensors(file, {"points": torch.from_numpy(points), "colors": torch.from_numpy(colors)}, {})

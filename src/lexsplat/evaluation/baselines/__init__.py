@@ -9,19 +9,18 @@ scored. They are not the authors' programs: docs/evaluation.md lists the differe
 - `nearest`: no 3D: the features of the evaluated photo itself.
 """
 
-from lexsplat.evaluation.baselines.dff import DffConfig, DistilledFeatures, distill
-from lexsplat.evaluation.baselines.feature_rendering import TrainingData
-from lexsplat.evaluation.baselines.lerf import LerfConfig, ScaledFeatures, fit_lerf
+from lexsplat.evaluation.baselines.dff import DffConfig, distill
+from lexsplat.evaluation.baselines.feature_rendering import GaussianFeatures, TrainingData
+from lexsplat.evaluation.baselines.lerf import LerfConfig, fit_lerf
 from lexsplat.evaluation.baselines.nearest import ViewFeatures
 from lexsplat.evaluation.baselines.ovs3d import ClassFeatures, Ovs3dConfig, fit_3dovs
 
 __all__ = [
     "ClassFeatures",
     "DffConfig",
-    "DistilledFeatures",
+    "GaussianFeatures",
     "LerfConfig",
     "Ovs3dConfig",
-    "ScaledFeatures",
     "TrainingData",
     "ViewFeatures",
     "distill",

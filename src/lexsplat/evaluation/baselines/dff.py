@@ -10,19 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from lexsplat.evaluation.baselines.feature_rendering import (
+    CHANNELS,
+    GaussianFeatures,
     TrainingData,
     back_projected_mean,
-    chunks,
-    render_cosines,
     resized_map,
-    unit_texts,
 )
-from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -41,49 +36,6 @@ class DffConfig:
     learning_rate: float = 0.01
     scale: int = 2
 
-    def __post_init__(self) -> None:
-        if self.steps < 0 or self.scale < 1 or self.learning_rate <= 0:
-            raise ValueError("steps must not be negative, scale and learning_rate must be positive")
-
-
-class DistilledFeatures:
-    """A feature on each Gaussian.
-
-    Args:
-        features: ``[N, D]``; 0 for a Gaussian that no training view shows.
-        method: Name of the method.
-    """
-
-    def __init__(self, features: Tensor, *, method: str = "dff") -> None:
-        self.features, self.method = features, method
-
-    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
-        """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature, times how much is covered."""
-        positives, negatives = unit_texts(question.positives, question.negatives)
-        cosines, alpha = render_cosines(gaussians, camera, self.features, torch.cat([positives, negatives]))
-        split = len(positives)
-        found = pairwise_relevancy(cosines[..., :split], cosines[..., split:], question.config.temperature)
-        return (found * alpha[..., None]).permute(2, 0, 1).contiguous()
-
-    def gaussian_scores(self, question: Question) -> Tensor | None:
-        """Scores ``[P, N]``, 0 for a Gaussian that was never seen."""
-        return feature_scores(self.features, question)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """The features, in half precision."""
-        return {"features": self.features.half()}
-
-
-def feature_scores(features: Tensor, question: Question) -> Tensor:
-    """LERF's relevancy of features ``[N, D]``: ``[P, N]``, 0 for zero features."""
-    positives, negatives = (
-        text.to(features.device) for text in unit_texts(question.positives, question.negatives)
-    )
-    lengths = features.norm(dim=1, keepdim=True)
-    unit = features / lengths.clamp_min(1e-12)
-    found = pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
-    return (found * (lengths > 0)).T.contiguous()
-
 
 def distill(
     data: TrainingData,
@@ -92,7 +44,7 @@ def distill(
     seed: int = 0,
     memory: int = DEFAULT_MEMORY,
     listener: Listener = silent,
-) -> DistilledFeatures:
+) -> GaussianFeatures:
     """Fit CLIP features to the Gaussians.
 
     Args:
@@ -105,7 +57,7 @@ def distill(
     config = config or DffConfig()
     maps, views = data.maps, data.views(memory, scale=config.scale)
     dimensions = maps[views.names[0]].clip.shape[-1]
-    ranges = chunks(dimensions)
+    ranges = [slice(start, start + CHANNELS) for start in range(0, dimensions, CHANNELS)]
     total = len(views.names) + config.steps * len(ranges)
     features, weights = back_projected_mean(
         views,
@@ -131,4 +83,4 @@ def distill(
             if done % 20 == 0 or done == total:
                 listener(Event("dff", done, total, {"loss": float(loss.detach())}))
         features[:, columns] = torch.where(seen, part.detach(), 0.0)
-    return DistilledFeatures(features)
+    return GaussianFeatures("dff", features[None])

@@ -7,7 +7,7 @@ Gaussian.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.rendering import PreparedView, accumulate_weights, back_project, prepare, render
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 
@@ -121,6 +122,54 @@ class TrainingViews:
             yield self.names[queue.pop()]
 
 
+class GaussianFeatures:
+    """Features on each Gaussian, at one or several physical scales; a prompt takes the scale that scores highest.
+
+    Args:
+        method: Name of the method.
+        features: ``[S, N, D]``; 0 for a Gaussian that no training view shows.
+        scales: The scales ``[S]`` in world units, where there are several.
+    """
+
+    def __init__(self, method: str, features: Tensor, scales: Tensor | None = None) -> None:
+        self.method, self.features, self.scales = method, features, scales
+
+    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
+        """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature, times how much is covered."""
+        positives, negatives = unit_texts(question.positives, question.negatives)
+        texts, split = torch.cat([positives, negatives]), len(positives)
+        maps = []
+        for features in self.features:
+            cosines, alpha = render_cosines(gaussians, camera, features, texts)
+            found = pairwise_relevancy(
+                cosines[..., :split], cosines[..., split:], question.config.temperature
+            )
+            maps.append((found * alpha[..., None]).permute(2, 0, 1))
+        return _best_of_scales(torch.stack(maps))
+
+    def gaussian_scores(self, question: Question) -> Tensor | None:
+        """Scores ``[P, N]``, 0 for a Gaussian that was never seen."""
+        device = self.features.device
+        positives, negatives = (
+            text.to(device) for text in unit_texts(question.positives, question.negatives)
+        )
+        lengths = self.features.norm(dim=2, keepdim=True)
+        unit = self.features / lengths.clamp_min(1e-12)
+        found = pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
+        return _best_of_scales((found * (lengths > 0)).transpose(1, 2))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The features in half precision, and the scales."""
+        scales = {} if self.scales is None else {"scales": self.scales}
+        return {"features": self.features.half(), **scales}
+
+
+def _best_of_scales(values: Tensor) -> Tensor:
+    """Of scores or maps ``[S, P, ...]``, those of the scale at which each prompt has its highest value."""
+    best = values.flatten(2).amax(2).argmax(0)
+    return values[best, torch.arange(values.shape[1], device=values.device)].contiguous()
+
+
 def resized_map(values: Tensor, camera: Camera) -> Tensor:
     """A map ``[h, w, C]`` at the size of a camera, bilinear, cell centers kept."""
     if values.shape[:2] == (camera.height, camera.width):
@@ -193,8 +242,3 @@ def render_cosines(
 def unit_texts(*texts: Tensor) -> list[Tensor]:
     """Text embeddings ``[T, D]`` with unit rows."""
     return [F.normalize(text.float(), dim=-1) for text in texts]
-
-
-def chunks(count: int, size: int = CHANNELS) -> Sequence[slice]:
-    """Ranges of at most ``size`` channels."""
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]

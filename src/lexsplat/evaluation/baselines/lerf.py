@@ -19,20 +19,15 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lexsplat.evaluation.baselines.dff import feature_scores
 from lexsplat.evaluation.baselines.feature_rendering import (
+    GaussianFeatures,
     LevelMaps,
     TrainingData,
     TrainingViews,
     back_projected_mean,
-    render_cosines,
     resized_map,
-    unit_texts,
 )
-from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.rendering import render
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -52,54 +47,6 @@ class LerfConfig:
     neighbors: int = 8
     sharpness: float = 10.0
 
-    def __post_init__(self) -> None:
-        if self.scales < 1 or self.neighbors < 0:
-            raise ValueError("scales must be positive, neighbors not negative")
-
-
-class ScaledFeatures:
-    """Features on each Gaussian at several scales.
-
-    Args:
-        features: ``[S, N, D]``.
-        scales: The scales ``[S]`` in world units.
-    """
-
-    method = "lerf"
-
-    def __init__(self, features: Tensor, scales: Tensor) -> None:
-        self.features, self.scales = features, scales
-
-    def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
-        """Maps ``[P, H, W]``, each at the scale where it is highest."""
-        positives, negatives = unit_texts(question.positives, question.negatives)
-        best: Tensor | None = None
-        for features in self.features:
-            cosines, alpha = render_cosines(gaussians, camera, features, torch.cat([positives, negatives]))
-            split = len(positives)
-            found = pairwise_relevancy(
-                cosines[..., :split], cosines[..., split:], question.config.temperature
-            )
-            maps = (found * alpha[..., None]).permute(2, 0, 1)
-            best = maps if best is None else torch.where(_higher(maps, best)[:, None, None], maps, best)
-        if best is None:
-            raise ValueError("there is no scale")
-        return best.contiguous()
-
-    def gaussian_scores(self, question: Question) -> Tensor | None:
-        """Scores ``[P, N]``, each at the scale where it is highest."""
-        scores = torch.stack([feature_scores(f, question) for f in self.features])
-        chosen = scores.amax(-1).argmax(0)
-        return scores[chosen, torch.arange(scores.shape[1], device=scores.device)]
-
-    def tensors(self) -> dict[str, Tensor]:
-        """The features in half precision, and the scales."""
-        return {"features": self.features.half(), "scales": self.scales}
-
-
-def _higher(maps: Tensor, best: Tensor) -> Tensor:
-    return maps.flatten(1).amax(1) > best.flatten(1).amax(1)
-
 
 def fit_lerf(
     data: TrainingData,
@@ -107,7 +54,7 @@ def fit_lerf(
     *,
     memory: int = DEFAULT_MEMORY,
     listener: Listener = silent,
-) -> ScaledFeatures:
+) -> GaussianFeatures:
     """Average CLIP at each scale over the training views, then over similar neighbors.
 
     Args:
@@ -135,18 +82,12 @@ def fit_lerf(
     if config.neighbors and with_dino and len(data.gaussians) > 1:
         dino, _ = back_projected_mean(
             views,
-            lambda name, camera: resized_map(_dino(maps[name]), camera),
+            lambda name, camera: resized_map(maps[name].dino, camera),  # type: ignore[arg-type]  # see with_dino
             listener=lambda done: listener(Event("lerf", total - len(views.names) + done, total)),
         )
         stacked = smooth_by_similarity(data.gaussians.means, dino, stacked, config)
     listener(Event("lerf", total, total))
-    return ScaledFeatures(stacked, scales)
-
-
-def _dino(found: FeatureMap) -> Tensor:
-    if found.dino is None:
-        raise ValueError("some views have DINO features and some have none")
-    return found.dino
+    return GaussianFeatures("lerf", stacked, scales)
 
 
 def physical_scales(views: TrainingViews, level_maps: LevelMaps, count: int) -> Tensor:

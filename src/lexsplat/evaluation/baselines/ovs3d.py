@@ -60,10 +60,6 @@ class Ovs3dConfig:
     temperature: float = 0.2
     pairs: int = 192
 
-    def __post_init__(self) -> None:
-        if self.steps < 0 or self.pairs < 2 or self.learning_rate <= 0 or self.temperature <= 0:
-            raise ValueError("steps must not be negative, pairs at least 2, the others positive")
-
 
 class ClassFeatures:
     """A feature on each Gaussian and the classes it was fitted to.
@@ -193,15 +189,7 @@ def fit_3dovs(
 
 
 class _Fit:
-    """The optimized tensors and their loss.
-
-    Args:
-        data: What is fitted.
-        views: Its training views.
-        start: Initial features ``[N, D]``.
-        classes: Unit text embeddings ``[K, D]``.
-        config: Settings.
-    """
+    """The optimized tensors and their loss."""
 
     def __init__(
         self, data: TrainingData, views: TrainingViews, start: Tensor, classes: Tensor, config: Ovs3dConfig

@@ -28,7 +28,7 @@ from lexsplat.evaluation.report.tables import (
 from lexsplat.evaluation.report.templating import write_page
 
 MAX_CASES = 40
-"""Prompts in a view that are shown with the images of all methods."""
+"""Cases that are shown with the images of all methods, at most; the page states how many were left out."""
 
 COLORS = 10
 """Line colors in the style sheet."""
@@ -74,7 +74,6 @@ class Comparison:
     Args:
         methods: The measured methods, in the order of the table.
         title: Heading of the page.
-        subtitle: Line below it.
         columns: Keys of the table; empty: the columns of the paper's Table 1 and ours.
         config: Settings, with "seeds".
         machine: What it ran on.
@@ -82,29 +81,22 @@ class Comparison:
 
     methods: Sequence[MeasuredMethod]
     title: str
-    subtitle: str = ""
     columns: Sequence[str] = ()
     config: Mapping[str, Any] = field(default_factory=dict)
     machine: Mapping[str, Any] = field(default_factory=dict)
 
 
-def write_comparison(path: Path, comparison: Comparison, *, max_cases: int = MAX_CASES) -> None:
-    """Write the page, whole or not at all.
-
-    Args:
-        path: The file.
-        comparison: Its content.
-        max_cases: Maximum number of cases with images; the page states how many were left out.
-    """
+def write_comparison(path: Path, comparison: Comparison) -> None:
+    """Write the page, whole or not at all."""
     methods = comparison.methods
     rows = table_rows({method.name: method.results for method in methods})
     ranked = _worst_first(methods)
-    shown = ranked[:max_cases]
+    shown = ranked[:MAX_CASES]
     stages, seconds = _seconds(methods)
     views = _shared_views(methods)
     content = {
         "title": comparison.title,
-        "subtitle": comparison.subtitle,
+        "subtitle": "The same Gaussians and the same features, measured on held-out views",
         "cards": _cards(methods, rows),
         "methods": methods,
         "method_names": [method.name for method in methods],

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from lexsplat.evaluation import ViewPictures
+from lexsplat.evaluation.results import ViewImages
 from lexsplat.queries.heatmaps import overlay_heatmap, overlay_mask
 
 
@@ -30,7 +30,7 @@ class Gallery:
     views: dict[str, dict[str, bytes]] = field(default_factory=dict)
     cases: dict[tuple[str, str], dict[str, bytes]] = field(default_factory=dict)
 
-    def add(self, view: ViewPictures) -> None:
+    def add(self, view: ViewImages) -> None:
         """Store thumbnails of a view and of all its prompts."""
         self.views[view.name] = {
             "photo": self._jpeg(_to_bytes(view.photo)),

@@ -17,37 +17,19 @@ from lexsplat.evaluation.results import Metrics
 from lexsplat.queries.heatmaps import color_scale
 
 MAX_CASES = 120
-"""Rows of images in a report."""
+"""Rows of images in a report, at most; the page states how many were left out."""
 
 
-def write_report(
-    path: Path,
-    metrics: Metrics,
-    gallery: Gallery | None = None,
-    *,
-    title: str = "lexsplat",
-    subtitle: str = "Measured on held-out views",
-    max_cases: int = MAX_CASES,
-) -> None:
-    """Write ``report.html``, whole or not at all.
-
-    Args:
-        path: The file.
-        metrics: Results of the evaluation.
-        gallery: Images of the same evaluation.
-        title: Heading of the page.
-        subtitle: Line below it.
-        max_cases: Maximum number of rows of images; the page states how many were left out.
-    """
-    gallery = gallery or Gallery()
+def write_report(path: Path, metrics: Metrics, gallery: Gallery, *, title: str = "lexsplat") -> None:
+    """Write ``report.html``, whole or not at all."""
     data = metrics.to_json()
     language, per_view = data["language"], data["quality"]["per_view"]
     cases = _worst_first(metrics, gallery)
-    shown = cases[:max_cases]
+    shown = cases[:MAX_CASES]
     content = {
         **data,
         "title": title,
-        "subtitle": subtitle,
+        "subtitle": "Measured on held-out views",
         "cards": _cards(data),
         "hero": _hero(cases, gallery),
         "protocols": protocol_rows(language, with_localization=True) if language else [],
@@ -74,7 +56,7 @@ class _Case:
 
 def _worst_first(metrics: Metrics, gallery: Gallery) -> list[_Case]:
     cases = [
-        _Case(view, prompt, pair.counts.at(metrics.thresholds[prompt]["auto"]).iou, pair.average_precision)
+        _Case(view, prompt, pair.auto.iou, pair.average_precision)
         for view, prompts in metrics.pairs.items()
         for prompt, pair in prompts.items()
         if (view, prompt) in gallery.cases

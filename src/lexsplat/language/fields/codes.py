@@ -63,13 +63,14 @@ class CodeField:
         self.segments = segments
         self.codes = codes
         self.weights = weights.float()
-        self._uncertainties = uncertainties.float()
+        self.uncertainties = uncertainties.float()
         self.method = method
 
-    @property
-    def uncertainties(self) -> Tensor:
-        """u_G ``[N]`` in 0..1."""
-        return self._uncertainties
+    def __repr__(self) -> str:
+        count, kept = self.codes.shape
+        return (
+            f"CodeField({count:,} Gaussians, {kept} of {self.codebook.num_codes} codes each, {self.method!r})"
+        )
 
     def code_probabilities(self) -> Tensor:
         """The distributions as a dense array ``[N, K]``."""
@@ -113,14 +114,14 @@ class CodeField:
             self.codebook,
             self.codes[index],
             self.weights[index],
-            self._uncertainties[index],
+            self.uncertainties[index],
             method=self.method,
             segments=self.segments.select(index) if self.segments else None,
         )
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors; those of the codebook under ``codebook.``."""
-        own = {"codes": self.codes, "weights": self.weights, "uncertainties": self._uncertainties}
+        own = {"codes": self.codes, "weights": self.weights, "uncertainties": self.uncertainties}
         own |= self.segments.tensors() if self.segments else {}
         return {name: value.contiguous() for name, value in own.items()} | codebook_tensors(self.codebook)
 

@@ -13,7 +13,7 @@ from lexsplat.language.methods.averaged import Averaged
 from lexsplat.language.methods.method import FitRun, LanguageMethod, TrainingViews
 from lexsplat.language.methods.trained import Trained
 
-__all__ = ["METHODS", "FitRun", "LanguageMethod", "MethodName", "TrainingViews", "names"]
+__all__ = ["METHODS", "VARIANTS", "FitRun", "LanguageMethod", "MethodName", "TrainingViews"]
 
 MethodName = Literal["averaged", "trained"]
 """Names of the methods, for the types of settings and options."""
@@ -21,7 +21,5 @@ MethodName = Literal["averaged", "trained"]
 METHODS: Mapping[str, LanguageMethod] = {method.name: method for method in (Averaged(), Trained())}
 """The methods by name."""
 
-
-def names() -> tuple[str, ...]:
-    """Names of all methods."""
-    return tuple(METHODS)
+VARIANTS = tuple(dict.fromkeys(variant for method in METHODS.values() for variant in method.variants))
+"""Names of the variants of all methods, among them the rows of the paper's Table 2."""

@@ -91,11 +91,6 @@ class JointTrainer:
         """Those of the reconstruction, and the loss of the language."""
         return {**self.reconstructor.metrics, "language": self._losses["loss"]}
 
-    @property
-    def done(self) -> bool:
-        """Whether all iterations have run."""
-        return self.reconstructor.done
-
     def step(self) -> dict[str, float]:
         """One iteration of both on one view; returns the losses of the language, on a GPU those that were read last.
 

@@ -109,19 +109,6 @@ def find_boxes(
 
 
 @kernel
-def count_pairs(start: int, stop: int, boxes: I32, tiles_x: int, strips: int, histogram: I64) -> None:
-    """Count the pairs of every tile, separately for each strip of Gaussians."""
-    total = boxes.shape[0]
-    for strip in range(start, stop):
-        for k in range(strip * total // strips, (strip + 1) * total // strips):
-            if boxes[k, ROW_LAST] == 0:
-                continue
-            for tile_y in range(boxes[k, ROW_FIRST] // TILE, (boxes[k, ROW_LAST] - 1) // TILE + 1):
-                for tile_x in range(boxes[k, TILE_FIRST], boxes[k, TILE_LAST]):
-                    histogram[strip, tile_y * tiles_x + tile_x] += 1
-
-
-@kernel
 def offsets_of(histogram: I64, tile_offsets: I64) -> None:
     """Replace the counts by the index of the first pair of each tile and, within it, of each strip."""
     strips, tiles = histogram.shape
@@ -136,19 +123,22 @@ def offsets_of(histogram: I64, tile_offsets: I64) -> None:
 
 
 @kernel
-def fill_pairs(
+def list_pairs(
     start: int,
     stop: int,
+    counts_only: bool,
     boxes: I32,
     tiles_x: int,
-    strips: int,
     histogram: I64,
     pair_offsets: I64,
     members: I32,
     pairs: I32,
 ) -> None:
-    """List the pairs by tile; strips are consecutive within a tile, which preserves depth order."""
-    total = boxes.shape[0]
+    """Count the pairs of every tile, separately for each strip of Gaussians; after `offsets_of`, list them by tile.
+
+    Strips are consecutive within a tile, which preserves depth order.
+    """
+    total, strips = boxes.shape[0], histogram.shape[0]
     for strip in range(start, stop):
         for k in range(strip * total // strips, (strip + 1) * total // strips):
             if boxes[k, ROW_LAST] == 0:
@@ -159,6 +149,7 @@ def fill_pairs(
                     tile = tile_y * tiles_x + tile_x
                     slot = histogram[strip, tile]
                     histogram[strip, tile] = slot + 1
-                    members[slot] = k
-                    pairs[slot] = pair
-                    pair += 1
+                    if not counts_only:
+                        members[slot] = k
+                        pairs[slot] = pair
+                        pair += 1

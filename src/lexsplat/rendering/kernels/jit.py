@@ -1,14 +1,13 @@
-"""Compilation and caching of the kernels, the log message about it, and their execution on several threads.
+"""Compilation of the kernels, with a cache on disk, and their execution on several threads.
 
-Kernels release the GIL and run on a thread pool of this module instead of Numba's ``prange``. They compile several
-times faster this way, need no threading layer (which has problems with forked processes and concurrent callers), and
-several Python threads can render at the same time.
+A kernel releases the GIL and runs on the thread pool of this module instead of Numba's ``prange``. It compiles
+several times faster that way and needs no threading layer, which fails after a fork and with concurrent callers.
+Several Python threads can render at once.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import itertools
 import logging
 import os
@@ -22,6 +21,8 @@ import numba
 import torch
 from numba.core import event
 
+from lexsplat.runtime.fingerprints import digest
+
 logger = logging.getLogger("lexsplat")
 
 _dispatchers: set[Any] = set()
@@ -31,8 +32,7 @@ _announced = False
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that releases the GIL, with a cache on disk.
 
-    Fast-math stays off. It assumes that no value is NaN, which makes comparisons with NaN undefined, and comparisons
-    determine here where memory is written.
+    Fast-math stays off: it leaves comparisons with NaN undefined, and comparisons decide where memory is written.
     """
     # Numba reads the folder from its global settings when it creates the cache; the settings are restored afterwards.
     before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
@@ -54,17 +54,17 @@ def _cache_folder() -> str:
     is used: the environment variable NUMBA_CACHE_DIR, or else the package's cache, then the user's, then a temporary
     one.
     """
-    digest = hashlib.sha256(numba.__version__.encode())
     here = Path(__file__).parent
-    for source in sorted(here.glob("*.py")):
-        digest.update(source.read_bytes())
+    key = digest(
+        [numba.__version__.encode(), *(source.read_bytes() for source in sorted(here.glob("*.py")))], 6
+    )
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
     places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home) / "lexsplat"]
     for place in places:
         try:
             # expanduser() raises RuntimeError if the user has no home directory.
-            folder = place.expanduser() / f"kernels-{digest.hexdigest()[:12]}"
+            folder = place.expanduser() / f"kernels-{key}"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return str(folder)
@@ -75,10 +75,7 @@ def _cache_folder() -> str:
 
 
 class _Announcer(event.Listener):
-    """Logs the reason for the delay once per process, before the first of this package's kernels is compiled.
-
-    Numba triggers the event only for actual compilation, not for kernels found in the cache.
-    """
+    """Logs once per process that kernels are compiled; Numba sends no event for kernels from the cache."""
 
     def on_start(self, event: Any) -> None:
         global _announced

@@ -34,7 +34,14 @@ def write_compressed(gaussians: Gaussians, path: Path, kind: str) -> None:
         BackendError: If GaussForge is not installed.
         FileFormatError: If GaussForge cannot convert the Gaussians.
     """
-    path.write_bytes(_converted(gaussians, path, kind))
+    library = _library(path)
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "plain.ply"
+        write_ply(transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians, plain)
+        answer = library.convert(plain.read_bytes(), "ply", kind)
+    if "data" not in answer:
+        raise FileFormatError(path, expected=f"a {kind} file", found=str(answer.get("error")))
+    path.write_bytes(answer["data"])
 
 
 def read_compressed(path: Path, kind: str) -> Gaussians:
@@ -63,17 +70,6 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
         except FileFormatError as error:  # its text concerns the temporary file, not the user's
             raise FileFormatError(path, expected=f"a {kind} file", found="damaged content") from error
     return transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians
-
-
-def _converted(gaussians: Gaussians, path: Path, kind: str) -> bytes:
-    library = _library(path)
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "plain.ply"
-        write_ply(transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians, plain)
-        answer = library.convert(plain.read_bytes(), "ply", kind)
-    if "data" not in answer:
-        raise FileFormatError(path, expected=f"a {kind} file", found=str(answer.get("error")))
-    return bytes(answer["data"])
 
 
 def _library(path: Path) -> Any:

@@ -47,11 +47,11 @@ class StoredLanguage:
 
 
 @torch.no_grad()
-def stored_language(field: LanguageField, encoder: Mapping[str, str], rows: int = 1 << 16) -> StoredLanguage:
-    """The `CODES` most probable codes of every Gaussian, on the CPU, computed in blocks of ``rows`` Gaussians."""
+def stored_language(field: LanguageField, encoder: Mapping[str, str]) -> StoredLanguage:
+    """The `CODES` most probable codes of every Gaussian, on the CPU, computed in blocks."""
     index = torch.arange(len(field.uncertainties), device=field.uncertainties.device)
     codes, weights = [], []
-    for block in index.split(rows):
+    for block in index.split(1 << 16):
         probabilities = field.select(block).code_probabilities()
         kept = min(CODES, probabilities.shape[1])
         best, where = probabilities.topk(kept, dim=1)

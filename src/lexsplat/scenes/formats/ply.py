@@ -1,7 +1,7 @@
 """The PLY of 3D Gaussian Splatting: binary little endian, one float32 property per value.
 
-The writer uses the column order of `_properties`. The reader looks properties up by *name*, so the columns may be in
-any order and additional properties are ignored.
+`write_ply` writes the columns in the order of the original 3DGS. `read_ply` finds columns by name: their order does
+not matter, and unknown columns are ignored.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ def _properties(num_rest: int) -> list[str]:
 def write_ply(gaussians: Gaussians, path: Path, *, further: Mapping[str, torch.Tensor] | None = None) -> None:
     """Write the standard 3DGS PLY, readable by every splat viewer.
 
-    Values are written before activation: log scales and opacity logits. ``f_rest`` is channel-major as in the
-    original files: all red coefficients, then green, then blue.
+    The file holds log scales and opacity logits. ``f_rest`` is channel-major as in the original files: all red
+    coefficients, then green, then blue.
 
     Args:
         gaussians: Gaussians to write, on any device.
-        path: The file; overwritten. The write is not atomic (see `lexsplat.runtime.files.atomic_path`).
+        path: The file; overwritten, and not atomically (see `lexsplat.runtime.files.atomic_path`).
         further: Additional properties by name, ``[N]`` each, uint8 or float, written after the standard ones. Other
             readers ignore them.
 
     Raises:
-        ValueError: If a value is NaN or infinite; other programs fail on such files without an error message.
+        ValueError: If a value is NaN or infinite.
     """
     g = gaussians.detach().to("cpu")
     rest = g.shN.transpose(1, 2).flatten(1)

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 
 
-def colors_of(gaussians: Gaussians) -> Tensor:
-    """View-independent color of every Gaussian (spherical harmonics of degree 0): ``[N, 3]`` uint8."""
+def colors_of(gaussians: Gaussians) -> NDArray[np.uint8]:
+    """View-independent color of every Gaussian (spherical harmonics of degree 0) ``[N, 3]``."""
     rgb = gaussians.sh0[:, 0].detach() * SH_C0 + 0.5
-    return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+    return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def write_labels_csv(
@@ -33,7 +34,7 @@ def write_labels_csv(
     """
     means = gaussians.means.detach().cpu().numpy()
     opacities = gaussians.opacities.detach().cpu().numpy()
-    rgb = colors_of(gaussians).numpy()
+    rgb = colors_of(gaussians)
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["index", "x", "y", "z", "red", "green", "blue", "opacity", "label", "score"])
@@ -45,16 +46,16 @@ def write_labels_csv(
             )
 
 
-def write_points_ply(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.1) -> int:
-    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of at least ``min_opacity``.
+def write_points_ply(gaussians: Gaussians, path: Path) -> int:
+    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of opacity 0.1 or more.
 
     Returns:
         Number of points.
     """
-    shown = gaussians.select((gaussians.opacities >= min_opacity).detach())
+    shown = gaussians.select((gaussians.opacities >= 0.1).detach())
     layout = [("place", "<f4", 3), ("color", "u1", 3)]
     table = np.zeros(len(shown), dtype=layout)
-    table["place"], table["color"] = shown.means.detach().cpu().numpy(), colors_of(shown).numpy()
+    table["place"], table["color"] = shown.means.detach().cpu().numpy(), colors_of(shown)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(shown)}"]
     header += [f"property float {name}" for name in "xyz"]
     header += [f"property uchar {name}" for name in ("red", "green", "blue")]

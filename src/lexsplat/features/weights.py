@@ -1,0 +1,233 @@
+"""Weights of a model folder: which files are read, and their tensors under the names of transformers."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import re
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.runtime.files import read_json
+
+log = logging.getLogger("lexsplat")
+
+INDEX = "model.safetensors.index.json"
+WEIGHTS = (
+    "model.safetensors",
+    INDEX,
+    "open_clip_model.safetensors",
+    "pytorch_model.bin",
+    "open_clip_pytorch_model.bin",
+)
+"""Files of weights; the first that exists is read. The index lists the shards of large models."""
+
+_CLIP_NAMES = (
+    (r"^visual\.class_embedding$", "vision_model.embeddings.class_embedding"),
+    (r"^visual\.positional_embedding$", "vision_model.embeddings.position_embedding.weight"),
+    (r"^visual\.conv1\.", "vision_model.embeddings.patch_embedding."),
+    (r"^visual\.ln_pre\.", "vision_model.pre_layrnorm."),  # spelled like this by transformers
+    (r"^visual\.ln_post\.", "vision_model.post_layernorm."),
+    (r"^visual\.proj$", "visual_projection.weight"),
+    (r"^positional_embedding$", "text_model.embeddings.position_embedding.weight"),
+    (r"^token_embedding\.", "text_model.embeddings.token_embedding."),
+    (r"^ln_final\.", "text_model.final_layer_norm."),
+    (r"^text_projection$", "text_projection.weight"),
+    (r"^visual\.transformer\.resblocks\.", "vision_model.encoder.layers."),
+    (r"^transformer\.resblocks\.", "text_model.encoder.layers."),
+    (r"(\.\d+)\.ln_([12])\.", r"\1.layer_norm\2."),
+    (r"(\.\d+)\.attn\.", r"\1.self_attn."),
+    (r"(\.\d+)\.mlp\.c_fc\.", r"\1.mlp.fc1."),
+    (r"(\.\d+)\.mlp\.c_proj\.", r"\1.mlp.fc2."),
+)
+"""Names of OpenCLIP, which are those of OpenAI's CLIP, as patterns, and what transformers calls them."""
+
+_VIT_NAMES = (
+    (r"^cls_token$", "embeddings.cls_token"),
+    (r"^pos_embed$", "embeddings.position_embeddings"),
+    (r"^patch_embed\.proj\.", "embeddings.patch_embeddings.projection."),
+    (r"^norm\.", "layernorm."),
+    (r"^blocks\.", "encoder.layer."),
+    (r"(\.\d+)\.norm1\.", r"\1.layernorm_before."),
+    (r"(\.\d+)\.norm2\.", r"\1.layernorm_after."),
+    (r"(\.\d+)\.attn\.proj\.", r"\1.attention.output.dense."),
+    (r"(\.\d+)\.mlp\.fc1\.", r"\1.intermediate.dense."),
+    (r"(\.\d+)\.mlp\.fc2\.", r"\1.output.dense."),
+)
+"""Names of timm and of the original DINO, and what transformers calls them."""
+
+
+def first_weights(names: Collection[str]) -> str | None:
+    """The file of `WEIGHTS` that is read, among the names of a folder's files; None if there is none."""
+    return next((name for name in WEIGHTS if name in names), None)
+
+
+def weight_files(folder: Path) -> list[Path]:
+    """The files of weights that `load_weights` reads; empty if there are none or a shard is missing."""
+    name = first_weights({path.name for path in folder.iterdir() if path.is_file()})
+    if name != INDEX:
+        return [] if name is None else [folder / name]
+    table = _index(folder / INDEX)
+    # Only files of the folder itself: shard names are not paths.
+    plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in table.values())
+    shards = sorted({folder / shard for shard in table.values()}) if plain else []
+    return shards if all(shard.is_file() for shard in shards) else []
+
+
+def _index(path: Path) -> dict[str, Any]:
+    try:
+        table = read_json(path).get("weight_map")
+    except (FileFormatError, AttributeError):
+        return {}
+    return table if isinstance(table, dict) else {}
+
+
+def load_weights(folder: Path, name: str) -> dict[str, Tensor]:
+    """All tensors of a model folder under the names of transformers.
+
+    Names of OpenCLIP and of timm's vision transformer are translated. Pickled files are read by
+    ``torch.load(weights_only=True)``, which runs no code of the file.
+
+    Args:
+        folder: The folder.
+        name: Name of the model in messages.
+
+    Raises:
+        ModelError: If a file is damaged or holds anything but tensors.
+    """
+    state: dict[str, Tensor] = {}
+    for path in weight_files(folder):
+        state.update(_pickled(path, name) if path.suffix == ".bin" else _safetensors(path, name))
+    return in_transformers_names(state)
+
+
+def _safetensors(path: Path, name: str) -> dict[str, Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise _damaged(path, name, "safetensors", error) from error
+
+
+def _pickled(path: Path, name: str) -> dict[str, Tensor]:
+    log.warning(
+        "%s: %s has no safetensors; %s is read without running its code", name, path.parent, path.name
+    )
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, KeyError) as error:
+        raise _damaged(path, name, "a pickled dictionary of tensors only", error) from error
+    if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
+        content = content["state_dict"]
+    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise _damaged(path, name, "a pickled dictionary of tensors only", TypeError("other objects"))
+    return {key.removeprefix("module."): value for key, value in content.items()}
+
+
+def _damaged(path: Path, name: str, expected: str, error: Exception) -> ModelError:
+    found = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'nothing'}"[:160]
+    return ModelError(
+        f"model {name}: {path.name}",
+        expected=expected,
+        found=found,
+        remedy=f"delete {path} and fetch it again",
+    )
+
+
+def in_transformers_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors of a CLIP in OpenCLIP's names, or of a vision transformer in timm's, in those of transformers.
+
+    Stacked projections of attention are split, and projections that are stored as ``[in, out]`` transposed. Other
+    dictionaries are returned unchanged.
+    """
+    if "text.ln_final.weight" in state:  # OpenCLIP's newer layout, with a name for the text tower
+        state = {key.removeprefix("text."): value for key, value in state.items()}
+    patterns: tuple[tuple[str, str], ...]
+    if "visual.conv1.weight" in state and "ln_final.weight" in state:
+        stacked, patterns = r"^(.*\.\d+)\.attn\.in_proj_(weight|bias)$", _CLIP_NAMES
+        parts = [rf"\1.self_attn.{part}_proj.\2" for part in "qkv"]
+    elif "patch_embed.proj.weight" in state and "pos_embed" in state:
+        stacked, patterns = r"^blocks(\.\d+)\.attn\.qkv\.(weight|bias)$", _VIT_NAMES
+        parts = [rf"encoder.layer\1.attention.attention.{part}.\2" for part in ("query", "key", "value")]
+    else:
+        return state
+    found: dict[str, Tensor] = {}
+    for key, tensor in state.items():
+        if re.match(stacked, key):
+            for part, piece in zip(parts, tensor.chunk(3)):
+                found[_renamed(re.sub(stacked, part, key), patterns)] = piece.clone()
+        elif key in ("visual.proj", "text_projection"):
+            found[_renamed(key, patterns)] = tensor.T.contiguous()
+        else:
+            found[_renamed(key, patterns)] = tensor
+    return found
+
+
+def _renamed(key: str, patterns: Iterable[tuple[str, str]]) -> str:
+    for pattern, name in patterns:
+        key = re.sub(pattern, name, key)
+    return key
+
+
+def build_model(folder: Path, name: str, spare: str) -> Any:
+    """The model of transformers that a folder describes, with all its weights.
+
+    Args:
+        folder: Folder with ``config.json`` and weights.
+        name: Name of the model in messages.
+        spare: Pattern of the names of tensors whose absence does not matter.
+
+    Raises:
+        ModelError: If transformers cannot build it, a tensor is missing or has another shape, or the folder holds
+            layers that the configuration does not have.
+    """
+    from transformers import AutoConfig, AutoModel
+
+    state = load_weights(folder, name)
+    try:
+        config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+        with torch.device("meta"):
+            kind = type(AutoModel.from_config(config))
+        model, report = kind.from_pretrained(
+            None, config=config, state_dict=state, output_loading_info=True, ignore_mismatched_sizes=True
+        )
+    except Exception as error:  # KeyError, OSError, ValueError, RuntimeError ...
+        raise ModelError(
+            f"model {name}",
+            expected="a model that transformers can load",
+            found=f"{str(error)[:160]}",
+            remedy="fetch it again, or choose another model",
+        ) from error
+    mismatched = sorted(entry[0] for entry in report["mismatched_keys"])
+    if mismatched:
+        _refuse(folder, name, "weights of the sizes in config.json", f"{_some(mismatched)} of another size")
+    total = len(model.state_dict())
+    missing = sorted(key for key in report["missing_keys"] if not re.search(spare, key))
+    if missing:
+        _refuse(
+            folder, name, f"all {total} tensors of the model", f"{len(missing)} missing: {_some(missing)}"
+        )
+    shapes = {re.sub(r"\d+", "*", key) for key in model.state_dict()}
+    unmatched = sorted(key for key in report["unexpected_keys"] if re.sub(r"\d+", "*", key) in shapes)
+    if unmatched:
+        _refuse(
+            folder, name, "a config.json with all layers of the weights", f"no place for {_some(unmatched)}"
+        )
+    return model.float()  # some models are stored in half precision
+
+
+def _refuse(folder: Path, name: str, expected: str, found: str) -> None:
+    files = ", ".join(path.name for path in weight_files(folder))
+    remedy = "fetch the whole model again, or choose another model"
+    raise ModelError(f"model {name}: {files}", expected=expected, found=found, remedy=remedy)
+
+
+def _some(keys: list[str]) -> str:
+    return ", ".join(keys[:2]) + (f" and {len(keys) - 2} more" if len(keys) > 2 else "")

@@ -1,0 +1,297 @@
+"""Model folders as they occur: a model loads whole, or is refused in one line."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from support.encoder_folders import in_open_clip_names, in_timm_names, save_model, seeded, tiny_vit
+from support.refusals import assert_tells
+
+from lexsplat.features import hub
+from lexsplat.features.encoders import load_clip, load_dino
+from lexsplat.runtime.errors import ModelError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
+
+
+@pytest.fixture
+def copy(clip_folder, tmp_path) -> Path:
+    """A copy of the tiny CLIP to damage."""
+    return shutil.copytree(clip_folder, tmp_path / "copy")
+
+
+@pytest.fixture(scope="module")
+def vit_folder(tmp_path_factory) -> Path:
+    return save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit"))
+
+
+def rewrite(folder: Path, change, name: str = "model.safetensors") -> None:
+    """Replace the weights of a folder by ``change`` of them, under another name if one is given."""
+    state = load_file(folder / "model.safetensors")
+    (folder / "model.safetensors").unlink()
+    save_file(change(state), folder / name, metadata={"format": "pt"})
+
+
+def refused(folder: Path, *parts: str, load=load_clip) -> None:
+    with pytest.raises(ModelError) as caught:
+        load(str(folder))
+    assert_tells(caught.value, *parts)
+
+
+def assert_same_model(found, folder: Path) -> None:
+    """Assert that every tensor is that of transformers' own loading of a folder."""
+    from transformers import AutoModel
+
+    expected = AutoModel.from_pretrained(folder).state_dict()
+    state = found._model.state_dict()
+    assert {name for name in expected if "pooler" not in name} <= set(state)
+    for name, tensor in state.items():
+        if "pooler" not in name:
+            torch.testing.assert_close(tensor, expected[name], atol=0, rtol=0)
+
+
+# -- what loads
+
+
+def test_weights_in_the_names_of_open_clip_give_every_tensor_its_place(clip_folder, copy):
+    from transformers import CLIPModel
+
+    foreign = in_open_clip_names(CLIPModel.from_pretrained(clip_folder))
+    rewrite(copy, lambda state: foreign, "open_clip_model.safetensors")
+    assert_same_model(load_clip(str(copy)), clip_folder)
+    newer = {
+        f"text.{name}": value for name, value in foreign.items() if not name.startswith(("visual", "logit"))
+    }
+    newer |= {name: value for name, value in foreign.items() if name.startswith(("visual", "logit"))}
+    save_file(newer, copy / "open_clip_model.safetensors")
+    assert_same_model(load_clip(str(copy)), clip_folder)
+
+
+def test_the_weights_of_transformers_are_preferred_to_those_of_open_clip(clip_folder, copy):
+    save_file({"visual.proj": torch.zeros(1)}, copy / "open_clip_model.safetensors")
+    (copy / "pytorch_model.bin").write_bytes(b"no pickle")
+    assert_same_model(load_clip(str(copy)), clip_folder)
+
+
+def test_weights_in_the_names_of_timm_give_every_tensor_its_place(vit_folder, tmp_path):
+    folder = shutil.copytree(vit_folder, tmp_path / "timm")
+    rewrite(folder, lambda state: in_timm_names(seeded(tiny_vit)))
+    assert_same_model(load_dino(str(folder)), vit_folder)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_pickled_weights_are_read_with_a_note(clip_folder, copy, caplog, wrapped):
+    state = load_file(copy / "model.safetensors")
+    (copy / "model.safetensors").unlink()
+    content = {"state_dict": {f"module.{name}": value for name, value in state.items()}} if wrapped else state
+    torch.save(content, copy / "pytorch_model.bin")
+    with caplog.at_level(logging.WARNING, logger="lexsplat"):
+        assert_same_model(load_clip(str(copy)), clip_folder)
+    assert "pytorch_model.bin is read without running its code" in caplog.text
+
+
+def test_pickled_code_does_not_run(copy, tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "ran",)
+
+    (copy / "model.safetensors").unlink()
+    torch.save({"weight": Trap()}, copy / "pytorch_model.bin")
+    refused(copy, "pytorch_model.bin", "tensors only")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_old_and_new_layouts_of_transformers_load_whole(vit_folder, clip_folder, copy, tmp_path):
+    from transformers import ViTConfig, ViTForImageClassification
+
+    names = list(load_file(vit_folder / "model.safetensors"))
+    assert any(name.startswith("encoder.layer.0.attention.attention.key") for name in names), (
+        "the Hub's layout"
+    )
+    assert_same_model(load_dino(str(vit_folder)), vit_folder)
+    newer = shutil.copytree(vit_folder, tmp_path / "newer")
+    rewrite(newer, lambda state: seeded(tiny_vit).state_dict())
+    assert_same_model(load_dino(str(newer)), vit_folder)
+    # A classifier has its layers under "vit." and a head that is not used.
+    classifier = ViTForImageClassification(ViTConfig.from_pretrained(vit_folder))
+    headed = save_model(classifier.eval(), tmp_path / "headed")
+    for name, tensor in load_dino(str(headed))._model.state_dict().items():
+        if "pooler" not in name:
+            torch.testing.assert_close(tensor, classifier.vit.state_dict()[name], atol=0, rtol=0)
+    # Old CLIP files hold positions, which newer versions compute.
+    rewrite(copy, lambda state: {**state, "text_model.embeddings.position_ids": torch.arange(11)[None]})
+    assert_same_model(load_clip(str(copy)), clip_folder)
+
+
+def test_shards_load_whole_and_every_shard_is_needed(clip_folder, copy):
+    state = load_file(copy / "model.safetensors")
+    (copy / "model.safetensors").unlink()
+    shards = [f"model-0000{number}-of-00002.safetensors" for number in (1, 2)]
+    table = {name: shards[place % 2] for place, name in enumerate(state)}
+    for shard in shards:
+        save_file({name: state[name] for name in table if table[name] == shard}, copy / shard)
+    (copy / "model.safetensors.index.json").write_text(json.dumps({"weight_map": table}))
+    assert_same_model(load_clip(str(copy)), clip_folder)
+    (copy / shards[1]).unlink()
+    refused(copy, "all shards of model.safetensors", "save_pretrained")
+    (copy / "model.safetensors.index.json").write_text('{"weight_map": {"a": "../copy/config.json"}}')
+    refused(copy, "all shards of model.safetensors")
+
+
+# -- what is refused
+
+
+def test_a_model_saved_without_its_tokenizer_is_refused(copy):
+    for name in TOKENIZER:
+        (copy / name).unlink()
+    refused(copy, "a tokenizer (tokenizer.json)", "copy the tokenizer files")
+    (copy / "vocab.json").write_text("{}")
+    refused(copy, "a tokenizer (tokenizer.json)")  # without its merges
+
+
+def test_the_tokenizer_of_another_model_is_refused(copy):
+    content = json.loads((copy / "tokenizer.json").read_text())
+    vocabulary = content["model"]["vocab"]
+    kept = dict(sorted(vocabulary.items(), key=lambda item: item[1])[:600])
+    content["model"] |= {"vocab": kept, "merges": []}
+    content["added_tokens"] = []
+    (copy / "tokenizer.json").write_text(json.dumps(content))
+    refused(copy, f"a tokenizer with the {len(vocabulary):,} words of the model", "fetch")
+
+
+def test_a_layer_without_its_attention_is_refused(copy):
+    rewrite(
+        copy,
+        lambda state: {n: t for n, t in state.items() if "vision_model.encoder.layers.1.self" not in n},
+    )
+    refused(
+        copy,
+        "model.safetensors",
+        "all 78 tensors",
+        "8 missing: vision_model.encoder.layers.1.self_attn.k_proj",
+    )
+
+
+def test_names_that_do_not_match_are_refused(copy, vit_folder, tmp_path):
+    rewrite(copy, lambda state: {f"tower.{name}": tensor for name, tensor in state.items()})
+    refused(copy, "model.safetensors", "missing")
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    rewrite(folder, lambda state: {f"backbone.{name}": tensor for name, tensor in state.items()})
+    refused(folder, "model.safetensors", "missing", load=load_dino)
+
+
+def test_a_configuration_with_fewer_layers_than_the_weights_is_refused(copy):
+    config = json.loads((copy / "config.json").read_text())
+    config["vision_config"]["num_hidden_layers"] = 1
+    (copy / "config.json").write_text(json.dumps(config))
+    refused(copy, "all layers of the weights", "vision_model.encoder.layers.1")
+
+
+def test_weights_of_another_size_are_refused(copy):
+    rewrite(copy, lambda state: {**state, "visual_projection.weight": torch.ones(7, 32)})
+    refused(copy, "sizes in config.json", "visual_projection.weight")
+
+
+def test_unlike_words_with_one_vector_are_refused(copy):
+    def blind(state: dict) -> dict:
+        return {
+            n: torch.zeros_like(t) if n.endswith("token_embedding.weight") else t for n, t in state.items()
+        }
+
+    rewrite(copy, blind)
+    refused(copy, "unlike words with unlike embeddings", "an apple")
+
+
+def test_weights_that_are_not_finite_are_refused(copy, vit_folder, tmp_path):
+    def spoiled(state: dict) -> dict:
+        return {
+            **state,
+            "visual_projection.weight": torch.full_like(state["visual_projection.weight"], torch.nan),
+        }
+
+    rewrite(copy, spoiled)
+    encoder = load_clip(str(copy))
+    with pytest.raises(ModelError) as caught:
+        encoder.encode_images(torch.rand(1, 3, 40, 40))
+    assert_tells(caught.value, "finite features")
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    rewrite(folder, lambda state: {name: tensor * torch.inf for name, tensor in state.items()})
+    with pytest.raises(ModelError, match="finite features"):
+        load_dino(str(folder)).encode_dense(torch.rand(3, 32, 32), short_side=32)
+
+
+def test_an_overflow_in_half_precision_is_computed_again_in_full(clip_folder, monkeypatch):
+    from contextlib import contextmanager
+
+    monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda: False)
+    encoder, images = load_clip(str(clip_folder)), torch.rand(2, 3, 40, 40)
+    expected = encoder.encode_images(images)
+    halves = []
+
+    @contextmanager
+    def overflowing(device, *, crops=False):
+        scale = encoder._model.visual_projection.weight
+        halves.append(scale.clone())
+        scale.fill_(torch.inf)
+        yield
+        scale.copy_(halves[0])
+
+    monkeypatch.setattr("lexsplat.features.pretrained.precision", overflowing)
+    for _ in range(2):
+        torch.testing.assert_close(encoder.encode_images(images), expected)
+    assert len(halves) == 1, "after an overflow, half precision is not tried again"
+
+
+@pytest.mark.parametrize("content", ["damaged", "empty", "missing", "a list"])
+def test_a_damaged_folder_is_refused(copy, content):
+    weights, config = copy / "model.safetensors", copy / "config.json"
+    if content == "damaged":
+        weights.write_bytes(weights.read_bytes()[: weights.stat().st_size // 2])
+        refused(copy, "model.safetensors", "expected safetensors", "fetch it again")
+    elif content == "missing":
+        weights.unlink()
+        refused(copy, "a model folder with model.safetensors", "config.json", "--clip bundled")
+    elif content == "a list":
+        config.write_text("[]")
+        refused(copy, "transformers can load")
+    else:
+        shutil.rmtree(copy)
+        copy.mkdir()
+        refused(copy, "an empty folder")
+
+
+def test_a_model_of_the_other_kind_is_refused(clip_folder):
+    refused(clip_folder, "vision transformer", load=load_dino)
+    refused(hub.BUNDLED_ENCODERS / "dino", "tokenizer")
+
+
+def test_the_tokenizer_of_siglip_needs_an_extra(copy, monkeypatch):
+    (copy / "tokenizer.json").unlink()
+    (copy / "spiece.model").write_bytes(b"")
+    (copy / "tokenizer_config.json").write_text('{"tokenizer_class": "SiglipTokenizer"}')
+    monkeypatch.setattr("lexsplat.features.clip._is_installed", lambda module: False)
+    refused(copy, "SentencePiece, which is not installed", 'pip install "lexsplat[siglip]"')
+
+
+def test_the_content_hash_covers_the_loaded_files_alone(clip_folder, copy):
+    expected = hub.content_hash(clip_folder, "clip")
+    assert hub.content_hash(copy, "clip") == expected
+    # What other programs add to a snapshot of the Hub.
+    (copy / "README.md").write_text("prose")
+    (copy / "open_clip_config.json").write_text("{}")
+    (copy / "open_clip_model.safetensors").write_bytes(b"another format")
+    (copy / "vocab.txt").write_text("another tokenizer")
+    assert hub.content_hash(copy, "clip") == expected
+    for name in ("model.safetensors", "config.json", "tokenizer.json", "preprocessor_config.json"):
+        content = (copy / name).read_bytes()
+        (copy / name).write_bytes(content + b" ")
+        assert hub.content_hash(copy, "clip") != expected, name
+        (copy / name).write_bytes(content)
