@@ -67,7 +67,8 @@ def test_threads_and_rows_at_a_time_do_not_change_segments():
         second = make_segments(gaussians, lambda rows: language[rows].clone(), masses)
     finally:
         torch.set_num_threads(before)
-    assert torch.equal(first.labels, second.labels) and torch.equal(first.levels, second.levels)
+    assert torch.equal(first.labels, second.labels)
+    assert torch.equal(first.levels, second.levels)
 
 
 @pytest.mark.parametrize(("tolerance", "limit"), [(0.0, 0.0), (math.inf, math.inf)])
@@ -95,7 +96,8 @@ def test_a_long_link_joins_only_small_sets():
 def test_few_gaussians_have_segments(count):
     gaussians = floor().select(torch.arange(count))
     found = make_segments(gaussians, lambda rows: torch.zeros(count, 4)[rows], torch.zeros(count))
-    assert len(found.labels) == count and found.levels.shape[0] >= 1
+    assert len(found.labels) == count
+    assert found.levels.shape[0] >= 1
 
 
 def field(count: int, segments: Segments | None) -> CodeField:
@@ -112,7 +114,8 @@ def test_segments_are_stored_with_the_language_in_4_bytes_a_gaussian():
     assert sum(tensors[name].numel() * tensors[name].element_size() for name in per_gaussian) == 4 * 4
     opened = field_from_tensors(tensors).select(torch.tensor([3, 1])).segments
     assert opened is not None
-    assert opened.labels.tolist() == [2, 2] and opened.masses.tolist() == [9, 0]
+    assert opened.labels.tolist() == [2, 2]
+    assert opened.masses.tolist() == [9, 0]
     assert torch.equal(opened.levels, segments.levels)
     assert field_from_tensors(field(4, None).tensors()).segments is None
 

@@ -207,7 +207,7 @@ def join_linked(
 def _describe(
     labels: IntArray, features: Rows, colors: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean language and color ``[S, D + 3]``, each scaled by its spread in the scene, and mass ``[S]`` of segments."""
+    """Mean language and color ``[S, D + 3]`` of segments, each scaled by its spread, and their masses ``[S]``."""
     segments, total = int(labels.max()) + 1, max(float(weights.sum()), 1e-12)
     masses = np.bincount(labels, weights, segments).astype(np.float64)
     described = []

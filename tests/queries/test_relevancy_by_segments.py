@@ -1,7 +1,9 @@
+import itertools
+
 import numpy as np
 import pytest
 import torch
-from support.question_scene import lifted_cloud, texts
+from support.question_scene import coded_cloud, texts
 
 from lexsplat.language.segments import Segments
 from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy
@@ -52,16 +54,17 @@ def test_scores_stay_in_range_and_do_not_depend_on_the_other_prompts():
     own = torch.rand(5, 24, generator=torch.Generator().manual_seed(0))
     segments = Segments(LABELS, torch.rand(24, generator=torch.Generator().manual_seed(1)), LEVELS)
     together = segment_relevancy(own, segments)
-    assert float(together.min()) >= 0 and float(together.max()) <= 1
+    assert float(together.min()) >= 0
+    assert float(together.max()) <= 1
     assert torch.equal(together, torch.cat([segment_relevancy(row[None], segments) for row in own]))
 
 
 def test_the_cut_is_the_widest_gap_of_means_by_hand():
     generator = np.random.default_rng(3)
     own, masses = generator.random(24), generator.random(24)
-    means = [np.average(own[LABELS == k], weights=masses[LABELS == k]) for k in range(6)]
+    means = [np.average(own[k == LABELS], weights=masses[k == LABELS]) for k in range(6)]
     ranked = sorted(means, reverse=True)
-    gaps = [(a - b, (a + b) / 2) for a, b in zip(ranked, ranked[1:]) if a >= 0.3 * ranked[0]]
+    gaps = [(a - b, (a + b) / 2) for a, b in itertools.pairwise(ranked) if a >= 0.3 * ranked[0]]
     expected = [mean >= max(gaps)[1] for mean in means]
     segments = Segments(LABELS, torch.from_numpy(masses).float(), LEVELS[:1])
     found = (
@@ -72,7 +75,7 @@ def test_the_cut_is_the_widest_gap_of_means_by_hand():
 
 @pytest.mark.parametrize("form", ["code", "feature", "segment"])
 def test_absent_prompts_and_other_forms_keep_the_scores_of_gaussians(form):
-    field, _ = lifted_cloud()
+    field, *_ = coded_cloud()
     field.segments = Segments(
         torch.arange(len(field.codes)) % 3, torch.ones(len(field.codes)), torch.tensor([[0, 1, 2]])
     )
@@ -86,7 +89,8 @@ def test_absent_prompts_and_other_forms_keep_the_scores_of_gaussians(form):
 
 
 def test_a_field_without_segments_answers_by_gaussians():
-    field, _ = lifted_cloud()
+    field, *_ = coded_cloud()
     question = Question(texts(2, 16, 5), texts(4, 16, 6))
     scored = score_prompts(field, question, None)
-    assert not scored.by_segments and torch.equal(scored.scores, gaussian_relevancy(field, question))
+    assert not scored.by_segments
+    assert torch.equal(scored.scores, gaussian_relevancy(field, question))
