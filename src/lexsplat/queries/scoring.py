@@ -16,7 +16,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.fields.rendering import render_chunks
-from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy, render_relevancy
+from lexsplat.queries.relevancy import QueryConfig, QueryForm, Question, gaussian_relevancy, render_relevancy
 from lexsplat.queries.segments import segment_relevancy
 from lexsplat.queries.selection import Presence
 
@@ -40,9 +40,9 @@ class Scored:
     by_segments: bool
 
 
-def uses_segments(field: LanguageField, query: QueryConfig) -> bool:
-    """Whether prompts are answered by segments: asked for, and the field has some."""
-    return query.form == "segment" and field.segments is not None
+def form_used(field: LanguageField, query: QueryConfig) -> QueryForm:
+    """The form in which a field answers: "code" where segments are asked for and the field has none."""
+    return "code" if query.form == "segment" and field.segments is None else query.form
 
 
 def score_prompts(field: LanguageField, question: Question, classify: Classify | None) -> Scored:
@@ -55,7 +55,7 @@ def score_prompts(field: LanguageField, question: Question, classify: Classify |
     """
     scores = gaussian_relevancy(field, question)
     presences: tuple[Presence, ...] = tuple(classify(row) if classify else "yes" for row in scores)
-    if not uses_segments(field, question.config) or field.segments is None:
+    if field.segments is None or question.config.form != "segment":
         return Scored(scores, presences, False)
     present = [place for place, presence in enumerate(presences) if presence != "no"]
     if present:
@@ -80,7 +80,7 @@ def render_scored(
         question: Embeddings of the prompts.
         classify: See `score_prompts`.
     """
-    if not uses_segments(field, question.config):
+    if form_used(field, question.config) != "segment":
         return render_relevancy(field, gaussians, camera, question)
     scores = score_prompts(field, question, classify).scores.T
     maps = render_chunks(gaussians, camera, scores.shape[1], lambda part: scores[:, part].contiguous())
