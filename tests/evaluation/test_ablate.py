@@ -19,7 +19,7 @@ from lexsplat.evaluation import ablate as ablation
 from lexsplat.evaluation import experiments
 from lexsplat.evaluation.ablate import AblationPlan
 from lexsplat.evaluation.ground_truth import GroundTruthSource
-from lexsplat.language.methods import METHODS
+from lexsplat.language.methods import METHODS, VARIANTS
 from lexsplat.language.methods.averaged import Averaged
 from lexsplat.language.methods.trained import Trained
 from lexsplat.pipeline.config import BuildConfig
@@ -76,7 +76,7 @@ def test_each_method_has_the_variants_that_change_it():
     table_2 = ("w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full")
     assert tuple(METHODS["trained"].variants) == table_2
     assert tuple(METHODS["averaged"].variants) == ("one code", "full")
-    assert set(ablation.VARIANTS) == {*table_2, "one code"}
+    assert set(VARIANTS) == {*table_2, "one code"}
     assert ablation.changed(BuildConfig(), "one code").averaged.top == 1
     with pytest.raises(ValueError, match="averaged"):
         ablation.changed(BuildConfig(), "w/o MLP")

@@ -121,7 +121,7 @@ def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_captur
         build(tiny_capture, tmp_path / "other", joint, splats=tmp_path / "any.ply")
 
 
-def test_encoders_are_loaded_once_a_build(tiny_capture, tmp_path, monkeypatch):
+def test_encoders_are_loaded_for_their_check_and_once_for_the_features(tiny_capture, tmp_path, monkeypatch):
     loaded = []
     for kind, encoder in (("clip", color_encoder.ColorClip), ("dino", color_encoder.ColorDino)):
         monkeypatch.setattr(
@@ -129,10 +129,10 @@ def test_encoders_are_loaded_once_a_build(tiny_capture, tmp_path, monkeypatch):
             lambda *_, kind=kind, encoder=encoder: loaded.append(kind) or encoder(),
         )
     build(tiny_capture, tmp_path / "trained", TRAINED)
-    assert sorted(loaded) == ["clip", "dino"]
+    assert sorted(loaded) == ["clip", "clip", "dino", "dino"]
     loaded.clear()
     build(tiny_capture, tmp_path / "averaged", AVERAGED)
-    assert loaded == ["clip"], "averaged features need no DINO"
+    assert loaded == ["clip", "clip"], "averaged features need no DINO"
     loaded.clear()
     build(tiny_capture, tmp_path / "trained", replace(TRAINED, trained=TrainedConfig(iterations=2)))
     assert loaded == [], "the codes are there"

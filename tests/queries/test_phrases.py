@@ -2,7 +2,21 @@
 
 import pytest
 
-from lexsplat.queries.phrases import Both, Except, Pick, Related, Thing, parse
+from lexsplat.queries.grammar import parse, understand
+from lexsplat.queries.phrases import (
+    Anything,
+    AtLeast,
+    Between,
+    Both,
+    Except,
+    InCorner,
+    Pick,
+    Related,
+    Thing,
+    Understood,
+    Viewer,
+)
+from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import QueryError
 
 MUG, CLOTH, DUCK = Thing("mug"), Thing("cloth"), Thing("duck")
@@ -38,7 +52,7 @@ MUG, CLOTH, DUCK = Thing("mug"), Thing("cloth"), Thing("duck")
         ("how many glass", Thing("glass")),
         ("how many people", Thing("people")),
         ('how many "jeans"', Thing("jeans")),
-        ("mugs", Thing("mugs")),
+        ("mugs", MUG),
         ('"something on wheels" behind the duck', Related("behind", Thing("something on wheels"), DUCK)),
         ('"salt and pepper"', Thing("salt and pepper")),
         ("something to drink from", Thing("something to drink from")),
@@ -49,7 +63,7 @@ MUG, CLOTH, DUCK = Thing("mug"), Thing("cloth"), Thing("duck")
         ("How many red apples are there on the cloth?", Related("on", Thing("red apple"), CLOTH)),
         ("is there a mug?", MUG),
         ("is there a mug on the cloth?", Related("on", MUG, CLOTH)),
-        ("are there any mugs", Thing("mugs")),
+        ("are there any mugs", MUG),
         ("where is the mug?", MUG),
         ("Where are the mug and the duck", Both(MUG, DUCK)),
         ("Mug On The Cloth", Related("on", Thing("mug"), Thing("Cloth"))),
@@ -80,9 +94,88 @@ def test_phrases_with_an_empty_part_are_refused(text):
 def test_phrases_of_very_many_parts_are_refused(joint):
     assert str(parse(joint.join(["cup"] * 30)))
     with pytest.raises(QueryError, match="parts"):
-        parse(joint.join(["cup"] * 3000))
+        parse(joint.join(["x"] * 45))
     with pytest.raises(QueryError, match="parts"):
-        parse("largest " * 3000 + "cup")
+        parse("largest " * 45 + "cup")
+
+
+@pytest.mark.parametrize(
+    "text", ["cup and " * 12_500, "why is the sky blue", "is the mug closer to the duck than to the lamp"]
+)
+def test_what_is_not_understood_is_one_thing_in_its_own_words_and_said(text):
+    understood = understand(text)
+    assert isinstance(understood.phrase, Thing)
+    assert understood.phrase.text == text.strip()
+    assert understood.note
+
+
+ANY, ME = Anything(), Viewer()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("where can I find the mug?", MUG),
+        ("Could you please show me where the mug is?", MUG),
+        ("I've lost my mug, where is it?", MUG),
+        ("hand me the mug", MUG),
+        ("hand on the cloth", Related("on", Thing("hand"), CLOTH)),
+        ("what can I drink from?", Thing("something to drink from")),
+        ("where can I put flowers?", Thing("something to put flowers in")),
+        ("what gives light?", Thing("something that gives light")),
+        ("what is on the cloth?", Related("on", ANY, CLOTH)),
+        ("what is the mug on?", Related("under", ANY, MUG)),
+        ("list everything", ANY),
+        ("what is in the room", ANY),
+        ("red things", Thing("something red")),
+        ("the mug that is red", Thing("red mug")),
+        ("mug, red", Thing("red mug")),
+        ("is the mug red?", Thing("red mug")),
+        ("which mug is red?", Thing("red mug")),
+        ("a ring made of silver", Thing("silver ring")),
+        ("which objects are made of wood", Thing("something made of wood")),
+        ("two mugs", AtLeast(2, MUG)),
+        ("more than two mugs", AtLeast(3, MUG)),
+        ("one mug", MUG),
+        ("mug between the duck and the cloth", Between(MUG, DUCK, CLOTH)),
+        ("is the mug between the duck and the cloth", Between(MUG, DUCK, CLOTH)),
+        ("which thing is closest to the duck?", Related("nearest to", ANY, DUCK)),
+        ("the mug furthest away from the duck", Related("farthest from", MUG, DUCK)),
+        ("what is closest to me", Related("nearest to", ANY, ME)),
+        ("the closest mug", Related("nearest to", MUG, ME)),
+        ("mugs in front of me", Related("in front of", MUG, ME)),
+        ("what is on my left?", Related("left of", ANY, ME)),
+        ("the mug on the left", Pick("leftmost", MUG)),
+        ("which mug is the tallest?", Pick("tallest", MUG)),
+        ("the biggest thing here", Pick("largest", ANY)),
+        ("mug in the corner", InCorner(MUG)),
+        ("what is in the far left corner of the table", InCorner(ANY, "back left")),
+        ("mugs that are not the duck", Except(MUG, DUCK)),
+        ("everything except the mug", Except(ANY, MUG)),
+        ("children", Thing("child")),
+        ("glasses", Thing("glass")),
+        ("mug with a handle", Thing("mug with a handle")),
+    ],
+)
+def test_questions_as_people_ask_them_are_understood(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+def test_words_in_quotation_marks_keep_their_form():
+    assert parse('"apples"') == Thing("apples")
+    assert parse('"apples"').exact
+    assert not parse("apples").exact
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("rubber dukc", "rubber duck"), ("bananna", "banana"), ("stripped ball", "striped ball"),
+        ("horse", "horse"), ("theremin", "theremin"), ("mugs", "mugs"), ("日本", "日本"),
+    ],
+)  # fmt: skip
+def test_typing_errors_are_mended_and_other_words_are_not(typed, meant):
+    assert corrected(typed, ["rubber duck", "banana", "house", "mug", "striped ball", "candle"]) == meant
 
 
 def test_what_was_understood_can_be_read():

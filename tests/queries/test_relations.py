@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
-from lexsplat.queries.phrases import parse
-from lexsplat.queries.relations import answer, distance, frame_of, holds, nearest, related
+from lexsplat.queries.answering import Searched, answer
+from lexsplat.queries.grammar import parse
+from lexsplat.queries.relations import distance, frame_of, holds, nearest, related
 from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import QueryError
 
 UP = np.array([0.0, 0.0, 1.0])
 THINGS = {  # a table top, things on it, a lamp over it, a pea in a bowl, a ball on the floor
@@ -76,6 +78,7 @@ FALSE = [
     ("far ball", "left of", "bowl"), ("lamp", "next to", "table"), ("left ball", "next to", "right ball"),
     ("far ball", "next to", "right ball"),
     ("beside", "on", "table"), ("table", "under", "beside"), ("pole", "next to", "other pole"),
+    ("bowl", "inside", "bowl"), ("left ball", "next to", "table"),
 ]  # fmt: skip
 
 
@@ -144,7 +147,7 @@ def test_a_phrase_is_answered_with_what_it_asks_for(things):
     words = {"ball": ("left ball", "right ball", "floor ball"), "table": ("table",), "lamp": ("lamp",)}
 
     def ask(text: str) -> Selection:
-        return answer(parse(text), lambda word: things(*words[word]), lambda _: FRONT)
+        return answer(parse(text), Searched(lambda word: things(*words[word]), lambda _: FRONT))
 
     assert torch.equal(ask("ball on the table").mask, things("left ball", "right ball").mask)
     assert torch.equal(
@@ -165,13 +168,72 @@ def test_what_fits_is_as_sure_as_the_least_sure_of_the_words(things):
     def ask(text: str) -> Selection:
         return answer(
             parse(text),
-            lambda word: replace(things(*words[word]), present=sure[word]),
-            lambda _: FRONT,
+            Searched(lambda word: replace(things(*words[word]), present=sure[word]), lambda _: FRONT),
         )
 
     assert ask("ball on the table").present == "unsure"
-    assert len(ask("ball next to the bowl")) == 400
+    assert len(ask("ball next to the bowl")) == 0, "a no has no instances"
     assert ask("ball next to the bowl").present == "no", "what it stands next to is not in the scene"
     assert ask("ball nearest to the bowl").present == "no"
     assert (ask("ball but not the lamp").present, ask("ball but not the bowl").present) == ("yes", "yes")
     assert (len(ask("ball but not the ball")), ask("ball but not the ball").present) == (0, "no")
+
+
+NAMES = {
+    "ball": ("left ball", "right ball", "floor ball"),
+    "table": ("table",),
+    "lamp": ("lamp",),
+    "bowl": ("bowl",),
+}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("what is between the bowl and the far ball", ()),
+        ("bowl between the left ball and the right ball", ("bowl",)),
+        ("lamp between the left ball and the bowl", ()),
+        ("ball farthest from the lamp", ("floor ball",)),
+        ("the leftmost ball", ("left ball",)),
+        ("the ball on the right", ("floor ball",)),
+        ("what is closest to me", ("bowl",)),
+        ("ball to my left", ("left ball",)),
+        ("ball behind me", ()),
+        ("which thing is on the table", ("left ball", "right ball", "bowl")),
+        ("everything but the lamp", ("left ball", "right ball", "floor ball", "bowl")),
+        ("the tallest thing", ("bowl",)),
+        ("two lamps", ()),
+        ("three balls", ("left ball", "right ball", "floor ball")),
+        ("ball in the right corner", ("floor ball",)),
+    ],
+)
+def test_questions_are_answered_with_the_things_that_fit(things, text, expected):
+    words = {**NAMES, "far ball": ("far ball",)}
+    objects = [replace(things(name), phrase=word) for word, names in NAMES.items() for name in names]
+    searched = Searched(lambda word: things(*words[word]), lambda _: FRONT, lambda: objects)
+    found = answer(parse(text), searched)
+    empty = torch.zeros_like(found.mask)
+    assert torch.equal(found.mask, things(*expected).mask if expected else empty)
+    assert len(found.instances) == len(expected)
+    assert (found.present == "no") == (not expected)
+
+
+def test_a_cluster_of_several_known_objects_is_answered_by_those_that_score_as_wholes(things):
+    toys = ("left ball", "right ball", "bowl")
+    whole = things(*toys, "table")
+    scores = whole.scores * 0.6
+    for name in toys[:2]:
+        scores = torch.where(things(name).mask, 0.9, scores)
+    objects = [replace(things(name), phrase=name) for name in (*toys, "table")]
+    searched = Searched(
+        lambda word: replace(whole, scores=scores, phrase=word), lambda _: None, lambda: objects
+    )
+    assert [each.phrase for each in answer(parse("toy"), searched).instances] == ["left ball", "right ball"]
+
+
+def test_a_place_that_a_viewer_cannot_be_at_is_refused(things):
+    searched = Searched(lambda word: things("lamp"), lambda _: FRONT)
+    with pytest.raises(QueryError, match="closest to me"):
+        answer(parse("lamp on me"), searched)
+    with pytest.raises(QueryError, match="in front of me"):
+        answer(parse("me"), searched)

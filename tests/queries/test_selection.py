@@ -66,6 +66,13 @@ def test_operators_are_those_of_sets(balls):
         assert len(combined) == combined.num_gaussians == expected.sum()
 
 
+def test_a_union_has_the_lower_threshold_and_other_combinations_the_first(balls):
+    low, high = (select(balls, balls.labels == 0, threshold=threshold) for threshold in (0.3, 0.6))
+    for first, second in ((low, high), (high, low)):
+        assert (first | second).threshold == 0.3
+        assert (first & second).threshold == (first - second).threshold == first.threshold
+
+
 def test_presence_of_combinations_is_that_of_the_words(balls):
     yes, no = ball(balls, 0), select(balls, balls.labels == 1, present="no")
     assert [(yes | no).present, (yes & no).present, (yes - no).present, (no - yes).present] == [

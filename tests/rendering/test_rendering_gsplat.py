@@ -136,7 +136,7 @@ def test_an_extension_that_fails_to_compile_is_reported_in_one_line(monkeypatch,
     with pytest.raises(
         BackendError, match=r"expected its CUDA extension, found .*Error building extension.*nvcc"
     ):
-        gsplat_backend._require_gsplat()
+        gsplat_backend.require_gsplat()
 
 
 def test_gsplats_compiler_messages_are_not_printed(monkeypatch, capsys):
@@ -151,7 +151,7 @@ def test_gsplats_compiler_messages_are_not_printed(monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Talkative(), *sys.meta_path])
     try:
-        gsplat_backend._require_gsplat()
+        gsplat_backend.require_gsplat()
     finally:
         sys.modules.pop("gsplat.cuda._backend", None)
     said = capsys.readouterr()
@@ -164,10 +164,10 @@ def test_an_installation_without_the_extension_is_reported_in_one_line(monkeypat
     backend._C = None
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
     with pytest.raises(BackendError, match="expected its CUDA extension, found an installation without one"):
-        gsplat_backend._require_gsplat()
+        gsplat_backend.require_gsplat()
 
 
 def test_a_missing_gsplat_is_reported_in_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(BackendError, match=r"gsplat: found .*; pip install gsplat==1\.5\.3"):
-        gsplat_backend._require_gsplat()
+    with pytest.raises(BackendError, match=r"gsplat: found .*; run: pip install gsplat==1\.5\.3"):
+        gsplat_backend.require_gsplat()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import os
 import resource
 import shutil
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from lexsplat import cli
 from lexsplat.scenes.scene import open_scene
 
 pytestmark = pytest.mark.slow
@@ -46,8 +49,11 @@ def small_disk(tmp_path):
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "lexsplat.cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=LONGEST)
+    """The command line in this process, as `subprocess.run` would tell it."""
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        status = cli.main([*arguments])
+    return subprocess.CompletedProcess(arguments, status, output.getvalue(), errors.getvalue())
 
 
 def build_arguments(capture: Path, output: Path) -> list[str]:

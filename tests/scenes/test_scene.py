@@ -9,7 +9,7 @@ from support.viewer_scene import ball_scene
 
 import lexsplat
 from lexsplat.queries import thresholds as threshold_rule
-from lexsplat.queries.relevancy import Question, gaussian_relevancy, render_relevancy
+from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes import scene as scene_module
 from lexsplat.scenes.answers import _default_views, find_phrases
@@ -33,8 +33,19 @@ def scene(made):
 
 def test_answers_contain_scores_thresholds_and_presences(scene):
     answers = scene.ask(BALLS)
-    question = Question(scene.embed(BALLS), scene.embed(list(scene.query.negatives)), scene.query)
+    question = scene.question(BALLS)
+    assert question.scale is not None
     assert torch.equal(answers.scores, gaussian_relevancy(scene.field, question))
+    assert answers.thresholds.tolist() == [0.5] * 3
+    assert answers.presences == scene.presence_classifier.classify(question.positives, answers.scores)
+    assert answers.prompts == tuple(BALLS)
+    assert len(answers) == 3
+
+
+def test_relevancy_over_given_negatives_has_its_threshold_from_training_views(scene):
+    scene.query = QueryConfig(negatives=("object", "stuff"))
+    answers, question = scene.ask(BALLS), scene.question(BALLS)
+    assert question.scale is None
     training = [view.camera for view in scene.views.values() if view.split == "train"]
     expected = threshold_rule.scene_thresholds(
         lambda camera: render_relevancy(scene.field, scene.gaussians, camera, question),
@@ -42,9 +53,6 @@ def test_answers_contain_scores_thresholds_and_presences(scene):
         answers.presences,
     )
     torch.testing.assert_close(answers.thresholds, expected)
-    assert answers.presences == tuple(scene.presence_classifier.classify(row) for row in answers.scores)
-    assert answers.prompts == tuple(BALLS)
-    assert len(answers) == 3
 
 
 def test_threshold_and_presence_are_the_same_everywhere(scene):

@@ -106,16 +106,7 @@ class View:
     def undistort_mask(
         self, mask: NDArray[np.bool_], subject: Path, size: tuple[int, int] | None = None
     ) -> NDArray[np.bool_]:
-        """A mask ``[h, w]`` drawn on the photo, undistorted as by `load_mask`.
-
-        Args:
-            mask: The mask.
-            subject: The file named in messages.
-            size: Width and height of the result; None keeps the mask's own resolution.
-
-        Raises:
-            CaptureError: If the aspect of the mask is not the photo's.
-        """
+        """A mask ``[h, w]`` as `load_mask` undistorts one; ``subject`` is the file named in errors."""
         height, width = mask.shape
         self._check_aspect(subject, (width, height))
         if self._is_undistorted(mask) or not self.lens.distorts:

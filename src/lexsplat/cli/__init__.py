@@ -35,6 +35,7 @@ COMMANDS = {
     "language": CommandEntry("build", "Language", "the later stages of build: language on the Gaussians"),
     "query": CommandEntry("query", "Query", "heatmaps, masks and scores for free text"),
     "find": CommandEntry("find", "Find", "where things are in 3D, how many and how large"),
+    "ask": CommandEntry("ask", "Ask", "questions in your own words, many a second with --stdin"),
     "scale": CommandEntry("scale", "Scale", "set the length of a meter and the up direction of a scene"),
     "evaluate": CommandEntry("evaluate", "Evaluate", "measure a scene on its held-out views"),
     "ablate": CommandEntry("ablate", "Ablate", "measure the method without its parts"),
@@ -42,6 +43,10 @@ COMMANDS = {
     "edit": CommandEntry("edit", "Edit", "delete, recolor, move or duplicate things by words"),
     "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
     "view": CommandEntry("view", "View", "show and search a scene in the browser"),
+    "encoders": CommandEntry(
+        "encoders", "EncodersCommand", "fetch, check and time encoders before a long build"
+    ),
+    "mcp": CommandEntry("mcp", "Mcp", "tools for language models"),
     "info": CommandEntry("info", "Info", "show what a scene folder contains"),
 }
 """Commands by name, in the order of the help page."""

@@ -61,8 +61,6 @@ class Ablate:
     defaults: ClassVar[dict[str, str]] = {
         "variants": "all that differ for the method",
         "methods": "the method of the settings",
-        "masks": "the ground truth in the capture or beside it",
-        "prompt_list": "the prompts of the ground truth",
     }
 
     def check(self) -> None:

@@ -4,7 +4,7 @@ A command class may have these attributes beside its fields:
 
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
-- ``defaults``: what help pages state as the default of an option that is None or empty;
+- ``defaults``: defaults of options that are None or empty, in words, beside the usual ones;
 - ``synonyms``: other spellings of options.
 
 Its method ``check``, if it has one, raises ValueError for options that are invalid together.
@@ -38,11 +38,17 @@ _PLACEHOLDERS = {
     "template": "SENTENCE", "points": "X,Y,Z X,Y,Z", "up": "X,Y,Z", "memory": "SIZE",
 }  # fmt: skip
 """Placeholders by name of option; that of an option with any number of values is followed by an ellipsis."""
-_SETTINGS_DEFAULTS = {
+_DEFAULTS = {
+    "clip": "the encoder of the build",
+    "view": "the view that shows the other thing best",
+    "threshold": "chosen for each phrase",
+    "masks": "the ground truth in the capture or beside it",
+    "prompt_list": "the prompts of the ground truth",
     "downscale": "chosen for the device",
     "iterations": "chosen for the device",
     "up": "from the cameras",
 }
+"""What help pages state as the default of an option that is None or empty, unless the command states another."""
 
 CommandT = TypeVar("CommandT")
 REGISTRY = ConstructorRegistry()
@@ -123,7 +129,7 @@ def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
         factory: Any = field.default_factory
         if field.name == "settings" and factory is not dataclasses.MISSING:
             example = factory()
-            page = _help_page(type(example), hidden, _SETTINGS_DEFAULTS)
+            page = _help_page(type(example), hidden, {})
             values = {part.name: getattr(example, part.name) for part in dataclasses.fields(example)}
             hint = Annotated[page, tyro.conf.arg(name="")]  # as `options.Settings`
             factory = _maker(page, values)
@@ -154,7 +160,8 @@ def _in_words(name: str, kind: Any, default: Any, defaults: dict[str, str]) -> A
     if placeholder and get_origin(kind) is tuple and Ellipsis in get_args(kind):
         placeholder += " ..."
     if default is None or default == ():
-        hint = f"(default: {defaults.get(name, 'none')})"
+        words = {**_DEFAULTS, **defaults}
+        hint = f"(default: {words.get(name, 'none')})"
     elif default is False or default is True:
         hint = ""
     return tyro.conf.arg(metavar=placeholder, help_behavior_hint=hint)

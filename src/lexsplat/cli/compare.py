@@ -59,10 +59,6 @@ class Compare:
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
-    defaults: ClassVar[dict[str, str]] = {
-        "masks": "the ground truth in the capture or beside it",
-        "prompt_list": "the prompts of the ground truth",
-    }
 
     def check(self) -> None:
         """Refuse invalid options."""

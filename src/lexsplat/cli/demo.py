@@ -35,7 +35,7 @@ class Demo:
     seed: int = 0
     iterations: int | None = None
 
-    defaults: ClassVar[dict[str, str]] = {"method": "averaged", "iterations": "chosen for the device"}
+    defaults: ClassVar[dict[str, str]] = {"method": "averaged"}
 
     def check(self) -> None:
         """Refuse invalid options."""

@@ -86,11 +86,6 @@ class Edit:
     clip: str | None = None
     device: Device = "auto"
 
-    defaults: ClassVar[dict[str, str]] = {
-        "view": "the view that shows the other thing best",
-        "threshold": "chosen for each phrase",
-        "clip": "the encoder of the build",
-    }
     synonyms: ClassVar[dict[str, str]] = {"--colour": "--color"}
 
     def check(self) -> None:

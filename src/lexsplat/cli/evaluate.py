@@ -47,11 +47,8 @@ class Evaluate:
     json: bool = False
 
     defaults: ClassVar[dict[str, str]] = {
-        "masks": "the ground truth in the capture or beside it",
-        "prompt_list": "the prompts of the ground truth",
         "capture": "where the build found it",
         "form": "the form of the scene",
-        "clip": "the encoder of the build",
     }
 
     def run(self) -> None:

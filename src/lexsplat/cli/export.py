@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 from lexsplat.cli.options import (
     PRESENCE,
@@ -49,12 +48,6 @@ class Export:
     threshold: float | None = None
     clip: str | None = None
     device: Device = "auto"
-
-    defaults: ClassVar[dict[str, str]] = {
-        "view": "the view that shows the other thing best",
-        "threshold": "chosen for each phrase",
-        "clip": "the encoder of the build",
-    }
 
     def check(self) -> None:
         """Refuse invalid options."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 from lexsplat.cli.options import (
     Device,
@@ -43,12 +43,6 @@ class Find:
     device: Device = "auto"
     json: bool = False
 
-    defaults: ClassVar[dict[str, str]] = {
-        "view": "the view that shows the other thing best",
-        "threshold": "chosen for each phrase",
-        "clip": "the encoder of the build",
-    }
-
     def check(self) -> None:
         """Refuse invalid options."""
         check_phrases(self.phrases)
@@ -65,6 +59,7 @@ class Find:
             return
         for answer in answers["phrases"]:
             _print_answer(answer)
+        print(f"relative to {answers['rests_on']}")
 
 
 def _print_answer(answer: dict[str, Any]) -> None:

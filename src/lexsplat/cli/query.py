@@ -62,10 +62,9 @@ class Query:
         "output": 'SCENE/heatmaps; demo_heatmaps for "demo"',
         "threshold": "chosen for each prompt from the scene alone",
         "form": "the form of the scene",
-        "negatives": '"object" "things" "stuff" "texture"',
+        "negatives": 'everyday words; "object" "things" "stuff" "texture" for --form feature',
         "temperature": "10",
         "template": "those of the scene",
-        "clip": "the encoder of the build",
     }
 
     def check(self) -> None:
@@ -101,6 +100,7 @@ class Query:
                 f"threshold {answer['threshold']:.2f}, {answer['gaussians']} Gaussians"
                 f"{PRESENCE[answer['present']]}"
             )
+        print(f"relative to {answers['rests_on']}")
         if folder:
             print(f"images in {folder}")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import ClassVar
 
 from lexsplat.cli.options import Device, SceneArgument, open_folder, open_scene, print_json
 from lexsplat.cli.values import Length
@@ -45,8 +44,6 @@ class Scale:
     clip: str | None = None
     device: Device = "auto"
     json: bool = False
-
-    defaults: ClassVar[dict[str, str]] = {"up": "from the cameras", "clip": "the encoder of the build"}
 
     def check(self) -> None:
         """Refuse invalid options."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene
 
@@ -35,8 +35,6 @@ class View:
     splats: int = 1_000_000
     clip: str | None = None
     device: Device = "auto"
-
-    defaults: ClassVar[dict[str, str]] = {"clip": "the encoder of the build"}
 
     def check(self) -> None:
         """Refuse invalid options."""

@@ -80,7 +80,7 @@ class AblationPlan:
 
     Args:
         seeds: Seeds of codebook and language.
-        variants: Names out of `VARIANTS`; empty takes all of each method.
+        variants: Names out of `lexsplat.language.methods.VARIANTS`; empty takes all of each method.
         methods: Names of methods. Rows of several are named "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
         forms: How codes and text are compared: "feature" as in the paper, "code". Names of rows end in the form if

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.captures import check_ground_truth_options, load_annotations
+from lexsplat.captures import Annotations, Capture, check_ground_truth_options, load_annotations
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
     EvaluationConfig,
@@ -49,7 +49,7 @@ from lexsplat.language.methods import METHODS
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, feature_maps
-from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.pipeline.inputs import preview_capture, reload_capture
 from lexsplat.queries.relevancy import QueryConfig, QueryForm
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.environment import code_identity, machine_facts
@@ -133,6 +133,9 @@ class Bench:
         self.origin = ground_truth or GroundTruthSource()
         check_ground_truth_options(source, self.origin.masks, self.origin.prompt_list)
         self.output, self.listener, self.evaluation = output, listener, evaluation
+        preview = preview_capture(source, output, config)
+        if preview is not None:  # before the build, which takes long
+            self._read_ground_truth(preview, source)
         # Features are shared by methods that use DINO and others that do not, so they are made with both encoders.
         with_dino: Any = next(name for name, method in METHODS.items() if method.uses_dino)
         every = config if METHODS[config.method].uses_dino else replace(config, method=with_dino)
@@ -142,15 +145,24 @@ class Bench:
         sizes = [view.capture_size for view in self.capture.views.values()]
         self.config = config.resolved(self.device, max(sizes, key=lambda size: size[0] * size[1]))
         self.memory = parse_bytes(config.memory)
-        self.ground_truth = load_annotations(self.capture, self.origin.masks, self.origin.prompt_list)
-        if not any(self.ground_truth.masks.get(name) for name in self.capture.test_names):
-            raise _no_ground_truth(source, self.origin)
+        self.ground_truth = self._read_ground_truth(self.capture, source)
         self.gaussians = self.folder.read_gaussians().to(self.device)
-        self._encoders = Encoders(config.clip, config.dino, self.device)
+        self._encoders = Encoders(config.clip, config.dino, self.config.encoder_device)
         self._maps: FeatureMaps | None = None
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
         self._codebook_peaks: Peaks = {}
+
+    def _read_ground_truth(self, capture: Capture, source: Path) -> Annotations:
+        """The ground truth of a capture.
+
+        Raises:
+            CaptureError: If no held-out view has any.
+        """
+        found = load_annotations(capture, self.origin.masks, self.origin.prompt_list)
+        if not any(found.masks.get(name) for name in capture.test_names):
+            raise _no_ground_truth(source, self.origin)
+        return found
 
     # -- shared stages
 

@@ -79,6 +79,6 @@ class MethodScene:
     def _question(self, prompts: Sequence[str]) -> Question:
         positives, negatives = (
             embed_prompts(texts, self.encode_text, self.query.templates)
-            for texts in (prompts, self.query.negatives)
+            for texts in (prompts, self.query.compared)
         )
         return Question(positives, negatives, self.query)

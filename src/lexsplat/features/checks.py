@@ -29,7 +29,7 @@ _MARGIN = 1.2  # side of a picture, in sides of the box around what it shows
 
 
 def pictures(side: int) -> Tensor:
-    """A square crop for each of `WORDS` ``[W, 3, side, side]`` in 0..1, of the photo that shows it largest."""
+    """Square pictures of of `WORDS`, where each is largest in the bundled photos: ``[W, 3, side, side]`` in 0..1."""
     return torch.cat([_picture(word, side) for word in WORDS])
 
 
@@ -67,6 +67,23 @@ def rank_words(clip: ImageTextEncoder) -> float:
     similarity = images @ texts.T
     below = (similarity < similarity.diagonal()[:, None]).sum(1)
     return float(below.double().mean()) / (len(WORDS) - 1)
+
+
+def check_words(clip: ImageTextEncoder) -> float:
+    """`rank_words`, at least `ENOUGH`.
+
+    Raises:
+        ModelError: If words rank little better than by chance, or as `rank_words`.
+    """
+    right = rank_words(clip)
+    if right < ENOUGH:
+        raise ModelError(
+            f"model {clip.name}",
+            expected=f"words that match bundled pictures (at least {ENOUGH:.2f} of the others rank lower)",
+            found=f"{right:.2f}, where chance is 0.50",
+            remedy="choose another model",
+        )
+    return right
 
 
 def check_dense(dino: DenseEncoder) -> None:

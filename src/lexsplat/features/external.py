@@ -156,21 +156,16 @@ class _Reading:
                 parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
                 for name, part in parts.items():
                     if part.get_dtype() not in _FLOATS:
-                        found = str(part.get_dtype())
-                        raise FileFormatError(path, expected=f"{name} as floating-point numbers", found=found)
+                        raise _wrong(path, f"{name} as floating-point numbers", part.get_dtype())
                 dino = parts.pop("dino", None)
                 if len(parts) != 1 and "clip" not in parts:
-                    found = ", ".join(sorted(parts)) or "none"
-                    raise FileFormatError(path, expected='a tensor "clip"', found=found)
+                    raise _wrong(path, 'a tensor "clip"', ", ".join(sorted(parts)) or "none")
                 clip = parts.get("clip", next(iter(parts.values())))
                 if dino is not None and dino.get_shape()[:2] != clip.get_shape()[:2]:
-                    size = clip.get_shape()[:2]
-                    raise FileFormatError(
-                        path, expected=f"dino of size {size}", found=f"{dino.get_shape()[:2]}"
-                    )
+                    raise _wrong(path, f"dino of size {clip.get_shape()[:2]}", dino.get_shape()[:2])
                 made = [None if part is None else self._sliced(part, path) for part in (clip, dino)]
         except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
-            raise FileFormatError(path, expected="safetensors", found=str(error)[:200]) from error
+            raise _wrong(path, "safetensors", error) from error
         return FeatureMap(*made)  # type: ignore[arg-type]
 
     def _sliced(self, part: Any, path: Path) -> torch.Tensor:
@@ -183,13 +178,12 @@ class _Reading:
         """The map of one feature per segment and the segments of every pixel."""
         features, pixels = _open_npy(path), _segments_of(path)
         if features.ndim != 2:
-            raise FileFormatError(path, expected="[n, D]", found=str(list(features.shape)))
+            raise _wrong(path, "[n, D]", list(features.shape))
         numbers = _open_npy(pixels)
         if numbers.ndim not in (2, 3):
-            found = str(list(numbers.shape))
-            raise FileFormatError(pixels, expected="[h, w] or [L, h, w]", found=found)
+            raise _wrong(pixels, "[h, w] or [L, h, w]", list(numbers.shape))
         if 0 in numbers.shape:
-            raise FileFormatError(pixels, expected="segment ids", found="an empty array")
+            raise _wrong(pixels, "segment ids", "an empty array")
         rows, columns = self._cells((*numbers.shape[-2:], features.shape[1]), 0, pixels)
         index = _segment_numbers(numbers[..., rows[:, None], columns], len(features), pixels)
         unit = _unit(np.array(features)[None], path)[0].numpy()
@@ -210,7 +204,7 @@ class _Reading:
             MemoryBudgetError: If the map does not fit.
         """
         if len(shape) != 3 or 0 in shape:
-            raise FileFormatError(path, expected="features [h, w, D]", found=str(list(shape)))
+            raise _wrong(path, "features [h, w, D]", list(shape))
         height, width, depth = shape
         photo_width, photo_height = self.view.capture_size
         # Numbers of cells are rounded: either side may be off by one.
@@ -237,16 +231,10 @@ def _centers(count: int, length: int) -> NDArray[np.intp]:
 def _segment_numbers(segments: NDArray, count: int, path: Path) -> NDArray[np.int64]:
     """Segment ids ``[L, h, w]`` from ``[h, w]`` or ``[L, h, w]``: integers from -1 to ``count`` - 1."""
     if not np.isfinite(segments).all() or np.abs(segments.astype(np.float64)).max() > 2**31:
-        raise FileFormatError(
-            path, expected="integer segment ids", found="NaN, infinity or values beyond 2^31"
-        )
+        raise _wrong(path, "integer segment ids", "NaN, infinity or values beyond 2^31")
     index = segments.astype(np.int64)
     if index.min() < -1 or index.max() >= count or (index != segments).any():
-        raise FileFormatError(
-            path,
-            expected=f"integers from -1 to {count - 1}",
-            found=f"{segments.min():g} to {segments.max():g}",
-        )
+        raise _wrong(path, f"integers from -1 to {count - 1}", f"{segments.min():g} to {segments.max():g}")
     return index.reshape(-1, *index.shape[-2:])
 
 
@@ -254,28 +242,31 @@ def _open_npy(path: Path) -> NDArray:
     """An array of numbers, memory-mapped: a damaged header cannot allocate more than the file holds."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError) as error:
-        raise _no_array(path, error) from error
-    except (SyntaxError, RecursionError, tokenize.TokenError, zipfile.BadZipFile) as error:
-        raise _no_array(path, error) from error
+    except _UNREADABLE as error:
+        raise _wrong(path, "a .npy array without pickled objects", error) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise FileFormatError(
-            path, expected="an array of numbers", found=str(getattr(array, "dtype", type(array)))
-        )
+        raise _wrong(path, "an array of numbers", getattr(array, "dtype", type(array)))
     return array
 
 
-def _no_array(path: Path, error: Exception) -> FileFormatError:
-    return FileFormatError(path, expected="a .npy array without pickled objects", found=str(error)[:200])
+_UNREADABLE = (
+    *(OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError, SyntaxError, RecursionError),
+    *(tokenize.TokenError, zipfile.BadZipFile),
+)
+"""Types that numpy raises on damaged arrays."""
+
+
+def _wrong(path: Path, expected: str, found: object) -> FileFormatError:
+    return FileFormatError(path, expected=expected, found=str(found)[:200])
 
 
 def _unit(array: NDArray, path: Path) -> torch.Tensor:
     """Unit vectors ``[h, w, D]`` in float32; normalizes in place if the array is float32 already."""
     if 0 in array.shape:
-        raise FileFormatError(path, expected="features [h, w, D]", found=str(list(array.shape)))
+        raise _wrong(path, "features [h, w, D]", list(array.shape))
     with np.errstate(over="ignore"):  # overflow becomes infinity, which is refused below
         values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
     lengths = torch.linalg.vector_norm(values, dim=-1, keepdim=True)
     if not bool(torch.isfinite(lengths).all()):
-        raise FileFormatError(path, expected="finite numbers", found="NaN, infinity, or values beyond 1e19")
+        raise _wrong(path, "finite numbers", "NaN, infinity, or values beyond 1e19")
     return values.div_(lengths.clamp_min(1e-12))

@@ -93,7 +93,7 @@ def extract_features(
     listener(Event("features", done, total))
     largest = max([1, *(_view_bytes(capture.views[n], entries[n], clip, config, memory) for n in entries)])
     workers = (
-        1 if clip.device.type == "cuda" else min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing)))
+        min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing))) if clip.device.type == "cpu" else 1
     )
     workers = max(1, min(workers, memory // 2 // largest))
     same_files: dict[tuple[Path, Path | None], list[str]] = {}  # views of identical photos share their files
@@ -148,6 +148,12 @@ def load_level_maps(
     return read_levels(entry.clip, *entry.map_size)
 
 
+def encoded_size(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
+    """Width and height at which a photo is cut into crops."""
+    factor = min(1.0, config.max_short_side / min(capture_size))
+    return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
+
+
 @dataclass(frozen=True)
 class _Entry:
     """Cache files, image size and map size of a view."""
@@ -168,8 +174,7 @@ class _Entry:
         cache_dir: Path,
     ) -> _Entry:
         width, height = view.capture_size
-        factor = min(1.0, config.max_short_side / min(width, height))
-        image_size = max(1, round(width * factor)), max(1, round(height * factor))
+        image_size = encoded_size(view.capture_size, config)
         cells = config.map_cells / min(width, height) * _strip_factor(width, height)
         map_size = max(1, round(width * cells)), max(1, round(height * cells))
         # Everything the pixels depend on: file, lens, background, size and mask.
@@ -215,7 +220,7 @@ class _Extraction:
         batch_size: int,
     ) -> None:
         self.views, self.entries, self.clip, self.dino, self.config = views, entries, clip, dino, config
-        self.batch_size = batch_size if clip.device.type == "cuda" else min(batch_size, _CPU_BATCH)
+        self.batch_size = min(batch_size, _CPU_BATCH) if clip.device.type == "cpu" else batch_size
         self._todo: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._stop = threading.Event()

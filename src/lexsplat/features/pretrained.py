@@ -131,6 +131,8 @@ def resize_images(images: Tensor, height: int, width: int) -> Tensor:
     """Antialiased bicubic resize of ``[B, 3, h, w]`` in 0..1; overshoot of the filter is clamped."""
     if images.shape[-2:] == (height, width):
         return images
+    if images.device.type == "mps":  # not every torch has this filter there
+        return resize_images(images.cpu(), height, width).to(images.device)
     return F.interpolate(images, (height, width), mode="bicubic", antialias=True, align_corners=False).clamp(
         0, 1
     )

@@ -29,10 +29,11 @@ class TextCache:
 
     Args:
         folder: Folder of the files; created on the first write.
+        writable: Whether new embeddings are stored.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = Path(folder)
+    def __init__(self, folder: Path, *, writable: bool = True) -> None:
+        self._folder, self._writable = Path(folder), writable
         self._known: dict[str, dict[str, Tensor]] = {}
 
     def encode(
@@ -58,7 +59,8 @@ class TextCache:
                 raise ValueError(f"{model.name} is not the model of the features ({content_hash})")
             known.update(zip(new, encode_each(model, new)))
             try:
-                self._write(content_hash, known)
+                if self._writable:
+                    self._write(content_hash, known)
             except OSError as error:  # the cache is optional
                 log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
         return torch.stack([known[prompt] for prompt in prompts])

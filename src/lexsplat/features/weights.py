@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -122,7 +121,7 @@ def _pickled(path: Path, name: str) -> dict[str, Tensor]:
     )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, KeyError) as error:
+    except Exception as error:  # UnpicklingError, RuntimeError, EOFError, KeyError ...
         raise _damaged(path, name, "a pickled dictionary of tensors only", error) from error
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -81,10 +82,8 @@ class MaskedCodeMaps(Mapping[str, Any]):
             return codes
         bits, (height, width) = self._bits[name]
         valid = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
-        # As in `codes_at_pixels`.
-        rows = (2 * np.arange(height) + 1) * codes.shape[0] // (2 * height)
-        columns = (2 * np.arange(width) + 1) * codes.shape[1] // (2 * width)
-        return np.where(valid, codes[rows[:, None], columns].astype(np.int16), np.int16(MASKED_CODE))
+        at = codes_at_pixels(torch.from_numpy(codes), height, width, torch.arange(height * width))
+        return np.where(valid, at.view(height, width).numpy(), MASKED_CODE).astype(np.int16)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._code_maps)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,13 @@ from lexsplat.language.methods import METHODS, FitRun, TrainingViews
 from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps
-from lexsplat.pipeline.inputs import prepare_capture
+from lexsplat.pipeline.inputs import prepare_capture, refuse_without_cameras, survey_photos
 from lexsplat.pipeline.provenance import model_identity, write_provenance
-from lexsplat.pipeline.splats import check_in_view, existing_splats
+from lexsplat.pipeline.splats import check_agreement, existing_splats
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
+from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.device import choose_device
+from lexsplat.runtime.device import choose_device, choose_encoder_device
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
@@ -66,7 +67,8 @@ def build(
         listener: Receives progress events of every stage.
 
     Raises:
-        LexsplatError: If anything in the capture, the models or the output folder is wrong.
+        LexsplatError: If anything in the capture, the models or the output folder is wrong, or the device cannot be
+            used.
         ValueError: If ``until`` is not a stage, or ``splats`` are given for joint training.
     """
     if until not in STAGES:
@@ -75,13 +77,23 @@ def build(
     if config.joint and splats is not None:
         raise ValueError("joint training makes its own Gaussians: leave --splats out")
     device = choose_device(config.device)
+    config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
+    if device == "cuda":
+        require_gsplat()  # before anything that takes time
+    if splats is not None:
+        existing_splats(splats)
+        refuse_without_cameras(source)
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
     with folder.locked():
         try:
+            # Errors in ground truth and encoders are reported before structure from motion, not after it.
+            photos = survey_photos(source, folder.root, config, test_names)
+            encodes = until != "reconstruct" and "features" not in folder.record["stages"]
+            if photos is not None and encodes:
+                check_encoders(config.resolved(device, photos.size), source, photos.count, photos.size)
             capture = prepare_capture(source, folder, config, test_names, listener)
-            # Errors in ground truth and external features are reported before the training, not after it.
             load_annotations(capture)
             sizes = [view.capture_size for view in capture.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
@@ -89,7 +101,8 @@ def build(
             _check_photos(capture, parse_bytes(config.memory))
             if config.features_from is not None:
                 load_external_features(config.features_from, capture)
-            return _Builder(capture, folder, config, device, listener, splats).run(until)
+            builder = _Builder(capture, folder, config, device, listener, splats)
+            return builder.run(until, encoders_checked=photos is not None and encodes)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw()
@@ -132,13 +145,18 @@ class _Builder:
         self._maps: FeatureMaps | None = None
         self._clip_hash = ""
 
-    def run(self, until: str) -> SceneFolder:
+    def run(self, until: str, *, encoders_checked: bool) -> SceneFolder:
         """Run the stages of the method up to ``until``; of a stage the method does not have, those before it."""
         stages = self._stages(write_provenance(self.folder, self.capture, self.config))
         order = list(stages)
         wanted = order[: order.index(until if until in stages else "features") + 1]
-        if "features" in wanted and not self._is_finished("features", stages["features"]):
-            check_encoders(self.config)  # a missing model is reported before the reconstruction
+        if (
+            "features" in wanted
+            and not encoders_checked
+            and not self._is_finished("features", stages["features"])
+        ):
+            sizes = [view.capture_size for view in self.capture.views.values()]
+            check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
         for name in wanted:
             self._run_stage(name, stages[name])
         if until == "language":
@@ -233,7 +251,7 @@ class _Builder:
     def _take_splats(self) -> dict[str, Any]:
         splats = existing_splats(self.splats)
         gaussians = read_splats(splats)
-        check_in_view(gaussians, [view.camera for view in self._training_views.values()], splats)
+        check_agreement(gaussians, list(self._training_views.values()), splats)
         self.folder.write_gaussians(gaussians)
         return {"gaussians": len(gaussians), "splats": str(splats.resolve())}
 
@@ -319,7 +337,7 @@ class _Builder:
         """Features of every view. The encoders are loaded once a build, and freed when all features are stored."""
         if self._maps is None:
             config = self.config
-            encoders = Encoders(config.clip, config.dino if config.uses_dino else "none", self.device)
+            encoders = Encoders.of(config)
             cache = self.folder.features_path
             self._maps = feature_maps(self.capture, config, encoders, cache, self.listener)
             self._clip_hash = encoders.clip.content_hash

@@ -17,7 +17,7 @@ from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction import ReconstructionConfig
-from lexsplat.runtime.device import check_seed
+from lexsplat.runtime.device import check_seed, choose_encoder_device
 from lexsplat.runtime.memory import parse_bytes
 
 CPU_PIXELS = 80_000
@@ -39,6 +39,8 @@ class BuildConfig:
             demo).
         dino: Dense encoder: a name, a folder, "bundled", or "none".
         device: Device to compute on; "auto" takes CUDA if there is a GPU.
+        encoder_device: Device of the encoders; "auto" takes that of the rasterizer. With a CPU rasterizer, "cuda" or
+            "mps" (the GPU of a Mac) speeds up the features.
         seed: Seed of all randomness.
         features_from: Folder with features of another program, one array a view (docs/captures.md). CLIP is then
             used for prompts only.
@@ -69,6 +71,7 @@ class BuildConfig:
     clip: str = DEFAULT_CLIP
     dino: str = DEFAULT_DINO
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    encoder_device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     seed: int = 0
     features_from: Path | None = None
     memory: str = "4GB"
@@ -93,6 +96,8 @@ class BuildConfig:
                 object.__setattr__(self, encoder, "bundled")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device must be auto, cpu or cuda, got {self.device!r}")
+        if self.encoder_device not in ("auto", "cpu", "cuda", "mps"):
+            raise ValueError(f"encoder_device must be auto, cpu, cuda or mps, got {self.encoder_device!r}")
         parse_bytes(self.memory)
         check_seed(self.seed)
         if self.downscale is not None and not 0 < self.downscale < 1e6:
@@ -116,13 +121,14 @@ class BuildConfig:
     def result_settings(self) -> BuildConfig:
         """These settings with everything that does not affect the result at its default, for fingerprints.
 
-        Memory, checkpoints, settings of methods that are not used, and features that take no part.
+        Memory, checkpoints, the device of the encoders, settings of methods that are not used, and features that
+        take no part.
         """
         used = METHODS[self.method].settings
         unused = {part for method in METHODS.values() for part in method.settings} - set(used)
         usual = BuildConfig()
         idle: dict[str, Any] = {
-            name: getattr(usual, name) for name in unused | {"memory", "checkpoint_seconds"}
+            name: getattr(usual, name) for name in unused | {"memory", "checkpoint_seconds", "encoder_device"}
         }
         return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **idle)
 
@@ -137,7 +143,11 @@ class BuildConfig:
         Args:
             device: "cpu" or "cuda".
             capture_size: Width and height of the largest photo.
+
+        Raises:
+            BackendError: If the device of the encoders is not available.
         """
+        encoder_device = choose_encoder_device(self.encoder_device, device)
         downscale = self.downscale
         if downscale is None:
             pixels = CPU_PIXELS if device == "cpu" else CUDA_PIXELS
@@ -145,7 +155,7 @@ class BuildConfig:
             # Halves keep the numbers readable; never enlarge.
             downscale = max(1.0, round(factor * 2) / 2)
         features = self.features
-        if self.clip == "bundled" or device == "cpu":
+        if self.clip == "bundled" or encoder_device != "cuda":
             suited = FeatureConfig.bundled() if self.clip == "bundled" else FeatureConfig.sparse()
             features = features.on_top_of(suited)
         iterations = self.iterations
@@ -156,6 +166,7 @@ class BuildConfig:
         return replace(
             self,
             device=device,  # type: ignore[arg-type]
+            encoder_device=encoder_device,  # type: ignore[arg-type]
             downscale=downscale,
             iterations=iterations,
             features=features,

@@ -10,17 +10,23 @@ from typing import TYPE_CHECKING
 from lexsplat.captures import Capture
 from lexsplat.codebook import MAX_CODES
 from lexsplat.features import FeatureMaps, extract_features, load_external_features
-from lexsplat.features.clip import check_patches
+from lexsplat.features.checks import ENOUGH, check_dense, rank_words
+from lexsplat.features.clip import UNLIKE_WORDS, check_patches
+from lexsplat.features.estimate import estimate
 from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.memory import parse_bytes
-from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.progress import NOTE, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
 
 log = logging.getLogger("lexsplat")
+
+
+BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
+"""What the bundled encoders know."""
 
 
 class Encoders:
@@ -34,6 +40,11 @@ class Encoders:
 
     def __init__(self, clip: str, dino: str, device: str) -> None:
         self._clip_name, self._dino_name, self.device = clip, dino, device
+
+    @classmethod
+    def of(cls, config: BuildConfig) -> Encoders:
+        """Those of resolved settings."""
+        return cls(config.clip, config.dino if config.uses_dino else "none", config.encoder_device)
 
     @cached_property
     def clip(self) -> ImageTextEncoder:
@@ -50,19 +61,56 @@ class Encoders:
         return None if self._dino_name == "none" else load_dino(self._dino_name, self.device)
 
 
-def check_encoders(config: BuildConfig) -> None:
-    """Find the encoders of the settings without loading them.
+def check_encoders(
+    config: BuildConfig, source: Path | None = None, photos: int = 0, size: tuple[int, int] = (1440, 1080)
+) -> None:
+    """Load the encoders of the settings once, check them, and log how long the features will take.
+
+    The bundled encoders are only looked at by name.
+
+    Args:
+        config: Resolved settings.
+        source: The capture, to which bundled encoders must suit; None is not checked.
+        photos: Number of photos.
+        size: Width and height of a photo.
 
     Raises:
-        ModelError: If one is missing, or the settings ask CLIP for patches that it does not have.
+        ModelError: If one is missing, does not load whole, or gives useless features, or the settings ask CLIP for
+            patches that it does not have.
     """
-    clip = model_folder(config.clip, "clip")
-    if config.features_from is not None:
-        return  # CLIP embeds the prompts only, and DINO is not used
+    folder = model_folder(config.clip, "clip")
+    if (
+        config.clip == "bundled"
+        and source is not None
+        and not source.resolve().is_relative_to(BUNDLED_SCENES)
+    ):
+        log.warning(
+            "--clip bundled knows only scenes like the demo's; for other places use CLIP from the Hugging Face Hub"
+        )
+    if config.features_from is not None:  # CLIP embeds the prompts only, and DINO is not used
+        if config.clip != "bundled":
+            Encoders.of(config).clip.encode_text(UNLIKE_WORDS)
+        return
     if config.features.tokens != "class":
-        check_patches(clip, config.clip)
-    if config.uses_dino:
-        model_folder(config.dino, "dino")
+        check_patches(folder, config.clip)
+    encoders = Encoders.of(config)
+    if config.clip == "bundled" and config.dino in ("bundled", "none"):
+        return
+    right = rank_words(encoders.clip)
+    if (
+        right < ENOUGH
+    ):  # a warning only: an encoder may be made for other things than the bundled pictures show
+        log.warning(
+            "model %s: words match bundled pictures by %.2f only (expected %.2f, chance 0.50); answers may be wrong",
+            config.clip,
+            right,
+            ENOUGH,
+        )
+    if encoders.dino is not None:
+        check_dense(encoders.dino)
+    if photos:
+        found = estimate(encoders.clip, encoders.dino, config.features, size)
+        log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(photos))
 
 
 def feature_maps(

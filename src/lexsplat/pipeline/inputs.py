@@ -7,13 +7,28 @@ writes ``poses/`` in the scene folder: ``sparse/0``, upright copies or frames in
 from __future__ import annotations
 
 import logging
+import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lexsplat.captures import Capture, is_photo_folder, load_capture, poses_from_photos
+import numpy as np
+
+from lexsplat.captures import (
+    Capture,
+    Lens,
+    View,
+    is_photo_folder,
+    load_annotations,
+    load_capture,
+    poses_from_photos,
+)
+from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
 from lexsplat.captures.readers.video import is_video, sample_video
-from lexsplat.captures.sfm.preparation import find_photos, mask_places, photo_folder
+from lexsplat.captures.sfm.preparation import find_photos, mask_places, photo_folder, upright_size
+from lexsplat.captures.splits import choose_test_names
+from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import fingerprint
@@ -22,6 +37,8 @@ from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
 
 log = logging.getLogger("lexsplat")
+
+_VIDEO_SIZE = (1920, 1080)
 
 
 def prepare_capture(
@@ -65,6 +82,116 @@ def prepare_capture(
         test_every=config.test_every,
         test_names=test_names,
     )
+
+
+@dataclass(frozen=True)
+class PhotoSurvey:
+    """Number and size of the photos of a capture.
+
+    Args:
+        count: Number of photos, or of frames to sample from a video.
+        size: Width and height of the largest, upright; a guess for a video.
+    """
+
+    count: int
+    size: tuple[int, int]
+
+
+def preview_capture(
+    source: Path, output: Path, config: BuildConfig, test_names: list[str] | None = None
+) -> Capture | None:
+    """The capture of a build before structure from motion, for checks; only headers of photos are read.
+
+    Args:
+        source: Folder or video that the user gave.
+        output: The scene folder, where it may lie among the photos.
+        config: Settings of the build.
+        test_names: Names of the held-out views; None takes those of the capture, or else every n-th view.
+
+    Returns:
+        The capture, without points and with unknown cameras if it has none. None for a video.
+
+    Raises:
+        CaptureError: If a photo is no image, or a held-out name or a camera belongs to no photo.
+    """
+    if is_video(source):
+        return None
+    if not is_photo_folder(source):
+        return load_capture(source, test_every=config.test_every, test_names=test_names)
+    photos = photo_folder(source)
+    views = {name: _unposed_view(name, photos / name) for name in find_photos(photos, output)}
+    found = find_annotations(source)
+    annotated = set() if found is None else annotated_names(*found, list(views), source / "images")
+    chosen, _ = choose_test_names(
+        list(views),
+        root=source,
+        test_names=test_names,
+        listed=None,
+        annotated=annotated,
+        test_every=config.test_every,
+    )
+    training = tuple(name for name in views if name not in chosen)
+    return Capture(source, views, training, chosen)
+
+
+def survey_photos(
+    source: Path, output: Path, config: BuildConfig, test_names: list[str] | None
+) -> PhotoSurvey | None:
+    """Look at photos without cameras and their ground truth (`preview_capture`); None for a capture with cameras.
+
+    Masks are checked by structure from motion before it searches features.
+
+    Raises:
+        CaptureError: As `preview_capture`, or if ground truth belongs to no photo or does not fit it.
+    """
+    if not is_photo_folder(source):
+        return None
+    capture = preview_capture(source, output, config, test_names)
+    if capture is None:
+        return PhotoSurvey(config.frames, _VIDEO_SIZE)
+    load_annotations(capture)
+    return PhotoSurvey(len(capture.views), _largest(capture))
+
+
+def count_photos(source: Path, config: BuildConfig) -> PhotoSurvey:
+    """Number and size of the photos of a capture, with or without cameras.
+
+    Raises:
+        CaptureError: If there is no usable capture.
+    """
+    capture = preview_capture(source, source, config)
+    if capture is None:
+        return PhotoSurvey(config.frames, _VIDEO_SIZE)
+    return PhotoSurvey(len(capture.views), _largest(capture))
+
+
+def _largest(capture: Capture) -> tuple[int, int]:
+    sizes = (view.capture_size for view in capture.views.values())
+    return max(sizes, key=math.prod, default=_VIDEO_SIZE)
+
+
+def _unposed_view(name: str, path: Path) -> View:
+    """A photo as a view of an unknown camera."""
+    width, height = upright_size(path)
+    focal = float(max(width, height))
+    lens = Lens("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return View(name, path, Camera(width, height, K, np.eye(4)), (width, height), lens)
+
+
+def refuse_without_cameras(source: Path) -> None:
+    """Refuse photos without cameras, and videos, where Gaussians of another program are given.
+
+    Raises:
+        CaptureError: If the capture has no cameras.
+    """
+    if is_photo_folder(source):
+        raise CaptureError(
+            source,
+            expected="the cameras with which the Gaussians of --splats were trained",
+            found="a video" if is_video(source) else "photos without cameras",
+            remedy="give the capture with these cameras, or leave --splats out",
+        )
 
 
 def _registered_images(

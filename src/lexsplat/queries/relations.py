@@ -1,4 +1,4 @@
-"""Spatial relations between selections (left of, on, inside, nearest, ...), and the evaluation of parsed phrases.
+"""Spatial relations between selections: left of, on, inside, between, nearest and the like.
 
 "Left", "right", "in front of" and "behind" refer to a viewer whose axes are made horizontal by gravity. "On", "above"
 and "under" depend on gravity alone. Relations hold between instances, by their upright boxes and their points.
@@ -6,18 +6,16 @@ and "under" depend on gravity alone. Relations hold between instances, by their 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lexsplat.geometry.boxes import upright_frame
 from lexsplat.geometry.cameras import Camera
-from lexsplat.queries.phrases import Both, Except, Phrase, Pick, RelationName, Thing
-from lexsplat.queries.selection import PRESENCES, Presence, Selection
+from lexsplat.queries.phrases import CornerName, RelationName
+from lexsplat.queries.selection import Selection
 
 _CONE = 0.5
 """Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
@@ -28,12 +26,14 @@ _SUPPORT = 0.5
 lies in its own shadow."""
 _OVER = 0.3
 """Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
+_CORNER = 0.5
+"""In a corner: at least this far out along both sides, from 0 (the middle) to 1."""
+_BESIDE = 0.1
+"""Left or right of the viewer: at least this share of the offset lies sideways (6 degrees)."""
 _INSIDE = 0.6
 """Inside: at least this share of the object lies in the box of the other."""
 _SAME_SIZE = 0.1
 """Two phrases name one object only if the smaller box has at least this share of the larger one's volume."""
-_SAMPLE = 4000
-"""Number of points per selection that relations are computed from, at most."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
         upper, lower = (target, reference) if relation == "above" else (reference, target)
         return _over(upper, lower, frame)
     if relation == "inside":
-        share = float(reference.box.contains(_points(target)).mean())
+        share = float(reference.box.contains(target.sample).mean())
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
@@ -102,23 +102,81 @@ def related(relation: RelationName, targets: Selection, references: Selection, f
         target
         for target in targets.instances
         if any(
-            holds(relation, target, reference - target, frame)  # shared Gaussians support nothing
+            holds(relation, target, _without(reference, target), frame)
             for reference in references.instances
-            if not _same(target, reference)
+            if not same(target, reference)
         )
     ]
     return _union(targets, pairs)
 
 
-def nearest(targets: Selection, references: Selection) -> Selection:
-    """The instance of ``targets`` with the smallest gap to any instance of ``references``."""
-    pairs = [
-        (distance(target, reference), number)
+def nearest(targets: Selection, references: Selection, *, farthest: bool = False) -> Selection:
+    """The instance of ``targets`` with the smallest gap to any instance of ``references``, or with the largest."""
+    gaps = [
+        (min(distance(target, reference) for reference in references.instances), number)
         for number, target in enumerate(targets.instances)
-        for reference in references.instances
-        if not _same(target, reference)
+        if references and not any(same(target, reference) for reference in references.instances)
     ]
-    return _union(targets, [targets.instances[min(pairs)[1]]] if pairs else [])
+    return _union(targets, [targets.instances[(max if farthest else min)(gaps)[1]]] if gaps else [])
+
+
+def between(targets: Selection, first: Selection, second: Selection) -> Selection:
+    """The instances of ``targets`` between two others: from there, the two lie at least 120 degrees apart."""
+
+    def is_between(target: Selection, one: Selection, other: Selection) -> bool:
+        if same(target, one) or same(target, other) or same(one, other):
+            return False
+        to_one, to_other = one.center - target.center, other.center - target.center
+        lengths = np.linalg.norm(to_one) * np.linalg.norm(to_other)
+        return bool(lengths > 0 and to_one @ to_other <= -_CONE * lengths)
+
+    pairs = [(one, other) for one in first.instances for other in second.instances]
+    return _union(
+        targets, [each for each in targets.instances if any(is_between(each, *pair) for pair in pairs)]
+    )
+
+
+def beside_viewer(relation: RelationName, targets: Selection, camera: Camera, frame: Frame) -> Selection:
+    """The instances of ``targets`` in front of, left of or near whoever stands at a camera.
+
+    Raises:
+        ValueError: If the relation is none to a viewer, such as "on".
+    """
+    offsets = [_level(each.center - camera.position, frame) for each in targets.instances]
+    if relation in ("nearest to", "farthest from", "next to"):
+        order = sorted(range(len(offsets)), key=lambda number: float(np.linalg.norm(offsets[number])))
+        found = order[-1:] if relation == "farthest from" else order[:1]
+    else:
+        axis, share = {
+            "left of": (-frame.right, _BESIDE), "right of": (frame.right, _BESIDE),
+            "in front of": (frame.ahead, _CONE), "behind": (-frame.ahead, _CONE),
+        }.get(relation, (None, 0.0))  # fmt: skip
+        if axis is None:
+            raise ValueError(f"not a relation to a viewer: {relation!r}")
+        found = [n for n, offset in enumerate(offsets) if offset @ axis >= share * np.linalg.norm(offset)]
+    return _union(targets, [targets.instances[number] for number in found])
+
+
+def in_corner(targets: Selection, everything: Selection, corner: CornerName, frame: Frame) -> Selection:
+    """The instances of ``targets`` in the corners of the area that ``everything`` takes.
+
+    The area is a rectangle along the viewer's axes. An instance is in a corner if it lies in the outer quarter of
+    both sides. Of several in one corner, the one farthest out is taken.
+    """
+    axes = np.stack([frame.right, frame.ahead])
+    places = np.array([axes @ each.center for each in everything.instances or targets.instances])
+    if len(places) == 0:
+        return targets
+    low, high = places.min(0), places.max(0)
+    best: dict[tuple[bool, bool], tuple[float, Selection]] = {}
+    for each in targets.instances:
+        right, ahead = 2 * (axes @ each.center - low) / np.maximum(high - low, 1e-9) - 1
+        sides = ("left" if right < 0 else "right", "front" if ahead < 0 else "back")
+        out = min(abs(right), abs(ahead))
+        key = (right < 0, ahead < 0)
+        if out >= _CORNER and set(corner.split()) <= set(sides) and (key not in best or out > best[key][0]):
+            best[key] = (out, each)
+    return _union(targets, [each for _, each in best.values()])
 
 
 def distance(first: Selection, second: Selection) -> float:
@@ -129,44 +187,8 @@ def distance(first: Selection, second: Selection) -> float:
     """
     if not first or not second:
         raise ValueError("an empty selection has no place")
-    apart, _ = cKDTree(_points(first)).query(_points(second))
+    apart, _ = first.tree.query(second.sample)
     return float(np.quantile(apart, 0.002))  # one stray Gaussian does not close a gap
-
-
-def answer(
-    phrase: Phrase, select: Callable[[str], Selection], viewer: Callable[[Selection], Camera | None]
-) -> Selection:
-    """The selection that a phrase describes.
-
-    Args:
-        phrase: From `lexsplat.queries.phrases.parse`.
-        select: The selection of a thing, by its text.
-        viewer: The camera of the viewer, given the reference of a direction.
-    """
-    if isinstance(phrase, Thing):
-        return select(phrase.text)
-    present: Presence | None = None
-    if isinstance(phrase, Both):
-        found = answer(phrase.first, select, viewer) | answer(phrase.second, select, viewer)
-    elif isinstance(phrase, Except):
-        found = answer(phrase.first, select, viewer) - answer(phrase.second, select, viewer)
-    elif isinstance(phrase, Pick):
-        found = answer(phrase.target, select, viewer)
-        if found:
-            pick = min if phrase.which == "smallest" else max
-            chosen = pick(found.instances, key=lambda instance: instance.box.volume)
-            found = found.within(chosen.mask)
-    else:
-        targets = answer(phrase.target, select, viewer)
-        references = answer(phrase.reference, select, viewer)
-        if phrase.relation == "nearest to":
-            found = nearest(targets, references)
-        else:
-            frame = frame_of(viewer(references), references.up.direction)
-            found = related(phrase.relation, targets, references, frame)
-        present = min(found.present, references.present, key=PRESENCES.index)
-    # An empty result is a "no", whatever the presence of the parts.
-    return replace(found, phrase=str(phrase), present=(present or found.present) if found else "no")
 
 
 # One relation each
@@ -177,7 +199,7 @@ def _sideways(relation: str, target: Selection, reference: Selection, frame: Fra
         relation, -frame.ahead
     )
     offset = target.center - reference.center
-    level = offset - (offset @ frame.up) * frame.up
+    level = _level(offset, frame)
     along = float(level @ axis)
     reach = float((np.abs(reference.box.axes @ axis) * reference.box.half_sizes).sum())
     return along > 0.5 * reach and along >= _CONE * float(np.linalg.norm(level))
@@ -193,7 +215,7 @@ def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
     if not _overlap(target, support):
         return False
     box, height = target.box, float(2 * target.box.half_sizes[2])
-    points = _points(support)
+    points = support.sample
     local = (points - box.center) @ box.axes.T
     below = (np.abs(local[:, :2]) <= 1.5 * box.half_sizes[:2]).all(1) & (local[:, 2] < 0)
     if below.sum() < 5:
@@ -229,16 +251,20 @@ def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
 def _overlap(first: Selection, second: Selection) -> bool:
     """Whether the footprints of two objects overlap, seen from above."""
     small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
-    local = (_points(small) - large.center) @ large.box.axes[:2].T
+    local = (small.sample - large.center) @ large.box.axes[:2].T
     return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
 
 
-def _points(selection: Selection) -> NDArray[np.float64]:
-    points = selection.gaussians.means[selection.mask].detach().cpu().double().numpy()
-    return np.asarray(points[:: max(1, len(points) // _SAMPLE)], dtype=np.float64)
+def _level(offset: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
+    return np.asarray(offset - (offset @ frame.up) * frame.up)
 
 
-def _same(first: Selection, second: Selection) -> bool:
+def _without(reference: Selection, target: Selection) -> Selection:
+    """The reference without the Gaussians of the target: shared Gaussians support nothing."""
+    return reference - target if bool((reference.mask & target.mask).any()) else reference
+
+
+def same(first: Selection, second: Selection) -> bool:
     """Whether two phrases name one object. A coin within the selection of its table is not the table."""
     small, large = sorted((first, second), key=lambda s: s.box.volume)
     shared = int((first.mask & second.mask).sum())
@@ -249,4 +275,4 @@ def _union(whole: Selection, parts: list[Selection]) -> Selection:
     mask = torch.zeros_like(whole.mask)
     for part in parts:
         mask |= part.mask
-    return replace(whole, mask=mask, present=whole.present if parts else "no")
+    return replace(whole, mask=mask, parts=tuple(parts), present=whole.present if parts else "no")

@@ -3,12 +3,13 @@
 Nothing here needs an encoder: texts arrive as embeddings. Dimension letters: P prompts (positives),
 M negatives, T texts, K codes, D feature dimensions, N Gaussians, H and W image size.
 
-Relevancy follows LERF: a prompt is compared with each canonical phrase by a softmax over the two, and the
-smallest result counts. 0.5 means that the prompt and a canonical phrase are equally near. There are two forms:
+LERF and the paper compare a prompt with each canonical phrase by a softmax over the two, and the smallest result
+counts. 0.5 means that the prompt and a canonical phrase are equally near. There are two forms:
 
 - ``"feature"`` (the paper): code probabilities p become a feature, F = p S, which is compared with the text.
 - ``"code"``: each code is compared with the text once (a table r of K numbers per prompt), and the results
   are blended, sum over k of p_k r_k. This is linear: the map of a view is the rendering of the Gaussians' scores.
+  In a scene the table is relative to everyday words (`lexsplat.queries.everyday`) unless negatives are given.
 
 Both forms give relevancy 0 to the transparent part of a pixel: relevancy is an expectation over what the pixel
 shows. Dividing by the coverage instead would give a faint floater in front of an empty background the full
@@ -27,6 +28,7 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
+from lexsplat.queries.everyday import EverydayScale
 from lexsplat.runtime.errors import QueryError
 
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
@@ -53,14 +55,15 @@ class QueryConfig:
         form: ``"code"`` blends the relevancies of codes; ``"feature"`` (the paper) compares the blended feature;
             ``"segment"`` takes or leaves whole segments by their relevancy in the form "code"
             (`lexsplat.queries.segments`), and is "code" for a field without segments.
-        negatives: Phrases that each prompt is compared with.
+        negatives: Phrases that each prompt is compared with. None given: "code" and "segment" compare with everyday
+            words (`lexsplat.queries.everyday`), "feature" with `CANONICAL_PHRASES` (LERF and the paper).
         templates: Sentences with ``{}`` for the prompt; the embeddings of several are averaged.
         threshold: Fixed relevancy threshold of masks, in 0..1 (paper: 0.5).
     """
 
     temperature: float = 10.0
     form: QueryForm = "segment"
-    negatives: tuple[str, ...] = CANONICAL_PHRASES
+    negatives: tuple[str, ...] = ()
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5
 
@@ -69,8 +72,6 @@ class QueryConfig:
             raise ValueError(f"temperature must be positive, got {self.temperature}")
         if self.form not in get_args(QueryForm):
             raise ValueError(f"form must be one of {', '.join(get_args(QueryForm))}, got {self.form!r}")
-        if not self.negatives:
-            raise ValueError("negatives must hold at least one phrase")
         if not self.templates:
             raise ValueError("templates must hold at least one sentence with {}")
         for template in self.templates:
@@ -78,6 +79,16 @@ class QueryConfig:
                 raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"threshold must be in 0..1, got {self.threshold}")
+
+    @property
+    def everyday(self) -> bool:
+        """Whether relevancy is relative to everyday words."""
+        return self.form != "feature" and not self.negatives
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """The negatives, by default the canonical phrases."""
+        return self.negatives or CANONICAL_PHRASES
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +99,13 @@ class Question:
         positives: Text embeddings of the prompts ``[P, D]``, of any length.
         negatives: Text embeddings of the negatives ``[M, D]``, M > 0, of any length.
         config: Temperature and form.
+        scale: What everyday words reach in the scene; replaces the negatives in form "code".
     """
 
     positives: Tensor
     negatives: Tensor
     config: QueryConfig = field(default_factory=QueryConfig)
+    scale: EverydayScale | None = None
 
     def __len__(self) -> int:
         return len(self.positives)
@@ -188,6 +201,8 @@ def code_relevancy(codewords: Tensor, question: Question) -> Tensor:
         question: Embeddings of the prompts.
     """
     positives, negatives = question.units(codewords)
+    if question.scale is not None:
+        return question.scale.relevancy(codewords, positives)
     unit = torch.nn.functional.normalize(codewords.float(), dim=-1)
     return pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
 

@@ -1,7 +1,9 @@
 """Masks from relevancies: by a fixed threshold (the paper's 0.5) or an automatic one for each prompt.
 
-The automatic threshold comes from the scene alone, never from ground truth: from relevancy maps of training views
-(`scene_thresholds`), and 0.5 for what the scene does not hold (`lexsplat.queries.presence`). Dimension letters are
+The automatic threshold comes from the scene alone, never from ground truth. Relevancy relative to everyday words
+(`lexsplat.queries.everyday`) has its border at 0.5 in every scene. Relevancy relative to canonical phrases has none that
+holds for all encoders: its threshold comes from maps of training views (`scene_thresholds`), and is 0.5 for what the
+scene does not hold (`lexsplat.queries.presence`). Dimension letters are
 those of `lexsplat.queries.relevancy`.
 """
 
@@ -21,7 +23,7 @@ BORDER = 0.5
 """Relevancy at which a prompt and a canonical phrase are equally near; the paper's threshold."""
 THRESHOLD_VIEWS = 8
 """Number of training views that the threshold of a scene comes from, at most."""
-_LONG_SIDE = 320
+_LONG_SIDE = 80
 """Longer side of their renderings in pixels, at most."""
 _TOP_SHARE = 5e-4
 """The peak of the samples is the mean of their best 0.05 percent."""

@@ -61,11 +61,11 @@ def check_moments(tensors: Mapping[str, Tensor], parameter: Tensor) -> None:
             raise ValueError("the state of an optimizer holds NaN or infinity")
 
 
-def with_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The same tensors with ``prefix`` before every name."""
     return {f"{prefix}{name}": value for name, value in tensors.items()}
 
 
-def below_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def below_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors whose names start with ``prefix``, named without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -240,14 +240,8 @@ class Reconstructor:
 
     def find_invalid(self) -> str:
         """The first defect of the parameters, such as "NaN or Inf in means"; empty if there is none."""
-        invalid = self.gaussians().find_invalid()
-        if (
-            not invalid
-            and self._exposures is not None
-            and not bool(self._exposures.matrices.isfinite().all())
-        ):
-            return "NaN or Inf in the exposures"
-        return invalid
+        finite = self._exposures is None or bool(self._exposures.matrices.isfinite().all())
+        return self.gaussians().find_invalid() or ("" if finite else "NaN or Inf in the exposures")
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Continue where `state_dict` was called; capture, settings and device must be the same.

@@ -29,3 +29,14 @@ def backend_for(gaussians: Gaussians) -> ModuleType:
         found=f"Gaussians on {device}",
         remedy='move them with gaussians.to("cpu")',
     )
+
+
+def require_gsplat() -> None:
+    """Load the CUDA rasterizer.
+
+    Raises:
+        BackendError: If it is not installed, or has no CUDA extension and no compiler to build it with.
+    """
+    from lexsplat.rendering import gsplat_backend
+
+    gsplat_backend.require_gsplat()

@@ -51,11 +51,18 @@ class TileLists:
         return sum(t.numel() * t.element_size() for t in (self.offsets, self.members))
 
 
-def _require_gsplat() -> None:
+def require_gsplat() -> None:
+    """Load gsplat with its CUDA extension.
+
+    Raises:
+        BackendError: If it is not installed, or has no extension and no compiler to build it with.
+    """
     try:
         import gsplat  # noqa: F401
     except ImportError as error:
-        raise BackendError("gsplat", found=str(error), remedy="pip install gsplat==1.5.3") from error
+        raise BackendError(
+            "gsplat", found=str(error), remedy="run: pip install gsplat==1.5.3; or use --device cpu"
+        ) from error
     found = "an installation without one"
     # The import may compile the extension and print to standard output, which carries our JSON.
     first = "gsplat.cuda._backend" not in sys.modules
@@ -69,7 +76,8 @@ def _require_gsplat() -> None:
             "gsplat",
             expected="its CUDA extension",
             found=found,
-            remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH",
+            remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH, or "
+            "rasterize on the CPU: --device cpu --encoder-device cuda",
         )
 
 
@@ -87,7 +95,7 @@ def _cached(content: bytes, shape: tuple[int, ...], device: torch.device) -> Ten
 
 def project(gaussians: Gaussians, camera: Camera, near: float) -> Projection:
     """Project every Gaussian; means2d, conics and opacities have gradients."""
-    _require_gsplat()
+    require_gsplat()
     from gsplat.cuda._wrapper import fully_fused_projection
 
     g = gaussians

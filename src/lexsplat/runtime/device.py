@@ -43,6 +43,32 @@ def choose_device(wanted: str) -> str:
     return "cuda" if available else "cpu"
 
 
+def choose_encoder_device(wanted: str, device: str) -> str:
+    """Resolve the device of the encoders to "cpu", "cuda" or "mps".
+
+    Args:
+        wanted: "auto" (that of the rasterizer), "cpu", "cuda" or "mps" (the GPU of a Mac).
+        device: Device of the rasterizer: "cpu" or "cuda".
+
+    Raises:
+        BackendError: If the device is requested but not available.
+        ValueError: If the name is not one of these.
+    """
+    if wanted not in ("auto", "cpu", "cuda", "mps"):
+        raise ValueError(f"encoder_device must be auto, cpu, cuda or mps, got {wanted!r}")
+    if wanted == "auto":
+        return device
+    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not there[wanted]:
+        raise BackendError(
+            f"--encoder-device {wanted}",
+            expected=f"a PyTorch with a GPU of this kind ({wanted})",
+            found=", ".join(name for name, found in there.items() if found),
+            remedy="use --encoder-device cpu",
+        )
+    return wanted
+
+
 def check_seed(seed: int) -> None:
     """Refuse a seed that one of the libraries does not accept.
 

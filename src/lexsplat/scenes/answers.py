@@ -15,8 +15,8 @@ from torch import Tensor
 
 from lexsplat.geometry.world import world_of
 from lexsplat.language.methods import METHODS
+from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.phrases import parse
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
@@ -32,6 +32,23 @@ MAX_DEFAULT_VIEWS = 6
 """Number of held-out views that a query without ``--view`` renders, at most."""
 
 
+@dataclass(eq=False)
+class Word:
+    """What a scene keeps of a prompt.
+
+    Args:
+        scores: Relevancy of every Gaussian ``[N]`` in 0..1.
+        presence: Whether the scene holds it.
+        threshold: The automatic threshold; None until it is asked for.
+        selection: The selection of that threshold; None until it is asked for.
+    """
+
+    scores: Tensor
+    presence: Presence
+    threshold: float | None = None
+    selection: Selection | None = None
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Answers:
     """Scores, threshold and presence of every prompt in a scene, from `Scene.ask`.
@@ -43,6 +60,7 @@ class Answers:
         presences: Whether the scene holds what each prompt names.
         scene: The scene that was asked.
         automatic: Whether the thresholds come from the scene; False if they were given.
+        words: What the scene keeps of each prompt; () keeps nothing.
     """
 
     prompts: tuple[str, ...]
@@ -51,6 +69,7 @@ class Answers:
     presences: tuple[Presence, ...]
     scene: Scene
     automatic: bool = True
+    words: tuple[Word, ...] = ()
 
     def __len__(self) -> int:
         return len(self.prompts)
@@ -70,7 +89,15 @@ class Answers:
         """
         if type(index) is not int or not -len(self) <= index < len(self):
             raise QueryError("answer", expected=f"a number from 0 to {len(self) - 1}", found=repr(index)[:40])
-        scores, threshold = self.scores[index], float(self.thresholds[index])
+        if not self.words:
+            return self._selection(index)
+        word = self.words[index]
+        word.selection = word.selection or self._selection(index)
+        return word.selection
+
+    def _selection(self, index: int) -> Selection:
+        scores = self.words[index].scores if self.words else self.scores[index]
+        threshold = float(self.thresholds[index])
         selection = Selection(
             self.scene.gaussians,
             self.scene.cameras,
@@ -105,7 +132,7 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
+        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
         highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
 
     Raises:
@@ -136,8 +163,17 @@ def answer_queries(
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         "form": form_used(scene.field, scene.query),
+        "rests_on": rests_on(scene),
         "prompts": answers,
     }
+
+
+def rests_on(scene: Scene) -> str:
+    """What relevancy and presence in a scene are relative to, for people."""
+    words = f"{len(everyday_words()):,} everyday words in this scene"
+    return (
+        words if scene.query.everyday else f"relevancy: {', '.join(scene.query.compared)}; presence: {words}"
+    )
 
 
 def find_phrases(
@@ -155,26 +191,29 @@ def find_phrases(
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
-        ``{"scene", "up", "meters_per_unit", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
+        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
         "count", "gaussians", "threshold", "best_view" and "instances" with center, size and axes in world units,
         and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and "instances" is empty.
 
     Raises:
         QueryError: If a phrase is empty, the view is unknown, or the threshold is not in 0..1.
     """
-    answers = [
-        {
-            **scene.find(phrase, view, threshold=threshold).to_dict(),
-            "phrase": phrase,
-            "understood": str(parse(phrase)),
-        }
-        for phrase in check_prompts(phrases)
-    ]
+    answers = [find_phrase(scene, phrase, view, threshold) for phrase in check_prompts(phrases)]
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
+        "rests_on": rests_on(scene),
         **scene.world.to_json(),
         "phrases": answers,
     }
+
+
+def find_phrase(
+    scene: Scene, phrase: str, view: str | None = None, threshold: float | None = None
+) -> dict[str, Any]:
+    """One entry of `find_phrases`."""
+    understood = scene.understand(phrase)
+    found = scene.find(phrase, view, threshold=threshold).to_dict()
+    return {**found, "phrase": phrase, "understood": str(understood.phrase), "note": understood.note}
 
 
 def _default_views(scene: Scene) -> list[str]:

@@ -10,6 +10,7 @@ apple = scene.find("red apple left of the mug")  # a Selection: instances, boxes
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,31 +23,38 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
-from lexsplat.queries.phrases import parse, things_of
+from lexsplat.queries.everyday import EverydayScale, everyday_words
+from lexsplat.queries.phrases import Understood
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, Presence, PresenceClassifier
-from lexsplat.queries.relations import answer
+from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,
     TextEncoder,
     check_prompts,
     embed_prompts,
+    gaussian_relevancy,
     render_relevancy,
 )
-from lexsplat.queries.scoring import render_scored, score_prompts
-from lexsplat.queries.segments import SEGMENT_THRESHOLD
+from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.thresholds import check_threshold, scene_thresholds
+from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
+from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
-from lexsplat.scenes.answers import Answers
+from lexsplat.scenes.answers import Answers, Word
+from lexsplat.scenes.finding import find_in, named_objects, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.reading import read_scene
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import ImageTextEncoder
+
+_KEPT_BYTES = 128 << 20
+"""Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
+_KEPT_TEXTS = 4096
+"""Number of text embeddings and of parsed phrases that are kept."""
 
 
 class Scene:
@@ -54,6 +62,8 @@ class Scene:
 
     Wherever a list of prompts is expected, a single text is one prompt. Wherever a view is expected, the name of a
     view (with or without suffix), a `StoredView` or any `Camera` will do.
+
+    A scene keeps what it has computed for a word (bounded), and may be asked by many threads at once.
 
     Args:
         gaussians: Geometry and appearance.
@@ -77,11 +87,13 @@ class Scene:
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.folder = clip, folder
+        self._working = threading.RLock()
+        """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
         self._given_encode_text = encode_text
         self._encoder: ImageTextEncoder | None = None
         self._cache: TextCache | None = None
-        self._texts: dict[str, Tensor] = {}
+        self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
 
     def __repr__(self) -> str:
@@ -97,7 +109,12 @@ class Scene:
     def query(self, query: QueryConfig) -> None:
         self._query = query
         self._classifier: PresenceClassifier | None = None
-        self._thresholds: dict[str, float] = {}
+        self._scale: EverydayScale | None = None
+        self._objects: tuple[Selection, ...] | None = None
+        kept = max(32, min(1024, _KEPT_BYTES // (5 * max(1, len(self.gaussians)))))
+        self._words: Bounded[str, Word] = Bounded(kept)
+        self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
+        self._understood: Bounded[str, Understood] = Bounded(_KEPT_TEXTS)
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
@@ -117,10 +134,13 @@ class Scene:
             ModelError: If the text encoder cannot be loaded.
         """
         prompts = check_prompts(prompts)
-        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._texts]
+        found = {prompt: self._texts.get(prompt) for prompt in dict.fromkeys(prompts)}
+        new = [prompt for prompt, vector in found.items() if vector is None]
         if new:  # in one call, so that the cache on disk is written once
-            self._texts.update(zip(new, embed_prompts(new, self.encode_text, self.query.templates)))
-        return torch.stack([self._texts[prompt] for prompt in prompts])
+            with self._working:
+                vectors = embed_prompts(new, self.encode_text, self.query.templates)
+            found.update((prompt, self._texts.put(prompt, vector)) for prompt, vector in zip(new, vectors))
+        return torch.stack([vector for prompt in prompts if (vector := found[prompt]) is not None])
 
     def encode_text(self, texts: list[str]) -> Tensor:
         """Embeddings ``[T, D]`` of whole sentences, from the encoder that belongs to the language.
@@ -133,11 +153,11 @@ class Scene:
         if self._given_encode_text is not None:
             return self._given_encode_text(texts)
         known = self._encoder_hash
-        writable = self.folder and not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
-        if self.folder is None or known is None or not writable:
+        if self.folder is None or known is None:
             return encode_each(self._load_encoder(known), texts)
         if self._cache is None:
-            self._cache = TextCache(self.folder.root / "checkpoints" / "texts")
+            writable = not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
+            self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     def encoder_identity(self) -> dict[str, str]:
@@ -171,8 +191,17 @@ class Scene:
             )
         return self._encoder
 
-    def _question(self, prompts: str | Sequence[str]) -> Question:
-        return Question(self.embed(prompts), self.embed(self.query.negatives), self.query)
+    def question(self, prompts: str | Sequence[str]) -> Question:
+        """The embedded prompts with what they are compared with."""
+        scale = self.everyday_scale if self.query.everyday else None
+        return Question(self.embed(prompts), self.embed(self.query.compared), self.query, scale)
+
+    @property
+    def everyday_scale(self) -> EverydayScale:
+        """What everyday words reach in the scene; made at first use."""
+        if self._scale is None:
+            self._scale = EverydayScale.of(self.field.codebook.clip, self.embed(everyday_words()))
+        return self._scale
 
     # -- answers
 
@@ -181,9 +210,8 @@ class Scene:
 
         Args:
             prompts: What to look for.
-            threshold: Smallest score of a selected Gaussian, in 0..1; None takes whole segments
-                (`lexsplat.queries.segments`), or derives one for each prompt from the training views
-                (`lexsplat.queries.thresholds.scene_thresholds`) if there are no segments.
+            threshold: Smallest score of a selected Gaussian, in 0..1; None derives one for each prompt from the
+                training views (`lexsplat.queries.thresholds.scene_thresholds`).
 
         Raises:
             QueryError: If there is no prompt, one is empty, or the threshold is not in 0..1.
@@ -191,16 +219,26 @@ class Scene:
         """
         prompts = check_prompts(prompts)
         given = None if threshold is None else check_threshold(threshold)
-        question = self._question(prompts)
-        scored = score_prompts(self.field, question, self.presence_classifier.classify)
+        words_of = self._words  # another query replaces it
+        found = {prompt: words_of.get(prompt) for prompt in dict.fromkeys(prompts)}
+        new = [prompt for prompt, word in found.items() if word is None]
+        if new:
+            with self._working:
+                made = zip(new, self._new_words(new))
+                found.update((prompt, words_of.put(prompt, word)) for prompt, word in made)
+        words = [word for prompt in prompts if (word := found[prompt]) is not None]
+        presences = tuple(word.presence for word in words)
+        scores = torch.stack([word.scores for word in words])
         if given is not None:
-            thresholds = torch.full((len(prompts),), given)
-        elif scored.by_segments:
-            thresholds = torch.full((len(prompts),), SEGMENT_THRESHOLD)
-        else:
-            thresholds = self._automatic_thresholds(prompts, question, scored.presences)
-        automatic = given is None
-        return Answers(tuple(prompts), scored.scores, thresholds, scored.presences, self, automatic)
+            return Answers(
+                tuple(prompts), scores, torch.full((len(words),), given), presences, self, automatic=False
+            )
+        unknown = {prompt: word for prompt, word in zip(prompts, words) if word.threshold is None}
+        if unknown:
+            with self._working:
+                self._find_thresholds(unknown)
+        limits = torch.tensor([word.threshold for word in words])
+        return Answers(tuple(prompts), scores, limits, presences, self, words=tuple(words))
 
     def relevancy(self, prompts: str | Sequence[str], view: str | StoredView | Camera) -> Tensor:
         """Relevancy maps ``[P, H, W]`` of the prompts in a view, in 0..1.
@@ -208,13 +246,14 @@ class Scene:
         Raises:
             QueryError: If a prompt is empty or the view is unknown.
         """
-        camera, question = self.camera(view), self._question(prompts)
-        return render_scored(self.field, self.gaussians, camera, question, self.presence_classifier.classify)
+        camera = self.camera(view)
+        if form_used(self.field, self.query) == "segment":
+            return render_gaussian_scores(self.gaussians, camera, self.ask(prompts).scores)
+        return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        question = self._question(prompts)
-        return score_prompts(self.field, question, self.presence_classifier.classify).scores
+        return self.ask(prompts).scores
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
@@ -242,7 +281,7 @@ class Scene:
     ) -> Selection:
         """The Gaussians that match a phrase with relations, such as "mug on the cloth".
 
-        `lexsplat.queries.phrases` describes the grammar.
+        `lexsplat.queries.grammar` describes the grammar.
 
         Args:
             phrase: What to look for.
@@ -252,15 +291,30 @@ class Scene:
         Raises:
             QueryError: If a part of the phrase is empty, the view is unknown, or the threshold is not in 0..1.
         """
-        parsed = parse(_one_phrase(phrase))
-        chosen = None if view is None else self.camera(view)
-        things = things_of(parsed)
-        answers = self.ask(things, threshold)
+        understood = self.understand(phrase)
+        camera = None if view is None else self.camera(view)
+        if isinstance(view, Camera):
+            return find_in(self, understood, camera, threshold)
+        name = view.name if isinstance(view, StoredView) else view
+        key = (str(understood.phrase), name, threshold)
+        return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
-        def viewer(reference: Selection) -> Camera | None:
-            return chosen or self.cameras.get(reference.best_view)
+    def understand(self, phrase: str) -> Understood:
+        """How `find` understands a phrase; its typing errors are mended where the scene holds what is meant.
 
-        return answer(parsed, lambda text: answers.selection(things.index(text)), viewer)
+        Raises:
+            QueryError: If a part of the phrase is empty.
+        """
+        text = _one_phrase(phrase)
+        return self._understood.get_or_make(text, lambda: understood_in(self, text))
+
+    @property
+    def objects(self) -> tuple[Selection, ...]:
+        """The things of the everyday vocabulary that the scene holds, each with its name in ``phrase``."""
+        if self._objects is None:
+            with self._working:
+                self._objects = self._objects or named_objects(self)
+        return self._objects
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
         """The surface at a pixel, and what is connected to it and means the same.
@@ -280,26 +334,36 @@ class Scene:
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            references = self._question(REFERENCE_PHRASES)
-            self._classifier = PresenceClassifier(self.gaussians, self.field, references)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale)
         return self._classifier
 
-    def _automatic_thresholds(
-        self, prompts: Sequence[str], question: Question, presences: Sequence[Presence]
-    ) -> Tensor:
-        """The threshold ``[P]`` of each prompt; known ones are not computed again."""
-        new = [place for place, prompt in enumerate(prompts) if prompt not in self._thresholds]
-        if new:
-            asked = Question(question.positives[new], question.negatives, question.config)
+    def _new_words(self, prompts: list[str]) -> list[Word]:
+        """Scores and presence of prompts that were not asked before."""
+        question = self.question(prompts)
+        scores = gaussian_relevancy(self.field, question)
+        presences = self.presence_classifier.classify(question.positives, scores)
+        scores = scores_in_form(self.field, self.query, scores, presences)
+        # Copies: a row would keep the scores of all prompts asked with it.
+        return [Word(row.clone(), presence) for row, presence in zip(scores, presences)]
+
+    def _find_thresholds(self, words: Mapping[str, Word]) -> None:
+        """The automatic thresholds of words, from one rendering of the training views.
+
+        Relative to everyday words and by segments, a score of 0.5 is the border itself.
+        """
+        question = self.question(list(words))
+        if question.scale is not None or form_used(self.field, self.query) == "segment":
+            found = [BORDER] * len(words)
+        else:
             views = list(self.views.values())
             training = [view.camera for view in views if view.split == "train"]
             found = scene_thresholds(
-                lambda camera: render_relevancy(self.field, self.gaussians, camera, asked),
+                lambda camera: render_relevancy(self.field, self.gaussians, camera, question),
                 training or [view.camera for view in views],
-                [presences[place] for place in new],
-            )
-            self._thresholds.update(zip((prompts[place] for place in new), found.tolist()))
-        return torch.tensor([self._thresholds[prompt] for prompt in prompts])
+                [word.presence for word in words.values()],
+            ).tolist()
+        for word, threshold in zip(words.values(), found):
+            word.threshold = threshold
 
     # -- views
 

@@ -7,9 +7,10 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import LexsplatError
 from lexsplat.runtime.files import read_json, write_json
-from lexsplat.viewer.vocabulary import clean_phrases, default_vocabulary
+from lexsplat.viewer.vocabulary import clean_phrases
 
 MAX_PROMPTS = 50
 

@@ -16,11 +16,12 @@ import torch
 from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.grammar import parse
 from lexsplat.queries.heatmaps import overlay_mask
-from lexsplat.queries.phrases import Thing, parse
+from lexsplat.queries.phrases import Thing
 from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import REFERENCE_PHRASES, PresenceClassifier
-from lexsplat.queries.relevancy import Question as TextQuestion
+from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import check_prompts, probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER
@@ -103,7 +104,7 @@ class Session:
         """
         with self._encoding:
             self.scene.preload()
-        for phrase in [*self.scene.query.negatives, *self.history.vocabulary, *REFERENCE_PHRASES]:
+        for phrase in [*self.scene.query.compared, *self.history.vocabulary, *everyday_words()]:
             with self._encoding:  # one phrase at a time, so that a prompt waits for one phrase at most
                 self.scene.embed([phrase])
         self._presence = self.scene.presence_classifier
@@ -127,7 +128,7 @@ class Session:
             with self._encoding:
                 self.scene.embed([text])
             scores = self.scene.scores([text])[0].cpu().numpy()
-            layer = Layer(text, scores, self._provisional_threshold(scores), self._free_color())
+            layer = Layer(text, scores, self._provisional_threshold(text, scores), self._free_color())
             question = Question(layer)
             self.questions = [*self.questions[-(MAX_QUESTIONS - 1) :], question]
         self.current, self.mode = question, "relevancy"
@@ -176,7 +177,7 @@ class Session:
         elif question.automatic is not None:
             question.layer.threshold = question.automatic
         else:
-            question.layer.threshold = self._provisional_threshold(question.layer.scores)
+            question.layer.threshold = self._provisional_threshold(question.layer.text, question.layer.scores)
 
     def remove(self, question: Question) -> None:
         """Remove a prompt; the latest remaining one becomes the current one."""
@@ -187,11 +188,12 @@ class Session:
             shown = self.all_questions()
             self.current = shown[-1] if shown else None
 
-    def _provisional_threshold(self, scores: NDArray[np.float32]) -> float:
+    def _provisional_threshold(self, text: str, scores: NDArray[np.float32]) -> float:
         """A threshold in milliseconds. It is 0.5 for an absent object, as the automatic one will be."""
-        presence = self._presence  # None until `warm_up` has encoded the reference phrases
-        if presence is not None and presence.classify(torch.from_numpy(scores)) == "no":
-            return BORDER
+        if self._presence is not None:  # None until `warm_up` has encoded the everyday words
+            (present,) = self._presence.classify(self.scene.embed([text]), torch.from_numpy(scores)[None])
+            if present == "no":
+                return BORDER
         return quick_threshold(scores, self._opacities)
 
     def _free_color(self) -> tuple[int, int, int]:
@@ -219,8 +221,7 @@ class Session:
         probabilities = shares @ scene.field.select(hit.indices).code_probabilities()
         vocabulary = self.history.vocabulary
         with self._encoding:
-            words, negatives = scene.embed(vocabulary), scene.embed(list(scene.query.negatives))
-        asked = TextQuestion(words, negatives, scene.query)
+            asked = scene.question(vocabulary)
         relevancy = probability_relevancy(probabilities[None], scene.field.codebook.clip, asked)[0]
         order = relevancy.argsort(descending=True)[:count].tolist()
         phrases = [(vocabulary[i], float(relevancy[i])) for i in order]

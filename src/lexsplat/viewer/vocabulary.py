@@ -8,28 +8,6 @@ MAX_PHRASES = 500
 MAX_LENGTH = 120
 """Characters in one phrase."""
 
-_EVERYDAY = """
-    apple, banana, orange, lemon, pear, bread, cake, cookie, cheese, egg, cup, mug, glass, bottle, bowl,
-    plate, teapot, spoon, fork, knife, pan, jar, box, basket, bag, book, newspaper, pen, paper, lamp,
-    candle, clock, vase, flower, potted plant, leaves, grass, tree, bush, stone, brick, wall, floor,
-    ceiling, window, door, curtain, carpet, cushion, blanket, tablecloth, table, chair, sofa, bench,
-    shelf, cabinet, bed, desk, computer keyboard, computer mouse, screen, phone, camera, headphones,
-    cable, shoe, hat, shirt, glove, umbrella, backpack, ball, toy car, toy bulldozer, stuffed animal,
-    rubber duck, doll, bicycle, car, wheel, road, sky, water, sand, wood, metal, plastic, cloth, cat,
-    dog, bird, person, hand, picture, mirror, stairs, fence, statue, sign, ring, cone, cube, drum,
-    guitar, piano
-"""
-
-_BUNDLED = """
-    apple, rubber duck, mug, stack of books, vase, ring, traffic cone, potted plant, table lamp, banana, teddy bear,
-    striped ball, bowl, candle, bottle, pumpkin, toy car, wooden crate, table, tablecloth, wall, floor
-"""
-
-
-def default_vocabulary(clip: str = "") -> list[str]:
-    """The initial vocabulary: everyday things, or what the bundled encoder was trained on."""
-    return clean_phrases((_BUNDLED if clip == "bundled" else _EVERYDAY).split(","))
-
 
 def clean_phrases(phrases: Iterable[str]) -> list[str]:
     """Normalize white space; drop empty phrases and duplicates (ignoring case); keep at most `MAX_PHRASES`."""

@@ -12,7 +12,7 @@ from support.hostile.registry import Reader, reader
 @reader
 def phrases() -> Reader:
     """Phrases as typed by people and programs: the bytes of the file are the phrase."""
-    from lexsplat.queries.phrases import parse
+    from lexsplat.queries.grammar import parse
     from lexsplat.queries.relevancy import check_prompts
     from lexsplat.scenes.answers import file_name
 

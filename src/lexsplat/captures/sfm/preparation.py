@@ -190,6 +190,18 @@ def _can_be_listed(folder: Path, name: str) -> bool:
         return False
 
 
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo turned upright by its EXIF orientation, from the header alone.
+
+    Raises:
+        CaptureError: If it is not an image.
+    """
+    width, height = image_size(path)
+    with open_image(path) as image:
+        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+    return (height, width) if turned else (width, height)
+
+
 def _look_at(folder: Path, name: str) -> _Photo:
     """The header of a photo.
 

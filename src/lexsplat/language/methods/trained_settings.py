@@ -64,12 +64,7 @@ class TrainedConfig:
     clip_decoder_grad: float | None = 1.0
 
     def __post_init__(self) -> None:
-        if (
-            self.iterations < 0
-            or self.pixel_sample < 0
-            or self.smoothing_sample < 0
-            or self.smoothing_every < 1
-        ):
+        if min(self.iterations, self.pixel_sample, self.smoothing_sample) < 0 or self.smoothing_every < 1:
             raise ValueError("iterations and samples must not be negative, smoothing_every must be positive")
         if not self.render_downscale > 0 or not self.final_lr_factor > 0:
             raise ValueError("render_downscale and final_lr_factor must be positive")

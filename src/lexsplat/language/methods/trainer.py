@@ -18,7 +18,7 @@ from lexsplat.language.code_maps import MASKED_CODE, codes_at_pixels
 from lexsplat.language.fields import TrainedField
 from lexsplat.language.losses import cross_entropy_loss, smoothing_loss, uncertainty_loss
 from lexsplat.language.methods.trained_settings import TrainedConfig
-from lexsplat.reconstruction.optimizers import check_moments
+from lexsplat.reconstruction.optimizers import below_prefix, check_moments, with_prefix
 from lexsplat.rendering import PreparedView
 from lexsplat.runtime.errors import TrainingError
 
@@ -199,10 +199,9 @@ class FieldTrainer:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that an exact continuation needs, as named tensors."""
-        state = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        state = with_prefix("field.", self.field.state_dict())
         for name, parameter in self.field.named_parameters():
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                state[f"optimizer.{name}.{key}"] = value
+            state |= with_prefix(f"optimizer.{name}.", self.optimizer.state.get(parameter, {}))
         state["generator"] = self.generator.get_state()
         state["iteration"] = torch.tensor(self.iteration)
         state["rate_factor"] = torch.tensor(self.rate_factor, dtype=torch.float64)
@@ -236,10 +235,8 @@ class FieldTrainer:
         Raises:
             ValueError: If the state belongs to another scene or is incomplete.
         """
-        prefix = "field."
-        own = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
         try:
-            self.field.load_state_dict(own)
+            self.field.load_state_dict(below_prefix("field.", state))
             self.generator.set_state(state["generator"].cpu())
             self.iteration = int(state["iteration"])
             self.rate_factor = float(state.get("rate_factor", 1.0))
@@ -250,8 +247,7 @@ class FieldTrainer:
             raise ValueError(f"the training state does not fit: {error}") from error
         self.optimizer.state.clear()
         for name, parameter in self.field.named_parameters():
-            prefix = f"optimizer.{name}."
-            moments = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+            moments = below_prefix(f"optimizer.{name}.", state)
             check_moments(moments, parameter)
             if moments:
                 self.optimizer.state[parameter] = {

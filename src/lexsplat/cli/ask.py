@@ -1,0 +1,61 @@
+"""``lexsplat ask``: many questions to one scene, from one process."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from typing import ClassVar
+
+import tyro
+
+from lexsplat.cli.options import Device, SceneArgument, note_hidden
+
+Phrases = tyro.conf.Positional[tuple[str, ...]]
+
+
+@dataclasses.dataclass
+class Ask:
+    """Ask a scene in your own words: "where is the mug?", "what is on the table?", "how many toys are there?".
+
+    With --stdin the scene stays open. Each line of standard input is a phrase, or a JSON object with "ask" and
+    optionally "view", "threshold" and "id". Each line of standard output is the answer as one JSON document. Errors
+    are answers as well, and the program goes on.
+
+    Args:
+        scene: A scene folder, or the word "demo" for the bundled scene.
+        phrases: What to ask, if it does not come from standard input.
+        stdin: Answer the lines of standard input until it ends.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
+    """
+
+    scene: SceneArgument
+    phrases: tyro.conf.Positional[tuple[str, ...]] = ()
+    stdin: bool = False
+    clip: str | None = None
+    device: Device = "auto"
+
+    defaults: ClassVar[dict[str, str]] = {"clip": "the encoder of the build"}
+
+    def check(self) -> None:
+        """Refuse invalid options."""
+        if bool(self.phrases) == self.stdin:
+            raise ValueError('give either phrases, such as "where is the mug?", or --stdin')
+
+    def run(self) -> None:
+        """Answer."""
+        from lexsplat.scenes.answers import find_phrase
+        from lexsplat.scenes.serving import OpenScene, answer_line, sentence
+
+        note_hidden("demo", self.scene)
+        served = OpenScene(self.scene, self.device, self.clip)
+        for phrase in self.phrases:
+            print(sentence(find_phrase(served.scene, phrase), served.scene.world.meters_per_unit))
+        if not self.stdin:
+            return
+        print(f"{self.scene}: ready, one question a line", file=sys.stderr, flush=True)
+        sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
+        for line in sys.stdin:
+            if line.strip():
+                print(json.dumps(answer_line(served, line), ensure_ascii=False), flush=True)

@@ -1,0 +1,101 @@
+"""``lexsplat encoders``: fetch, check and time encoders before a long build."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated, Any, ClassVar, Literal
+
+import tyro
+
+from lexsplat.cli.options import Device, print_json
+from lexsplat.features.encoders import DEFAULT_CLIP
+
+_PHOTOS, _SIZE = 100, (1440, 1080)
+"""What the time is stated for if no capture is given."""
+
+
+@dataclasses.dataclass
+class EncodersCommand:
+    """Fetch, check and time encoders before a long build.
+
+    Downloads what is missing, loads it, checks that words match bundled pictures, and measures the time of the
+    features of one photo and of a capture.
+
+    Args:
+        clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled".
+        dino: Dense encoder to check, too: a name, a folder, or "bundled". The default method needs none.
+        capture: Folder of photos or capture for which the time is stated.
+        device: Device of the rasterizer.
+        encoder_device: Device of the encoders; "auto" takes that of the rasterizer.
+        json: Print one JSON document on standard output.
+    """
+
+    clip: str = DEFAULT_CLIP
+    dino: str | None = None
+    capture: Annotated[str | None, tyro.conf.arg(metavar="CAPTURE")] = None
+    device: Device = "auto"
+    encoder_device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    json: bool = False
+
+    defaults: ClassVar[dict[str, str]] = {"capture": f"{_PHOTOS} photos of {_SIZE[0]}x{_SIZE[1]}"}
+
+    def run(self) -> None:
+        """Print what was found.
+
+        Raises:
+            ModelError: If an encoder is not usable.
+        """
+        from lexsplat.features.checks import check_dense, check_words
+        from lexsplat.features.estimate import estimate
+        from lexsplat.pipeline.config import BuildConfig
+        from lexsplat.pipeline.encoding import Encoders
+        from lexsplat.pipeline.inputs import count_photos
+        from lexsplat.runtime.device import choose_device
+
+        photos, size = _PHOTOS, _SIZE
+        config = BuildConfig(
+            clip=self.clip, dino=self.dino or "none", device=self.device, encoder_device=self.encoder_device
+        )
+        if self.capture is not None:
+            survey = count_photos(_place(self.capture), config)
+            photos, size = survey.count, survey.size
+        config = config.resolved(choose_device(self.device), size)
+        encoders = Encoders(config.clip, config.dino, config.encoder_device)
+        facts: dict[str, Any] = {"clip": _facts(encoders.clip) | {"words_ranked": check_words(encoders.clip)}}
+        if encoders.dino is not None:
+            check_dense(encoders.dino)
+            facts["dino"] = _facts(encoders.dino)
+        found = estimate(encoders.clip, encoders.dino, config.features, size)
+        facts["time"] = {
+            "device": config.encoder_device,
+            "crops_per_photo": found.crops,
+            "seconds_per_photo": found.seconds,
+            "photos": photos,
+            "seconds": found.seconds * photos,
+        }
+        if self.json:
+            print_json(facts)
+            return
+        for tower in ("clip", "dino"):
+            if tower in facts:
+                print(
+                    ", ".join(
+                        f"{name.replace('_', ' ')} {_short(value)}" for name, value in facts[tower].items()
+                    )
+                )
+        print(f"features on {config.encoder_device}: {found.describe(photos)}")
+
+
+def _place(capture: str) -> Any:
+    from lexsplat.cli.captures import capture_and_settings
+    from lexsplat.pipeline.config import BuildConfig
+
+    return capture_and_settings(capture, BuildConfig())[0]
+
+
+def _facts(encoder: Any) -> dict[str, Any]:
+    return {"encoder": encoder.name, "dimensions": encoder.dim, "hash": encoder.content_hash}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -1,0 +1,74 @@
+"""``lexsplat mcp``: tools for language models."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+
+from lexsplat.cli.options import Device
+from lexsplat.runtime.errors import BackendError
+
+Scenes = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...")]]
+
+
+@dataclasses.dataclass
+class Mcp:
+    """Serve scenes to language models over the Model Context Protocol (docs/mcp.md).
+
+    Clients such as Claude Desktop start this command themselves and talk over standard input and output. With --http
+    it listens at http://127.0.0.1:8765/mcp.
+
+    Args:
+        scenes: Scene folders, or the word "demo" for the bundled scene.
+        http: Serve over HTTP instead of standard input and output.
+        host: Address to listen on. Other addresses than this machine's need --token.
+        port: Port to listen on.
+        token: What clients must send as "Authorization: Bearer TOKEN".
+        allow_write: Offer the tools export and edit, which write new files into --output.
+        output: Folder of the files that export and edit write.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
+    """
+
+    scenes: Scenes
+    http: bool = False
+    host: str = "127.0.0.1"
+    port: int = 8765
+    token: str | None = None
+    allow_write: bool = False
+    output: Path = Path("lexsplat-output")
+    clip: str | None = None
+    device: Device = "auto"
+
+    defaults: ClassVar[dict[str, str]] = {"clip": "the encoder of the build", "token": "none"}
+
+    def check(self) -> None:
+        """Refuse invalid options."""
+        if not self.scenes:
+            raise ValueError("at least one SCENE is needed, such as demo")
+        if not 0 < self.port < 65536:
+            raise ValueError(f"port must be in 1..65535, got {self.port}")
+        if self.token is not None and len(self.token) < 16:
+            raise ValueError("token must have at least 16 characters")
+        if self.http and self.token is None and self.host not in ("127.0.0.1", "localhost", "::1"):
+            raise ValueError(f"host {self.host} can be reached by others: give --token")
+
+    def run(self) -> None:
+        """Serve until the client ends or Ctrl-C."""
+        if importlib.util.find_spec("mcp") is None:
+            raise BackendError(
+                "lexsplat mcp", expected="the package mcp", found="none", remedy='pip install "lexsplat[mcp]"'
+            )
+        from lexsplat.mcp.server import make_server, serve_http
+        from lexsplat.scenes.serving import open_scenes
+
+        scenes = open_scenes(self.scenes, self.device, self.clip)
+        server = make_server(scenes, self.output.resolve() if self.allow_write else None)
+        if self.http:
+            serve_http(server, self.host, self.port, self.token)
+        else:
+            server.run()

@@ -1,0 +1,68 @@
+"""Pictures for a language model: a view with heat and a legend."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from lexsplat.queries.heatmaps import overlay_heatmap
+from lexsplat.scenes.scene import Scene
+
+_WIDTH = 640
+"""Width of a picture with one phrase or none; several share twice of it."""
+_LINE = 18
+
+
+def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[str, Any]], bytes]:
+    """A view in color, or one heatmap a phrase side by side, as PNG, and what the heat shows.
+
+    Args:
+        scene: The scene.
+        view: Name of a view.
+        phrases: What the heat is about.
+
+    Raises:
+        QueryError: If the view is unknown or a phrase is empty.
+    """
+    camera = scene.camera(view)
+    width = _WIDTH if len(phrases) < 2 else 2 * _WIDTH // len(phrases)
+    camera = camera.downscaled(max(1.0, camera.width / width))
+    image = scene.render(camera).image.clamp(0, 1).cpu().numpy()
+    if not phrases:
+        return [], _png([((image * 255).round().astype(np.uint8), view)])
+    answers = scene.ask(phrases)
+    maps = scene.relevancy(phrases, camera).cpu().numpy()
+    legend = [
+        {
+            "phrase": phrase,
+            "present": presence,
+            "peak": round(float(heat.max()), 3),
+            "threshold": round(limit, 4),
+        }
+        for phrase, presence, heat, limit in zip(
+            answers.prompts, answers.presences, maps, answers.thresholds.tolist()
+        )
+    ]
+    tiles = [
+        (overlay_heatmap(image, heat), f"{entry['phrase'][:60]}: {entry['present']}, peak {entry['peak']}")
+        for heat, entry in zip(maps, legend)
+    ]
+    return legend, _png(tiles)
+
+
+def _png(tiles: Sequence[tuple[np.ndarray, str]]) -> bytes:
+    """Tiles side by side, each with a line of text below."""
+    height, width = tiles[0][0].shape[:2]
+    sheet = Image.new("RGB", (width * len(tiles), height + _LINE), "black")
+    draw = ImageDraw.Draw(sheet)
+    for number, (pixels, text) in enumerate(tiles):
+        sheet.paste(Image.fromarray(pixels), (number * width, 0))
+        shown = text.encode("latin-1", "replace").decode("latin-1")  # the built-in font has no other letters
+        draw.text((number * width + 4, height + 3), shown, fill="white")
+    file = io.BytesIO()
+    sheet.save(file, format="PNG")
+    return file.getvalue()

@@ -1,0 +1,177 @@
+"""The MCP server: tools, resources and prompts over standard input and output or over HTTP."""
+
+from __future__ import annotations
+
+import functools
+import hmac
+import inspect
+import json
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mcp.server import MCPServer
+from mcp.server.mcpserver.exceptions import ResourceError
+from mcp.server.transport_security import TransportSecuritySettings
+from mcp_types import CallToolResult, ImageContent, TextContent, ToolAnnotations
+
+from lexsplat import __version__
+from lexsplat.mcp.tools import Reply, Tools
+from lexsplat.mcp.writing import WritingTools
+from lexsplat.runtime.errors import LexsplatError
+from lexsplat.scenes.serving import OpenScene, error_document
+
+MAX_BODY = 1 << 20
+"""Size limit of an HTTP request in bytes."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+INSTRUCTIONS = (
+    "Places that can be searched with words. Positions are in scene units, in the axes of the scene; meters are "
+    'given where the scale is known. "present": "no" means that the scene does not hold it: say so, and do not guess. '
+    '"understood" tells how a phrase was parsed.'
+)
+
+
+def make_server(scenes: Mapping[str, OpenScene], output: Path | None = None) -> MCPServer:
+    """A server for scenes.
+
+    Args:
+        scenes: The scenes by name.
+        output: Where the tools that write put their files; None offers none of these tools.
+    """
+    server: MCPServer = MCPServer(
+        "lexsplat", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING"
+    )
+    logging.getLogger("mcp").setLevel(logging.ERROR)
+    tools = Tools(scenes)
+    reading = ToolAnnotations(read_only_hint=True, open_world_hint=False)
+    for name in _public(Tools):
+        server.add_tool(_tool(getattr(tools, name)), name=name, annotations=reading)
+    if output is not None:
+        writing = WritingTools(scenes, output)
+        for name in set(_public(WritingTools)) - set(_public(Tools)):
+            server.add_tool(
+                _tool(getattr(writing, name)), name=name, annotations=ToolAnnotations(read_only_hint=False)
+            )
+    _add_resources(server, tools)
+    _add_prompts(server)
+    return server
+
+
+def serve_http(server: MCPServer, host: str, port: int, token: str | None) -> None:
+    """Serve over Streamable HTTP at ``/mcp`` until Ctrl-C.
+
+    Host and Origin must be this machine's. Bound elsewhere, each request needs the token.
+    """
+    import uvicorn
+
+    uvicorn.run(http_app(server, host, token), host=host, port=port, log_level="warning")
+
+
+def http_app(server: MCPServer, host: str, token: str | None) -> Callable[..., Any]:
+    """The ASGI application of `serve_http`."""
+    local = host in LOOPBACK
+    if not (local or token):
+        raise ValueError("a token is needed where the server does not listen on this machine alone")
+    names = [*LOOPBACK[:2], "[::1]"]
+    security = TransportSecuritySettings(
+        enable_dns_rebinding_protection=local,
+        allowed_hosts=[*names, *(f"{name}:*" for name in names)],
+        allowed_origins=[*(f"http://{name}" for name in names), *(f"http://{name}:*" for name in names)],
+    )
+    app = server.streamable_http_app(transport_security=security, host=host, max_request_body_size=MAX_BODY)
+    return app if token is None else _with_token(app, token)
+
+
+def _with_token(app: Callable[..., Any], token: str) -> Callable[..., Any]:
+    """The application for those who send ``Authorization: Bearer TOKEN``."""
+    wanted = f"Bearer {token}".encode()
+
+    async def checked(scope: Any, receive: Any, send: Any) -> None:
+        given = dict(scope.get("headers", [])).get(b"authorization", b"")
+        if scope["type"] == "http" and not hmac.compare_digest(given, wanted):
+            await send(
+                {"type": "http.response.start", "status": 401, "headers": [(b"www-authenticate", b"Bearer")]}
+            )
+            await send({"type": "http.response.body", "body": b"the token is missing or wrong\n"})
+            return
+        await app(scope, receive, send)
+
+    return checked
+
+
+def _public(kind: type) -> list[str]:
+    return [name for name, _ in inspect.getmembers(kind, inspect.isfunction) if not name.startswith("_")]
+
+
+def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
+    """A tool of the protocol: structured content and one sentence; errors that have a remedy are answers."""
+    # The package reads names and types from the signature; its annotations are strings of the other module.
+    hints = inspect.signature(function, eval_str=True)
+
+    @functools.wraps(function)
+    def call(**arguments: Any) -> CallToolResult:
+        try:
+            reply = function(**arguments)
+        except LexsplatError as error:
+            return CallToolResult(
+                content=[TextContent(text=str(error))],
+                structured_content=error_document(error),
+                is_error=True,
+            )
+        content: list[Any] = [TextContent(text=reply.sentence)]
+        if reply.image is not None:
+            import base64
+
+            content.append(ImageContent(data=base64.b64encode(reply.image).decode(), mime_type="image/png"))
+        return CallToolResult(content=content, structured_content=reply.document)
+
+    call.__signature__ = hints.replace(return_annotation=CallToolResult)  # type: ignore[attr-defined]
+    call.__annotations__ = {name: each.annotation for name, each in hints.parameters.items()} | {
+        "return": CallToolResult
+    }
+    del call.__wrapped__  # type: ignore[attr-defined]
+    return call
+
+
+def _add_resources(server: MCPServer, tools: Tools) -> None:
+    @server.resource("lexsplat://scenes", mime_type="application/json")
+    def scenes() -> str:
+        """The names and facts of all scenes."""
+        return json.dumps(tools.list_scenes().document)
+
+    @server.resource("lexsplat://scene/{name}", mime_type="application/json")
+    def facts(name: str) -> str:
+        """What describe_scene tells."""
+        try:
+            return json.dumps(tools.describe_scene(name).document)
+        except LexsplatError as error:
+            raise ResourceError(str(error)) from error
+
+    @server.resource("lexsplat://scene/{name}/view/{view}", mime_type="image/png")
+    def view(name: str, view: str) -> bytes:
+        """A view as PNG."""
+        try:
+            return tools.render(view, scene=name).image or b""
+        except LexsplatError as error:
+            raise ResourceError(str(error)) from error
+
+
+def _add_prompts(server: MCPServer) -> None:
+    @server.prompt(name="inventory", title="Inventory this room")
+    def inventory(scene: str = "") -> str:
+        """List what a place holds, with places and sizes."""
+        return (
+            f"Make an inventory of the place {scene}. Call describe_scene and list_objects, then find for things "
+            "that you expect in such a place but do not see in the list. Give a table: name, count, place in words, size. "
+            "Name what is unsure, and leave out what is not present."
+        )
+
+    @server.prompt(name="where_is", title="Where did I leave it?")
+    def where_is(thing: str, scene: str = "") -> str:
+        """Find a lost thing and tell where it is in words."""
+        return (
+            f"Find {thing} in the place {scene} with find. If it is present, describe its place by what is next to it "
+            "(relate, nearest) and show it with render(look_at=...). If it is not, say so and name what is similar."
+        )

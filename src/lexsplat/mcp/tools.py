@@ -1,0 +1,255 @@
+"""What a language model may ask of scenes. Each function returns one sentence and the same JSON as the commands.
+
+The docstrings and type hints are what the model reads: `lexsplat.mcp.server` makes descriptions and schemas of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from lexsplat.mcp.pictures import picture
+from lexsplat.queries.phrases import Related, RelationName, Understood
+from lexsplat.queries.relations import distance, same
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.answers import find_phrases
+from lexsplat.scenes.finding import find_in
+from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.serving import OpenScene, sentence
+
+SceneName = Annotated[str, Field(description="Name from list_scenes; may be left out if there is one scene.")]
+PhraseText = Annotated[
+    str,
+    Field(description='Free text, such as "red apple", "what is on the table?" or "mug left of the lamp".'),
+]
+ViewName = Annotated[
+    str, Field(description="Name of a view (a photo): what left, right and me refer to; may be empty.")
+]
+
+
+class Reply(NamedTuple):
+    """What a tool answers: a sentence, plain data, and for `Tools.render` a PNG."""
+
+    sentence: str
+    document: dict[str, Any]
+    image: bytes | None = None
+
+
+class Tools:
+    """The read-only tools.
+
+    Args:
+        scenes: The served scenes by name.
+    """
+
+    def __init__(self, scenes: Mapping[str, OpenScene]) -> None:
+        self.scenes = scenes
+
+    def list_scenes(self) -> Reply:
+        """List the places that can be searched."""
+        listed = [{"name": name, **_facts(served.scene)} for name, served in self.scenes.items()]
+        return Reply(f"{len(listed)} scenes: {', '.join(self.scenes)}.", {"scenes": listed})
+
+    def describe_scene(self, scene: SceneName = "") -> Reply:
+        """Describe a place: its size, its up direction, its unit of length, its views and the things it holds."""
+        place = self._scene(scene)
+        low, high = np.quantile(place.gaussians.means.detach().cpu().numpy(), (0.01, 0.99), axis=0)
+        names = [thing.phrase for thing in place.objects]
+        document = {
+            **_facts(place),
+            **place.world.to_json(),
+            "extent": [[round(float(v), 4) for v in corner] for corner in (low, high)],
+            "view_names": list(place.views),
+            "things": names,
+            "encoder": place.encoder_identity(),
+        }
+        unit = place.world.meters_per_unit
+        scale = f"one unit is {unit:.3g} m" if unit else "the length of a unit in meters is unknown"
+        return Reply(f"{len(names)} known things: {', '.join(names)}; {scale}.", document)
+
+    def list_objects(self, scene: SceneName = "") -> Reply:
+        """List the things of an everyday vocabulary that a place holds, with their places and sizes."""
+        return self.find("everything", scene)
+
+    def find(
+        self,
+        phrase: PhraseText,
+        scene: SceneName = "",
+        view: ViewName = "",
+        threshold: Annotated[
+            float | None, Field(description="Relevancy in 0..1; chosen by itself if left out.")
+        ] = None,
+    ) -> Reply:
+        """Find things by words: where they are, how large, how many, best view; "present": "no" means not here."""
+        place = self._scene(scene)
+        document = find_phrases(place, phrase, view or None, threshold)
+        return Reply(sentence(document["phrases"][0], place.world.meters_per_unit), document)
+
+    def count(self, phrase: PhraseText, scene: SceneName = "") -> Reply:
+        """Count things by words, such as "apples" or "toys on the table"."""
+        answer = self.find(phrase, scene).document["phrases"][0]
+        document = {key: answer[key] for key in ("phrase", "understood", "note", "present", "count")}
+        return Reply(f"{answer['count']} found for {answer['understood']}.", document)
+
+    def relate(
+        self,
+        first: PhraseText,
+        relation: RelationName,
+        second: PhraseText,
+        scene: SceneName = "",
+        view: ViewName = "",
+    ) -> Reply:
+        """Tell whether things stand in a relation to others, and which do. Left and right are those of the view."""
+        place = self._scene(scene)
+        both = (place.understand(first).phrase, place.understand(second).phrase)
+        asked = Related(relation, *both)
+        found = find_in(place, Understood(asked), place.camera(view) if view else None, None)
+        answer = {**found.to_dict(), "understood": str(asked), "note": ""}
+        holds = "Yes" if found.present == "yes" else "Perhaps" if found.present == "unsure" else "No"
+        return Reply(
+            f"{holds}: {sentence(answer, place.world.meters_per_unit)}", {"holds": holds.lower(), **answer}
+        )
+
+    def nearest(
+        self,
+        target: PhraseText,
+        to: Annotated[
+            str, Field(description="What the target is nearest to, in words; empty if a point is given.")
+        ] = "",
+        point: Annotated[list[float], Field(description="Or a point x, y, z in scene units.")] = [],  # noqa: B006
+        scene: SceneName = "",
+    ) -> Reply:
+        """Find which of several things is nearest to another thing or to a point, and how far away it is."""
+        place = self._scene(scene)
+        if point:
+            goal = np.array(point, dtype=float)
+            if goal.shape != (3,) or not np.isfinite(goal).all():
+                raise QueryError("point", expected="three finite numbers", found=repr(point)[:60])
+            gaps = [(float(np.linalg.norm(one.center - goal)), one) for one in _instances(place, target)]
+        else:
+            others = _instances(place, to)
+            gaps = [
+                (min(distance(one, other) for other in others), one)
+                for one in _instances(place, target)
+                if not any(same(one, other) for other in others)
+            ]
+        if not gaps:
+            raise QueryError(target, expected="something else than what it is nearest to", found="nothing")
+        gap, best = min(gaps, key=lambda entry: entry[0])
+        document = {"distance": _lengths(place, gap), "nearest": best.geometry(), "among": len(gaps)}
+        return Reply(f"{best.phrase} is nearest: {_length(place, gap)} away.", document)
+
+    def measure(self, first: PhraseText, second: PhraseText, scene: SceneName = "") -> Reply:
+        """Measure between two things: center to center, the gap between their surfaces, the difference in height."""
+        place = self._scene(scene)
+        one, other = (_instances(place, phrase)[0] for phrase in (first, second))
+        offset = other.center - one.center
+        rise = float(offset @ np.asarray(one.up.direction))
+        lengths = {
+            "centers": float(np.linalg.norm(offset)),
+            "gap": distance(one, other),
+            "height": rise,
+        }
+        document = {
+            **place.world.to_json(),
+            "first": one.geometry(),
+            "second": other.geometry(),
+            **{name: _lengths(place, value) for name, value in lengths.items()},
+        }
+        said = (
+            f"{one.phrase} and {other.phrase}: {_length(place, lengths['centers'])} between their centers, "
+            f"{_length(place, lengths['gap'])} between their surfaces; the second is {_length(place, abs(rise))} "
+            f"{'higher' if rise >= 0 else 'lower'}."
+        )
+        return Reply(said, document)
+
+    def what_is_at(
+        self,
+        view: Annotated[str, Field(description="Name of a view.")],
+        x: Annotated[float, Field(description="Pixels from the left.")],
+        y: Annotated[float, Field(description="Pixels from the top.")],
+        scene: SceneName = "",
+    ) -> Reply:
+        """Tell what a pixel of a view shows: the name of the thing, its place and its size."""
+        place = self._scene(scene)
+        hit = place.click(view, x, y)
+        shares = [
+            (int((hit.mask & thing.mask).sum()) / max(1, min(len(hit), len(thing))), thing)
+            for thing in place.objects
+        ]
+        share, best = max(shares, key=lambda entry: entry[0], default=(0.0, hit))
+        name = best.phrase if share > 0.3 else ""
+        document = {
+            "name": name,
+            "view": view,
+            "x": x,
+            "y": y,
+            "surface": hit.geometry(),
+            "thing": best.geometry() if name else None,
+        }
+        return Reply(f"{name or 'Something without a known name'} is there.", document)
+
+    def render(
+        self,
+        view: ViewName = "",
+        look_at: Annotated[str, Field(description="Or a phrase: the view that shows it best.")] = "",
+        phrases: Annotated[
+            list[str], Field(description="Up to 4 phrases whose relevancy is drawn as heat.", max_length=4)
+        ] = [],  # noqa: B006
+        scene: SceneName = "",
+    ) -> Reply:
+        """Show a picture of a place: a view, or the view that shows a thing best; with a heatmap for each phrase."""
+        place = self._scene(scene)
+        name = place.view(view).name if view else ""
+        if look_at and not name:
+            name = _instances(place, look_at)[0].best_view
+        name = name or next(iter(place.views))
+        legend, png = picture(place, name, phrases)
+        document = {"view": name, "legend": legend}
+        listed = "; ".join(
+            f"{entry['phrase']}: present {entry['present']}, peak {entry['peak']}" for entry in legend
+        )
+        return Reply(f"{name}{' with heat for ' + listed if listed else ''}.", document, png)
+
+    def _scene(self, name: str) -> Scene:
+        if not name and len(self.scenes) == 1:
+            return next(iter(self.scenes.values())).scene
+        if name not in self.scenes:
+            known = ", ".join(self.scenes)[:200]
+            raise QueryError(f"scene {name[:60]!r}", expected=f"one of {known}", found="no such name")
+        return self.scenes[name].scene
+
+
+def _facts(scene: Scene) -> dict[str, Any]:
+    return {
+        "gaussians": len(scene.gaussians),
+        "views": len(scene.views),
+        "meters_per_unit": scene.world.meters_per_unit,
+        "method": scene.field.method,
+    }
+
+
+def _instances(scene: Scene, phrase: str) -> list[Selection]:
+    """The instances of a phrase, the best first.
+
+    Raises:
+        QueryError: If the scene does not hold it.
+    """
+    found = scene.find(phrase)
+    if found.present == "no" or not found:
+        raise QueryError(phrase[:60], expected="something that the scene holds", found="not here")
+    return sorted(found.instances, key=lambda one: -one.score)
+
+
+def _lengths(scene: Scene, value: float) -> dict[str, float | None]:
+    unit = scene.world.meters_per_unit
+    return {"units": round(value, 5), "meters": None if unit is None else round(value * unit, 5)}
+
+
+def _length(scene: Scene, value: float) -> str:
+    unit = scene.world.meters_per_unit
+    return f"{value:.3g} scene units" if unit is None else f"{value * unit:.3g} m"

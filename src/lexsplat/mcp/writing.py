@@ -1,0 +1,84 @@
+"""Tools that write files, offered with ``--allow-write``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools
+from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.scenes.editing import Editor
+from lexsplat.scenes.exporting import ending_of, export_scene
+from lexsplat.scenes.serving import OpenScene
+
+FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
+
+
+class WritingTools(Tools):
+    """The tools that write.
+
+    Args:
+        scenes: The served scenes by name.
+        output: The folder of all files; nothing is written elsewhere.
+    """
+
+    def __init__(self, scenes: Mapping[str, OpenScene], output: Path) -> None:
+        super().__init__(scenes)
+        self.output = output
+
+    def export(self, phrase: PhraseText, file: FileName, scene: SceneName = "") -> Reply:
+        """Write the Gaussians of a thing to a new file for other programs; the ending selects the format."""
+        place, path = self._scene(scene), self._new(file)
+        ending_of(path)
+        found = place.find(phrase)
+        if not found:
+            raise QueryError(phrase[:60], expected="something that the scene holds", found="not here")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files = export_scene(place, path, found=[replace(found, phrase=phrase)])
+        written = [str(each) for each in files]
+        return Reply(
+            f"{len(found)} Gaussians written to {written[0]}.", {"files": written, "gaussians": len(found)}
+        )
+
+    def edit(
+        self,
+        action: Literal["delete", "keep", "recolor"],
+        phrase: PhraseText,
+        folder: Annotated[str, Field(description="Name of a new scene folder for the result.")],
+        color: Annotated[list[float], Field(description="Red, green, blue in 0..1, for recolor.")] = [],  # noqa: B006
+        scene: SceneName = "",
+    ) -> Reply:
+        """Make a new scene without a thing, with a thing alone, or with a thing in another color; the scene stays."""
+        place, path = self._scene(scene), self._new(folder)
+        found = place.find(phrase)
+        if not found:
+            raise QueryError(phrase[:60], expected="something that the scene holds", found="not here")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        editor = Editor(place)
+        if action == "recolor":
+            editor.recolor(found, color)
+        else:
+            getattr(editor, action)(found)
+        saved = editor.save(path)
+        document = {"scene": str(saved.root), "action": action, "gaussians": len(found)}
+        return Reply(f"{action}: {len(found)} Gaussians; the result is the scene {saved.root}.", document)
+
+    def _new(self, name: str) -> Path:
+        path = self.output / name
+        if (
+            not name
+            or Path(name).name != name
+            or name.startswith(".")
+            or not name.isprintable()
+            or len(name) > 100
+        ):
+            raise QueryError("file", expected="a plain name without a folder", found=repr(name)[:60])
+        if path.exists() or path.is_symlink():
+            raise SceneFolderError(
+                path, expected="a new name", found="a file that exists", remedy="give another name"
+            )
+        return path

@@ -1,0 +1,214 @@
+"""The evaluation of parsed phrases: which instances a phrase describes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.phrases import (
+    Anything,
+    AtLeast,
+    Between,
+    Both,
+    Except,
+    InCorner,
+    Phrase,
+    Pick,
+    Related,
+    Thing,
+    Viewer,
+)
+from lexsplat.queries.relations import (
+    Frame,
+    beside_viewer,
+    between,
+    frame_of,
+    in_corner,
+    nearest,
+    related,
+    same,
+)
+from lexsplat.queries.selection import PRESENCES, Presence, Selection
+from lexsplat.queries.vocabulary import NAMES, SURFACES
+from lexsplat.runtime.errors import QueryError
+
+_LARGE = 0.05
+"""A selection of this share of a scene may be several objects; smaller ones are taken as they are."""
+_WHOLE = 0.5
+"""An object belongs to a selection that has this share of its Gaussians."""
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a phrase is evaluated on.
+
+    Args:
+        select: The selection of a thing, by its text.
+        viewer: The camera of whoever asks, given the reference of a direction; None asks for that of "me".
+        objects: The objects of the scene with their names in ``phrase``: what "thing" can be.
+    """
+
+    select: Callable[[str], Selection]
+    viewer: Callable[[Selection | None], Camera | None]
+    objects: Callable[[], Sequence[Selection]] = tuple
+
+
+def answer(phrase: Phrase, searched: Searched) -> Selection:
+    """The selection that a phrase describes; an empty one, with presence "no", if the scene has nothing that fits.
+
+    Args:
+        phrase: From `lexsplat.queries.grammar.parse`.
+        searched: What it is asked of.
+
+    Raises:
+        QueryError: If the phrase relates something to the viewer in a way that has no meaning, such as "on me".
+    """
+    if isinstance(phrase, Thing):
+        return apart(searched.select(phrase.text), searched)
+    found = _ANSWERS[type(phrase)](phrase, searched)
+    # An empty result is a "no", whatever the presence of the parts; a "no" has no instances.
+    if not found or found.present == "no":
+        found = replace(found, mask=torch.zeros_like(found.mask), parts=(), present="no")
+    return replace(found, phrase=str(phrase))
+
+
+def apart(selection: Selection, searched: Searched) -> Selection:
+    """A selection whose instances are single objects.
+
+    "Toy" scores high all over a table, so that several objects and the table are one cluster. Where a cluster has
+    several known objects, the objects are scored as wholes (by their median) and those close to the best are taken,
+    by the rule of `Selection.convincing`. Phrases with an everyday name, such as "red mug", stay as they are.
+    """
+    large = len(selection) >= _LARGE * len(selection.mask)
+    if selection.present == "no" or not large or NAMES & set(selection.phrase.lower().split()):
+        return selection
+    objects = _things(searched)
+    inside = [each for each in objects if (each.mask & selection.mask).sum() >= _WHOLE * len(each)]
+    if len(inside) < 2 or len(inside) <= selection.count:
+        return selection
+    scores = [float(selection.scores[each.mask].median()) for each in objects]
+    limit = selection.convincing_limit(max(scores))
+    kept = tuple(
+        replace(each, scores=selection.scores) for each, score in zip(objects, scores) if score >= limit
+    )
+    return _joined(selection, kept)
+
+
+def _anything(phrase: Anything, searched: Searched) -> Selection:
+    things = _things(searched)
+    return _joined(things[0] if things else searched.select("object"), things, present="yes")
+
+
+def _things(searched: Searched) -> tuple[Selection, ...]:
+    return tuple(each for each in searched.objects() if each.phrase not in SURFACES)
+
+
+def _related(phrase: Related, searched: Searched) -> Selection:
+    targets = answer(phrase.target, searched)
+    if isinstance(phrase.target, Anything) and phrase.relation in ("under", "below"):
+        targets = _joined(targets, tuple(searched.objects()), present="yes")
+    if isinstance(phrase.reference, Viewer):
+        camera = searched.viewer(None)
+        if camera is None or phrase.relation in ("on", "under", "above", "below", "inside"):
+            raise QueryError(
+                str(phrase),
+                expected="a place as seen by a viewer, in a scene with views",
+                found=f"{phrase.relation} {phrase.reference}",
+                remedy='such as "closest to me" or "in front of me"',
+            )
+        return beside_viewer(phrase.relation, targets, camera, frame_of(camera, targets.up.direction))
+    references = answer(phrase.reference, searched)
+    if phrase.relation in ("nearest to", "farthest from"):
+        found = nearest(targets, references, farthest=phrase.relation == "farthest from")
+    else:
+        directed = phrase.relation in ("left of", "right of", "in front of", "behind")
+        camera = searched.viewer(references) if directed and references else None
+        found = related(phrase.relation, targets, references, frame_of(camera, references.up.direction))
+    return replace(found, present=min(found.present, references.present, key=PRESENCES.index))
+
+
+def _between(phrase: Between, searched: Searched) -> Selection:
+    targets, first, second = (answer(part, searched) for part in (phrase.target, phrase.first, phrase.second))
+    found = between(targets, first, second)
+    return replace(found, present=min(found.present, first.present, second.present, key=PRESENCES.index))
+
+
+def _corner(phrase: InCorner, searched: Searched) -> Selection:
+    targets = answer(phrase.target, searched)
+    return in_corner(targets, _anything(Anything(), searched), phrase.corner, _frame(searched, targets))
+
+
+def _both(phrase: Both, searched: Searched) -> Selection:
+    first, second = answer(phrase.first, searched), answer(phrase.second, searched)
+    instances = [*_certain(first), *_certain(second)]
+    kept = [
+        each
+        for number, each in enumerate(instances)
+        if not any(same(each, other) for other in instances[:number])
+    ]
+    return _joined(first | second, tuple(kept))
+
+
+def _except(phrase: Except, searched: Searched) -> Selection:
+    first, second = answer(phrase.first, searched), answer(phrase.second, searched)
+    others = _certain(second)
+    kept = []
+    for each in _certain(first):
+        shared = sum(int((each.mask & other.mask).sum()) for other in others)
+        if shared <= _WHOLE * len(each) and not any(same(each, other) for other in others):
+            kept.append(each - second if shared else each)
+    return _joined(first, tuple(kept))
+
+
+def _pick(phrase: Pick, searched: Searched) -> Selection:
+    targets = answer(phrase.target, searched)
+    if not targets:
+        return targets
+    right = _frame(searched, targets).right
+    measure: Callable[[Selection], float] = {
+        "largest": lambda each: each.box.volume,
+        "smallest": lambda each: -each.box.volume,
+        "tallest": lambda each: each.box.half_sizes[2],
+        "shortest": lambda each: -each.box.half_sizes[2],
+        "leftmost": lambda each: -float(each.center @ right),
+        "rightmost": lambda each: float(each.center @ right),
+    }[phrase.which]
+    return _joined(targets, (max(targets.instances, key=measure),))
+
+
+def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
+    found = answer(phrase.target, searched)
+    return found if found.count >= phrase.count else _joined(found, ())
+
+
+def _viewer(phrase: Viewer, searched: Searched) -> Selection:
+    raise QueryError(
+        "the viewer", expected="a thing", found="a person", remedy='such as "mug in front of me"'
+    )
+
+
+_ANSWERS: dict[type, Callable[..., Selection]] = {
+    Anything: _anything, Related: _related, Between: _between, InCorner: _corner, Both: _both, Except: _except,
+    Pick: _pick, AtLeast: _at_least, Viewer: _viewer,
+}  # fmt: skip
+
+
+def _certain(selection: Selection) -> list[Selection]:
+    """The instances of an answer; none if it is a "no"."""
+    return [] if selection.present == "no" else selection.instances
+
+
+def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | None = None) -> Selection:
+    """The union of instances, which stay apart."""
+    mask = torch.zeros_like(like.mask)
+    for part in parts:
+        mask |= part.mask
+    return replace(like, mask=mask, parts=parts, present=present or like.present)
+
+
+def _frame(searched: Searched, targets: Selection) -> Frame:
+    return frame_of(searched.viewer(None), np.asarray(targets.up.direction))

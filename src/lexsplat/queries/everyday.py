@@ -1,0 +1,99 @@
+"""A scale for cosines that comes from the scene itself: how well everyday words describe each code.
+
+Encoders differ in where their cosines lie, in how far they spread, and in an offset of each word. Fixed numbers such as
+a relevancy of 0.5 over a canonical phrase hold for one encoder at best. Here a prompt is compared with about a thousand
+everyday words (``everyday_words.txt``), most of which any one scene lacks. With c the cosine of a code k and a text p,
+
+    h_kp = (c_kp - mean of c_kw over all words w) - its 40th percentile over the codes
+
+is the *height* of the text: the first difference removes what all texts share at a code, the second the offset of the
+text, because most codes do not show it. Two ratios of heights have no unit and no offset left:
+
+- h_kp over the best height of an everyday word at code k: whether another word describes the code better;
+- h_kp over the text's own best height: whether another code fits the text better.
+
+A code shows what a text names if both ratios exceed `BORDER`. The relevancy is a logistic function of the lesser one,
+0.5 at the border. Presence (`lexsplat.queries.presence`) reads the same heights.
+
+The constants were chosen on the second bundled scene with the bundled encoder and three encoders of
+``benchmarks/web_like.py`` together (docs/selection.md). None depends on the encoder.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+
+import torch
+from torch import Tensor
+
+BORDER = 0.68
+"""Ratio of heights at which the relevancy is 0.5."""
+STEEPNESS = 12.0
+"""Slope of the log-odds of the relevancy over the ratio."""
+
+_OFFSET = 0.4  # quantile over the codes at which a text counts as not shown
+_PEAK_SHARE = 0.04  # the best height of a text is the mean over this share of the codes
+_BEST_WORDS = 20  # everyday words whose peaks say how high the scene's own things reach
+_LEAST = 1e-6
+
+
+@lru_cache
+def everyday_words() -> tuple[str, ...]:
+    """About a thousand names of things, materials and parts."""
+    return tuple((files("lexsplat.queries") / "everyday_words.txt").read_text("utf-8").split("\n")[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class EverydayScale:
+    """What everyday words reach at the codes of a scene.
+
+    Args:
+        mean: Mean embedding of the words ``[D]``; its cosine with a code is the mean over the words.
+        best: The best height of a word at each code ``[K]``.
+        peak: Mean of the best heights of the 20 words that the codes show best.
+    """
+
+    mean: Tensor
+    best: Tensor
+    peak: float
+
+    @classmethod
+    def of(cls, codewords: Tensor, words: Tensor) -> EverydayScale:
+        """The scale of a codebook.
+
+        Args:
+            codewords: CLIP part of the codebook ``[K, D]``, of any length.
+            words: Embeddings of everyday words ``[W, D]``, of any length, W > 0.
+        """
+        words = torch.nn.functional.normalize(words.to(codewords.device, torch.float32), dim=-1)
+        mean = words.mean(0)
+        heights = _heights(codewords, words, mean)
+        peaks = _peaks(heights)
+        count = min(_BEST_WORDS, len(peaks))
+        return cls(
+            mean, heights.amax(1).clamp_min(_LEAST), max(float(peaks.topk(count).values.mean()), _LEAST)
+        )
+
+    def heights(self, codewords: Tensor, texts: Tensor) -> Tensor:
+        """Heights of texts ``[P, D]`` at the codes ``[K, D]``: ``[K, P]``."""
+        return _heights(codewords, torch.nn.functional.normalize(texts.to(self.mean), dim=-1), self.mean)
+
+    def relevancy(self, codewords: Tensor, texts: Tensor) -> Tensor:
+        """Relevancy in 0..1 of each code for each text ``[K, P]``."""
+        heights = self.heights(codewords, texts)
+        own = heights / _peaks(heights).clamp_min(_LEAST)
+        ratio = torch.minimum(own, heights / self.best[:, None])
+        return torch.sigmoid(STEEPNESS * (ratio - BORDER))
+
+
+def _heights(codewords: Tensor, texts: Tensor, mean: Tensor) -> Tensor:
+    codes = torch.nn.functional.normalize(codewords.float(), dim=-1)
+    shared = codes @ (texts - mean).T
+    return shared - shared.quantile(_OFFSET, dim=0)
+
+
+def _peaks(heights: Tensor) -> Tensor:
+    count = max(1, round(_PEAK_SHARE * len(heights)))
+    return heights.topk(count, dim=0).values.mean(0)

@@ -1,0 +1,167 @@
+"""Questions and requests as phrases: the words around the thing are taken off."""
+
+from __future__ import annotations
+
+import re
+
+_I = r"(?:i|we|you|one|someone|somebody|they|he|she|it)"
+_CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
+_ROOM = r"(?:the|this|that|your|my) (?:\w+ )?(?:room|scene|place|picture|photos?|image|view|house|kitchen|office|space|area|environment)"
+_FIND = (
+    r"(?:(?:show|find|locate|highlight|search|seek|look|detect|identify|see|get|give|bring|fetch|take|go|navigate|"
+    r"zoom|focus|tell|describe|grab|let|direct)\b"
+    # Words that are nouns as well: "hand me the mug", but "hand on the table".
+    r"|(?:hand|point|fly|move|lead|guide|walk|drive|turn|display|list|select|mark|check|pick|spot|name|count)"
+    r"(?= (?:me|us|to|at|out|for|up|the|all|every|everything|each|my|any|a|an)\b))"
+)
+_REQUEST = (
+    rf"{_FIND}(?: me| us)?(?: (?:see|know))?(?: (?:around|again|now))?"
+    r"(?: in on| in to| on to| over to| out| up| at| to| for| on| towards?| about)?"
+)
+_HERE = rf"(?:right |over |up |anywhere |somewhere )*(?:here|there|around|anywhere|somewhere|around here|in here|out there|(?:in|inside|of|within) {_ROOM})"
+
+_CONTRACTIONS = (
+    (r"[\u2018\u2019\u02bc]", "'"),
+    (r"\b(what|where|who|that|there|it|here|which|how)'s\b", r"\1 is"),
+    (r"\b(what|where|who|that|there|which|how|they|we|you)'re\b", r"\1 are"),
+    (r"\bcan't\b", "can not"),
+    (r"\bwon't\b", "will not"),
+    (r"n't\b", " not"),
+    (r"\bi'm\b", "i am"),
+    (r"\b(i|we|you)'ve\b", r"\1 have"),
+    (r"\b(i|we|you)'d\b", r"\1 would"),
+    (r"\b(what|where)s\b", r"\1 is"),
+)
+_TAIL = re.compile(
+    rf"[\s,;]+(?:please|pls|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
+    re.IGNORECASE,
+)
+_WHERE_IS_IT = re.compile(
+    r"[\s,;]+where (?:is it|are they|did it go|did i (?:leave|put) (?:it|them))$", re.IGNORECASE
+)
+
+_FRAMES: tuple[tuple[str, str], ...] = (
+    # Courtesies and requests
+    (r"(?:please|pls|kindly|just|hey|hi|hello|ok|okay|so|well|now|um+|excuse me|and|also)[\s,!:]+", ""),
+    (rf"{_CAN} {_I} (?:please |kindly |just |ever )?(?={_FIND}\b)", ""),
+    (rf"(?:{_I} (?:want|need|wish|would like|would love|have|am trying|try|am going) (?:you )?to )(?={_FIND}\b)", ""),
+    (r"(?:do you know|i wonder|i want to know|i would like to know|any idea|i am asking)(?: about)?[\s,]+(?=where|what|which|how|if)", ""),
+    (r"if (?=there (?:is|are)\b)", ""),
+    (rf"{_I} (?:am|are|is) (?:looking|searching|hunting) (?:for|at) ", ""),
+    (rf"{_I} (?:want|need|would like|would love|miss|am after|am missing|lost|forgot|misplaced|have lost|have misplaced|can ?not find|could not find) ", ""),
+    (r"(?:looking for|in search of|searching for|what about|how about|where about) ", ""),
+    (rf"{_REQUEST} (?=where|what|which|how|whether|if)", ""),
+    (rf"{_REQUEST} (?=\S)", ""),
+    (r"(?:whether|if) (?=there|the|a|an|any)", ""),
+    # Where
+    (r"where (?:is it|are they)[\s,]+", ""),
+    (rf"where(?: else| exactly)? {_CAN} {_I} (?:find|see|get|spot|look for|buy|locate)\s+", ""),
+    (rf"where (?:do|did|have|has|had|would) {_I} (?:ever |last )?(?:leave|left|put|place|placed|keep|kept|store|stored|drop|dropped|lose|lost|have)\s+", ""),
+    (rf"where (?:{_CAN}) {_I} (\w+)(?: (.+))?$", "something to @ in"),
+    (r"where (?:is|are|was|were|has|have) (?:located |the whereabouts of )?(?=\S)", ""),
+    (r"where (.+?) (?:is|are|was|were)(?: located| standing| lying)?$", r"\1"),
+    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|whereabouts|coordinates|place) of ", ""),
+    (r"in which (?:place|corner|spot) (?:is|are) ", ""),
+    # How many
+    (r"how (?:many|much)(?: of)?(?: the)? (?:different )?", ""),
+    (r"count(?: up)?(?: all)?(?: of)?(?: the)? (?=\S)", ""),
+    (r"(?:what (?:is|are) )?(?:the )?(?:total )?(?:number|amount|count|quantity) of ", ""),
+    # Is there
+    (r"(?:(?:is|are|was|were) there|there (?:is|are)) ", ""),
+    (rf"{_CAN} (?:{_I}|{_ROOM}) (?:\w+ )?(?:see|have|find|spot|contain|hold|show|own|know|include|notice|recognize)(?: of)? ", ""),
+    (rf"(?:have|has) (?:{_I}|{_ROOM}) (?:got|seen|found|noticed) ", ""),
+    (rf"have {_I} ", ""),
+    (r"(?:got|seen|anyone seen) ", ""),
+    (r"(?:does|do|did) (?=\S+ \S)", ""),
+    # What and which
+    (rf"(?:what|which(?: \w+)?) {_CAN} {_I} (?:see|find|spot|detect|have)$", "thing"),
+    (rf"(?:what|which) ([\w ]+?) {_CAN} {_I} (?:see|find|spot|detect|have)$", r"\1"),
+    (rf"(?:what|which things?|which objects?) {_CAN} {_I} (?:be used to |use to )?(.+)$", r"something to \1"),
+    (rf"(?:which|what) (\w+) {_CAN} {_I} (.+)$", r"\1 to \2"),
+    (r"(?:what|which)(?: else)? (?:is|are)(?: (?:there|here|this|that|it|these|those|visible|present))?$", "thing"),
+    (r"what (?:is|are) there (?=\S)", "thing "),
+    (r"(?:which|what) (?:one|ones)(?: of (?:the|these|those))? (?=(?:is|are)\b)", "which "),
+    (r"(?:which|what) (?:one|ones)? ?of (?:the|these|those|my) ", "which "),
+    (r"(?:which|what) (?:color(?:ed)?|colour(?:ed)?|kind of|sort of|type of|kinds of|sorts of|types of) (?=\w)", "which "),
+    (r"what (?:is|are) ((?:the|my|a|an) .+?) (?:(?:stand|sitt|ly|rest)ing )?on$", r"thing under \1"),
+    (r"(?:which|what) (?:is|are) (?:a|an|the|my) (?=(?:\w+ ?){1,3}$)", ""),
+    (r"(?:what|which) (?:is|are) (?:the )?(?=(?:\w+st|leftmost|rightmost)\b(?! (?:to|from|away)\b))", ""),
+    (r"(?:what|which|who) (?:is|are) ", "thing that is "),
+    (r"what (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
+    (r"what (\w+s) (.+)$", r"something that \1 \2"),
+    (r"(?:which|what) (.+?) (?:is|are) there$", r"\1"),
+    (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
+    (r"(?:which|what) (?=\w+ )", ""),
+)  # fmt: skip
+_COMPILED = tuple((re.compile("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
+_COUNTED_TAIL = re.compile(
+    rf"\s(?:(?:is|are|do|can|could|did|does|would)(?: {_I}| there)?(?: (?:see|find|count|have|spot|get|exist|visible|present|detect))?|exist)$",
+    re.IGNORECASE,
+)
+_IS = re.compile(r"^(?:is|are|was|were) (?=\S)", re.IGNORECASE)
+_PURPOSE = re.compile(
+    rf"^((?:some|any)?things?|objects?|items?|stuff) (?:that |which )?{_I} (?:can|could|may|might) (.+)$",
+    re.IGNORECASE,
+)
+_QUESTION = re.compile(
+    r"^(?:what|where|which|who|whom|whose|why|when|how|is|are|was|were|do|does|did|can|could|would|should|will|am|has|"
+    r"have|if|whether|please)\b|\b(?:what|where|why|when|i|you|we|they|he|she|is|are|was|were|does|did|me|than)\b",
+    re.IGNORECASE,
+)
+
+
+def as_phrase(words: str) -> str:
+    """A question or request without the words around the thing: "where can I find the mug" is "the mug".
+
+    Args:
+        words: One sentence with single spaces, without the mark at its end.
+    """
+    for contraction, long in _CONTRACTIONS:
+        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
+    whole, before = words, ""
+    is_asked = False
+    while words != before:
+        before = words
+        words = _without_tail(_WHERE_IS_IT.sub("", words))
+        for pattern, instead in _COMPILED:
+            found = pattern.match(words)
+            if found is None:
+                continue
+            if instead == "something to @ in":
+                instead = f"something to {' '.join(filter(None, found.groups()))} in"
+            words = found.expand(instead) + words[found.end() :]
+            if _is_count(found[0]):
+                words = _COUNTED_TAIL.sub("", words)
+            break
+        else:
+            if found := _IS.match(words):
+                words, is_asked = words[found.end() :], True
+    words = _PURPOSE.sub(r"something to \2", words)
+    if is_asked:
+        words = _with_quality_first(words)
+    return words or whole
+
+
+def is_question(words: str) -> bool:
+    """Whether words that should name a thing still hold a question or a sentence."""
+    return bool(_QUESTION.search(words)) and not words.lower().startswith("something ")
+
+
+def _is_count(frame: str) -> bool:
+    return bool(re.match(r"how (?:many|much)|count|.*\b(?:number|amount|quantity) of", frame, re.IGNORECASE))
+
+
+def _without_tail(words: str) -> str:
+    shorter = _TAIL.sub("", words)
+    # "what is in the room" without its end is "what is"; a single preposition is no phrase.
+    return shorter if len(shorter.split()) > 1 or shorter.lower() not in ("is", "are", "there") else words
+
+
+def _with_quality_first(words: str) -> str:
+    """The statement "the mug red" as a phrase: "red mug"; a statement with a place stays as it is."""
+    from lexsplat.queries.vocabulary import QUALITIES
+
+    subject, _, last = words.rpartition(" ")
+    if not subject or last.lower() not in QUALITIES:
+        return words
+    return f"{last} {re.sub(r'^(?:the|a|an|my|this|that|your) ', '', subject, flags=re.IGNORECASE)}"

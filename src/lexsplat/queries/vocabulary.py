@@ -1,0 +1,50 @@
+"""Everyday names: what "thing" can be, what typing errors are compared with, what the viewer suggests."""
+
+from __future__ import annotations
+
+_EVERYDAY = """
+    apple, banana, orange, lemon, pear, bread, cake, cookie, cheese, egg, cup, mug, glass, bottle, bowl,
+    plate, teapot, spoon, fork, knife, pan, jar, box, basket, bag, book, newspaper, pen, paper, lamp,
+    candle, clock, vase, flower, potted plant, leaves, grass, tree, bush, stone, brick, wall, floor,
+    ceiling, window, door, curtain, carpet, cushion, blanket, tablecloth, table, chair, sofa, bench,
+    shelf, cabinet, bed, desk, computer keyboard, computer mouse, screen, phone, camera, headphones,
+    cable, shoe, hat, shirt, glove, umbrella, backpack, ball, toy car, toy bulldozer, stuffed animal,
+    rubber duck, doll, bicycle, car, wheel, road, sky, water, sand, wood, metal, plastic, cloth, cat,
+    dog, bird, person, hand, picture, mirror, stairs, fence, statue, sign, ring, cone, cube, drum,
+    guitar, piano
+"""
+_BUNDLED = """
+    apple, rubber duck, mug, stack of books, vase, ring, traffic cone, potted plant, table lamp, banana, teddy bear,
+    striped ball, bowl, candle, bottle, pumpkin, toy car, wooden crate, table, tablecloth, wall, floor
+"""
+_QUALITIES = """
+    red, green, blue, yellow, orange, white, black, purple, pink, brown, gray, grey, gold, golden, silver, copper,
+    wooden, metal, metallic, ceramic, glass, rubber, plastic, wax, paper, stone, brick, striped, checkered, plain,
+    painted, shiny, soft, fluffy, leafy, tiled, potted, burning, round, square, flat, big, small, large, little, tall,
+    open, closed, empty, full, broken, wet, dry, old, new, dark, bright, transparent, colorful, dirty, clean
+"""
+_SURFACES = """
+    table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
+    plastic, stone, brick, leaves, ground, window, door, curtain, fence, shelf, bed, hand, wheel
+"""
+
+
+def words(text: str) -> list[str]:
+    """Phrases separated by commas, with single spaces."""
+    return [" ".join(entry.split()) for entry in text.split(",")]
+
+
+SURFACES = frozenset(words(_SURFACES))
+"""Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
+NAMES = frozenset(entry.split(" of ")[0].split()[-1] for entry in words(_EVERYDAY) + words(_BUNDLED)) - {
+    "wood",
+    "metal",
+}
+"""The nouns of all everyday names."""
+QUALITIES = frozenset(words(_QUALITIES))
+"""Adjectives that may follow their noun: "is the mug red", "vase, white"."""
+
+
+def default_vocabulary(clip: str = "") -> list[str]:
+    """Everyday things, or what the bundled encoder was trained on."""
+    return words(_BUNDLED if clip == "bundled" else _EVERYDAY)

@@ -1,0 +1,107 @@
+"""`Scene.find`: phrases with relations, answered in a scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.answering import Searched, answer
+from lexsplat.queries.grammar import understand
+from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
+from lexsplat.queries.relations import same
+from lexsplat.queries.selection import Selection
+from lexsplat.queries.spelling import corrected
+from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
+
+
+def understood_in(scene: Scene, phrase: str) -> Understood:
+    """How a phrase is understood; its typing errors are mended where the scene holds what is meant.
+
+    Raises:
+        QueryError: If a part of the phrase is empty.
+    """
+    understood = understand(phrase)
+    if understood.note:
+        return understood
+    if scene.clip == "bundled" and not phrase.isascii():
+        return Understood(understood.phrase, "the bundled encoder knows English words alone")
+    vocabulary = [*default_vocabulary(scene.clip), *QUALITIES]
+    mended: dict[str, str] = {}
+
+    def mend(thing: Thing) -> Thing:
+        meant = thing.text if thing.exact else corrected(thing.text, vocabulary)
+        if meant == thing.text or scene.ask(meant).presences[0] == "no":
+            return thing
+        mended[thing.text] = meant
+        return Thing(meant)
+
+    found = with_things(understood.phrase, mend)
+    notes = [f'"{typed}" is in no dictionary: asked for "{meant}"' for typed, meant in mended.items()]
+    return Understood(found, "; ".join(notes))
+
+
+def find_in(
+    scene: Scene, understood: Understood, camera: Camera | None, threshold: float | None
+) -> Selection:
+    """The selection that a parsed phrase describes.
+
+    Args:
+        scene: The scene to ask.
+        understood: The phrase.
+        camera: Where "left" and "me" refer to; None takes the view that shows the reference best, and for "me" the
+            camera in the middle of all.
+        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians.
+    """
+    things = things_of(understood.phrase)
+    answers = scene.ask(things, threshold) if things else None
+
+    def select(text: str) -> Selection:
+        if answers is None or text not in things:
+            return scene.select(text, threshold)
+        return answers.selection(things.index(text))
+
+    def viewer(reference: Selection | None) -> Camera | None:
+        if camera is not None or reference is None:
+            return camera or middle_camera(scene)
+        return scene.cameras.get(reference.best_view)
+
+    found = answer(understood.phrase, Searched(select, viewer, lambda: scene.objects))
+    if found.present == "no" and threshold is None:
+        return replace(found, mask=torch.zeros_like(found.mask), parts=())
+    return found
+
+
+def named_objects(scene: Scene) -> tuple[Selection, ...]:
+    """The instances of all everyday words in a scene, each with its name in ``phrase``.
+
+    Of several names for one place, the one that scores highest there is kept. The vocabulary is that of
+    `lexsplat.queries.vocabulary`: what it has no word for is not found.
+    """
+    answers = scene.ask(default_vocabulary(scene.clip))
+    found = [
+        instance
+        for number, presence in enumerate(answers.presences)
+        if presence != "no"
+        for instance in answers.selection(number).instances
+    ]
+    kept: list[Selection] = []
+    for instance in sorted(found, key=lambda each: -each.score):
+        if not any(same(instance, other) for other in kept):
+            kept.append(instance)
+    return tuple(kept)
+
+
+def middle_camera(scene: Scene) -> Camera | None:
+    """The camera closest to the middle of all: where somebody stands who says "me" and gives no view."""
+    cameras = list(scene.cameras.values())
+    if not cameras:
+        return None
+    middle = np.mean([camera.position for camera in cameras], axis=0)
+    return min(cameras, key=lambda camera: float(np.linalg.norm(camera.position - middle)))

@@ -1,0 +1,152 @@
+"""Scenes that stay open and answer many questions, while their folders may be rebuilt, moved or deleted."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
+from lexsplat.scenes.answers import find_phrase
+from lexsplat.scenes.scene import Scene, open_scene
+
+MAX_LINE = 1 << 20
+"""Characters of a line of `answer_line`, at most."""
+
+
+class OpenScene:
+    """A scene that is read again when its folder has changed.
+
+    Args:
+        path: The scene folder, or the word "demo".
+        device: "auto", "cpu" or "cuda".
+        clip: Text encoder, if it is not where the build found it.
+
+    Raises:
+        SceneFolderError: If there is no finished scene.
+    """
+
+    def __init__(self, path: str | Path, device: str = "auto", clip: str | None = None) -> None:
+        self.path, self._device, self._clip = path, device, clip
+        self._lock = threading.Lock()
+        self._scene = open_scene(path, device=device, clip=clip)
+        self._state = self._stamp()
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it is now.
+
+        Raises:
+            SceneFolderError: If the folder is gone or holds no finished scene any more.
+        """
+        stamp = self._stamp()
+        if stamp != self._state:
+            with self._lock:
+                if stamp != self._state:
+                    self._scene = open_scene(self.path, device=self._device, clip=self._clip)
+                    self._state = stamp
+        return self._scene
+
+    def _stamp(self) -> tuple[int, int]:
+        folder = self._scene.folder
+        if folder is None:
+            return (0, 0)
+        try:
+            facts = (folder.root / "scene.json").stat()
+        except OSError as error:
+            raise SceneFolderError(
+                folder.root,
+                expected="the scene that was opened",
+                found="no scene.json: it was moved or deleted",
+                remedy="put it back, or start again with its new place",
+            ) from error
+        return (facts.st_mtime_ns, facts.st_size)
+
+
+def open_scenes(paths: Sequence[str], device: str = "auto", clip: str | None = None) -> dict[str, OpenScene]:
+    """Several scenes by the names of their folders; a number is added to a name that occurs twice."""
+    found: dict[str, OpenScene] = {}
+    for path in paths:
+        base = name = Path(path).resolve().name if path != "demo" else path
+        number = 2
+        while name in found:
+            name, number = f"{base}-{number}", number + 1
+        found[name] = OpenScene(path, device, clip)
+    return found
+
+
+def error_document(error: LexsplatError) -> dict[str, Any]:
+    """An error as plain data for JSON."""
+    return {
+        "error": {
+            "message": str(error),
+            "subject": error.subject,
+            "expected": error.expected,
+            "found": error.found,
+            "remedy": error.remedy,
+        }
+    }
+
+
+def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) -> str:
+    """An answer of `find_phrase` in one plain sentence."""
+    understood = (
+        answer["understood"] if len(answer["understood"]) < 200 else answer["understood"][:200] + "..."
+    )
+    if answer["present"] == "no":
+        said = f"Not here: nothing fits {understood}."
+    else:
+        unsure = "Perhaps " if answer["present"] == "unsure" else ""
+        things = "; ".join(_place(thing, meters_per_unit) for thing in answer["instances"][:8])
+        more = f"; and {answer['count'] - 8} more" if answer["count"] > 8 else ""
+        said = f"{unsure}{answer['count']} found for {understood}: {things}{more}."
+    return f"{said} Note: {answer['note']}." if answer.get("note") else said
+
+
+def _place(thing: Mapping[str, Any], meters_per_unit: float | None) -> str:
+    scale, unit = (meters_per_unit, "m") if meters_per_unit else (1.0, "scene units")
+    center = ", ".join(f"{value * scale:.2f}" for value in thing["center"])
+    return f"{thing['name']} at ({center}) {unit}, best seen in {thing['best_view']}"
+
+
+def answer_line(served: OpenScene, line: str) -> dict[str, Any]:
+    """The answer to a line of ``lexsplat ask --stdin`` (docs/schemas/ask.json).
+
+    A line is a phrase, or a JSON object with "ask" and optionally "view", "threshold" and "id". Errors are answers
+    as well: one line with "error".
+    """
+    request: dict[str, Any] = {}
+    try:
+        if len(line) > MAX_LINE:
+            raise QueryError("line", expected=f"at most {MAX_LINE} characters", found=str(len(line)))
+        request = _request(line)
+        scene = served.scene
+        answer = find_phrase(scene, request["ask"], request.get("view"), request.get("threshold"))
+        return {**_id(request), **answer, "sentence": sentence(answer, scene.world.meters_per_unit)}
+    except LexsplatError as error:
+        return {**_id(request), **error_document(error)}
+
+
+def _id(request: Mapping[str, Any]) -> dict[str, Any]:
+    return {"id": request["id"]} if "id" in request else {}
+
+
+def _request(line: str) -> dict[str, Any]:
+    text = line.strip()
+    if not text.startswith(("{", "[")):
+        return {"ask": text.removeprefix("\ufeff")}
+    remedy = (
+        '{"ask": "red apple", "view": "view_033", "threshold": 0.5, "id": 1}; all but "ask" may be left out'
+    )
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise QueryError("line", expected="one JSON object", found=str(error)[:80], remedy=remedy) from error
+    if not isinstance(found, dict) or not isinstance(found.get("ask"), str):
+        raise QueryError("line", expected='an object with "ask"', found=text[:60], remedy=remedy)
+    unknown = set(found) - {"ask", "view", "threshold", "id"}
+    if unknown:
+        raise QueryError("line", expected="known keys", found=", ".join(sorted(unknown))[:60], remedy=remedy)
+    return found

@@ -1,0 +1,86 @@
+"""``lexsplat encoders``: encoders are checked and timed before a long build."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from jsonschema import Draft202012Validator
+
+from lexsplat import cli
+from lexsplat.features import checks
+from lexsplat.features.encoders import load_clip, load_dino
+from lexsplat.features.estimate import Estimate, count_crops, estimate
+from lexsplat.features.settings import FeatureConfig
+from lexsplat.runtime.errors import ModelError
+
+SCHEMA = Path(__file__).parents[2] / "docs" / "schemas" / "encoders.json"
+
+
+@pytest.fixture(autouse=True)
+def one_measurement(monkeypatch):
+    monkeypatch.setattr("lexsplat.features.estimate._SHORT", 0.0)
+
+
+def test_the_answer_has_its_schema_and_the_time_of_the_capture(tiny_capture, capsys):
+    words = ["encoders", "--clip", "bundled", "--dino", "bundled", "--capture", str(tiny_capture), "--json"]
+    assert cli.main(words) == 0
+    document = json.loads(capsys.readouterr().out)
+    Draft202012Validator(json.loads(SCHEMA.read_text())).validate(document)
+    assert document["clip"]["words_ranked"] > 0.9
+    assert document["clip"]["dimensions"] == load_clip("bundled").dim
+    assert document["time"]["photos"] == 12
+    assert document["time"]["seconds"] == pytest.approx(12 * document["time"]["seconds_per_photo"])
+
+
+def test_random_weights_are_refused_with_status_1(clip_folder, capsys):
+    assert cli.main(["encoders", "--clip", str(clip_folder)]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith(f"error: model {clip_folder}: expected words that match bundled pictures")
+    assert "where chance is 0.50; choose another model" in error
+
+
+def test_the_rank_of_words_is_that_of_a_loop(clip_folder):
+    for name in ("bundled", str(clip_folder)):
+        clip = load_clip(name)
+        images, texts = clip.encode_images(checks.pictures(clip.image_size)), clip.encode_text(checks.WORDS)
+        below = [
+            float(images[i] @ texts[j]) < float(images[i] @ texts[i])
+            for i in range(len(texts)) for j in range(len(texts)) if i != j
+        ]  # fmt: skip
+        assert checks.rank_words(clip) == pytest.approx(sum(below) / len(below), abs=0.01)
+
+
+def test_towers_of_different_sizes_and_blind_towers_are_refused(monkeypatch):
+    clip, dino = load_clip("bundled"), load_dino("bundled")
+    monkeypatch.setattr(clip, "encode_images", lambda images: torch.eye(12, 64))
+    with pytest.raises(ModelError, match="of one size, found 64 and 128 numbers"):
+        checks.check_words(clip)
+    monkeypatch.setattr(clip, "encode_images", lambda images: torch.full((12, 128), 128**-0.5))
+    with pytest.raises(ModelError, match="unlike features for unlike pictures"):
+        checks.check_words(clip)
+    checks.check_dense(dino)
+    monkeypatch.setattr(dino, "encode_dense", lambda image, **_: torch.full((12, 12, 128), 128**-0.5))
+    with pytest.raises(ModelError, match="unlike features for unlike pictures"):
+        checks.check_dense(dino)
+
+
+def test_the_estimate_counts_the_crops_that_extraction_encodes(tiny_capture, tmp_path):
+    from lexsplat.captures import load_capture
+    from lexsplat.features import extract_features
+
+    clip, config = load_clip("bundled"), FeatureConfig.sparse()
+    capture, encoded = load_capture(tiny_capture), []
+    inner = clip.encode_images
+    clip.encode_images = lambda images: encoded.append(len(images)) or inner(images)
+    extract_features(capture, clip, None, config, cache_dir=tmp_path)
+    size = next(iter(capture.views.values())).capture_size
+    assert sum(encoded) == len(capture.views) * count_crops(config, size)
+    assert estimate(clip, None, config, size).crops == count_crops(config, size)
+
+
+def test_times_are_told_in_their_unit():
+    assert Estimate(141, 12.3).describe(10) == "141 crops and about 12.3 s a photo; 2:03 min for 10 photos"
+    assert Estimate(1359, 90).describe(100).endswith("about 1.5 min a photo; 2:30:00 hours for 100 photos")

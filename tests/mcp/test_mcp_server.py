@@ -1,0 +1,257 @@
+# ruff: noqa: E501  (one question a line)
+"""The MCP server, through the client of the official package."""
+
+import asyncio
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from jsonschema import Draft202012Validator
+
+pytest.importorskip("mcp")
+import httpx2
+import uvicorn
+from mcp import Client
+from mcp.client.stdio import StdioServerParameters
+
+from lexsplat.mcp.server import http_app, make_server
+from lexsplat.runtime.files import read_json
+from lexsplat.scenes.serving import open_scenes
+
+SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
+TOKEN = "a token of sufficient length"
+READING = {
+    "list_scenes", "describe_scene", "list_objects", "find", "count", "relate", "nearest", "measure", "what_is_at",
+    "render",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return open_scenes(["demo"])
+
+
+@pytest.fixture(scope="module")
+def server(scenes):
+    return make_server(scenes)
+
+
+def talk(server, dialogue):
+    """Run an asynchronous dialogue with a server, in process."""
+
+    async def run():
+        async with Client(server) as client:
+            return await dialogue(client)
+
+    return asyncio.run(run())
+
+
+def ask(server, tool, **arguments):
+    """The answer of one tool, and the text that goes with it."""
+    reply = talk(server, lambda client: client.call_tool(tool, arguments))
+    return reply, " ".join(part.text for part in reply.content if part.type == "text")
+
+
+def place(thing):
+    return thing["center"][:2]
+
+
+def test_the_tools_are_described_and_read_only(server):
+    tools = talk(server, lambda client: client.list_tools()).tools
+    assert {tool.name for tool in tools} == READING
+    for tool in tools:
+        assert tool.description
+        assert tool.annotations.read_only_hint
+        Draft202012Validator.check_schema(tool.input_schema)
+
+
+DIALOGUE = [  # from the layout of the bundled scene
+    ("find", {"phrase": "where can I find the lamp?"}, lambda a: place(a["phrases"][0]["instances"][0]) == pytest.approx([1.5, 0.95], abs=0.2)),
+    ("find", {"phrase": "is there a dog?"}, lambda a: a["phrases"][0]["present"] == "no" and not a["phrases"][0]["instances"]),
+    ("find", {"phrase": "rubber dukc"}, lambda a: "dukc" in a["phrases"][0]["note"]),
+    ("find", {"phrase": "what is between the mug and the books?"}, lambda a: [i["name"] for i in a["phrases"][0]["instances"]] == ["pumpkin"]),
+    ("find", {"phrase": "why is the sky blue"}, lambda a: "not understood" in a["phrases"][0]["note"]),
+    ("count", {"phrase": "how many toys are there?"}, lambda a: a["count"] == 3),
+    ("count", {"phrase": "unicorns"}, lambda a: (a["count"], a["present"]) == (0, "no")),
+    ("list_objects", {}, lambda a: a["phrases"][0]["count"] == 14),
+    ("list_scenes", {}, lambda a: [s["name"] for s in a["scenes"]] == ["demo"]),
+    ("describe_scene", {"scene": "demo"}, lambda a: {"banana", "toy car"} <= set(a["things"]) and len(a["view_names"]) == 72),
+    ("relate", {"first": "apple", "relation": "on", "second": "cloth"}, lambda a: a["holds"] == "yes"),
+    ("relate", {"first": "lamp", "relation": "on", "second": "cloth"}, lambda a: a["holds"] == "no" and not a["instances"]),
+    ("relate", {"first": "bottle", "relation": "left of", "second": "teddy bear"}, lambda a: a["holds"] == "yes"),
+    ("nearest", {"target": "thing", "to": "lamp"}, lambda a: a["nearest"]["name"] == "stack of books"),
+    ("nearest", {"target": "fruit", "point": [-0.5, -1.3, 0.2]}, lambda a: place(a["nearest"]) == pytest.approx([-0.55, -1.25], abs=0.2)),
+    ("measure", {"first": "apple", "second": "duck"}, lambda a: a["centers"]["units"] == pytest.approx(0.9, abs=0.15)),
+    ("measure", {"first": "table", "second": "lamp"}, lambda a: a["height"]["units"] > 0.3 and a["gap"]["meters"] is None),
+    ("what_is_at", {"view": "view_033", "x": 200.5, "y": 150.5}, lambda a: a["name"] == "rubber duck"),
+    ("render", {"look_at": "duck", "phrases": ["duck"]}, lambda a: a["legend"][0]["peak"] > 0.7),
+    ("render", {"view": "view_000"}, lambda a: a["legend"] == []),
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_dialogue_of_twenty_questions_is_answered_rightly(server):
+    async def dialogue(client):
+        return [await client.call_tool(tool, arguments) for tool, arguments, _ in DIALOGUE]
+
+    assert len(DIALOGUE) == 20
+    for (tool, arguments, holds), reply in zip(DIALOGUE, talk(server, dialogue)):
+        assert not reply.is_error, reply
+        assert holds(reply.structured_content), (tool, arguments, reply.structured_content)
+        assert reply.content[0].text.endswith((".", ")"))
+        if tool == "find":
+            validator = Draft202012Validator(read_json(SCHEMAS / "find.json"))
+            assert not list(validator.iter_errors(reply.structured_content))
+        if tool == "render":
+            assert reply.content[1].mime_type == "image/png"
+
+
+HOSTILE = [
+    ("find", {"phrase": "mug", "scene": "../../etc/passwd"}, "no such name"),
+    ("find", {"phrase": "mug", "view": "../view"}, "view"),
+    ("find", {"phrase": "mug", "threshold": -1e308}, "0..1"),
+    ("find", {"phrase": ""}, "word or phrase"),
+    ("find", {"phrase": '"mug'}, "quotation"),
+    ("find", {"phrase": ["mug"]}, "string"),
+    ("find", {}, "phrase"),
+    ("what_is_at", {"view": "view_000", "x": 1e300, "y": -1e300}, "outside"),
+    ("what_is_at", {"view": "view_000", "x": float("nan"), "y": 0}, "number"),
+    ("nearest", {"target": "mug", "point": [1, 2]}, "three finite numbers"),
+    ("nearest", {"target": "mug", "point": [1e400, 0, 0]}, "number"),
+    ("measure", {"first": "unicorn", "second": "mug"}, "not here"),
+    ("relate", {"first": "mug", "relation": "eats", "second": "mug"}, "relation"),
+    ("render", {"phrases": ["a"] * 50}, "phrases"),
+    ("export", {"phrase": "mug", "file": "x.ply"}, "Unknown tool"),
+]
+
+
+@pytest.mark.parametrize(("tool", "arguments", "told"), HOSTILE)
+def test_hostile_arguments_are_answered_with_an_error_that_tells_what_was_expected(
+    server, tool, arguments, told
+):
+    reply, text = ask(server, tool, **arguments)
+    assert reply.is_error
+    assert told in text
+
+
+@pytest.mark.parametrize(
+    "phrase", ["x" * 100_000, "where is the " * 8000, "\x07\x1b[31m", "🍎", "красное яблоко"]
+)
+def test_any_text_is_a_phrase(server, phrase):
+    reply, _ = ask(server, "find", phrase=phrase)
+    assert not reply.is_error
+    assert len(reply.content[0].text) < 1000
+
+
+def test_resources_and_prompts_are_offered(server):
+    async def dialogue(client):
+        facts = await client.read_resource("lexsplat://scene/demo")
+        view = await client.read_resource("lexsplat://scene/demo/view/view_000")
+        prompt = await client.get_prompt("where_is", {"thing": "my ring"})
+        return facts, view, prompt
+
+    facts, view, prompt = talk(server, dialogue)
+    assert '"things"' in facts.contents[0].text
+    assert view.contents[0].mime_type == "image/png"
+    assert "my ring" in prompt.messages[0].content.text
+
+
+def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folder_alone(scenes, tmp_path):
+    server = make_server(scenes, tmp_path / "output")
+    reply, _ = ask(server, "export", phrase="rubber duck", file="duck.ply")
+    assert not reply.is_error
+    assert (tmp_path / "output" / "duck.ply").stat().st_size > 1000
+    for name in (
+        "../duck.ply",
+        "/tmp/duck.ply",
+        "duck.ply",
+        "",
+        ".duck.ply",
+        "a\0.ply",
+        "a" * 300 + ".ply",
+        "duck.exe",
+    ):
+        reply, _ = ask(server, "export", phrase="rubber duck", file=name)
+        assert reply.is_error, name
+    assert [path.name for path in tmp_path.rglob("*.ply")] == ["duck.ply"]
+    reply, _ = ask(server, "edit", action="delete", phrase="rubber duck", folder="without")
+    assert not reply.is_error
+    assert (tmp_path / "output" / "without" / "scene.json").exists()
+
+
+@pytest.mark.slow
+def test_ten_clients_at_once_get_the_answers_of_one(server):
+    async def one(phrase):
+        async with Client(server) as client:
+            return (await client.call_tool("find", {"phrase": phrase})).structured_content
+
+    async def all_at_once():
+        phrases = ["red apple", "what is on the cloth?", "toys", "mug", "vase"] * 2
+        return await asyncio.gather(*(one(phrase) for phrase in phrases))
+
+    answers = asyncio.run(all_at_once())
+    assert answers[:5] == answers[5:]
+    assert all(answer["phrases"][0]["present"] == "yes" for answer in answers)
+
+
+@pytest.mark.slow
+def test_over_http_clients_are_served_and_one_that_leaves_in_the_middle_disturbs_nobody(scenes):
+    server = make_server(scenes)  # an HTTP application runs once
+    for url in _served(http_app(server, "127.0.0.1", None)):
+        with socket.create_connection(("127.0.0.1", httpx2.URL(url).port)) as rude:
+            rude.sendall(b"POST /mcp HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 500\r\n\r\n{")
+        reply, _ = ask(url, "find", phrase="red apple")
+        assert reply.structured_content["phrases"][0]["present"] == "yes"
+        initialize = {"Accept": "application/json, text/event-stream", "Content-Type": "application/json"}
+        for header in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert httpx2.post(url, headers={**initialize, **header}, content="{}").status_code in (403, 421)
+        assert httpx2.post(url, headers=initialize, content=b" " * (2 << 20)).status_code == 413
+
+
+@pytest.mark.slow
+def test_elsewhere_a_token_is_needed(scenes):
+    server = make_server(scenes)
+    with pytest.raises(ValueError, match="token"):
+        http_app(server, "0.0.0.0", None)
+    for url in _served(http_app(server, "0.0.0.0", TOKEN)):
+        for given in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": TOKEN}):
+            assert httpx2.post(url, headers=given, content="{}").status_code == 401
+        assert httpx2.post(url, headers={"Authorization": f"Bearer {TOKEN}"}, content="{}").status_code != 401
+
+
+def _served(app):
+    """The address of an application that runs while the loop does."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    running = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_level="error"))
+    thread = threading.Thread(target=running.run, daemon=True)
+    thread.start()
+    while not running.started:
+        time.sleep(0.01)
+    try:
+        yield f"http://127.0.0.1:{port}/mcp"
+    finally:
+        running.should_exit = True
+        thread.join(10)
+
+
+@pytest.mark.slow
+def test_over_standard_input_and_output_and_a_killed_server_is_noticed():
+    command = [sys.executable, "-m", "lexsplat", "mcp", "demo"]
+
+    async def run():
+        async with Client(StdioServerParameters(command=command[0], args=command[1:])) as client:
+            reply = await client.call_tool("find", {"phrase": "where is the vase?"})
+            assert reply.structured_content["phrases"][0]["present"] == "yes"
+
+    asyncio.run(run())
+    killed = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    killed.kill()
+    _, errors = killed.communicate(timeout=30)
+    assert killed.returncode != 0
+    assert b"Traceback" not in errors

@@ -1,0 +1,163 @@
+"""What a build refuses or tells before it works for hours."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import color_encoder
+from support.refusals import assert_tells
+from support.written_captures import save
+
+from lexsplat.captures import load_capture
+from lexsplat.evaluation.demo import demo_capture
+from lexsplat.pipeline import build as pipeline
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.encoding import check_encoders
+from lexsplat.reconstruction import ReconstructionConfig
+from lexsplat.runtime.errors import BackendError, CaptureError, LexsplatError, ModelError
+from lexsplat.runtime.progress import NOTE
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+
+CONFIG = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2)
+
+
+@pytest.fixture
+def photos(tmp_path, monkeypatch) -> Path:
+    """Photos without cameras; structure from motion must not be reached."""
+    folder = tmp_path / "photos"
+    for number in range(4):
+        save(folder / "images" / f"{number}.png", np.full((60, 80, 3), number / 4))
+    monkeypatch.setattr(
+        "lexsplat.pipeline.inputs.poses_from_photos", lambda *_, **__: pytest.fail("too late")
+    )
+    return folder
+
+
+def refused(source: Path, output: Path, *parts: str, kind=CaptureError, config=CONFIG, **options) -> None:
+    with pytest.raises(kind) as caught:
+        build(source, output, config, **options)
+    assert isinstance(caught.value, LexsplatError)
+    assert_tells(caught.value, *parts)
+    assert not output.exists(), "nothing half-written"
+
+
+def test_ground_truth_is_checked_before_structure_from_motion(photos, tmp_path):
+    save(photos / "segmentations" / "2" / "wall.png", np.ones((60, 60)))
+    refused(photos, tmp_path / "out", "wall.png", "80x60", "60x60")
+    shutil.rmtree(photos / "segmentations")
+    save(photos / "segmentations" / "9" / "wall.png", np.ones((60, 80)))
+    refused(photos, tmp_path / "out", "segmentations/9", "no view of that name")
+
+
+def test_held_out_names_are_checked_before_structure_from_motion(photos, tmp_path):
+    refused(photos, tmp_path / "out", "'7'", "matches no view", test_names=["7"])
+
+
+def test_a_photo_that_is_none_is_told_before_structure_from_motion(photos, tmp_path):
+    (photos / "images" / "3.png").write_text("no image")
+    refused(photos, tmp_path / "out", "3.png")
+
+
+def test_encoders_are_checked_before_structure_from_motion(photos, clip_folder, tmp_path):
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    (folder / "tokenizer.json").unlink()
+    refused(photos, tmp_path / "out", "tokenizer", kind=ModelError, config=replace(CONFIG, clip=str(folder)))
+
+
+def test_masks_are_checked_before_features_are_searched(tmp_path):
+    folder, stages = tmp_path / "photos", []
+    for number in range(4):
+        save(folder / f"{number}.png", np.full((60, 80, 3), number / 4))
+    save(folder / "masks" / "2.png", np.ones((60, 60)))
+    refused(folder, tmp_path / "out", "2.png", "60x60", listener=lambda event: stages.append(event.stage))
+    assert "poses" not in stages
+
+
+def test_splats_need_cameras(photos, tmp_path):
+    refused(photos, tmp_path / "out", "without cameras", splats=BUNDLED_SCENE / "gaussians.ply")
+
+
+def test_splats_of_another_place_are_refused_and_those_of_the_place_taken(tmp_path):
+    splats = BUNDLED_SCENE / "gaussians.ply"
+    options = {"splats": splats, "until": "reconstruct"}
+    folder = build(demo_capture("tabletop"), tmp_path / "own", CONFIG, **options)
+    assert folder.record["stages"]["reconstruct"]["splats"] == str(splats)
+    refused(demo_capture("second"), tmp_path / "other", "gaussians.ply", "correlate", **options)
+
+
+def test_a_gpu_without_a_compiler_is_told_before_anything_is_written(photos, tmp_path, monkeypatch):
+    def without_extension():
+        raise BackendError("gsplat", expected="its extension", found="none", remedy="use --device cpu")
+
+    monkeypatch.setattr(pipeline, "choose_device", lambda wanted: "cuda")
+    monkeypatch.setattr(pipeline, "require_gsplat", without_extension)
+    refused(photos, tmp_path / "out", "--device cpu", kind=BackendError)
+
+
+def test_an_encoder_device_that_is_missing_is_told_before_anything_is_written(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+    config = replace(CONFIG, encoder_device="mps")
+    refused(photos, tmp_path / "out", "--encoder-device mps", kind=BackendError, config=config)
+
+
+def test_bundled_encoders_warn_of_other_places(tiny_capture, caplog):
+    with caplog.at_level(logging.WARNING, logger="lexsplat"):
+        check_encoders(CONFIG.resolved("cpu", (96, 72)), demo_capture("second"))
+        assert not caplog.messages
+        check_encoders(CONFIG.resolved("cpu", (96, 72)), tiny_capture)
+    assert "knows only scenes like the demo's" in caplog.text
+
+
+def test_the_time_of_the_features_is_told_first(clip_folder, tmp_path, caplog):
+    config = replace(CONFIG, clip=str(clip_folder)).resolved("cpu", (400, 300))
+    with caplog.at_level(NOTE, logger="lexsplat"):
+        check_encoders(config, tmp_path, 50, (400, 300))
+    # Crops of 60 pixels every 30 or less: 13 x 9. Crops of 120 every 60 or less: 6 x 4.
+    assert "features on cpu: 141 crops and about" in caplog.text
+    assert "for 50 photos" in caplog.text
+    assert "words match bundled pictures by" in caplog.text, "random weights match no words"
+
+
+def test_a_build_that_stops_for_its_encoder_goes_on_from_what_was_finished(
+    tiny_capture, tmp_path, monkeypatch
+):
+    class Failing(color_encoder.ColorClip):
+        works = True
+
+        def encode_images(self, images):
+            if not Failing.works:
+                raise ModelError(
+                    "model color", expected="finite features", found="NaN", remedy="choose another"
+                )
+            return super().encode_images(images)
+
+    color_encoder.install(monkeypatch)
+    settings = ReconstructionConfig(max_gaussians=400)
+    config = BuildConfig(dino="none", device="cpu", iterations=2, reconstruction=settings)
+    monkeypatch.setattr("lexsplat.features.encoders.load_clip", lambda *_: Failing())
+
+    def stop(event):
+        Failing.works = event.stage != "features" or event.done < 3
+
+    with pytest.raises(ModelError, match="finite features"):
+        build(tiny_capture, tmp_path / "scene", config, listener=stop)
+    assert list(SceneFolder.open(tmp_path / "scene").record["stages"]) == ["reconstruct"]
+    stored = list((tmp_path / "scene" / "checkpoints" / "features").glob("*.safetensors"))
+    views = len(load_capture(tiny_capture).views)
+    assert 0 < len(stored) < views
+    first, kept = [], {}
+    color_encoder.install(monkeypatch)
+
+    def listen(event):
+        first.append((event.stage, event.done))
+        kept[event.stage] = bool(event.metrics.get("kept"))
+
+    build(tiny_capture, tmp_path / "scene", config, listener=listen)
+    assert kept["reconstruct"]
+    assert next(done for stage, done in first if stage == "features") == len(stored)

@@ -1,0 +1,43 @@
+"""The encoders of a build: loaded when used, once, and looked for before the work begins."""
+
+from pathlib import Path
+
+import pytest
+
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.encoding import Encoders, check_encoders
+from lexsplat.runtime.errors import ModelError
+
+
+def test_an_encoder_is_loaded_when_it_is_first_used_and_only_then(monkeypatch):
+    loaded = []
+    for kind in ("clip", "dino"):
+        monkeypatch.setattr(
+            f"lexsplat.features.encoders.load_{kind}", lambda *given: loaded.append(given) or object()
+        )
+    encoders = Encoders("a", "b", "cpu")
+    assert loaded == []
+    assert encoders.dino is encoders.dino
+    assert encoders.clip is encoders.clip
+    assert loaded == [("b", "cpu"), ("a", "cpu")]
+    assert Encoders("a", "none", "cpu").dino is None
+    assert len(loaded) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [
+        ({"clip": "./absent"}, True),
+        ({"dino": "./absent", "method": "trained"}, True),
+        ({"dino": "./absent", "method": "averaged"}, False),
+        ({"dino": "./absent", "method": "trained", "features_from": Path("elsewhere")}, False),
+    ],
+    ids=["clip", "dino", "dino that takes no part", "dino beside given features"],
+)
+def test_only_encoders_that_take_part_are_looked_for(changes, missing):
+    config = BuildConfig(**{"clip": "bundled", "dino": "bundled", **changes})
+    if not missing:
+        check_encoders(config)
+        return
+    with pytest.raises(ModelError, match="absent"):
+        check_encoders(config)

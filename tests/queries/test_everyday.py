@@ -1,0 +1,105 @@
+"""Relevancy relative to everyday words: what holds for one encoder holds for others."""
+
+import numpy as np
+import pytest
+import torch
+from web_like import Facts, make_web_like, measure
+
+from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, everyday_words
+from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy
+
+unit = torch.nn.functional.normalize
+
+
+def scene_and_words(seed: int = 0):
+    """Codes of four things (ten each), their names, and 60 words for what is not there."""
+    g = torch.Generator().manual_seed(seed)
+    things = torch.eye(4, 24)
+    codes = unit(things.repeat_interleave(10, 0) + 0.05 * torch.randn(40, 24, generator=g), dim=1)
+    words = unit(torch.randn(60, 24, generator=g), dim=1)
+    return codes, things, words
+
+
+def in_a_narrow_cone(codes, texts, words, seed: int = 1):
+    """The same in a space with a common direction for each side, private noise, and an offset of each word."""
+    g = torch.Generator().manual_seed(seed)
+    every = torch.cat([texts, words])
+    images = torch.cat([0.5 * codes, torch.full((len(codes), 1), 0.8), torch.zeros(len(codes), 1)], 1)
+    offsets = 0.3 + 0.05 * torch.randn(len(every), 1, generator=g)
+    sides = torch.cat([0.35 * every, offsets, torch.full((len(every), 1), 0.85)], 1)
+    return images, sides[: len(texts)], sides[len(texts) :]
+
+
+def test_relevancy_by_hand():
+    codes, things, words = scene_and_words()
+    found = EverydayScale.of(codes, torch.cat([things, words])).relevancy(codes, things).numpy()
+    c, w = codes.double().numpy(), torch.cat([things, words]).double().numpy()
+
+    def heights(texts):
+        h = c @ texts.T - (c @ w.T).mean(1, keepdims=True)
+        return h - np.quantile(h, 0.4, axis=0)
+
+    best = heights(w).max(1)
+    h = heights(things.double().numpy())
+    own = np.sort(h, axis=0)[::-1][:2].mean(0)  # 4 % of 40 codes
+    expected = 1 / (1 + np.exp(-STEEPNESS * (np.minimum(h / own, h / best[:, None]) - BORDER)))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("cone", [False, True])
+def test_a_name_holds_at_its_own_codes_only_whatever_the_encoder(cone):
+    codes, things, words = scene_and_words()
+    if cone:
+        codes, things, words = in_a_narrow_cone(codes, things, words)
+    scale = EverydayScale.of(codes, words)
+    shown = scale.relevancy(codes, things) >= 0.5
+    assert torch.equal(shown, torch.eye(4, dtype=torch.bool).repeat_interleave(10, 0))
+
+
+def test_offsets_of_texts_and_what_all_texts_share_have_no_effect():
+    codes, things, words = scene_and_words()
+    scale = EverydayScale.of(codes, words)
+    plain = scale.heights(codes, things)
+    # Lengths do not count, and a direction that no code has lowers all heights of a text by one factor.
+    moved = torch.cat([things, torch.full((4, 1), 1.0)], 1)
+    padded = [torch.cat([rows, torch.zeros(len(rows), 1)], 1) for rows in (codes, words)]
+    found = EverydayScale.of(*padded).heights(padded[0], 7 * moved)
+    ratio = found / plain
+    big = plain > 0.3
+    assert float((ratio[big] - 2**-0.5).abs().max()) < 0.05
+
+
+def test_a_question_with_a_scale_does_not_read_its_negatives():
+    codes, things, words = scene_and_words()
+    scale = EverydayScale.of(codes, words)
+    one, other = (Question(things, n, scale=scale) for n in (words[:3], words[5:]))
+    assert torch.equal(code_relevancy(codes, one), code_relevancy(codes, other))
+    assert torch.equal(code_relevancy(codes, one), scale.relevancy(codes, things))
+
+
+@pytest.mark.parametrize(
+    ("config", "everyday"),
+    [
+        (QueryConfig(), True),
+        (QueryConfig(form="feature"), False),
+        (QueryConfig(negatives=("object",)), False),
+    ],
+)
+def test_everyday_words_replace_canonical_phrases_unless_asked_otherwise(config, everyday):
+    assert config.everyday is everyday
+
+
+def test_the_words_are_about_a_thousand_different_ones():
+    words = everyday_words()
+    assert 900 < len(words) == len(set(words)) < 1300
+    assert all(word == " ".join(word.split()) and word for word in words)
+
+
+@pytest.mark.slow
+def test_a_web_like_encoder_is_an_ordinary_folder_with_the_cosines_of_clip(tmp_path):
+    found, facts = measure(make_web_like(tmp_path / "clip", seed=1)), Facts()
+    assert found["matched"] == pytest.approx(facts.matched, abs=0.02)
+    assert found["unmatched"] == pytest.approx(facts.unmatched, abs=0.02)
+    assert found["canonical"] == pytest.approx(facts.canonical, abs=0.02)
+    assert found["images"] == pytest.approx(facts.images, abs=0.06)
+    assert found["texts, all"] == pytest.approx(facts.texts, abs=0.06)

@@ -1,0 +1,136 @@
+"""A scene that many questions are asked of: by lines, by threads, and while its folder changes."""
+
+import json
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from jsonschema import Draft202012Validator
+
+from lexsplat.runtime.bounded import Bounded
+from lexsplat.scenes.folder import BUNDLED_SCENE
+from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.serving import OpenScene, answer_line
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "ask.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return OpenScene("demo")
+
+
+def test_what_was_used_least_recently_is_forgotten():
+    kept = Bounded[str, int](2)
+    kept.put("a", 1)
+    kept.put("b", 2)
+    assert kept.get("a") == 1
+    kept.put("c", 3)
+    assert (kept.get("a"), kept.get("b"), kept.get("c"), len(kept)) == (1, None, 3, 2)
+    assert kept.put("a", 9) == 1, "the first one stays"
+    assert kept.get_or_make("d", lambda: 4) == 4
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("red apple", ""),
+        ('{"ask": "where is the mug?", "view": "view_033", "id": 7}', ""),
+        ('{"ask": "unicorn", "threshold": 0.5, "id": null}', ""),
+        ("\ufeffred apple\r\n", ""),
+        ("🍎", ""),
+        ("{", "one JSON object"),
+        ("[" * 100_000, "one JSON object"),
+        ('{"ask": 5}', "an object with"),
+        ('{"ask": "mug", "vew": "view_033"}', "vew"),
+        ('{"ask": "mug", "view": "nope"}', "view"),
+        ('{"ask": "mug", "view": 5}', "view"),
+        ('{"ask": "mug", "threshold": NaN}', "0..1"),
+        ('{"ask": "mug", "threshold": "high"}', "0..1"),
+        ('{"ask": ""}', "word or phrase"),
+        ('{"ask": "\\ud800"}', "UTF-8"),
+        ("x" * (2 << 20), "at most"),
+    ],
+)
+def test_each_line_is_answered_in_the_schema_and_errors_tell_what_was_expected(demo, line, told):
+    answer = answer_line(demo, line)
+    errors = [error.message for error in Draft202012Validator(SCHEMA).iter_errors(answer)]
+    assert not errors, errors
+    assert json.loads(json.dumps(answer)) == answer
+    assert told in answer.get("error", {}).get("message", "")
+    assert bool(told) == ("error" in answer)
+
+
+def test_an_answer_has_the_id_of_its_question_also_if_it_is_an_error(demo):
+    assert answer_line(demo, '{"ask": "mug", "id": [1, "a"]}')["id"] == [1, "a"]
+    assert answer_line(demo, '{"ask": "mug", "view": "nope", "id": 3}')["id"] == 3
+    assert "id" not in answer_line(demo, "mug")
+
+
+def test_a_no_has_no_instances_and_says_so(demo):
+    answer = answer_line(demo, "is there a bicycle?")
+    assert (answer["present"], answer["count"], answer["gaussians"], answer["instances"]) == ("no", 0, 0, [])
+    assert answer["sentence"].startswith("Not here")
+    assert not demo.scene.find("is there a bicycle?")
+
+
+def test_threads_get_the_answers_of_a_single_one(demo):
+    phrases = ["red apple", "toys", "what is on the cloth?", "vase left of the bear", "pumpkin", "mugs"]
+    alone = {phrase: open_scene("demo").find(phrase).mask for phrase in phrases[:3]}
+    scene, found, failed = open_scene("demo"), [], []
+
+    def ask(number):
+        try:
+            phrase = phrases[number % len(phrases)]
+            found.append((phrase, scene.find(phrase).mask))
+        except BaseException as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(24)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed
+    assert len(found) == 24
+    for phrase, mask in found:
+        assert torch.equal(mask, alone.get(phrase, scene.find(phrase).mask))
+
+
+def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(demo, monkeypatch):
+    from lexsplat.queries.relevancy import QueryConfig
+    from lexsplat.scenes import scene as module
+
+    monkeypatch.setattr(module, "_KEPT_BYTES", 0)
+    scene = open_scene("demo")
+    scene.query = QueryConfig()
+    first = scene.ask("mug")
+    for number in range(40):
+        scene.ask(f"thing {number}", 0.5)
+    assert len(scene._words) == 32
+    assert torch.equal(scene.ask("mug").scores, first.scores)
+    scene.query = QueryConfig(temperature=5.0)
+    assert not torch.equal(scene.ask("mug").scores, first.scores)
+
+
+def test_a_scene_that_is_rebuilt_moved_or_deleted_while_it_is_asked(tmp_path):
+    folder = tmp_path / "scene"
+    shutil.copytree(BUNDLED_SCENE, folder)
+    served = OpenScene(folder, "cpu")
+    before = served.scene
+    assert answer_line(served, "red apple")["present"] == "yes"
+    record = json.loads((folder / "scene.json").read_text())
+    record["world"] = {**record.get("world", {}), "meters_per_unit": 0.1}
+    (folder / "scene.json").write_text(json.dumps(record))
+    assert served.scene is not before
+    assert (
+        "0.05" in answer_line(served, "red apple")["sentence"]
+        or " m" in answer_line(served, "mug")["sentence"]
+    )
+    folder.rename(tmp_path / "moved")
+    assert "moved or deleted" in answer_line(served, "red apple")["error"]["message"]
+    assert not folder.exists()
+    (tmp_path / "moved").rename(folder)
+    assert answer_line(served, "red apple")["present"] == "yes"
