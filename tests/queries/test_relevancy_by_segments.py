@@ -7,8 +7,9 @@ from support.question_scene import coded_cloud, texts
 
 from lexsplat.language.segments import Segments
 from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy
-from lexsplat.queries.scoring import score_prompts
+from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
+from lexsplat.rendering import render
 
 # A mug of body (segments 0, 1) and handle (2), a table (3, 4) and a wall (5); 4 Gaussians each.
 LEVELS = torch.tensor([[0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 2]])
@@ -76,21 +77,27 @@ def test_the_cut_is_the_widest_gap_of_means_by_hand():
 @pytest.mark.parametrize("form", ["code", "feature", "segment"])
 def test_absent_prompts_and_other_forms_keep_the_scores_of_gaussians(form):
     field, *_ = coded_cloud()
-    field.segments = Segments(
-        torch.arange(len(field.codes)) % 3, torch.ones(len(field.codes)), torch.tensor([[0, 1, 2]])
-    )
-    question = Question(texts(3, 16, 5), texts(4, 16, 6), QueryConfig(form=form))
-    plain = gaussian_relevancy(field, question)
-    answers = iter(["no", "yes", "unsure"])
-    scored = score_prompts(field, question, lambda row: next(answers))
-    assert scored.presences == ("no", "yes", "unsure")
-    same = [torch.equal(*pair) for pair in zip(plain, scored.scores)]
+    count = len(field.codes)
+    field.segments = Segments(torch.arange(count) % 3, torch.ones(count), torch.tensor([[0, 1, 2]]))
+    query = QueryConfig(form=form)
+    plain = gaussian_relevancy(field, Question(texts(3, 16, 5), texts(4, 16, 6), query))
+    scores = scores_in_form(field, query, plain, ("no", "yes", "unsure"))
+    same = [torch.equal(*pair) for pair in zip(plain, scores)]
     assert same == ([True, False, False] if form == "segment" else [True] * 3)
 
 
 def test_a_field_without_segments_answers_by_gaussians():
     field, *_ = coded_cloud()
-    question = Question(texts(2, 16, 5), texts(4, 16, 6))
-    scored = score_prompts(field, question, None)
-    assert not scored.by_segments
-    assert torch.equal(scored.scores, gaussian_relevancy(field, question))
+    query = QueryConfig()
+    plain = gaussian_relevancy(field, Question(texts(2, 16, 5), texts(4, 16, 6), query))
+    assert form_used(field, query) == "code"
+    assert torch.equal(scores_in_form(field, query, plain, ("yes", "yes")), plain)
+
+
+def test_the_map_is_the_rendering_of_the_scores():
+    _, gaussians, camera = coded_cloud()
+    scores = torch.rand(40, len(gaussians), generator=torch.Generator().manual_seed(0))
+    found = render_gaussian_scores(gaussians, camera, scores)
+    for place in (0, 17, 39):  # more prompts than are rendered at once
+        alone = render(gaussians, camera, features=scores[place][:, None], color=False).features[..., 0]
+        torch.testing.assert_close(found[place], alone.detach().clamp(0, 1))
