@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import tyro
 
 from lexsplat.cli.options import Device, SceneArgument, note_hidden
 
-Phrases = tyro.conf.Positional[tuple[str, ...]]
+Phrases = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...")]]
 
 
 @dataclasses.dataclass
@@ -31,7 +31,7 @@ class Ask:
     """
 
     scene: SceneArgument
-    phrases: tyro.conf.Positional[tuple[str, ...]] = ()
+    phrases: Phrases = ()
     stdin: bool = False
     clip: str | None = None
     device: Device = "auto"

@@ -38,7 +38,7 @@ class Mcp:
     http: bool = False
     host: str = "127.0.0.1"
     port: int = 8765
-    token: str | None = None
+    token: Annotated[str | None, tyro.conf.arg(metavar="TOKEN")] = None
     allow_write: bool = False
     output: Path = Path("lexsplat-output")
     clip: str | None = None

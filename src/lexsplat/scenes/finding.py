@@ -15,7 +15,7 @@ from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
 from lexsplat.queries.relations import same
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import corrected
-from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
+from lexsplat.queries.vocabulary import QUALITIES, SURFACES, default_vocabulary
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -93,9 +93,15 @@ def named_objects(scene: Scene) -> tuple[Selection, ...]:
     ]
     kept: list[Selection] = []
     for instance in sorted(found, key=lambda each: -each.score):
-        if not any(same(instance, other) for other in kept):
+        if not any(same(instance, other) or _is_part(instance, other) for other in kept):
             kept.append(instance)
     return tuple(kept)
+
+
+def _is_part(instance: Selection, other: Selection) -> bool:
+    """Whether another name has most of it: a part of a thing is no object; a coin on a table is one."""
+    shared = int((instance.mask & other.mask).sum())
+    return other.phrase not in SURFACES and shared > 0.5 * len(instance)
 
 
 def middle_camera(scene: Scene) -> Camera | None:
