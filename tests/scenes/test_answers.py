@@ -35,7 +35,7 @@ def test_a_query_states_the_peak_of_each_view_and_the_best_of_them(scene, tmp_pa
     maps = {view: scene.relevancy(PROMPTS, view).numpy() for view in views}
     for number, answer in enumerate(found["prompts"]):
         peaks = {view: float(values[number].max()) for view, values in maps.items()}
-        assert answer["best_view"] == max(peaks, key=peaks.get)
+        assert answer["peak_view"] == max(peaks, key=peaks.get)
         assert answer["peak"] == pytest.approx(max(peaks.values()))
         assert answer["threshold"] == 0.4
         for view, entry in answer["views"].items():
