@@ -157,7 +157,7 @@ class Scene:
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     @property
-    def encoder(self) -> ImageTextEncoder:
+    def encoder(self) -> TextTower:
         """The text encoder that belongs to the language, loaded at first use (`preload`)."""
         return self._load_encoder(self._encoder_hash)
 
