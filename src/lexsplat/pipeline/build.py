@@ -316,9 +316,11 @@ class _Builder:
         )
         field = self.method.fit(gaussians, views, self.config, run)
         self._write_language(field.tensors(), field.metadata())
-        facts = {"method": field.method}
+        facts: dict[str, Any] = {"method": field.method}
         if isinstance(field, CodeField):
             facts |= _code_facts([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
+        if field.segments is not None:
+            facts["segments"] = field.segments.levels.shape[1]
         return facts
 
     def _take_joint_language(self) -> dict[str, Any]:

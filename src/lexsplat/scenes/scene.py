@@ -35,6 +35,7 @@ from lexsplat.queries.relevancy import (
     gaussian_relevancy,
     render_relevancy,
 )
+from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
@@ -156,7 +157,7 @@ class Scene:
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     @property
-    def encoder(self) -> ImageTextEncoder:
+    def encoder(self) -> TextTower:
         """The text encoder that belongs to the language, loaded at first use (`preload`)."""
         return self._load_encoder(self._encoder_hash)
 
@@ -245,11 +246,13 @@ class Scene:
             QueryError: If a prompt is empty or the view is unknown.
         """
         camera = self.camera(view)
+        if form_used(self.field, self.query) == "segment":
+            return render_gaussian_scores(self.gaussians, camera, self.ask(prompts).scores)
         return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        return gaussian_relevancy(self.field, self.question(prompts))
+        return self.ask(prompts).scores
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
@@ -338,16 +341,17 @@ class Scene:
         question = self.question(prompts)
         scores = gaussian_relevancy(self.field, question)
         presences = self.presence_classifier.classify(question.positives, scores)
+        scores = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
         return [Word(row.clone(), presence) for row, presence in zip(scores, presences)]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
         """The automatic thresholds of words, from one rendering of the training views.
 
-        Relative to everyday words, a relevancy of 0.5 is the border itself.
+        Relative to everyday words and by segments, a score of 0.5 is the border itself.
         """
         question = self.question(list(words))
-        if question.scale is not None:
+        if question.scale is not None or form_used(self.field, self.query) == "segment":
             found = [BORDER] * len(words)
         else:
             views = list(self.views.values())
