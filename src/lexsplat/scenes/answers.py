@@ -18,6 +18,7 @@ from lexsplat.language.methods import METHODS
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.relevancy import check_prompts
+from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
@@ -162,7 +163,7 @@ def answer_queries(
                 answer["peak"], answer["peak_view"] = float(values.max()), name
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
-        "form": scene.query.form,
+        "form": form_used(scene.field, scene.query),
         "rests_on": rests_on(scene),
         "prompts": answers,
     }
@@ -277,6 +278,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussians": stages.get("reconstruct", {}).get("gaussians"),
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
+        "segments": language.get("segments"),
         "method": language.get("method"),
         "clip": config.get("clip"),
         "dino": config.get("dino") if method is None or method.uses_dino else "not used",

@@ -35,6 +35,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views, codes_at_pixels
 from lexsplat.language.fields import CodeField
 from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
+from lexsplat.language.segments import make_segments
 from lexsplat.rendering import BACK_PROJECTED_CHANNELS, back_project, prepare
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
@@ -59,6 +60,7 @@ class AveragedConfig:
             count as never seen.
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
         shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels.
+        segments: Whether to find segments (`lexsplat.language.segments`), by which questions are answered.
     """
 
     top: int = 4
@@ -66,6 +68,7 @@ class AveragedConfig:
     min_visibility: float = 0.01
     prior_visibility: float = 0.25
     shortest_side: int = 120
+    segments: bool = True
 
     def __post_init__(self) -> None:
         if self.top < 1 or self.shortest_side < 1:
@@ -132,7 +135,10 @@ class Averaged:
             scratch=run.scratch,
             listener=run.listener,
         )
-        return field_from_means(found, config.codebook, config.averaged, seed=run.seed, memory=run.memory)
+        field = field_from_means(found, config.codebook, config.averaged, seed=run.seed, memory=run.memory)
+        if config.averaged.segments:
+            field.segments = make_segments(gaussians, found.rows, found.totals)
+        return field
 
 
 # Beside its inputs: masks, and three options of the run that tests leave out.
