@@ -19,6 +19,7 @@ from mcp import Client
 from mcp.client.stdio import StdioServerParameters
 
 from lexsplat.mcp.server import http_app, make_server
+from lexsplat.queries.relevancy import CANONICAL_PHRASES, QueryConfig
 from lexsplat.runtime.files import read_json
 from lexsplat.scenes.serving import open_scenes
 
@@ -32,7 +33,10 @@ READING = {
 
 @pytest.fixture(scope="module")
 def scenes():
-    return open_scenes(["demo"])
+    found = open_scenes(["demo"])
+    # The layout's answers do not depend on what relevancy is relative to.
+    found["demo"].scene.query = QueryConfig(negatives=CANONICAL_PHRASES)
+    return found
 
 
 @pytest.fixture(scope="module")
