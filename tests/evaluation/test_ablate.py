@@ -326,13 +326,19 @@ def test_unavailable_ground_truth_is_refused_before_any_work(
 @pytest.mark.parametrize("command", ["ablate", "compare"])
 def test_the_command_line_passes_ground_truth_and_protocols(tiny_capture, tmp_path, monkeypatch, command):
     from lexsplat.evaluation import compare as comparison
+    from lexsplat.evaluation import experiments
 
+    used = {}
+
+    def bench(capture, output, settings, evaluation, ground_truth, listener):
+        used.update(evaluation=evaluation, ground_truth=ground_truth)
+
+    monkeypatch.setattr(experiments, "Bench", bench)
     module = {"ablate": ablation, "compare": comparison}[command]
-    options = {}
-    monkeypatch.setattr(module, command, lambda *a, **k: options.update(k) or [])
+    monkeypatch.setattr(module, command, lambda *a, **k: [])
     arguments = ["--masks", str(tmp_path), "--prompt-list", "released"]
     arguments += ["--protocols", "strict", "lerf-2d"] if command == "compare" else []
     assert cli.main([command, str(tiny_capture), "--output", str(tmp_path / "out"), *arguments]) == 0
-    assert options["ground_truth"] == GroundTruthSource(tmp_path, "released")
+    assert used["ground_truth"] == GroundTruthSource(tmp_path, "released")
     if command == "compare":
-        assert options["evaluation"].protocols == ("strict", "lerf-2d")
+        assert used["evaluation"].protocols == ("strict", "lerf-2d")

@@ -90,7 +90,7 @@ def test_forms_follow_the_names(compared):
         stored = json.loads(path.read_text())
         forms[stored["name"]] = stored["metrics"]["language"]["form"]
     assert forms["averaged-feature"] == "feature"
-    assert forms["averaged"] == "code"
+    assert forms["averaged"] == "segment"
     stages = json.loads((folder / "runs" / "dff" / "seed-0.json").read_text())["metrics"]["speed"][
         "stage_seconds"
     ]

@@ -250,7 +250,7 @@ def test_metrics_json_has_the_sections_of_the_design_and_is_strict_json(capture,
     assert found["size"]["gaussians"] == len(gaussians)
     assert found["size"]["language_bytes"] == 7
     assert found["size"]["gaussian_bytes"] == 4 * 14 * len(gaussians)
-    assert found["config"]["evaluation"]["query"]["form"] == "code"
+    assert found["config"]["evaluation"]["query"]["form"] == "segment"
     assert found["config"]["seed"] == 3
     assert found["machine"] == {"cores": 2}
 

@@ -86,6 +86,7 @@ def test_a_known_prompt_renders_no_views_again(scene, monkeypatch):
         return original(field, gaussians, camera, question)
 
     monkeypatch.setattr(scene_module, "render_relevancy", render)
+    scene.query = replace(scene.query, negatives=("object", "things"))  # everyday words need no views
     training = sum(view.split == "train" for view in scene.views.values())
     first = scene.ask(["ball 0", "ball 1"])
     assert rendered == [2] * training
@@ -157,7 +158,7 @@ def test_invalid_prompts_are_refused(scene, wrong):
 
 
 def test_an_absent_object_has_no_instances_in_json(scene):
-    scene.presence_classifier.classify = lambda scores: "no"
+    scene.presence_classifier.classify = lambda texts, scores: ("no",) * len(scores)
     (entry,) = find_phrases(scene, "ball 0")["phrases"]
     assert (entry["present"], entry["count"], entry["instances"]) == ("no", 0, [])
     assert entry["threshold"] == 0.5

@@ -52,7 +52,7 @@ class Ablate:
     wrong_labels: float = 0.0
     masks: Path | None = None
     prompt_list: PromptListName | None = None
-    forms: tuple[Literal["feature", "code"], ...] = ("feature",)
+    forms: tuple[Literal["segment", "code", "feature"], ...] = ("feature",)
     as_in_paper: bool = False
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))

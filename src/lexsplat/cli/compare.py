@@ -37,7 +37,7 @@ class Compare:
     Args:
         capture: Folder with photos, cameras and ground truth, or the word "demo" or "second" for a bundled capture.
         output: Folder for all results. ``ablate`` with the same folder uses the same Gaussians and features.
-        methods: Rows to measure. "-feature" is the paper's form of relevancy in place of our default.
+        methods: Rows to measure. "-code" answers by single Gaussians, "-feature" in the paper's form.
         seeds: Seeds of codebook and language.
         masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.

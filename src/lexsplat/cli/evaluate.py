@@ -41,7 +41,7 @@ class Evaluate:
     prompt_list: PromptListName | None = None
     protocols: tuple[ProtocolName, ...] = ALL_PROTOCOLS
     capture: Path | None = None
-    form: Literal["feature", "code"] | None = None
+    form: Literal["segment", "code", "feature"] | None = None
     clip: str | None = None
     device: Device = "auto"
     json: bool = False

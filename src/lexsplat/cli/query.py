@@ -34,7 +34,7 @@ class Query:
         pictures: Write a heatmap and a mask for each prompt and view; --no-pictures writes none.
         threshold: Relevancy from which a pixel belongs to the mask. The paper's is 0.5.
         form: How codes and text are compared: "feature" blends features, then compares (the paper); "code"
-            compares each code, then blends.
+            compares each code, then blends; "segment" takes whole segments by the scores of "code".
         negatives: Phrases that a prompt is compared with.
         temperature: Factor on cosine similarities.
         template: Sentences with {} in place of the prompt, such as "a photo of a {}".
@@ -49,7 +49,7 @@ class Query:
     output: Path | None = None
     pictures: bool = True
     threshold: float | None = None
-    form: Literal["feature", "code"] | None = None
+    form: Literal["segment", "code", "feature"] | None = None
     negatives: tuple[str, ...] = ()
     temperature: float | None = None
     template: tuple[str, ...] = ()

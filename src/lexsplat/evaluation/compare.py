@@ -12,13 +12,14 @@ from lexsplat.evaluation.ablate import language_row
 from lexsplat.evaluation.experiments import Bench, Made, Row
 from lexsplat.evaluation.methods import Method
 from lexsplat.language.methods import METHODS, MethodName
-from lexsplat.queries.relevancy import embed_prompts
+from lexsplat.queries.relevancy import QueryForm, embed_prompts
 
 BASELINES = ("dff", "lerf", "3dovs", "nearest")
 """The methods that the paper compares with, and "nearest", a lower bound without 3D."""
 
-COMPARED = (*METHODS, *(f"{name}-feature" for name in METHODS), *BASELINES)
-"""Everything that can be compared. With "-feature", our methods answer in the paper's form of relevancy."""
+COMPARED = (*METHODS, *(f"{name}-{form}" for name in METHODS for form in ("code", "feature")), *BASELINES)
+"""Everything that can be compared. With "-code", our methods answer by single Gaussians; with "-feature", in the
+paper's form of relevancy."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class ComparisonPlan:
         ValueError: If a method is unknown, or there is no method or seed.
     """
 
-    methods: Sequence[str] = ("averaged", "trained-feature", *BASELINES)
+    methods: Sequence[str] = ("averaged", "averaged-code", "trained-feature", *BASELINES)
     seeds: Sequence[int] = (0,)
 
     def __post_init__(self) -> None:
@@ -60,10 +61,10 @@ def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, 
 
 
 def _row(bench: Bench, name: str) -> Row:
-    own = name.removesuffix("-feature")
+    own, _, form = name.partition("-")
     if own in METHODS:
         config = replace(bench.config, method=cast(MethodName, own))
-        return language_row(bench, name, config, "feature" if own != name else "code")
+        return language_row(bench, name, config, cast(QueryForm, form or "segment"))
     settings = {
         "dff": baselines.DffConfig(),
         "lerf": baselines.LerfConfig(),

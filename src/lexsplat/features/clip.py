@@ -43,7 +43,7 @@ UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
 
 
 @dataclass(frozen=True, eq=False)
-class TextTower:
+class TextWeights:
     """The text half of a CLIP.
 
     Args:
@@ -153,7 +153,7 @@ class ClipEncoder(PretrainedModel):
             raise self._refusal("finite text embeddings", "choose another model", "NaN or infinity")
         return found
 
-    def text_tower(self) -> TextTower | None:
+    def text_tower(self) -> TextWeights | None:
         """The text tower for other programs; None if it is not of CLIP's own architecture."""
         config = self._model.config.text_config
         tokenizer = getattr(self._tokenizer, "backend_tokenizer", None)
@@ -165,7 +165,7 @@ class ClipEncoder(PretrainedModel):
         tensors["text_projection.weight"] = self._model.text_projection.weight.detach().cpu()
         tensors.pop("embeddings.position_ids", None)
         content = json.loads(tokenizer.to_str())
-        return TextTower(tensors, int(config.num_attention_heads), str(config.hidden_act), content)
+        return TextWeights(tensors, int(config.num_attention_heads), str(config.hidden_act), content)
 
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask

@@ -155,7 +155,7 @@ class _Builder:
             and not encoders_checked
             and not self._is_finished("features", stages["features"])
         ):
-            sizes = [view.capture_size for view in self.capture.views.values()]
+            sizes = [view.capture_size for view in self._training_views.values()]
             check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
         for name in wanted:
             self._run_stage(name, stages[name])
@@ -316,9 +316,11 @@ class _Builder:
         )
         field = self.method.fit(gaussians, views, self.config, run)
         self._write_language(field.tensors(), field.metadata())
-        facts = {"method": field.method}
+        facts: dict[str, Any] = {"method": field.method}
         if isinstance(field, CodeField):
             facts |= _code_facts([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
+        if field.segments is not None:
+            facts["segments"] = field.segments.levels.shape[1]
         return facts
 
     def _take_joint_language(self) -> dict[str, Any]:
@@ -332,12 +334,13 @@ class _Builder:
         write_tensors(self.folder.language_path, dict(tensors), metadata)
 
     def _feature_maps(self) -> FeatureMaps:
-        """Features of every view. The encoders are loaded once a build, and freed when all features are stored."""
+        """Features of the training views. The encoders are freed when all features are stored."""
         if self._maps is None:
             config = self.config
             encoders = Encoders.of(config)
             cache = self.folder.features_path
-            self._maps = feature_maps(self.capture, config, encoders, cache, self.listener)
+            training = replace(self.capture, views=self._training_views, test_names=())
+            self._maps = feature_maps(training, config, encoders, cache, self.listener)
             self._clip_hash = encoders.clip.content_hash
         return self._maps
 

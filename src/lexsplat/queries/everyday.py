@@ -1,8 +1,9 @@
 """A scale for cosines that comes from the scene itself: how well everyday words describe each code.
 
-Encoders differ in where their cosines lie, in how far they spread, and in an offset of each word. Fixed numbers such as
-a relevancy of 0.5 over a canonical phrase hold for one encoder at best. Here a prompt is compared with about a thousand
-everyday words (``everyday_words.txt``), most of which any one scene lacks. With c the cosine of a code k and a text p,
+Encoders differ in where their cosines lie, in how far they spread, and in an offset of each word. Fixed numbers such
+as a relevancy of 0.5 over a canonical phrase hold for one encoder at best. Here a prompt is compared with about a
+thousand everyday words (``everyday_words.txt``), most of which any one scene lacks. With c_kp the cosine of code k
+and text p,
 
     h_kp = (c_kp - mean of c_kw over all words w) - its 40th percentile over the codes
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -40,8 +40,8 @@ NO_TEMPLATE = ("{}",)
 _CHUNK = 1 << 13  # pixels per block; small enough for a block to stay in the cache
 _GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
 
-QueryForm = Literal["feature", "code"]
-"""Whether the blended feature or each code is compared with the text."""
+QueryForm = Literal["segment", "code", "feature"]
+"""How text is compared with the scene (`QueryConfig.form`)."""
 TextEncoder = Callable[[list[str]], Tensor]
 """Texts to embeddings ``[T, D]``, of any length."""
 
@@ -52,16 +52,17 @@ class QueryConfig:
 
     Args:
         temperature: Factor on cosines before the pairwise softmax (the paper and LERF: 10).
-        form: ``"code"`` blends the relevancies of codes; ``"feature"`` (the paper) compares the blended feature.
-            "code" measures better for every field (docs/results.md).
-        negatives: Phrases that each prompt is compared with. None given: form "code" compares with everyday words
-            (`lexsplat.queries.everyday`), form "feature" with `CANONICAL_PHRASES` (LERF and the paper).
+        form: ``"code"`` blends the relevancies of codes; ``"feature"`` (the paper) compares the blended feature;
+            ``"segment"`` takes or leaves whole segments by their relevancy in the form "code"
+            (`lexsplat.queries.segments`), and is "code" for a field without segments.
+        negatives: Phrases that each prompt is compared with. None given: "code" and "segment" compare with everyday
+            words (`lexsplat.queries.everyday`), "feature" with `CANONICAL_PHRASES` (LERF and the paper).
         templates: Sentences with ``{}`` for the prompt; the embeddings of several are averaged.
         threshold: Fixed relevancy threshold of masks, in 0..1 (paper: 0.5).
     """
 
     temperature: float = 10.0
-    form: QueryForm = "code"
+    form: QueryForm = "segment"
     negatives: tuple[str, ...] = ()
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5
@@ -69,8 +70,8 @@ class QueryConfig:
     def __post_init__(self) -> None:
         if not 0 < self.temperature < float("inf"):
             raise ValueError(f"temperature must be positive, got {self.temperature}")
-        if self.form not in ("feature", "code"):
-            raise ValueError(f"form must be 'feature' or 'code', got {self.form!r}")
+        if self.form not in get_args(QueryForm):
+            raise ValueError(f"form must be one of {', '.join(get_args(QueryForm))}, got {self.form!r}")
         if not self.templates:
             raise ValueError("templates must hold at least one sentence with {}")
         for template in self.templates:
@@ -82,7 +83,7 @@ class QueryConfig:
     @property
     def everyday(self) -> bool:
         """Whether relevancy is relative to everyday words."""
-        return self.form == "code" and not self.negatives
+        return self.form != "feature" and not self.negatives
 
     @property
     def compared(self) -> tuple[str, ...]:
@@ -250,7 +251,7 @@ def probability_relevancy(probabilities: Tensor, codewords: Tensor, question: Qu
         Relevancy ``[..., P]`` in 0..1; 0 where the distribution is empty.
     """
     codewords = codewords.to(probabilities.device)
-    if question.config.form == "code":
+    if question.config.form != "feature":
         return (probabilities @ code_relevancy(codewords, question)).clamp_(0.0, 1.0)
     coverage = probabilities.sum(-1, keepdim=True).clamp_(0.0, 1.0)
     positives, negatives = question.units(codewords)
@@ -281,7 +282,7 @@ def render_relevancy(
 @torch.no_grad()
 def gaussian_relevancy(field: LanguageField, question: Question) -> Tensor:
     """Relevancy of every prompt for every Gaussian ``[P, N]`` in 0..1; 0 for Gaussians that no view saw."""
-    if question.config.form == "code":
+    if question.config.form != "feature":
         scores = field.scores(code_relevancy(field.codebook.clip, question))
         return scores.T.clamp(0.0, 1.0).contiguous()
     codewords = field.codebook.clip.to(field.uncertainties.device)

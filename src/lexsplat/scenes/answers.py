@@ -18,6 +18,7 @@ from lexsplat.language.methods import METHODS
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.relevancy import check_prompts
+from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
@@ -131,8 +132,9 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
-        highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
+        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak",
+        "peak_view" (the view with the highest relevancy), "gaussians", "present" (whether the scene holds it: "yes",
+        "no" or "unsure") and "views".
 
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
@@ -161,7 +163,7 @@ def answer_queries(
                 answer["peak"], answer["peak_view"] = float(values.max()), name
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
-        "form": scene.query.form,
+        "form": form_used(scene.field, scene.query),
         "rests_on": rests_on(scene),
         "prompts": answers,
     }
@@ -190,9 +192,10 @@ def find_phrases(
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
-        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
-        "count", "gaussians", "threshold", "best_view" and "instances" with center, size and axes in world units,
-        and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and "instances" is empty.
+        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase",
+        "understood", "present", "count", "gaussians", "threshold", "best_view" and "instances" with center, size and
+        axes in world units, and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and
+        "instances" is empty.
 
     Raises:
         QueryError: If a phrase is empty, the view is unknown, or the threshold is not in 0..1.
@@ -275,6 +278,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussians": stages.get("reconstruct", {}).get("gaussians"),
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
+        "segments": language.get("segments"),
         "method": language.get("method"),
         "clip": config.get("clip"),
         "dino": config.get("dino") if method is None or method.uses_dino else "not used",

@@ -13,12 +13,11 @@ import os
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from lexsplat.features.text import TextCache, encode_each
+from lexsplat.features.text import TextCache, TextTower, encode_each, load_text
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
@@ -36,6 +35,7 @@ from lexsplat.queries.relevancy import (
     gaussian_relevancy,
     render_relevancy,
 )
+from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
 from lexsplat.rendering import Rendering, render
@@ -46,9 +46,6 @@ from lexsplat.scenes.answers import Answers, Word
 from lexsplat.scenes.finding import find_in, named_objects, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.reading import read_scene
-
-if TYPE_CHECKING:
-    from lexsplat.features.encoders import ImageTextEncoder
 
 _KEPT_BYTES = 128 << 20
 """Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
@@ -90,7 +87,7 @@ class Scene:
         """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
         self._given_encode_text = encode_text
-        self._encoder: ImageTextEncoder | None = None
+        self._encoder: TextTower | None = None
         self._cache: TextCache | None = None
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
@@ -160,7 +157,7 @@ class Scene:
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
     @property
-    def encoder(self) -> ImageTextEncoder:
+    def encoder(self) -> TextTower:
         """The text encoder that belongs to the language, loaded at first use (`preload`)."""
         return self._load_encoder(self._encoder_hash)
 
@@ -181,11 +178,9 @@ class Scene:
     def _encoder_hash(self) -> str | None:
         return self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
 
-    def _load_encoder(self, known: str | None) -> ImageTextEncoder:
-        from lexsplat.features.encoders import load_clip
-
+    def _load_encoder(self, known: str | None) -> TextTower:
         if self._encoder is None:
-            self._encoder = load_clip(self.clip, str(self.gaussians.device))
+            self._encoder = load_text(self.clip, str(self.gaussians.device))
         if known is not None and self._encoder.content_hash != known:
             raise ModelError(
                 self.clip,
@@ -251,11 +246,13 @@ class Scene:
             QueryError: If a prompt is empty or the view is unknown.
         """
         camera = self.camera(view)
+        if form_used(self.field, self.query) == "segment":
+            return render_gaussian_scores(self.gaussians, camera, self.ask(prompts).scores)
         return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""
-        return gaussian_relevancy(self.field, self.question(prompts))
+        return self.ask(prompts).scores
 
     def thresholds(self, prompts: str | Sequence[str]) -> Tensor:
         """The automatic threshold ``[P]`` of each prompt (`ask`); 0.5 for what the scene does not hold."""
@@ -344,16 +341,17 @@ class Scene:
         question = self.question(prompts)
         scores = gaussian_relevancy(self.field, question)
         presences = self.presence_classifier.classify(question.positives, scores)
+        scores = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
         return [Word(row.clone(), presence) for row, presence in zip(scores, presences)]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
         """The automatic thresholds of words, from one rendering of the training views.
 
-        Relative to everyday words, a relevancy of 0.5 is the border itself.
+        Relative to everyday words and by segments, a score of 0.5 is the border itself.
         """
         question = self.question(list(words))
-        if question.scale is not None:
+        if question.scale is not None or form_used(self.field, self.query) == "segment":
             found = [BORDER] * len(words)
         else:
             views = list(self.views.values())

@@ -115,7 +115,8 @@ class Coloring:
         self._means = gaussians.means.detach().cpu().numpy()
         self._language = language
         self._fixed: dict[str, NDArray[np.uint8]] = {}
-        self._scale = (0.0, 1.0)
+        self.scale = (0.0, 1.0)
+        """The values of the darkest and the brightest color of the last depth or uncertainty image."""
 
     def colors(
         self,
@@ -150,14 +151,9 @@ class Coloring:
         if mode not in MODES:
             raise ValueError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
         if mode not in self._fixed:
-            make = {"language": self._pca, "codes": self._codes, "uncertainty": self._uncertainty}[mode]
-            self._fixed[mode] = make()
+            make = {"codes": self._codes, "uncertainty": self._uncertainty}.get(mode)
+            self._fixed[mode] = make() if make else language_colors(self._language)
         return self._fixed[mode].copy()
-
-    @property
-    def scale(self) -> tuple[float, float]:
-        """The values of the darkest and the brightest color of the last depth or uncertainty image."""
-        return self._scale
 
     def _relevancy(self, layers: Sequence[Layer], opacity: float, fade: float) -> NDArray[np.uint8]:
         result = _faded(self.photo, fade)
@@ -178,9 +174,6 @@ class Coloring:
             result[index] = np.round((1 - weight) * self.photo[index] + weight * marks).astype(np.uint8)
         return result
 
-    def _pca(self) -> NDArray[np.uint8]:
-        return language_colors(self._language)
-
     def _codes(self) -> NDArray[np.uint8]:
         codes, known = likeliest_codes(self._language)
         colors = code_palette(self._language.codebook.num_codes)[codes]
@@ -190,15 +183,15 @@ class Coloring:
     def _uncertainty(self) -> NDArray[np.uint8]:
         values = self._language.uncertainties.detach().cpu().numpy()
         high = max(float(np.percentile(values, 98)) if len(values) else 0.0, 1e-3)
-        self._scale = (0.0, high)
+        self.scale = (0.0, high)
         return colorize(values, 0.0, high)
 
     def _depth(self, eye: NDArray | None) -> NDArray[np.uint8]:
         center = self._means.mean(0) if eye is None else np.asarray(eye, dtype=np.float32)
         distances = np.linalg.norm(self._means - center, axis=1)
         low, high = (float(v) for v in np.percentile(distances, [1, 95])) if len(distances) else (0.0, 1.0)
-        self._scale = (low, max(high, low + 1e-6))
-        return colorize(-distances, -self._scale[1], -self._scale[0])
+        self.scale = (low, max(high, low + 1e-6))
+        return colorize(-distances, -self.scale[1], -self.scale[0])
 
 
 def _faded(colors: NDArray[np.uint8], fade: float) -> NDArray[np.uint8]:

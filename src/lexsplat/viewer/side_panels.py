@@ -64,7 +64,7 @@ class SelectionPanel:
 
 
 class ClickPanel:
-    """ "What is this?": names for the clicked object, and the vocabulary they come from."""
+    """Names for the clicked object, and the vocabulary they come from."""
 
     def __init__(self, gui: viser.GuiApi, panels: Panels) -> None:
         self._panels, self._history = panels, panels.session.history

@@ -17,6 +17,7 @@ from lexsplat.language.fields.rendering import (
     require,
     stored_codebook,
 )
+from lexsplat.language.segments import Segments
 
 
 class CodeField:
@@ -30,6 +31,7 @@ class CodeField:
         weights: Their probabilities ``[N, T]``; rows sum to 1, or to 0 for a Gaussian that no training view shows.
         uncertainties: u_G ``[N]`` in 0..1.
         method: Name of the method that made the field.
+        segments: The segments of the Gaussians; None for a field without.
     """
 
     def __init__(
@@ -40,6 +42,7 @@ class CodeField:
         uncertainties: Tensor,
         *,
         method: str = "averaged",
+        segments: Segments | None = None,
     ) -> None:
         if codes.ndim != 2 or codes.dtype != torch.uint8 or weights.shape != codes.shape:
             raise ValueError(
@@ -54,7 +57,10 @@ class CodeField:
             raise ValueError(f"uncertainties must be [{len(codes)}], got {list(uncertainties.shape)}")
         if codes.numel() and int(codes.max()) >= codebook.num_codes:
             raise ValueError(f"code {int(codes.max())} is not in a codebook of {codebook.num_codes}")
+        if segments is not None and len(segments.labels) != len(codes):
+            raise ValueError(f"segments of {len(codes)} Gaussians expected, got {len(segments.labels)}")
         self.codebook = codebook
+        self.segments = segments
         self.codes = codes
         self.weights = weights.float()
         self.uncertainties = uncertainties.float()
@@ -110,11 +116,13 @@ class CodeField:
             self.weights[index],
             self.uncertainties[index],
             method=self.method,
+            segments=self.segments.select(index) if self.segments else None,
         )
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors; those of the codebook under ``codebook.``."""
         own = {"codes": self.codes, "weights": self.weights, "uncertainties": self.uncertainties}
+        own |= self.segments.tensors() if self.segments else {}
         return {name: value.contiguous() for name, value in own.items()} | codebook_tensors(self.codebook)
 
     def metadata(self) -> dict[str, str]:
@@ -139,4 +147,5 @@ class CodeField:
             tensors["weights"],
             tensors["uncertainties"],
             method=(metadata or {}).get("method", "averaged"),
+            segments=Segments.from_tensors(tensors),
         )

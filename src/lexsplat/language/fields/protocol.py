@@ -9,6 +9,7 @@ from torch import Tensor
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.segments import Segments
 
 
 @runtime_checkable
@@ -20,6 +21,8 @@ class LanguageField(Protocol):
 
     method: str
     codebook: Codebook
+    segments: Segments | None
+    """The segments of the Gaussians; None for a field without."""
 
     @property
     def uncertainties(self) -> Tensor:

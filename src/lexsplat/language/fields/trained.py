@@ -20,6 +20,7 @@ from lexsplat.language.fields.rendering import (
     stored_codebook,
 )
 from lexsplat.language.fields.smoothing import SEMANTIC_CHANNELS, SmoothingMLP, mlp, scene_box
+from lexsplat.language.segments import Segments
 from lexsplat.rendering import PreparedView, render
 
 DECODER_WIDTHS = (128, 256)
@@ -41,6 +42,8 @@ class TrainedField(nn.Module):
         method: Name of the method that made the field.
         generator: Generator of the decoder's initial weights.
     """
+
+    segments: Segments | None = None
 
     def __init__(
         self,

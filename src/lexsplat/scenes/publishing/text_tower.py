@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lexsplat.features.clip import ClipEncoder
+from lexsplat.features.encoders import load_clip
 from lexsplat.queries import everyday, presence
 from lexsplat.runtime.files import save_tensors
 from lexsplat.scenes.scene import Scene
@@ -27,7 +28,7 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
     Returns:
         The entry "text" of the manifest; None if the encoder is not of CLIP's architecture.
     """
-    encoder = scene.encoder
+    encoder = load_clip(scene.clip)
     tower = encoder.text_tower() if isinstance(encoder, ClipEncoder) else None
     if tower is None:
         return None

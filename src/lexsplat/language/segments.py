@@ -1,0 +1,281 @@
+"""A hierarchy of segments in 3D: parts, objects and groups, made from what a build has, without classes or training.
+
+1. Each Gaussian is linked to its nearest neighbors. A link is short where language and color agree.
+2. Felzenszwalb and Huttenlocher 2004 join linked Gaussians to small segments of at least `_SMALLEST` Gaussians: two
+   sets are joined if the link between them is short compared with the links inside both.
+3. Neighboring segments are merged in pairs, the closest in mean language and color first (Ward's criterion with the
+   square root of the masses, which favors small segments less). Cuts through the tree of merges are the levels: each
+   has half as many segments as the one below.
+
+All distances are relative to their mean in the scene, so nothing depends on how narrow an encoder's features are.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.rendering.kernels.jit import kernel
+
+_NEIGHBORS = 10
+_COLOR = 0.2
+"""Weight of the squared difference of colors in the length of a link; that of language is 1."""
+_MERGE_COLOR = 0.25
+"""Weight of the difference of colors between segments; that of language is 1."""
+_TOLERANCE = 4.0
+"""Felzenszwalb and Huttenlocher's k, in median lengths of links."""
+_SMALLEST = 8
+_MOST = 20_000
+"""Number of segments of the lowest level, about, at most; more Gaussians make larger segments."""
+_COARSEST = 20
+"""No level has fewer segments, unless the lowest has."""
+_LINKS_AT_ONCE = 1 << 16
+_PREFIX = "segments."
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """The segments of N Gaussians at L levels; S segments at the lowest one.
+
+    Args:
+        labels: Segment of each Gaussian at the lowest level ``[N]`` int64, in 0..S-1.
+        masses: Visible weight of each Gaussian over the training views ``[N]`` float32, in cells; not negative.
+        levels: Segment at each level of each lowest segment ``[L, S]`` int64, the lowest level first.
+    """
+
+    labels: Tensor
+    masses: Tensor
+    levels: Tensor
+
+    def __post_init__(self) -> None:
+        if self.labels.ndim != 1 or self.masses.shape != self.labels.shape or self.levels.ndim != 2:
+            raise ValueError(
+                f"labels [N], masses [N] and levels [L, S] expected, got {list(self.labels.shape)}, "
+                f"{list(self.masses.shape)}, {list(self.levels.shape)}"
+            )
+        for name, values in (("labels", self.labels), ("levels", self.levels)):
+            if values.numel() and not 0 <= int(values.min()) <= int(values.max()) < self.levels.shape[1]:
+                raise ValueError(f"{name} must be in 0..{self.levels.shape[1] - 1}")
+        if self.masses.numel() and float(self.masses.min()) < 0:
+            raise ValueError("masses must not be negative")
+
+    def select(self, index: Tensor) -> Segments:
+        """The segments of some Gaussians, with the same numbers."""
+        return Segments(self.labels[index], self.masses[index], self.levels)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For safetensors: 4 bytes a Gaussian if there are at most 65,536 segments."""
+        small = self.levels.shape[1] <= 1 << 16
+        return {
+            _PREFIX + "labels": self.labels.to(torch.uint16 if small else torch.int32),
+            _PREFIX + "masses": self.masses.clamp(max=6e4).half(),
+            _PREFIX + "levels": self.levels.to(torch.int32),
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Segments | None:
+        """The inverse of `tensors`; None if there are no segments among them.
+
+        Raises:
+            ValueError: If one of the tensors is missing, or they do not fit each other.
+        """
+        names = ("labels", "masses", "levels")
+        found = {name: tensors[_PREFIX + name] for name in names if _PREFIX + name in tensors}
+        if not found:
+            return None
+        if len(found) < len(names):
+            raise ValueError(f"segments lack {', '.join(name for name in names if name not in found)}")
+        return cls(found["labels"].long(), found["masses"].float(), found["levels"].long())
+
+
+Rows = Callable[[slice | Tensor], Tensor]
+"""Language features of some Gaussians ``[n, D]``, of any length."""
+
+
+def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segments:
+    """The segments of a scene. Runs on the CPU; the result does not depend on the number of threads.
+
+    Args:
+        gaussians: The geometry and colors.
+        features: Their mean language features, 0 where no view shows them.
+        masses: Their visible weights over the training views ``[N]``.
+    """
+    count = len(gaussians)
+    weights = masses.detach().cpu().double().numpy()
+    if count < 2:
+        return Segments(torch.zeros(count, dtype=torch.int64), masses.cpu(), torch.zeros(1, 1).long())
+    colors = (0.5 + SH_C0 * gaussians.sh0[:, 0].detach()).clamp(0, 1).cpu().double().numpy()
+    means = gaussians.means.detach().cpu().double().numpy()
+    first, second = _links(means, min(_NEIGHBORS, count - 1))
+    language = np.concatenate([
+        _language_distances(features, first[start : start + _LINKS_AT_ONCE], second[start : start + _LINKS_AT_ONCE])
+        for start in range(0, len(first), _LINKS_AT_ONCE)
+    ])  # fmt: skip
+    color = ((colors[first] - colors[second]) ** 2).sum(1)
+    lengths = language / max(language.mean(), 1e-12) + _COLOR * color / max(color.mean(), 1e-12)
+    order = np.argsort(lengths, kind="stable")
+    smallest = max(_SMALLEST, count // _MOST)
+    tolerance = _TOLERANCE * float(np.median(lengths))
+    labels = np.unique(
+        join_linked(first, second, lengths, order, tolerance, smallest, count), return_inverse=True
+    )[1]
+    described = _describe(labels, features, colors, weights)
+    segments = int(labels.max()) + 1
+    merges = _merge(*described, labels[first], labels[second])
+    counts = [segments >> level for level in range(32) if level == 0 or segments >> level >= _COARSEST]
+    levels = np.stack([_cut(segments, merges, number) for number in counts])
+    return Segments(torch.from_numpy(labels), masses.detach().cpu().float(), torch.from_numpy(levels))
+
+
+def _links(means: FloatArray, neighbors: int) -> tuple[IntArray, IntArray]:
+    """Pairs of neighboring Gaussians ``[E]``, each once, the smaller index first."""
+    count = len(means)
+    _, found = cKDTree(means).query(means, k=neighbors + 1)
+    pairs = np.stack([np.repeat(np.arange(count), neighbors + 1), found.ravel().astype(np.int64)])
+    pairs = np.sort(pairs[:, pairs[0] != pairs[1]], axis=0)
+    keys = np.unique(pairs[0] * count + pairs[1])
+    return keys // count, keys % count
+
+
+def _language_distances(features: Rows, first: IntArray, second: IntArray) -> FloatArray:
+    """One minus the cosine of the features of linked Gaussians ``[E]``."""
+    rows = [features(torch.from_numpy(index)).cpu().double().numpy() for index in (first, second)]
+    lengths = [np.sqrt(np.einsum("ij,ij->i", one, one)) for one in rows]
+    cosines = np.einsum("ij,ij->i", *rows) / np.maximum(lengths[0] * lengths[1], 1e-12)
+    return np.maximum(1 - cosines, 0.0)
+
+
+@kernel
+def find_root(parents: IntArray, place: int) -> int:
+    """The root of an element, with path halving."""
+    while parents[place] != place:
+        parents[place] = parents[parents[place]]
+        place = parents[place]
+    return place
+
+
+@kernel
+def join_linked(
+    first: IntArray,
+    second: IntArray,
+    lengths: FloatArray,
+    order: IntArray,
+    tolerance: float,
+    smallest: int,
+    count: int,
+) -> IntArray:
+    """Felzenszwalb and Huttenlocher's segments of a graph: the root of each element ``[N]``.
+
+    Args:
+        first: One end of each link ``[E]``.
+        second: The other end ``[E]``.
+        lengths: Lengths of the links ``[E]``.
+        order: Links by length ``[E]``.
+        tolerance: k: a set of n elements accepts links that are longer than its longest by k / n.
+        smallest: Smaller segments are joined with the nearest one afterwards.
+        count: Number of elements N.
+    """
+    parents, sizes, longest = np.arange(count), np.ones(count, np.int64), np.zeros(count)
+    for late in (False, True):
+        for link in order:
+            a, b = find_root(parents, first[link]), find_root(parents, second[link])
+            if a == b:
+                continue
+            accepted = min(longest[a] + tolerance / sizes[a], longest[b] + tolerance / sizes[b])
+            small = sizes[a] < smallest or sizes[b] < smallest
+            if small if late else lengths[link] <= accepted:
+                if sizes[a] < sizes[b]:
+                    a, b = b, a
+                parents[b] = a
+                sizes[a] += sizes[b]
+                longest[a] = lengths[link]
+    return np.array([find_root(parents, place) for place in range(count)])
+
+
+def _describe(
+    labels: IntArray, features: Rows, colors: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean language and color ``[S, D + 3]`` of segments, each scaled by its spread, and their masses ``[S]``."""
+    segments, total = int(labels.max()) + 1, max(float(weights.sum()), 1e-12)
+    masses = np.bincount(labels, weights, segments).astype(np.float64)
+    described = []
+    step = 1 << 14
+
+    def sums(rows: Callable[[slice], FloatArray]) -> tuple[FloatArray, float]:
+        summed, squares = 0.0, 0.0
+        for start in range(0, len(labels), step):
+            part = slice(start, start + step)
+            values, shares = rows(part), weights[part]
+            places = labels[part], np.arange(len(shares))
+            summed = summed + csr_array((shares, places), shape=(segments, len(shares))) @ values
+            squares += float(shares @ np.einsum("ij,ij->i", values, values))
+        return np.asarray(summed), squares
+
+    def unit(part: slice) -> FloatArray:
+        values = features(part).cpu().double().numpy()
+        return values / np.maximum(np.sqrt(np.einsum("ij,ij->i", values, values)), 1e-12)[:, None]
+
+    for rows, weight in ((unit, 1.0), (lambda part: colors[part], _MERGE_COLOR)):
+        summed, squares = sums(rows)
+        spread = squares / total - float(((summed.sum(0) / total) ** 2).sum())
+        means = summed / np.maximum(masses, 1e-12)[:, None]
+        described.append(weight * means / np.sqrt(max(spread, 1e-12)))
+    return np.concatenate(described, 1), masses
+
+
+def _merge(means: FloatArray, masses: FloatArray, first: IntArray, second: IntArray) -> list[tuple[int, int]]:
+    """Merges of neighboring segments, the closest first: merge t joins two nodes to node S + t."""
+    count = len(means)
+    means = np.concatenate([means, np.zeros_like(means)])
+    masses = np.concatenate([masses, np.zeros_like(masses)])
+    neighbors: list[set[int]] = [set() for _ in range(2 * count)]
+    for a, b in np.unique(np.stack([first, second]), axis=1).T.tolist():
+        if a != b:
+            neighbors[a].add(b)
+            neighbors[b].add(a)
+
+    def cost(a: int, b: int) -> float:
+        apart = means[a] - means[b]
+        return float(apart @ apart) * float(masses[a] * masses[b] / max(masses[a] + masses[b], 1e-12)) ** 0.5
+
+    waiting = [(cost(a, b), a, b) for a in range(count) for b in neighbors[a] if a < b]
+    heapq.heapify(waiting)
+    alive, merges = set(range(count)), list[tuple[int, int]]()
+    while waiting:
+        _, a, b = heapq.heappop(waiting)
+        if a not in alive or b not in alive:
+            continue
+        node = count + len(merges)
+        merges.append((a, b))
+        alive.difference_update((a, b))
+        alive.add(node)
+        masses[node] = masses[a] + masses[b]
+        means[node] = (masses[a] * means[a] + masses[b] * means[b]) / max(masses[node], 1e-12)
+        neighbors[node] = (neighbors[a] | neighbors[b]) - {a, b}
+        for other in neighbors[node]:
+            neighbors[other] -= {a, b}
+            neighbors[other].add(node)
+            heapq.heappush(waiting, (cost(other, node), other, node))
+    return merges
+
+
+def _cut(count: int, merges: list[tuple[int, int]], number: int) -> IntArray:
+    """The segment of each of ``count`` lowest segments ``[S]`` after merging down to ``number``, numbered from 0."""
+    parents = np.arange(2 * count)
+    for place, pair in enumerate(merges[: count - number]):
+        parents[list(pair)] = count + place
+    while not np.array_equal(parents, parents[parents]):
+        parents = parents[parents]
+    return np.unique(parents[:count], return_inverse=True)[1]

@@ -1,0 +1,115 @@
+"""Relevancy by segments: whole segments are taken or left (`lexsplat.language.segments`).
+
+Each level of the hierarchy is tried. The score of a segment is the mean of its Gaussians, weighted by what the
+training views show of them. A cut through the sorted scores separates segments that are taken from those that are
+left, in the middle of the widest gap. The level whose gap is widest gives the answer: a mug is taken whole where its
+parts score alike, and its handle alone where only the handle scores high. As long as some level has segments above
+0.5, levels whose taken segments lie below it do not compete: what is taken there resembles the prompt a little more
+than the rest, such as the whole mug for "mug handle".
+
+The result is a score in 0..1 for each Gaussian. It is at least 0.5 exactly for Gaussians of taken segments, so the
+threshold of masks and of selections is 0.5 for every prompt. Dimension letters: P prompts, N Gaussians, L levels,
+S segments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.language.segments import Segments
+
+SEGMENT_THRESHOLD = 0.5
+"""Smallest score of a Gaussian in a taken segment."""
+
+_LOWEST = 0.3
+"""A cut is above this share of the best segment's score."""
+_BORDER = 0.5
+_OWN_SHARE = 0.7
+"""Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
+_STEEPNESS = 8.0
+"""Slope of the score at the cut, relative to the distance between what is taken and what is left."""
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """How one level answers all prompts.
+
+    Args:
+        scores: Scores of its segments ``[P, S]``.
+        masses: Their masses ``[S]``.
+        gaps: Width of the widest gap ``[P]``.
+        limits: Its middle ``[P]``.
+        taken: Mean score of the taken segments ``[P]``.
+        left: Mean score of the others ``[P]``.
+    """
+
+    scores: FloatArray
+    masses: FloatArray
+    gaps: FloatArray
+    limits: FloatArray
+    taken: FloatArray
+    left: FloatArray
+
+
+@torch.no_grad()
+def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
+    """Segment-aware scores from relevancies of Gaussians.
+
+    Args:
+        relevancy: ``[P, N]`` in 0..1.
+        segments: The segments of the N Gaussians.
+
+    Returns:
+        ``[P, N]`` in 0..1, on the device of ``relevancy``; at least `SEGMENT_THRESHOLD` exactly where a segment is
+        taken.
+    """
+    own = relevancy.detach().cpu().double().numpy()
+    if own.shape[1] == 0 or len(own) == 0:
+        return relevancy
+    labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
+    levels = segments.levels.cpu().numpy()
+    lowest = np.stack([_sums(labels, weights * row, levels.shape[1]) for row in own])
+    masses = _sums(labels, weights, levels.shape[1])
+    cuts = [_cut(lowest, masses, level) for level in levels]
+    result = np.empty_like(own)
+    for prompt in range(len(own)):
+        # Coarse levels first: of equal gaps the first one wins.
+        keys = [(cut.taken[prompt] >= _BORDER, cut.gaps[prompt]) for cut in reversed(cuts)]
+        place = len(cuts) - 1 - max(range(len(cuts)), key=lambda key: (keys[key], -key))
+        cut = cuts[place]
+        of_segment = cut.scores[prompt][levels[place]][labels]
+        limit, spread = cut.limits[prompt], max(cut.taken[prompt] - cut.left[prompt], 1e-6)
+        blended = _OWN_SHARE * own[prompt] + (1 - _OWN_SHARE) * of_segment
+        steep = 1 / (1 + np.exp(-np.clip((blended - limit) * _STEEPNESS / spread, -60, 60)))
+        result[prompt] = SEGMENT_THRESHOLD * (of_segment >= limit) + (1 - SEGMENT_THRESHOLD) * steep
+    return torch.from_numpy(result).to(relevancy)
+
+
+def _cut(lowest: FloatArray, lowest_masses: FloatArray, level: NDArray[np.int64]) -> _Cut:
+    """The widest gap between the scores of the segments of a level, for each prompt."""
+    count = int(level.max()) + 1
+    masses = _sums(level, lowest_masses, count)
+    sums = np.stack([_sums(level, row, count) for row in lowest])
+    scores = sums / np.maximum(masses, 1e-12)
+    order = np.argsort(-scores, axis=1, kind="stable")
+    ranked = np.take_along_axis(scores, order, 1)
+    if count == 1:
+        return _Cut(scores, masses, np.zeros(len(scores)), ranked[:, 0], ranked[:, 0], np.zeros(len(scores)))
+    gaps = np.where(ranked[:, :-1] >= _LOWEST * ranked[:, :1], ranked[:, :-1] - ranked[:, 1:], -1.0)
+    best = gaps.argmax(1)[:, None]
+    limits = (np.take_along_axis(ranked[:, :-1], best, 1) + np.take_along_axis(ranked[:, 1:], best, 1)) / 2
+    taken = scores >= limits
+    means = [(sums * side).sum(1) / np.maximum((masses * side).sum(1), 1e-12) for side in (taken, ~taken)]
+    return _Cut(scores, masses, np.take_along_axis(gaps, best, 1)[:, 0], limits[:, 0], *means)
+
+
+def _sums(places: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
+    """Sums of the values ``[M]`` at each of ``count`` places, in the order of the values."""
+    return np.bincount(places, values, count).astype(np.float64)

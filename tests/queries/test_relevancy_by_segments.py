@@ -1,0 +1,103 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from support.question_scene import coded_cloud, texts
+
+from lexsplat.language.segments import Segments
+from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy
+from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
+from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
+from lexsplat.rendering import render
+
+# A mug of body (segments 0, 1) and handle (2), a table (3, 4) and a wall (5); 4 Gaussians each.
+LEVELS = torch.tensor([[0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 2]])
+LABELS = torch.arange(6).repeat_interleave(4)
+
+
+def taken(scores, masses=None) -> list[bool]:
+    """Whether each of the 6 lowest segments is taken for scores of segments ``[6]``."""
+    segments = Segments(LABELS, torch.ones(24) if masses is None else masses, LEVELS)
+    found = segment_relevancy(torch.tensor(scores).repeat_interleave(4)[None], segments)[0]
+    sides = (found >= SEGMENT_THRESHOLD).view(6, 4)
+    assert torch.equal(sides.all(1), sides.any(1))
+    return sides.any(1).tolist()
+
+
+def test_whole_things_are_taken_where_their_parts_score_alike():
+    assert taken([0.9, 0.8, 0.6, 0.2, 0.1, 0.1]) == [True, True, True, False, False, False]
+
+
+def test_a_part_is_taken_alone_where_only_the_part_exceeds_half():
+    assert taken([0.3, 0.3, 0.8, 0.05, 0.0, 0.0]) == [False, False, True, False, False, False]
+
+
+def test_something_is_taken_where_nothing_exceeds_half():
+    assert taken([0.35, 0.4, 0.45, 0.1, 0.1, 0.1]) == [True, True, True, False, False, False]
+
+
+def test_a_gaussian_follows_its_segment():
+    own = torch.tensor([0.9, 0.8, 0.9, 0.2] + [0.1] * 20)[None]
+    segments = Segments(LABELS, torch.ones(24), LEVELS[:1])
+    assert (segment_relevancy(own, segments) >= SEGMENT_THRESHOLD)[0].tolist() == [True] * 4 + [False] * 20
+
+
+def test_unseen_gaussians_follow_but_have_no_say():
+    masses = torch.ones(24)
+    masses[1:4] = 0
+    own = torch.tensor([0.9, 0.0, 0.0, 0.0] + [0.1] * 20)[None]
+    segments = Segments(LABELS, masses, LEVELS[:1])
+    assert (segment_relevancy(own, segments) >= SEGMENT_THRESHOLD)[0].tolist() == [True] * 4 + [False] * 20
+
+
+def test_scores_stay_in_range_and_do_not_depend_on_the_other_prompts():
+    own = torch.rand(5, 24, generator=torch.Generator().manual_seed(0))
+    segments = Segments(LABELS, torch.rand(24, generator=torch.Generator().manual_seed(1)), LEVELS)
+    together = segment_relevancy(own, segments)
+    assert float(together.min()) >= 0
+    assert float(together.max()) <= 1
+    assert torch.equal(together, torch.cat([segment_relevancy(row[None], segments) for row in own]))
+
+
+def test_the_cut_is_the_widest_gap_of_means_by_hand():
+    generator = np.random.default_rng(3)
+    own, masses = generator.random(24), generator.random(24)
+    means = [np.average(own[k == LABELS], weights=masses[k == LABELS]) for k in range(6)]
+    ranked = sorted(means, reverse=True)
+    gaps = [(a - b, (a + b) / 2) for a, b in itertools.pairwise(ranked) if a >= 0.3 * ranked[0]]
+    expected = [mean >= max(gaps)[1] for mean in means]
+    segments = Segments(LABELS, torch.from_numpy(masses).float(), LEVELS[:1])
+    found = (
+        segment_relevancy(torch.from_numpy(own)[None], segments)[0].view(6, 4).amin(1) >= SEGMENT_THRESHOLD
+    )
+    assert found.tolist() == expected
+
+
+@pytest.mark.parametrize("form", ["code", "feature", "segment"])
+def test_absent_prompts_and_other_forms_keep_the_scores_of_gaussians(form):
+    field, *_ = coded_cloud()
+    count = len(field.codes)
+    field.segments = Segments(torch.arange(count) % 3, torch.ones(count), torch.tensor([[0, 1, 2]]))
+    query = QueryConfig(form=form)
+    plain = gaussian_relevancy(field, Question(texts(3, 16, 5), texts(4, 16, 6), query))
+    scores = scores_in_form(field, query, plain, ("no", "yes", "unsure"))
+    same = [torch.equal(*pair) for pair in zip(plain, scores)]
+    assert same == ([True, False, False] if form == "segment" else [True] * 3)
+
+
+def test_a_field_without_segments_answers_by_gaussians():
+    field, *_ = coded_cloud()
+    query = QueryConfig()
+    plain = gaussian_relevancy(field, Question(texts(2, 16, 5), texts(4, 16, 6), query))
+    assert form_used(field, query) == "code"
+    assert torch.equal(scores_in_form(field, query, plain, ("yes", "yes")), plain)
+
+
+def test_the_map_is_the_rendering_of_the_scores():
+    _, gaussians, camera = coded_cloud()
+    scores = torch.rand(40, len(gaussians), generator=torch.Generator().manual_seed(0))
+    found = render_gaussian_scores(gaussians, camera, scores)
+    for place in (0, 17, 39):  # more prompts than are rendered at once
+        alone = render(gaussians, camera, features=scores[place][:, None], color=False).features[..., 0]
+        torch.testing.assert_close(found[place], alone.detach().clamp(0, 1))
