@@ -46,7 +46,8 @@ def chromium() -> Iterator:
 
 def open_page(browser, address: str, width: int = 480, height: int = 360, script: str = ""):
     """A page that has started or failed; ``page.requested`` and ``page.complaints`` are filled."""
-    page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion="reduce")
+    size = {"width": width, "height": height}
+    page = browser.new_page(viewport=size, reduced_motion="reduce", color_scheme="dark")
     page.set_default_timeout(60_000)
     page.requested, page.complaints = [], []
     page.on("request", lambda request: page.requested.append(request.url))

@@ -21,7 +21,7 @@ interface Matrix {
   columns: number;
 }
 
-/** The tensors of a safetensors file: half precision becomes float32, 8-bit weights stay and have factors. */
+/** The tensors of a safetensors file: float32, or 8-bit weights with factors. */
 export function readSafetensors(content: Uint8Array<ArrayBuffer>): Map<string, Matrix> {
   const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
   const length = Number(view.getBigUint64(0, true));
@@ -34,23 +34,12 @@ export function readSafetensors(content: Uint8Array<ArrayBuffer>): Map<string, M
     if (name === "__metadata__") continue;
     const [start, end] = entry.data_offsets.map((offset) => offset + 8 + length);
     const bytes = content.slice(start, end).buffer;
-    const data =
-      entry.dtype === "F16" ? fromHalf(new Uint16Array(bytes)) : entry.dtype === "I8" ? new Int8Array(bytes) : new Float32Array(bytes);
+    const data = entry.dtype === "I8" ? new Int8Array(bytes) : new Float32Array(bytes);
     const columns = entry.shape.at(-1) ?? 1;
     tensors.set(name, { data, factors: null, rows: data.length / columns, columns });
   }
   for (const [name, tensor] of tensors) tensor.factors = (tensors.get(`${name}.factor`)?.data as Float32Array) ?? null;
   return tensors;
-}
-
-function fromHalf(halves: Uint16Array): Float32Array {
-  return Float32Array.from(halves, (half) => {
-    const sign = half & 0x8000 ? -1 : 1;
-    const exponent = (half >> 10) & 31;
-    const fraction = half & 1023;
-    if (exponent === 31) return fraction ? NaN : sign * Infinity;
-    return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
-  });
 }
 
 const QUICK_GELU = (x: number): number => x / (1 + Math.exp(-1.702 * x));
