@@ -1,19 +1,16 @@
-"""3D selections against exact ground truth, and the calibration of presence.
+"""3D selections and presence against exact ground truth.
 
 Ground truth is index maps and depth of each view (``FOLDER/truth/VIEW.npz`` and ``FOLDER/cameras.json``, written by
 tools/demo_scene), lifted to Gaussians and boxes (`selection_ground_truth`). The indices of a prompt are derived from
 the masks of the capture.
 
-    python benchmarks/selection.py --calibrate SECOND_SCENE --ground-truth-of SECOND_SCENE=RENDERS/second \\
-        --scene output/demo --ground-truth-of output/demo=RENDERS/tabletop
+    python benchmarks/selection.py --scene output/demo --ground-truth-of output/demo=RENDERS/tabletop
 
-Presence is calibrated on ``--calibrate`` only and reported on the scenes of ``--scene``. Prints JSON; ``calibration``
-holds the values of ``CALIBRATION`` in src/lexsplat/queries/presence.py.
+Prints JSON.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -29,12 +26,10 @@ from selection_ground_truth import (
     surface_points,
     true_box,
 )
-from sklearn.linear_model import LogisticRegression
 
 import lexsplat
 from lexsplat.geometry.boxes import gravity_up
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, Camera
-from lexsplat.queries.presence import CALIBRATION, Calibration, Evidence
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant", "table lamp",
@@ -54,7 +49,6 @@ COLORS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", 
 
 def main() -> None:
     parser = argument_parser(__doc__)
-    parser.add_argument("--calibrate", type=Path)
     parser.add_argument("--scene", type=Path, action="append", default=[])
     parser.add_argument("--ground-truth-of", action="append", default=[], metavar="SCENE=FOLDER")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th view of the ground truth")
@@ -63,15 +57,10 @@ def main() -> None:
     pairs = (item.split("=", 1) for item in options.ground_truth_of)
     ground_truths = {Path(key): Path(value) for key, value in pairs}
     result: dict = {"scenes": {}}
-    calibration = CALIBRATION
-    if options.calibrate and options.only != "accuracy":
-        present, absent, _ = evidence(options.calibrate, ground_truths[options.calibrate])
-        calibration = fit_calibration(list(present.values()), list(absent.values()))
-        result["calibration"] = dataclasses.asdict(calibration)
-    for folder in dict.fromkeys([*([options.calibrate] if options.calibrate else []), *options.scene]):
+    for folder in dict.fromkeys(options.scene):
         measured = result["scenes"].setdefault(str(folder), {})
         if options.only != "accuracy":
-            measured["presence"] = presence(folder, ground_truths[folder], calibration)
+            measured["presence"] = presence(folder, ground_truths[folder])
         if options.only != "presence":
             measured["accuracy"] = accuracy(folder, ground_truths[folder], options.stride)
     print(json.dumps(result, indent=1))
@@ -88,38 +77,6 @@ def table_rows(result: dict) -> list[dict]:
                 row[f"{group}: yes / unsure / no"] = f"{found['yes']} / {found['unsure']} / {found['no']}"
         rows.append(row)
     return rows
-
-
-def fit_calibration(
-    present: list[Evidence], absent: list[Evidence], *, recall: float = 0.9, false_positives: float = 0.1
-) -> Calibration:
-    """Logistic regression with balanced classes and slight shrinkage, and limits from the phrases themselves.
-
-    "no" ends where ``recall`` of the present phrases lies above; "yes" begins where at most ``false_positives`` of
-    the absent ones lie above. If these cross, both are their mean, and nothing is "unsure". A negative weight is
-    fitted to chance, as more evidence never counts against a phrase: its term is dropped and the others fitted again.
-    """
-    if not present or not absent:
-        raise ValueError("a calibration needs phrases that are present and phrases that are absent")
-    x = np.array([evidence.values()[1:] for evidence in (*present, *absent)])
-    y = np.array([1] * len(present) + [0] * len(absent))
-    used, weights = [0, 1, 2], np.zeros(3)
-    while True:
-        model = LogisticRegression(C=10, class_weight="balanced", tol=1e-10, max_iter=10_000)
-        found = model.fit(x[:, used], y).coef_[0]
-        if (found >= 0).all() or len(used) == 1:
-            break
-        used = [place for place, weight in zip(used, found) if weight >= 0]
-    weights[used] = found.clip(min=0)
-    p = 1 / (1 + np.exp(-(x @ weights + model.intercept_[0])))
-    low = float(np.quantile(p[y == 1], 1 - recall))
-    high = float(np.quantile(p[y == 0], 1 - false_positives))
-    if high <= low:
-        low = high = (low + high) / 2
-    height, rank, peak = (round(float(w), 3) for w in weights)
-    return Calibration(
-        round(float(model.intercept_[0]), 3), height, rank, yes=round(high, 3), no=round(low, 3), peak=peak
-    )
 
 
 def capture_folder(scene: lexsplat.Scene) -> Path:
@@ -143,33 +100,29 @@ def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
     classifier = scene.presence_classifier
 
     def of(phrases: list[str]) -> dict:
-        return {phrase: classifier.evidence(scores) for phrase, scores in zip(phrases, scene.scores(phrases))}
+        found = classifier.evidence(scene.embed(phrases), scene.scores(phrases))
+        return dict(zip(phrases, found))
 
     return of(prompts), of(absent), of(recolored)
 
 
-def presence(folder: Path, ground_truth: Path, calibration) -> dict:
+def presence(folder: Path, ground_truth: Path) -> dict:
     groups = zip(("present", "absent", "wrong color"), evidence(folder, ground_truth))
     answer = {}
     for name, found in groups:
-        decisions = {phrase: calibration.classify(e) for phrase, e in found.items()}
+        decisions = {phrase: e.presence for phrase, e in found.items()}
         answer[name] = {
             "phrases": len(decisions),
             **{word: sum(v == word for v in decisions.values()) for word in ("yes", "unsure", "no")},
             "each": {
-                p: [decisions[p], round(e.height, 2), round(e.rank, 2), round(e.peak, 3)]
+                p: [decisions[p], round(e.strength, 3), round(e.ratio, 3), round(e.height, 3)]
                 for p, e in found.items()
             },
         }
-    present = [calibration.probability(e) for e in evidence_values(answer["present"])]
-    absent = [calibration.probability(e) for e in evidence_values(answer["absent"])]
+    present, absent = ([row[1] for row in answer[name]["each"].values()] for name in ("present", "absent"))
     limit = float(np.quantile(present, 0.1))
     answer["false positives at 90 % recall"] = round(float(np.mean(np.array(absent) >= limit)), 3)
     return answer
-
-
-def evidence_values(group: dict):
-    return [Evidence(*numbers) for _, *numbers in group["each"].values()]
 
 
 def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:

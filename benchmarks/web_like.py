@@ -4,8 +4,8 @@
 
 The last layers of the bundled CLIP are replaced (`make_web_like`): what images and texts share is scaled down, each
 tower gets a common direction and directions that the other tower lacks, and each word an offset. The result is an
-ordinary folder of transformers for ``--clip FOLDER``. It knows what the bundled encoder knows, in a narrow cone: what a
-scene loses with it is lost to numbers that suit one encoder only. Prints the cosines that are reached beside `Facts`.
+ordinary folder of transformers for ``--clip FOLDER``. It knows what the bundled encoder knows, in a narrow cone: what
+a scene loses with it is lost to numbers that suit one encoder only. Prints the cosines that are reached.
 """
 
 from __future__ import annotations
@@ -29,17 +29,20 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import model_folder
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
 
-NOUNS = tuple(
-    "chair bed window door computer telephone clock shoe hat umbrella bicycle airplane horse dog cat fish elephant pizza "
-    "cake carrot knife guitar piano hammer scissors key bridge castle river cloud person television tree bread spoon "
-    "basket drum camera pillow curtain mirror glove backpack suitcase train ship".split()
-)
+NOUNS = (
+    "chair", "bed", "window", "door", "computer", "telephone", "clock", "shoe", "hat", "umbrella", "bicycle",
+    "airplane", "horse", "dog", "cat", "fish", "elephant", "pizza", "cake", "carrot", "knife", "guitar",
+    "piano", "hammer", "scissors", "key", "bridge", "castle", "river", "cloud", "person", "television", "tree",
+    "bread", "spoon", "basket", "drum", "camera", "pillow", "curtain", "mirror", "glove", "backpack",
+    "suitcase", "train", "ship",
+)  # fmt: skip
 """Things that no bundled scene holds."""
-KINDS = tuple(
-    "apple,rubber duck,mug,stack of books,vase,ring,traffic cone,potted plant,table lamp,banana,teddy bear,striped ball,"
-    "bowl,candle,green bottle,pumpkin,toy car,wooden crate,table,cloth,wall,red apple,blue mug,gold ring,fruit,"
-    "something made of metal,something to drink from,mug handle,bear nose".split(",")
-)
+KINDS = (
+    "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant",
+    "table lamp", "banana", "teddy bear", "striped ball", "bowl", "candle", "green bottle", "pumpkin",
+    "toy car", "wooden crate", "table", "cloth", "wall", "red apple", "blue mug", "gold ring", "fruit",
+    "something made of metal", "something to drink from", "mug handle", "bear nose",
+)  # fmt: skip
 """Phrases of the kind that the bundled encoder knows."""
 
 
@@ -88,8 +91,8 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     """Save an encoder with the statistics of a web-trained CLIP as a folder of transformers.
 
     An image is ``Q (s x + a e + p y)``: x is the bundled embedding, e a constant, y its private directions, and Q a
-    random rotation. A text is the same with its own constants, and with an offset along the images' constant: a linear
-    function of its hidden state.
+    random rotation. A text is the same with its own constants, and with an offset along the images' constant, a
+    linear function of its hidden state.
 
     Args:
         folder: Where it is written.
@@ -109,29 +112,16 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     x, t = image.unit(sample.things), text.unit(sample.phrases)
     signal = float((x * t).sum(1).mean() - (x @ text.unit(sample.kinds).T).mean())
     shares_image = _shares(0.5, facts.images, image.unit(sample.crops))
-    shares_text = _shares((facts.matched - facts.unmatched) / signal / 0.5, facts.texts, text.unit(sample.nouns))
+    shares_text = _shares(
+        (facts.matched - facts.unmatched) / signal / 0.5, facts.texts, text.unit(sample.nouns)
+    )
     dim, width = x.shape[1], x.shape[1] + 2 + 2 * private
     rotation = torch.linalg.qr(torch.randn(width, width, generator=draw, dtype=torch.float64))[0]
     rows = torch.zeros(width, image.size, dtype=torch.float64)
     rows[:dim] = shares_image[0] * image.shared
     rows[dim] = shares_image[1] * image.constant
     rows[dim + 2 : dim + 2 + private] = shares_image[2] * image.private(private, draw)
-    own = text.private(private, draw)
-    offsets = text.private(1, draw) * facts.offset * (facts.matched - facts.unmatched)
-    # The part of texts along the images' constant sets every level; normalization couples the levels, so they are
-    # corrected until they hold.
-    level = {"matched": facts.matched, "unmatched": facts.unmatched, "canonical": facts.canonical}
-    wanted, words = dict(level), torch.zeros(width, text.size, dtype=torch.float64)
-    for _ in range(60):
-        along = (_along(text, sample, level) + offsets[0]) / shares_image[1]
-        mean = float((texts @ along).mean())
-        words[:dim] = shares_text[0] * text.shared
-        words[dim] = along
-        words[dim + 1] = math.sqrt(max(0.0, shares_text[1] ** 2 - mean**2)) * text.constant
-        words[dim + 2 + private :] = shares_text[2] * own
-        reached = _levels(rows, words, sample)
-        print(reached) if _ in (5,20,59) else None
-        level = {name: level[name] + 0.7 * (wanted[name] - reached[name]) for name in level}
+    words = _text_rows(text, sample, facts, shares_text, rows, (dim, private), draw)
     model.visual_projection, model.text_projection = _layer(rotation @ rows), _layer(rotation @ words)
     model.config.projection_dim = width
     model.save_pretrained(folder)
@@ -168,6 +158,37 @@ class _Tower:
         rows = torch.randn(count, self.size, generator=draw, dtype=torch.float64) @ whiten.T
         spread = (self.centered @ rows.T).square().mean(0).sqrt()
         return self.affine(rows / spread[:, None] / math.sqrt(count), torch.zeros(count, dtype=torch.float64))
+
+
+# The image tower, its dimensions and the facts, which the text tower has to agree with.
+def _text_rows(
+    text: _Tower,
+    sample: Sample,
+    facts: Facts,
+    shares: tuple[float, float, float],
+    rows: Tensor,
+    dims: tuple[int, int],
+    draw: torch.Generator,
+) -> Tensor:
+    """The text tower's projection that reaches the levels of ``facts`` beside the image tower's ``rows``."""
+    dim, private = dims
+    own = text.private(private, draw)
+    offsets = text.private(1, draw) * facts.offset * (facts.matched - facts.unmatched)
+    common = float(rows[dim] @ sample.crops.mean(0))
+    # The part of texts along the images' constant sets every level; normalization couples the levels, so they are
+    # corrected until they hold.
+    level = {"matched": facts.matched, "unmatched": facts.unmatched, "canonical": facts.canonical}
+    wanted, words = dict(level), torch.zeros(len(rows), text.size, dtype=torch.float64)
+    for _ in range(60):
+        along = (_along(text, sample, level) + offsets[0]) / common
+        mean = float((text.hidden @ along).mean())
+        words[:dim] = shares[0] * text.shared
+        words[dim] = along
+        words[dim + 1] = math.sqrt(max(0.0, shares[1] ** 2 - mean**2)) * text.constant
+        words[dim + 2 + private :] = shares[2] * own
+        reached = _levels(rows, words, sample)
+        level = {name: level[name] + 0.7 * (wanted[name] - reached[name]) for name in level}
+    return words
 
 
 def _shares(shared: float, level: float, unit: Tensor) -> tuple[float, float, float]:
@@ -219,12 +240,17 @@ def _sample(encoder: ClipEncoder, seed: int = 0) -> Sample:
         return model.vision_model(pixel_values=(pixels - encoder._mean) / encoder._std).pooler_output.double()
 
     def texts(words: list[str]) -> Tensor:
-        return torch.cat([model.text_model(**encoder._text_inputs([w])).pooler_output for w in words]).double()
+        return torch.cat(
+            [model.text_model(**encoder._text_inputs([w])).pooler_output for w in words]
+        ).double()
 
     canonical = texts(list(CANONICAL_PHRASES))
     seen = images(things)
     towers = model.visual_projection.weight.double(), model.text_projection.weight.double()
-    near = (nn.functional.normalize(seen @ towers[0].T, dim=1) @ nn.functional.normalize(canonical @ towers[1].T, dim=1).T)
+    near = (
+        nn.functional.normalize(seen @ towers[0].T, dim=1)
+        @ nn.functional.normalize(canonical @ towers[1].T, dim=1).T
+    )
     nearest = int(near.mean(0).argmax())  # the bundled encoder knows "object"; the others are nouns to it
     others = [row for row in range(len(canonical)) if row != nearest]
     return Sample(
@@ -240,10 +266,14 @@ def _sample(encoder: ClipEncoder, seed: int = 0) -> Sample:
 def _crops(rng: np.random.Generator, side: int) -> tuple[Tensor, Tensor, list[str]]:
     """Random crops, crops at the middle of each mask, and the prompts of these."""
     root = demo_capture("second")
-    photos = {path.stem: np.asarray(Image.open(path).convert("RGB")) for path in sorted(root.glob("images/*"))}
+    photos = {
+        path.stem: np.asarray(Image.open(path).convert("RGB")) for path in sorted(root.glob("images/*"))
+    }
 
     def crop(photo: np.ndarray, x: int, y: int, size: int) -> Tensor:
-        part = Image.fromarray(photo[y : y + size, x : x + size]).resize((side, side), Image.Resampling.BICUBIC)
+        part = Image.fromarray(photo[y : y + size, x : x + size]).resize(
+            (side, side), Image.Resampling.BICUBIC
+        )
         return torch.from_numpy(np.asarray(part, np.float32) / 255).permute(2, 0, 1)
 
     crops = []
@@ -287,10 +317,8 @@ def measure(folder: Path) -> dict[str, float]:
         "unmatched, known kinds": (x @ kinds.T).mean(),
         "canonical": (m @ canonical.T).amax(1).mean(),
         "matched over canonical": (matched > (m @ canonical.T).amax(1)).float().mean(),
-        "each canonical": 0,
         "spread of nouns": (x @ nouns.T).mean(0).std(),
     }
-    print((m@canonical.T).mean(0), (x@encoder.encode_text("zebra sofa carpet truck microphone yarn lobster tractor violin perfume".split()).T).mean(0))
     return {name: round(float(value), 4) for name, value in found.items()}
 
 

@@ -278,27 +278,8 @@ def test_siglip_loads_with_its_tokenizer_of_sentencepiece(tmp_path):
     spm = pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
     from transformers import SiglipConfig, SiglipModel
 
-    words, model = (
-        [
-            "an",
-            "apple",
-            "a",
-            "wooden",
-            "table",
-            "blue",
-            "sky",
-            "a",
-            "car",
-            "red",
-            "mug",
-            "the",
-            "books",
-            "green",
-            "bottle",
-        ],
-        io.BytesIO(),
-    )
-    lines, options = iter([" ".join(words)] * 50), {"hard_vocab_limit": False, "minloglevel": 5}
+    words, model = "an apple a wooden table blue sky a car red mug the books", io.BytesIO()
+    lines, options = iter([words] * 50), {"hard_vocab_limit": False, "minloglevel": 5}
     spm.SentencePieceTrainer.train(
         sentence_iterator=lines,
         model_writer=model,

@@ -120,7 +120,7 @@ def test_the_time_of_the_features_is_told_first(clip_folder, tmp_path, caplog):
         check_encoders(config, tmp_path, 50, (400, 300))
     # Crops of 60 pixels every 30 or less: 13 x 9. Crops of 120 every 60 or less: 6 x 4.
     assert "features on cpu: 141 crops and about" in caplog.text
-    assert "for 50 photos" in caplog.text
+    assert "for 50 training photos" in caplog.text
     assert "words match bundled pictures by" in caplog.text, "random weights match no words"
 
 
@@ -149,7 +149,7 @@ def test_a_build_that_stops_for_its_encoder_goes_on_from_what_was_finished(
         build(tiny_capture, tmp_path / "scene", config, listener=stop)
     assert list(SceneFolder.open(tmp_path / "scene").record["stages"]) == ["reconstruct"]
     stored = list((tmp_path / "scene" / "checkpoints" / "features").glob("*.safetensors"))
-    views = len(load_capture(tiny_capture).views)
+    views = len(load_capture(tiny_capture).train_names)
     assert 0 < len(stored) < views
     first, kept = [], {}
     color_encoder.install(monkeypatch)

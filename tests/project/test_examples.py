@@ -61,6 +61,13 @@ def test_05_builds_a_scene(run, tmp_path):
     assert (tmp_path / "scene" / "language.safetensors").exists()
 
 
+def test_06_asks_while_it_moves(tmp_path):
+    output = run("06_robot.py", tmp_path)
+    assert "red apple: yes: red apple at" in output
+    assert "toy closest to me: yes" in output
+    assert "of 20 answers were late" in output
+
+
 def test_every_example_is_listed_and_tested():
     listed = (EXAMPLES / "README.md").read_text()
     tested = Path(__file__).read_text()

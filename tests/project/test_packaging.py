@@ -14,6 +14,7 @@ else:
 
 REPOSITORY = Path(__file__).parents[2]
 DATA = REPOSITORY / "src" / "lexsplat"
+PAGE = ("LICENSES.txt", "index.html", "page.css", "page.js", "words.txt")
 
 
 def patterns() -> list[str]:
@@ -26,7 +27,7 @@ def packaged(root: Path) -> set[str]:
     return {path.relative_to(root).as_posix() for path in found}
 
 
-def test_every_file_of_the_demo_and_every_template_is_packaged():
+def test_every_file_of_the_demo_of_the_page_and_every_template_is_packaged():
     bundled = {
         path.relative_to(DATA).as_posix()
         for path in (DATA / "demo").rglob("*")
@@ -37,7 +38,8 @@ def test_every_file_of_the_demo_and_every_template_is_packaged():
     }
     assert len(bundled) > 400
     templates = {path.relative_to(DATA).as_posix() for path in DATA.rglob("templates/*.*")}
-    assert bundled | templates | {"py.typed"} == packaged(DATA)
+    page = {f"scenes/publishing/page/{name}" for name in PAGE}
+    assert bundled | templates | page | {"py.typed", "queries/everyday_words.txt"} == packaged(DATA)
 
 
 def test_package_data_take_less_than_38_megabytes():

@@ -76,9 +76,10 @@ def test_a_no_has_no_instances_and_says_so(demo):
     assert not demo.scene.find("is there a bicycle?")
 
 
+@pytest.mark.slow
 def test_threads_get_the_answers_of_a_single_one(demo):
     phrases = ["red apple", "toys", "what is on the cloth?", "vase left of the bear", "pumpkin", "mugs"]
-    alone = {phrase: open_scene("demo").find(phrase).mask for phrase in phrases[:3]}
+    alone = {phrase: demo.scene.find(phrase).mask for phrase in phrases}
     scene, found, failed = open_scene("demo"), [], []
 
     def ask(number):
@@ -96,9 +97,10 @@ def test_threads_get_the_answers_of_a_single_one(demo):
     assert not failed
     assert len(found) == 24
     for phrase, mask in found:
-        assert torch.equal(mask, alone.get(phrase, scene.find(phrase).mask))
+        assert torch.equal(mask, alone[phrase])
 
 
+@pytest.mark.slow
 def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(demo, monkeypatch):
     from lexsplat.queries.relevancy import QueryConfig
     from lexsplat.scenes import scene as module
@@ -115,6 +117,7 @@ def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(demo, monkeypa
     assert not torch.equal(scene.ask("mug").scores, first.scores)
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_rebuilt_moved_or_deleted_while_it_is_asked(tmp_path):
     folder = tmp_path / "scene"
     shutil.copytree(BUNDLED_SCENE, folder)

@@ -27,6 +27,8 @@ class BallScene(Scene):
                 row[31 if text in CANONICAL_PHRASES else 5 + sum(text.encode()) % 26] = 1
         return rows
 
+    encoder = property(lambda self: self)
+
     def preload(self) -> None:
         pass
 

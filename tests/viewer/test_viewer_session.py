@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from PIL import Image
 from support.viewer_scene import WORDS, ball_scene
 
+from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import QueryError
 from lexsplat.viewer import pages
 from lexsplat.viewer.history import MAX_PROMPTS, History
 from lexsplat.viewer.recording import encode_png, encode_video, orbit
 from lexsplat.viewer.session import MAX_QUESTIONS, Session, is_plain
-from lexsplat.viewer.vocabulary import MAX_PHRASES, clean_phrases, default_vocabulary, suggestions
+from lexsplat.viewer.vocabulary import MAX_PHRASES, clean_phrases, suggestions
 
 
 @pytest.fixture(scope="module")

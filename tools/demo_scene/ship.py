@@ -47,7 +47,9 @@ def main() -> None:
             folder = build(demo_capture(), work, config, listener=bars)
             quality = evaluate_scene(open_scene(work, device="cpu"), listener=bars)
         BUNDLED_SCENE.mkdir(parents=True, exist_ok=True)
-        texts = Path("checkpoints") / "texts"  # embeddings of everyday words: a question needs no other encoding
+        texts = (
+            Path("checkpoints") / "texts"
+        )  # embeddings of everyday words: a question needs no other encoding
         shutil.copytree(work / texts, BUNDLED_SCENE / texts, dirs_exist_ok=True)
         for name in KEPT:
             shutil.copyfile(work / name, BUNDLED_SCENE / name)

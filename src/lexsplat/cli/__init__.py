@@ -42,6 +42,7 @@ COMMANDS = {
     "compare": CommandEntry("compare", "Compare", "measure several methods side by side"),
     "edit": CommandEntry("edit", "Edit", "delete, recolor, move or duplicate things by words"),
     "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
+    "publish": CommandEntry("publish", "Publish", "write a page that searches a scene with no server"),
     "view": CommandEntry("view", "View", "show and search a scene in the browser"),
     "encoders": CommandEntry(
         "encoders", "EncodersCommand", "fetch, check and time encoders before a long build"

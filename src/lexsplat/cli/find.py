@@ -20,9 +20,9 @@ from lexsplat.cli.options import (
 class Find:
     """Find things in 3D: where they are, how large, how many, and whether the scene has them at all.
 
-    Phrases may relate things: "mug on the cloth", "largest book", "fruit but not the banana", "how many apples",
-    "chair next to the table" (left of, right of, in front of, behind, on, under, above, below, inside, next to,
-    nearest to). Quotation marks inside the phrase keep words together. Positions are in the units of the scene; sizes
+    Ask in your own words: "mug on the cloth", "what is between the mug and the books?", "largest toy", "two apples",
+    "which fruit is closest to me?" (docs/selection.md). What was understood is printed with the answer. Quotation
+    marks inside the phrase keep words together. Positions are in the units of the scene; sizes
     are in meters once the scale is known (see lexsplat scale).
 
     Args:
@@ -64,13 +64,14 @@ class Find:
 
 def _print_answer(answer: dict[str, Any]) -> None:
     understood = f" (understood as {answer['understood']})"
-    print(f"{answer['phrase']}: present: {answer['present']}, {answer['count']} found{understood}")
+    note = f"; {answer['note']}" if answer["note"] else ""
+    print(f"{answer['phrase']}: present: {answer['present']}, {answer['count']} found{understood}{note}")
     for number, thing in enumerate(answer["instances"], start=1):
         center = ", ".join(f"{v:.2f}" for v in thing["center"])
         size = " x ".join(f"{v:.2f}" for v in thing["size"])
         if thing.get("size_meters") is not None:
             size = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m"
         print(
-            f"  {number}. at ({center}), size {size}, score {thing['score']:.2f}, "
+            f"  {number}. {thing['name']} at ({center}), size {size}, score {thing['score']:.2f}, "
             f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
         )

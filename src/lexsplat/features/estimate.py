@@ -38,7 +38,7 @@ class Estimate:
             if minutes >= 60
             else f"{minutes}:{seconds:02} min"
         )
-        return f"{self.crops:,} crops and about {each} a photo; {total} for {photos:,} photos"
+        return f"{self.crops:,} crops and about {each} a photo; {total} for {photos:,} training photos"
 
 
 def estimate(

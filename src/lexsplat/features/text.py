@@ -5,19 +5,48 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from lexsplat.features.encoders import ImageTextEncoder
+from lexsplat.features.hub import model_folder
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
 
 log = logging.getLogger("lexsplat")
 
+_MAX_STORED = 10_000
+"""Texts in one file, at most; further ones are encoded each time."""
 
-def encode_each(encoder: ImageTextEncoder, texts: Sequence[str]) -> Tensor:
+
+class TextTower(Protocol):
+    """What questions need of an encoder."""
+
+    content_hash: str
+
+    def encode_text(self, prompts: Sequence[str]) -> Tensor:
+        """Prompts to unit embeddings ``[B, D]``."""
+        ...
+
+
+def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
+    """The text tower of a CLIP-like encoder by name, folder, or "bundled".
+
+    Raises:
+        ModelError: If it is not available and cannot be downloaded, or is not a CLIP-like model.
+    """
+    if name in ("bundled", "embedded"):
+        from lexsplat.features.clip_text import ClipText
+
+        return ClipText(model_folder(name, "clip"), device)
+    from lexsplat.features.encoders import load_clip
+
+    return load_clip(name, device)
+
+
+def encode_each(encoder: TextTower, texts: Sequence[str]) -> Tensor:
     """Embeddings ``[T, D]`` of texts, encoded one by one: in a batch, the last bits depend on the other texts."""
     return torch.cat([encoder.encode_text([text]) for text in texts])
 
@@ -36,9 +65,7 @@ class TextCache:
         self._folder, self._writable = Path(folder), writable
         self._known: dict[str, dict[str, Tensor]] = {}
 
-    def encode(
-        self, content_hash: str, prompts: Sequence[str], encoder: Callable[[], ImageTextEncoder]
-    ) -> Tensor:
+    def encode(self, content_hash: str, prompts: Sequence[str], encoder: Callable[[], TextTower]) -> Tensor:
         """Embeddings ``[P, D]`` of prompts, float32, unit length.
 
         Args:
@@ -56,8 +83,13 @@ class TextCache:
         if new:
             model = encoder()
             if model.content_hash != content_hash:
-                raise ValueError(f"{model.name} is not the model of the features ({content_hash})")
+                raise ValueError(f"{model.content_hash} is not the model of the features ({content_hash})")
             known.update(zip(new, encode_each(model, new)))
+            if len(known) > _MAX_STORED:
+                found = torch.stack([known[prompt] for prompt in prompts])
+                for prompt in new:
+                    del known[prompt]
+                return found
             try:
                 if self._writable:
                     self._write(content_hash, known)

@@ -28,7 +28,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 INSTRUCTIONS = (
     "Places that can be searched with words. Positions are in scene units, in the axes of the scene; meters are "
-    'given where the scale is known. "present": "no" means that the scene does not hold it: say so, and do not guess. '
+    'given where the scale is known. "present": "no" means that the scene does not hold it: say so, do not guess. '
     '"understood" tells how a phrase was parsed.'
 )
 
@@ -164,14 +164,14 @@ def _add_prompts(server: MCPServer) -> None:
         """List what a place holds, with places and sizes."""
         return (
             f"Make an inventory of the place {scene}. Call describe_scene and list_objects, then find for things "
-            "that you expect in such a place but do not see in the list. Give a table: name, count, place in words, size. "
-            "Name what is unsure, and leave out what is not present."
+            "that you expect in such a place but do not see in the list. Give a table of names, counts, places "
+            "in words and sizes. Name what is unsure, and leave out what is not present."
         )
 
     @server.prompt(name="where_is", title="Where did I leave it?")
     def where_is(thing: str, scene: str = "") -> str:
         """Find a lost thing and tell where it is in words."""
         return (
-            f"Find {thing} in the place {scene} with find. If it is present, describe its place by what is next to it "
+            f"Find {thing} in the place {scene} with find. If it is present, describe its place by what is near it "
             "(relate, nearest) and show it with render(look_at=...). If it is not, say so and name what is similar."
         )

@@ -155,7 +155,7 @@ class _Builder:
             and not encoders_checked
             and not self._is_finished("features", stages["features"])
         ):
-            sizes = [view.capture_size for view in self.capture.views.values()]
+            sizes = [view.capture_size for view in self._training_views.values()]
             check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
         for name in wanted:
             self._run_stage(name, stages[name])
@@ -334,12 +334,13 @@ class _Builder:
         write_tensors(self.folder.language_path, dict(tensors), metadata)
 
     def _feature_maps(self) -> FeatureMaps:
-        """Features of every view. The encoders are loaded once a build, and freed when all features are stored."""
+        """Features of the training views. The encoders are freed when all features are stored."""
         if self._maps is None:
             config = self.config
             encoders = Encoders.of(config)
             cache = self.folder.features_path
-            self._maps = feature_maps(self.capture, config, encoders, cache, self.listener)
+            training = replace(self.capture, views=self._training_views, test_names=())
+            self._maps = feature_maps(training, config, encoders, cache, self.listener)
             self._clip_hash = encoders.clip.content_hash
         return self._maps
 

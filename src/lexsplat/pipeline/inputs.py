@@ -86,10 +86,10 @@ def prepare_capture(
 
 @dataclass(frozen=True)
 class PhotoSurvey:
-    """Number and size of the photos of a capture.
+    """Number and size of the training photos of a capture.
 
     Args:
-        count: Number of photos, or of frames to sample from a video.
+        count: Number of training photos, or of frames to sample from a video.
         size: Width and height of the largest, upright; a guess for a video.
     """
 
@@ -150,11 +150,11 @@ def survey_photos(
     if capture is None:
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
     load_annotations(capture)
-    return PhotoSurvey(len(capture.views), _largest(capture))
+    return PhotoSurvey(len(capture.train_names), _largest(capture))
 
 
 def count_photos(source: Path, config: BuildConfig) -> PhotoSurvey:
-    """Number and size of the photos of a capture, with or without cameras.
+    """Number and size of the training photos of a capture, with or without cameras.
 
     Raises:
         CaptureError: If there is no usable capture.
@@ -162,7 +162,7 @@ def count_photos(source: Path, config: BuildConfig) -> PhotoSurvey:
     capture = preview_capture(source, source, config)
     if capture is None:
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
-    return PhotoSurvey(len(capture.views), _largest(capture))
+    return PhotoSurvey(len(capture.train_names), _largest(capture))
 
 
 def _largest(capture: Capture) -> tuple[int, int]:

@@ -204,10 +204,11 @@ def _certain(selection: Selection) -> list[Selection]:
 
 def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | None = None) -> Selection:
     """The union of instances, which stay apart."""
-    mask = torch.zeros_like(like.mask)
+    mask, scores = torch.zeros_like(like.mask), like.scores
     for part in parts:
         mask |= part.mask
-    return replace(like, mask=mask, parts=parts, present=present or like.present)
+        scores = torch.where(part.mask, torch.maximum(scores, part.scores), scores)
+    return replace(like, mask=mask, scores=scores, parts=parts, present=present or like.present)
 
 
 def _frame(searched: Searched, targets: Selection) -> Frame:

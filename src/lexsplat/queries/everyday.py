@@ -1,8 +1,9 @@
 """A scale for cosines that comes from the scene itself: how well everyday words describe each code.
 
-Encoders differ in where their cosines lie, in how far they spread, and in an offset of each word. Fixed numbers such as
-a relevancy of 0.5 over a canonical phrase hold for one encoder at best. Here a prompt is compared with about a thousand
-everyday words (``everyday_words.txt``), most of which any one scene lacks. With c the cosine of a code k and a text p,
+Encoders differ in where their cosines lie, in how far they spread, and in an offset of each word. Fixed numbers such
+as a relevancy of 0.5 over a canonical phrase hold for one encoder at best. Here a prompt is compared with about a
+thousand everyday words (``everyday_words.txt``), most of which any one scene lacks. With c_kp the cosine of code k
+and text p,
 
     h_kp = (c_kp - mean of c_kw over all words w) - its 40th percentile over the codes
 
@@ -33,8 +34,10 @@ BORDER = 0.68
 STEEPNESS = 12.0
 """Slope of the log-odds of the relevancy over the ratio."""
 
-_OFFSET = 0.4  # quantile over the codes at which a text counts as not shown
-_PEAK_SHARE = 0.04  # the best height of a text is the mean over this share of the codes
+OFFSET = 0.4
+"""Quantile over the codes at which a text counts as not shown."""
+PEAK_SHARE = 0.04
+"""The best height of a text is the mean over this share of the codes."""
 _BEST_WORDS = 20  # everyday words whose peaks say how high the scene's own things reach
 _LEAST = 1e-6
 
@@ -91,9 +94,9 @@ class EverydayScale:
 def _heights(codewords: Tensor, texts: Tensor, mean: Tensor) -> Tensor:
     codes = torch.nn.functional.normalize(codewords.float(), dim=-1)
     shared = codes @ (texts - mean).T
-    return shared - shared.quantile(_OFFSET, dim=0)
+    return shared - shared.quantile(OFFSET, dim=0)
 
 
 def _peaks(heights: Tensor) -> Tensor:
-    count = max(1, round(_PEAK_SHARE * len(heights)))
+    count = max(1, round(PEAK_SHARE * len(heights)))
     return heights.topk(count, dim=0).values.mean(0)

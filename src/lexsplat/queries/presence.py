@@ -23,7 +23,7 @@ from lexsplat.language.fields import LanguageField
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.selection import Presence
 
-YES, NO = 0.72, 0.6
+YES, NO = 0.74, 0.6
 """Strengths from which the answer is "yes", and below which it is "no"."""
 
 _PEAK_SHARE = 5e-4

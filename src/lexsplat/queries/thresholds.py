@@ -1,10 +1,9 @@
 """Masks from relevancies: by a fixed threshold (the paper's 0.5) or an automatic one for each prompt.
 
 The automatic threshold comes from the scene alone, never from ground truth. Relevancy relative to everyday words
-(`lexsplat.queries.everyday`) has its border at 0.5 in every scene. Relevancy relative to canonical phrases has none that
-holds for all encoders: its threshold comes from maps of training views (`scene_thresholds`), and is 0.5 for what the
-scene does not hold (`lexsplat.queries.presence`). Dimension letters are
-those of `lexsplat.queries.relevancy`.
+(`lexsplat.queries.everyday`) has its border at 0.5 in every scene. Relevancy relative to canonical phrases has none
+that holds for all encoders: its threshold comes from maps of training views (`scene_thresholds`), and is 0.5 for what
+the scene does not hold (`lexsplat.queries.presence`). Dimension letters are those of `lexsplat.queries.relevancy`.
 """
 
 from __future__ import annotations

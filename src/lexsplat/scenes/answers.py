@@ -132,8 +132,9 @@ def answer_queries(
         folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
 
     Returns:
-        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak", "peak_view" (the view with the
-        highest relevancy), "gaussians", "present" (whether the scene holds it: "yes", "no" or "unsure") and "views".
+        ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak",
+        "peak_view" (the view with the highest relevancy), "gaussians", "present" (whether the scene holds it: "yes",
+        "no" or "unsure") and "views".
 
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
@@ -191,9 +192,10 @@ def find_phrases(
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
-        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase", "understood", "present",
-        "count", "gaussians", "threshold", "best_view" and "instances" with center, size and axes in world units,
-        and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and "instances" is empty.
+        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase",
+        "understood", "present", "count", "gaussians", "threshold", "best_view" and "instances" with center, size and
+        axes in world units, and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and
+        "instances" is empty.
 
     Raises:
         QueryError: If a phrase is empty, the view is unknown, or the threshold is not in 0..1.

@@ -13,12 +13,11 @@ import os
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from lexsplat.features.text import TextCache, encode_each
+from lexsplat.features.text import TextCache, TextTower, encode_each, load_text
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
@@ -47,9 +46,6 @@ from lexsplat.scenes.answers import Answers, Word
 from lexsplat.scenes.finding import find_in, named_objects, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.reading import read_scene
-
-if TYPE_CHECKING:
-    from lexsplat.features.encoders import ImageTextEncoder
 
 _KEPT_BYTES = 128 << 20
 """Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
@@ -91,7 +87,7 @@ class Scene:
         """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
         self._given_encode_text = encode_text
-        self._encoder: ImageTextEncoder | None = None
+        self._encoder: TextTower | None = None
         self._cache: TextCache | None = None
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
@@ -160,6 +156,11 @@ class Scene:
             self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
         return self._cache.encode(known, texts, lambda: self._load_encoder(known))
 
+    @property
+    def encoder(self) -> TextTower:
+        """The text encoder that belongs to the language, loaded at first use (`preload`)."""
+        return self._load_encoder(self._encoder_hash)
+
     def encoder_identity(self) -> dict[str, str]:
         """Name and content hash (if known) of the text encoder, for files of other programs."""
         known = self._encoder_hash
@@ -177,11 +178,9 @@ class Scene:
     def _encoder_hash(self) -> str | None:
         return self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
 
-    def _load_encoder(self, known: str | None) -> ImageTextEncoder:
-        from lexsplat.features.encoders import load_clip
-
+    def _load_encoder(self, known: str | None) -> TextTower:
         if self._encoder is None:
-            self._encoder = load_clip(self.clip, str(self.gaussians.device))
+            self._encoder = load_text(self.clip, str(self.gaussians.device))
         if known is not None and self._encoder.content_hash != known:
             raise ModelError(
                 self.clip,

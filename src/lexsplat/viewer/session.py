@@ -48,12 +48,14 @@ class Question:
         automatic: The automatic threshold; None until `Session.refine`.
         manual: The threshold set by the user, if any.
         selection: The Gaussians that answer it; None until `Session.refine`.
+        understood: How it was parsed, for phrases that are more than a thing; "" until `Session.refine`.
     """
 
     layer: Layer
     automatic: float | None = None
     manual: float | None = None
     selection: Selection | None = None
+    understood: str = ""
 
     @property
     def text(self) -> str:
@@ -159,6 +161,7 @@ class Session:
             question.automatic = float(selection.threshold)
         if manual == question.manual:  # otherwise the user has moved the slider in the meantime
             question.selection = selection
+            question.understood = understood_as(self.scene, question.text)
             question.layer.set_scores(selection.scores.float().cpu().numpy())
             question.layer.threshold = float(selection.threshold)
             question.layer.mask = selection.mask.cpu().numpy()
@@ -285,9 +288,17 @@ def answer_prompt(
 
     All final answers of the viewer come from here. Phrases with relations are answered by `Scene.find`.
     """
-    if is_plain(prompt):
+    if is_plain(prompt) and scene.understand(prompt).phrase == Thing(prompt):
         return scene.select(prompt, threshold)
     return replace(scene.find(prompt, viewpoint, threshold=threshold), phrase=prompt)
+
+
+def understood_as(scene: Scene, prompt: str) -> str:
+    """How a prompt was parsed, and what was not understood; "" for one thing in its own words."""
+    understood = scene.understand(prompt)
+    if is_plain(prompt) and not understood.note:
+        return ""
+    return "; ".join(filter(None, [f"understood as {understood.phrase}", understood.note]))
 
 
 def is_plain(phrase: str) -> bool:

@@ -9,7 +9,8 @@ feature, so its own feature is the weighted mean over all pixels of all training
 
 the transpose of rendering (as in LUDVIG and Occam's LGS). Averaging cancels what is wrong in single views. The
 codebook is then fitted to the Gaussians (Eq. 2 to 4 without the DINO half), and each Gaussian carries a softmax over
-its nearest codes. The length of the mean of unit vectors measures how far the views agree, which gives u_G.
+its nearest codes. The length of the mean of unit vectors measures how far the views agree, which gives u_G: 0 for a
+mean of length 1, and 1 for a mean no longer than that of all features of the scene.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class AveragedConfig:
 
     Args:
         top: Codes kept for each Gaussian.
-        temperature: Temperature of the softmax over their cosines; towards 0 only the nearest code counts.
+        temperature: Temperature of the softmax over their cosines, without the direction that all features share;
+            towards 0 only the nearest code counts.
         min_visibility: Gaussians with less weight than this over all training views, in cells of the feature maps,
             count as never seen.
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
@@ -62,7 +64,7 @@ class AveragedConfig:
     """
 
     top: int = 4
-    temperature: float = 1 / 80
+    temperature: float = 1 / 40
     min_visibility: float = 0.01
     prior_visibility: float = 0.25
     shortest_side: int = 120
@@ -239,7 +241,8 @@ def field_from_means(
     budget.require_sample("language", what, looked_at, dimensions, number, 0, memory, share=0.5)
     visible = found.visible(config)
     with one_thread():  # the order of a sum decides its last bit, which can decide between two codes
-        codewords = _fit(found, visible, codebook_config, seed)
+        codewords, centers, common = _fit(found, visible, codebook_config, seed)
+        shared = float(common.square().sum().clamp(max=1 - 1e-6))
         kept = min(config.top, len(codewords))
         codes = torch.zeros(count, kept, dtype=torch.uint8, device=device)
         weights = torch.zeros(count, kept, device=device)
@@ -247,27 +250,46 @@ def field_from_means(
         for start in range(0, count, ROWS):
             rows = slice(start, min(start + ROWS, count))
             means = found.rows(rows)
-            cosines, nearest = (functional.normalize(means, dim=-1) @ codewords.T).topk(kept, dim=1)
+            own = functional.normalize(functional.normalize(means, dim=-1) - common, dim=-1)
+            cosines, nearest = (own @ centers.T).topk(kept, dim=1)
             codes[rows] = nearest.to(torch.uint8)
             weights[rows] = torch.softmax(cosines / config.temperature, 1) * visible[rows, None]
-            agreement[rows] = means.norm(dim=-1).clamp(0, 1)
+            agreement[rows] = ((means.square().sum(-1) - shared) / (1 - shared)).clamp(0, 1)
     trusted = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
     uncertainties = torch.where(visible, 1 - agreement * trusted, torch.ones_like(trusted))
     return CodeField(Codebook(codewords), codes, weights, uncertainties, method="averaged")
 
 
-def _fit(found: MeanFeatures, visible: Tensor, config: CodebookConfig, seed: int) -> Tensor:
-    """Unit codewords ``[K, D]`` by spherical k-means over the visible Gaussians; at most one code a Gaussian."""
+def _fit(
+    found: MeanFeatures, visible: Tensor, config: CodebookConfig, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Spherical k-means over the visible Gaussians, without the direction that all features share.
+
+    Features of an encoder lie in a cone. Cosines inside it depend on its width, those of what is left without its
+    axis do not: the temperature of the softmax then holds for narrow and for wide cones.
+
+    Returns:
+        Unit codewords ``[K, D]``, at most one a Gaussian; their unit centers without the shared direction ``[K, D]``;
+        that direction ``[D]``, the mean of the Gaussians' unit features.
+    """
     generator = torch.Generator().manual_seed(seed)
     seen = visible.nonzero()[:, 0].cpu()
     if len(seen) == 0:
-        return torch.ones(1, found.means.shape[1], device=found.totals.device) / found.means.shape[1] ** 0.5
+        nothing = (
+            torch.ones(1, found.means.shape[1], device=found.totals.device) / found.means.shape[1] ** 0.5
+        )
+        return nothing, nothing, torch.zeros_like(nothing[0])
     if len(seen) > config.sample_size:
         seen = seen[torch.randperm(len(seen), generator=generator)[: config.sample_size].sort().values]
     sample = functional.normalize(found.rows(seen), dim=-1)
+    common = sample.mean(0)
+    own = functional.normalize(sample - common, dim=-1)
     number = min(config.num_codes, len(sample))
     iterations = config.kmeans_iterations
-    return spherical_kmeans(sample, None, number, 0.0, iterations=iterations, generator=generator)[0]
+    centers = spherical_kmeans(own, None, number, 0.0, iterations=iterations, generator=generator)[0]
+    sums = torch.zeros_like(centers).index_add_(0, (own @ centers.T).argmax(1), sample)
+    empty = ~sums.any(-1, keepdim=True)
+    return functional.normalize(torch.where(empty, common + centers, sums), dim=-1), centers, common
 
 
 def _weighted_sum(

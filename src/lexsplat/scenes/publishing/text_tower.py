@@ -1,0 +1,90 @@
+"""The text tower of a CLIP for the browser: its weights as safetensors and its tokenizer as plain JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lexsplat.features.clip import ClipEncoder
+from lexsplat.features.encoders import load_clip
+from lexsplat.queries import everyday, presence
+from lexsplat.runtime.files import save_tensors
+from lexsplat.scenes.scene import Scene
+
+_HALF_BYTES = 16 << 20
+"""Towers that are larger than this in half precision are stored with 8 bits a weight."""
+
+
+def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, Any] | None:
+    """Write what the page needs to embed any phrase and compare it with the codes.
+
+    Args:
+        scene: The scene, whose text encoder is taken.
+        weights: Safetensors to write: the tower, the codewords of unit length ``[K, D]``, and the mean embedding
+            ``[D]`` and the best height at each code ``[K]`` of everyday words.
+        tokenizer: JSON to write.
+
+    Returns:
+        The entry "text" of the manifest; None if the encoder is not of CLIP's architecture.
+    """
+    encoder = load_clip(scene.clip)
+    tower = encoder.text_tower() if isinstance(encoder, ClipEncoder) else None
+    if tower is None:
+        return None
+    tensors = _stored(tower.tensors)
+    codewords = torch.nn.functional.normalize(scene.field.codebook.clip.detach().cpu().float(), dim=-1)
+    tensors |= {"codewords": codewords, "mean": scene.everyday_scale.mean, "best": scene.everyday_scale.best}
+    save_tensors(
+        {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
+        weights,
+        scene.encoder_identity(),
+    )
+    tokenizer.write_text(json.dumps(_plain_tokenizer(tower.tokenizer), ensure_ascii=False), encoding="utf-8")
+    return {
+        "weights": weights.name,
+        "tokenizer": tokenizer.name,
+        "heads": tower.heads,
+        "activation": tower.activation,
+        "templates": list(scene.query.templates),
+        "everyday": {
+            "border": everyday.BORDER,
+            "steepness": everyday.STEEPNESS,
+            "offset": everyday.OFFSET,
+            "peak_share": everyday.PEAK_SHARE,
+            "peak": scene.everyday_scale.peak,
+            "yes": presence.YES,
+            "no": presence.NO,
+        },
+    }
+
+
+def _stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors in half precision, or with 8 bits a weight and a factor for each row (``NAME.factor``)."""
+    if 2 * sum(tensor.numel() for tensor in tensors.values()) <= _HALF_BYTES:
+        return {name: tensor.half() for name, tensor in tensors.items()}
+    stored: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        if tensor.ndim < 2:
+            stored[name] = tensor.float()
+            continue
+        factor = tensor.float().abs().amax(1).clamp_min(1e-12) / 127
+        stored[name] = (tensor.float() / factor[:, None]).round().to(torch.int8)
+        stored[f"{name}.factor"] = factor
+    return stored
+
+
+def _plain_tokenizer(content: dict[str, Any]) -> dict[str, Any]:
+    """Vocabulary and merges of a ``tokenizer.json`` of CLIP, and the tokens of start and end."""
+    model = content["model"]
+    special = {token["content"]: token["id"] for token in content["added_tokens"]}
+    merges = [merge if isinstance(merge, str) else " ".join(merge) for merge in model["merges"]]
+    return {
+        "vocabulary": model["vocab"],
+        "merges": merges,
+        "start": special["<|startoftext|>"],
+        "end": special["<|endoftext|>"],
+    }

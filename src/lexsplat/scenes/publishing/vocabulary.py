@@ -1,0 +1,106 @@
+"""The phrases that a published page answers without a text encoder, and what it answers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from importlib.resources import files
+
+import torch
+from torch import Tensor
+
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.relevancy import embed_prompts
+from lexsplat.runtime.errors import LexsplatError
+from lexsplat.runtime.files import read_json
+from lexsplat.scenes.scene import Scene
+
+ASKED, NAME, COMBINED, USE = "a", "n", "c", "u"
+"""Kinds of phrases: asked of this scene before; names, which answer "what is this?"; names with a color, material or
+part; what things are for."""
+
+_MOST_ASKED = 500
+_LONGEST = 120
+_BATCH = 128
+
+
+def everyday_phrases(bundled: bool = False) -> dict[str, str]:
+    """The kind of each everyday phrase, in the order of ``words.txt``: names first.
+
+    Args:
+        bundled: Whether the encoder is the bundled one, which knows few names: the others count as `COMBINED`.
+    """
+    text = files(__package__).joinpath("page/words.txt").read_text(encoding="utf-8")
+    sections: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        name, colon, content = line.partition(":")
+        if colon and not line.startswith("#"):
+            separator = ";" if name == "parts" else ","
+            sections.setdefault(name, []).extend(part.strip() for part in content.split(separator))
+    phrases = dict.fromkeys(sections["bundled"], NAME)
+    for name in (*sections["things"], *everyday_words()):
+        phrases.setdefault(name.lower(), COMBINED if bundled else NAME)
+    for adjectives, things in (("colors", "colored"), ("materials", "made")):
+        for thing in sections[things]:
+            for adjective in sections[adjectives]:
+                phrases.setdefault(f"{adjective} {thing}", COMBINED)
+    for entry in sections["parts"]:
+        owner, _, parts = entry.partition("=")
+        for part in parts.split(","):
+            phrases.setdefault(f"{owner.strip()} {part.strip()}", COMBINED)
+    for use in sections["uses"]:
+        phrases.setdefault(use, USE)
+    return phrases
+
+
+def page_phrases(asked: Iterable[str] = (), bundled: bool = False) -> dict[str, str]:
+    """The kind of each phrase of a page: those asked of the scene, then everyday ones."""
+    phrases: dict[str, str] = {}
+    for phrase in asked:
+        plain = " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", phrase).split())[:_LONGEST].lower()
+        if plain and len(phrases) < _MOST_ASKED:
+            phrases[plain] = ASKED
+    for phrase, kind in everyday_phrases(bundled).items():
+        phrases.setdefault(phrase, kind)
+    return phrases
+
+
+def asked_phrases(scene: Scene) -> list[str]:
+    """What was asked of a scene in the viewer, the latest first; nothing for a scene without a folder."""
+    if scene.folder is None:
+        return []
+    try:
+        content = read_json(scene.folder.root / "viewer.json")
+        history = content.get("history", []) if isinstance(content, dict) else []
+    except LexsplatError:
+        return []
+    return [phrase for phrase in history if isinstance(phrase, str)]
+
+
+@torch.no_grad()
+def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]:
+    """Relevancy of every phrase for every code, ``[P, K]`` uint8 in 255ths, and its presence: "y", "u" or "n".
+
+    Both are relative to everyday words (`lexsplat.queries.everyday`).
+
+    Raises:
+        ModelError: If the text encoder cannot be loaded.
+    """
+    scale, field = scene.everyday_scale, scene.field
+    codewords = field.codebook.clip
+    tables, presences = [], []
+    for start in range(0, len(phrases), _BATCH):
+        texts = embed_prompts(
+            phrases[start : start + _BATCH], scene.encoder.encode_text, scene.query.templates
+        )
+        relevancy = scale.relevancy(codewords, texts.to(codewords.device))
+        tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
+        scores = field.scores(relevancy).T.contiguous()
+        presences += [presence[0] for presence in scene.presence_classifier.classify(texts, scores)]
+    return torch.cat(tables), presences
+
+
+def words_file(phrases: dict[str, str], presences: list[str]) -> bytes:
+    """The list of phrases for the page: one a line, its kind and its presence in front."""
+    lines = (f"{kind}{present}{phrase}\n" for (phrase, kind), present in zip(phrases.items(), presences))
+    return "".join(lines).encode("utf-8")

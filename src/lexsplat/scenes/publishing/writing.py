@@ -1,0 +1,333 @@
+"""Writes a scene as a static page: a folder for any web server, or one file that opens by double click."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import shutil
+import tempfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from lexsplat import __version__
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
+from lexsplat.runtime.files import read_json, write_json
+from lexsplat.scenes.formats.language import stored_language
+from lexsplat.scenes.publishing.sidecar import splat_codes, view_entries
+from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
+from lexsplat.scenes.publishing.text_tower import write_text_tower
+from lexsplat.scenes.publishing.vocabulary import (
+    asked_phrases,
+    page_phrases,
+    phrase_answers,
+    words_file,
+)
+from lexsplat.scenes.scene import Scene
+
+MOST_SPLATS = 4_000_000
+"""Gaussians that a browser draws, at most."""
+SINGLE_FILE_BYTES = 50_000_000
+"""Largest size of the files that go into one HTML file."""
+
+_FORMAT, _FORMAT_VERSION = "lexsplat-page", 1
+_PAGE_FILES = ("page.js", "page.css", "LICENSES.txt")
+_POLICY = (
+    "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; style-src {style}; img-src data: blob:; "
+    "connect-src {connect}; worker-src blob:; base-uri 'none'; form-action 'none'"
+)
+
+
+@dataclass(frozen=True)
+class PublishOptions:
+    """How a page is written.
+
+    Args:
+        title: Title of the page; empty takes the name of the scene folder.
+        description: A sentence under the title.
+        start_view: Name of the view from which the page starts; None takes the first one.
+        max_splats: Number of Gaussians to publish, those that cover most; None takes all.
+        words_only: Leave out the text tower: the page then answers the phrases of its dictionary only.
+        single_file: Write one HTML file instead of a folder.
+    """
+
+    title: str = ""
+    description: str = ""
+    start_view: str | None = None
+    max_splats: int | None = None
+    words_only: bool = False
+    single_file: bool = False
+
+
+@dataclass(frozen=True)
+class Published:
+    """What was written.
+
+    Args:
+        path: The folder or the file.
+        bytes: Its size.
+        splats: Number of Gaussians in it.
+        phrases: Number of phrases in its dictionary.
+        free_text: Whether it holds a text tower.
+    """
+
+    path: Path
+    bytes: int
+    splats: int
+    phrases: int
+    free_text: bool
+
+
+def publish(scene: Scene, target: Path, options: PublishOptions | None = None) -> Published:
+    """Write a scene as a page that is searched in the browser.
+
+    Args:
+        scene: The scene, with language.
+        target: The folder; new, empty, or an earlier page, which is replaced. With ``single_file`` a file that ends
+            in ``.html``.
+        options: Title, start and what is left out.
+
+    Raises:
+        SceneFolderError: If the target holds other files, or the content is too large for one file.
+        QueryError: If the scene has too few or too many Gaussians, invalid numbers, or no view of that name.
+        ModelError: If the text encoder cannot be loaded.
+    """
+    options = options or PublishOptions()
+    check_target(target, options.single_file)
+    _check_scene(scene.gaussians, options.max_splats)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as work:
+        folder = Path(work) / "page"
+        folder.mkdir()
+        manifest = _write_content(scene, folder, options)
+        if options.single_file:
+            written = _write_single(folder, manifest, target)
+        else:
+            written = _write_folder(folder, manifest, target)
+    return Published(
+        target,
+        written,
+        manifest["scene"]["gaussians"],
+        manifest["words"]["count"],
+        manifest["text"] is not None,
+    )
+
+
+def _check_scene(gaussians: Gaussians, max_splats: int | None) -> None:
+    if len(gaussians) < 2:
+        raise QueryError("scene", expected="at least 2 Gaussians", found=str(len(gaussians)))
+    if damage := gaussians.find_invalid():
+        raise QueryError("scene", expected="finite Gaussians", found=damage, remedy="build the scene again")
+    if min(len(gaussians), max_splats or len(gaussians)) > MOST_SPLATS:
+        raise QueryError(
+            "scene",
+            expected=f"at most {MOST_SPLATS:,} Gaussians, which a browser can draw",
+            found=f"{min(len(gaussians), max_splats or len(gaussians)):,}",
+            remedy="--max-splats 2000000 publishes those that cover most",
+        )
+
+
+def check_target(target: Path, single_file: bool) -> None:
+    """Refuse a target that would lose files of others.
+
+    Raises:
+        SceneFolderError: If it is not new, empty or an earlier page.
+    """
+    if single_file:
+        if target.suffix.lower() != ".html":
+            raise SceneFolderError(target, expected="a name that ends in .html", found=repr(target.suffix))
+        if target.exists() and (not target.is_file() or _FORMAT not in _head(target)):
+            raise SceneFolderError(
+                target,
+                expected="a new file or an earlier page",
+                found="another file",
+                remedy="give another name",
+            )
+        return
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise SceneFolderError(target, expected="a folder", found="a file", remedy="give another name")
+    foreign = sorted(
+        path.name for path in target.iterdir() if path.name not in (_own_files(target) | {"manifest.json"})
+    )
+    if not _own_files(target) and (target / "manifest.json").exists():
+        foreign.append("manifest.json")
+    if foreign:
+        raise SceneFolderError(
+            target,
+            expected="a new folder, an empty one or an earlier page",
+            found=f"foreign files: {', '.join(foreign[:3])}" + (", ..." if len(foreign) > 3 else ""),
+            remedy="give another folder",
+        )
+
+
+def _head(path: Path) -> str:
+    with open(path, encoding="utf-8", errors="replace") as file:
+        return file.read(4096)
+
+
+def _own_files(folder: Path) -> set[str]:
+    """Names of the files of an earlier page in a folder; none if there is no page."""
+    try:
+        manifest = read_json(folder / "manifest.json")
+    except LexsplatError:
+        return set()
+    if not isinstance(manifest, Mapping) or manifest.get("format") != _FORMAT:
+        return set()
+    return set(manifest.get("files", ()))
+
+
+def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[str, Any]:
+    """Write everything but ``index.html`` and return the manifest, which is written as well."""
+    start = _start_view(scene, options.start_view)
+    kept = most_visible(scene.gaussians, options.max_splats or len(scene.gaussians))
+    gaussians = scene.gaussians.select(kept.to(scene.gaussians.device)).to("cpu")
+    splats, rotation = write_splats(gaussians, folder)
+    identity = scene.encoder_identity()
+    language = stored_language(scene.field, identity).select(kept)
+    (folder / "codes.bin").write_bytes(splat_codes(language))
+    phrases = page_phrases(asked_phrases(scene), bundled=scene.clip in ("bundled", "embedded"))
+    tables, presences = phrase_answers(scene, list(phrases))
+    (folder / "words.txt").write_bytes(words_file(phrases, presences))
+    (folder / "words.bin").write_bytes(tables.numpy().tobytes())
+    text = None
+    if not options.words_only:
+        text = write_text_tower(scene, folder / "text.safetensors", folder / "tokenizer.json")
+    for name in _PAGE_FILES:
+        shutil.copyfile(str(files(__package__).joinpath("page", name)), folder / name)
+    record = scene.folder.record if scene.folder else {}
+    manifest: dict[str, Any] = {
+        "format": _FORMAT,
+        "format_version": _FORMAT_VERSION,
+        "lexsplat": __version__,
+        "title": _one_line(options.title) or (scene.folder.root.resolve().name if scene.folder else "scene"),
+        "description": _one_line(options.description),
+        "scene": {
+            "file": splats.name,
+            "gaussians": len(gaussians),
+            "of": len(scene.gaussians),
+            "rotation": rotation,
+            "antialiased": gaussians.antialiased,
+            "up": [round(float(value), 6) + 0.0 for value in scene.world.up.direction],
+            "meters_per_unit": scene.world.meters_per_unit,
+            "start_view": start,
+        },
+        "language": {
+            "codes": "codes.bin",
+            "num_codes": scene.field.codebook.num_codes,
+            "method": scene.field.method,
+        },
+        "words": {"phrases": "words.txt", "table": "words.bin", "count": len(phrases)},
+        "text": text,
+        "views": view_entries(scene),
+        "licenses": {
+            "page.js": "Apache-2.0 and those of LICENSES.txt",
+            "words.txt": "Apache-2.0",
+            "text.safetensors": "Apache-2.0" if scene.clip == "bundled" else f"that of {scene.clip}",
+            "scene": "not stated",
+        },
+        "provenance": {
+            **identity,
+            "built_with": {
+                key: record.get("provenance", {}).get(key) for key in ("lexsplat", "versions", "seed")
+            },
+        },
+    }
+    manifest["files"] = {path.name: _checksums(path.read_bytes()) for path in sorted(folder.iterdir())}
+    manifest["files"]["index.html"] = {}  # it belongs to the page; nothing reads it by its checksum
+    write_json(folder / "manifest.json", manifest)
+    return manifest
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())[:500]
+
+
+def _start_view(scene: Scene, name: str | None) -> str:
+    if name is not None:
+        return scene.view(name).name
+    return min(scene.views, default="")
+
+
+def _checksums(content: bytes) -> dict[str, Any]:
+    return {
+        "bytes": len(content),
+        "crc32": zlib.crc32(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+
+
+def _page(manifest: dict[str, Any], policy: str, style: str, script: str) -> str:
+    """``index.html``; all that others wrote in it is escaped."""
+    template = files(__package__).joinpath("page/index.html").read_text(encoding="utf-8")
+    values = {
+        "POLICY": html.escape(policy),
+        "TITLE": html.escape(manifest["title"]),
+        "DESCRIPTION": html.escape(manifest["description"] or f"Search {manifest['title']} with words."),
+        "STYLE": style,
+        "SCRIPT": script,
+    }
+    head, *parts = template.split("{{")
+    return head + "".join(values[name] + rest for name, rest in (part.split("}}", 1) for part in parts))
+
+
+def _write_folder(folder: Path, manifest: dict[str, Any], target: Path) -> int:
+    """Move a finished page to its place; returns its size. The manifest of an earlier page is the last to go."""
+    policy = _POLICY.format(script="'self'", style="'self'", connect="'self'")
+    page = _page(
+        manifest, policy, '<link rel="stylesheet" href="page.css">', '<script src="page.js" defer></script>'
+    )
+    (folder / "index.html").write_text(page, encoding="utf-8")
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    earlier = _own_files(target) if target.exists() else set()
+    target.mkdir(exist_ok=True)
+    for path in sorted(folder.iterdir(), key=lambda path: path.name == "manifest.json"):
+        path.replace(target / path.name)
+    for name in earlier - set(manifest["files"]):
+        (target / name).unlink(missing_ok=True)
+    return size
+
+
+def _write_single(folder: Path, manifest: dict[str, Any], target: Path) -> int:
+    """Write one HTML file that holds all files as base64; returns its size.
+
+    Raises:
+        SceneFolderError: If they are too large.
+    """
+    data = [path for path in sorted(folder.iterdir()) if path.name not in ("page.js", "page.css")]
+    size = sum(path.stat().st_size for path in data)
+    if size > SINGLE_FILE_BYTES:
+        raise SceneFolderError(
+            target,
+            expected=f"at most {SINGLE_FILE_BYTES / 1e6:.0f} MB for a single file",
+            found=f"{size / 1e6:.0f} MB",
+            remedy="publish a folder, or give --max-splats or --words-only",
+        )
+    # "</script" and "<!--" would end the element; in scripts they occur within texts only.
+    script = (folder / "page.js").read_text(encoding="utf-8")
+    script = script.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    style = (folder / "page.css").read_text(encoding="utf-8")
+    blocks = [
+        f'<script type="application/octet-stream" id="file:{path.name}">'
+        f"{base64.b64encode(path.read_bytes()).decode()}</script>"
+        for path in data
+    ]
+    policy = _POLICY.format(script=_source(script), style=_source(style), connect="'none'")
+    page = _page(
+        manifest, policy, f"<style>{style}</style>", "\n".join([*blocks, f"<script>{script}</script>"])
+    )
+    temporary = folder / "single.html"
+    temporary.write_text(page, encoding="utf-8")
+    temporary.replace(target)
+    return target.stat().st_size
+
+
+def _source(content: str) -> str:
+    """The source expression of a content security policy that admits one inline element."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"

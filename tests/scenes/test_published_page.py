@@ -1,0 +1,300 @@
+"""Published pages in a real browser: headless Chromium with software WebGL. Nothing but the folder is served."""
+
+from __future__ import annotations
+
+import base64
+import io
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import binary_erosion
+from support.language_scene import CENTERS
+from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
+from support.viewer_scene import ball_scene
+
+from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.rendering import render
+from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
+from lexsplat.scenes.scene import open_scene
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
+
+PROMPTS = (
+    "red apple",
+    "something to drink from",
+    "the handle of that blue mug",  # in no dictionary
+    "Café's über-mug, 42!",  # accents, marks and digits
+    "zebra",  # not in the scene
+    "qwzx blorp",
+)
+SIZE = (664, 498)
+"""Of a window in which nothing covers the picture's bottom, with the sides of the demo's photos."""
+HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</script>\"'{{TITLE}}"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    pytest.importorskip("playwright.sync_api")
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def demo():
+    scene = open_scene("demo")
+    scene.query = QueryConfig(form="code")  # the page's
+    return scene
+
+
+@pytest.fixture(scope="module")
+def folder(demo, tmp_path_factory):
+    target = tmp_path_factory.mktemp("published") / "demo"
+    publish(demo, target, PublishOptions(title="A table top"))
+    return target
+
+
+@pytest.fixture(scope="module")
+def address(folder):
+    with serving(folder) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def page(browser, address):
+    opened = open_page(browser, address)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def ball_page(tmp_path, monkeypatch):
+    """Publishes the scene of balls with some options; returns the folder and the ground truth."""
+    words = [*(f"ball {n}" for n in range(5)), "toy", "chair", "bed"]
+    monkeypatch.setattr(vocabulary, "everyday_phrases", lambda bundled: dict.fromkeys(words, "n"))
+    scene, ground_truth = ball_scene()
+
+    def write(target=tmp_path / "page", **options):
+        publish(scene, target, PublishOptions(words_only=True, **options))
+        return target
+
+    write.scene, write.ground_truth = scene, ground_truth
+    return write
+
+
+def picture(page) -> np.ndarray:
+    """The page ``[H, W, 3]`` once the scene is drawn."""
+    page.evaluate("lexsplat.app.stage.settled()")
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+
+
+def test_answers_are_those_of_python(page, demo):
+    found = page.evaluate(
+        """async (prompts) => {
+            const app = await lexsplat.ready;
+            const tower = await app.loader.load();
+            const answers = [];
+            for (const prompt of prompts) {
+                const answer = await app.answerer.answer(prompt, "#fff");
+                const bytes = new Uint8Array(answer.scores.buffer);
+                let text = "";
+                for (let i = 0; i < bytes.length; i += 4096) {
+                    text += String.fromCharCode(...bytes.subarray(i, i + 4096));
+                }
+                const places = answer.presence === "no" ? [] : app.geometry.places(answer.scores, answer.threshold);
+                answers.push({ ...answer, table: 0, scores: btoa(text), places: places.length,
+                    marked: places.reduce((sum, place) => sum + place.splats.length, 0),
+                    embedding: [...tower.embed(prompt)] });
+            }
+            return answers;
+        }""",
+        PROMPTS,
+    )
+    phrases = [answer["phrase"] for answer in found]
+    asked = demo.ask(phrases)
+    embeddings = demo.embed(PROMPTS)
+    for number, answer in enumerate(found):
+        scores = np.frombuffer(base64.b64decode(answer["scores"]), np.float32)
+        assert np.abs(scores - asked.scores[number].numpy()).max() <= 1 / 255, answer["prompt"]
+        assert answer["presence"] == asked.presences[number], answer["prompt"]
+        assert answer["threshold"] == pytest.approx(float(asked.thresholds[number]), abs=0.02), answer[
+            "prompt"
+        ]
+        cosine = torch.nn.functional.cosine_similarity(
+            torch.tensor(answer["embedding"]), embeddings[number], dim=0
+        )
+        assert float(cosine) > 1 - 1e-3, answer["prompt"]
+        if answer["presence"] == "yes":
+            selection = asked.selection(number)
+            assert answer["places"] == selection.count, answer["prompt"]
+            assert answer["marked"] == pytest.approx(len(selection), rel=0.02), answer["prompt"]
+    assert [answer["from"] for answer in found[:3]] == ["dictionary", "dictionary", "text tower"]
+    assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
+
+
+def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absent(browser, address, demo):
+    page = open_page(browser, address + "#view=view_010.jpg", *SIZE)
+    bare = "document.querySelectorAll('.bar, .tools, .title').forEach((one) => { one.style.visibility = 'hidden'; })"
+    page.evaluate(bare)
+    before = picture(page)
+    page.evaluate("lexsplat.app.ask('red apple', false, false)")
+    after = picture(page)
+    camera = demo.camera("view_010").resized(*SIZE)
+    mask = demo.select("red apple", 0.5).mask.float()[:, None]
+    seen = render(demo.gaussians, camera, features=mask, color=False).features[..., 0].numpy()
+    ours = (render(demo.gaussians, camera).image.detach().clamp(0, 1) * 255).numpy()
+    inside, outside = binary_erosion(seen > 0.9, iterations=2), seen < 0.02
+    assert inside.sum() > 100
+    warm = after[..., 0] - after[..., 2]
+    assert (after[inside][:, 0] > after[inside][:, 2] + 40).mean() > 0.97, "the apple is orange"
+    gray = np.ptp(after[outside], axis=1).mean() / np.ptp(before[outside], axis=1).mean()
+    assert gray < 0.5, "everything else is gray"
+    assert warm[inside].mean() > 3 * warm[outside].mean()
+    assert 10 * np.log10(255**2 / np.square(before - ours).mean()) > 25, "the picture is that of our renderer"
+    page.evaluate("lexsplat.app.ask('zebra', false, false)")
+    assert np.abs(picture(page) - before).mean() < 0.5
+    page.close()
+
+
+def test_the_page_asks_for_nothing_but_its_folder_and_its_policy_forbids_it(page, address):
+    ask(page, "the handle of that blue mug")
+    assert page.requested
+    assert all(url.startswith((address, "blob:", "data:")) for url in page.requested)
+    assert page.complaints == []
+    refused = page.evaluate("fetch('https://example.org/').then(() => 'sent', (error) => String(error))")
+    assert "TypeError" in refused
+    assert any("Content Security Policy" in text for text in page.complaints)
+
+
+def test_asking_speaks_shows_a_card_and_is_kept_in_the_link(page, browser, address):
+    ask(page, "red apple, zebra")
+    cards = page.locator(".card")
+    assert cards.count() == 2
+    assert "here, one place" in cards.nth(0).inner_text()
+    assert "not in this scene" in cards.nth(1).inner_text()
+    assert "red apple: here" in page.locator("[role=status]").inner_text()
+    until(page, "location.hash.includes('q=red+apple') && location.hash.includes('q=zebra')")
+    link = page.evaluate("location.href")
+    again = open_page(browser, link)
+    assert again.locator(".card strong").all_inner_texts() == ["red apple", "zebra"]
+    positions = [one.evaluate("lexsplat.app.stage.camera.position.toArray()") for one in (page, again)]
+    assert np.allclose(*positions, atol=1e-3)
+    again.close()
+
+
+def test_the_search_box_completes_and_the_keyboard_suffices(page):
+    page.keyboard.press("Escape")
+    page.locator("canvas").focus()
+    page.keyboard.press("/")
+    page.keyboard.type("pump")
+    box = page.get_by_role("combobox", name="Search this place with words")
+    assert box.get_attribute("aria-expanded") == "true"
+    page.keyboard.press("ArrowDown")
+    chosen = page.locator(f"#{box.get_attribute('aria-activedescendant')}").inner_text()
+    assert chosen == "pumpkin"
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.card strong')?.textContent === 'pumpkin'")
+    assert box.input_value() == ""
+    unnamed = "[...document.querySelectorAll('button, input')].filter((e) => !(e.ariaLabel || e.textContent.trim()))"
+    assert page.evaluate(f"{unnamed}.length") == 0
+
+
+def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_text_tower(
+    browser, folder, ball_page
+):
+    with serving(ball_page()) as address:
+        page = open_page(browser, address)
+        assert page.evaluate("lexsplat.app.answerer.dictionary.similar('bal 3')[0]") == "ball 3"
+        page.fill(".search input", "a green unicorn")
+        page.keyboard.press("Enter")
+        until(page, "document.querySelector('.status')?.textContent.includes('is not among')")
+        assert page.locator(".card").count() == 0
+        page.close()
+
+
+def test_a_click_names_the_thing_and_two_clicks_measure(browser, ball_page):
+    with serving(ball_page()) as address:
+        page = open_page(browser, address + "#view=view0")
+        centers = list(CENTERS)
+        pixels = page.evaluate(
+            """(points) => points.map((point) => {
+                const at = lexsplat.app.stage.camera.position.clone().fromArray(point);
+                const hit = lexsplat.app.stage.pixel(at);
+                return [hit.x, hit.y];
+            })""",
+            [center.tolist() for center in centers],
+        )
+        camera = ball_page.scene.camera("view0")
+        nearest = int(np.argmin([np.linalg.norm(center - camera.position) for center in centers]))
+        page.evaluate("(at) => { lexsplat.app.whatIs(at[0], at[1]); }", pixels[nearest])
+        assert page.locator(".status .examples button").first.inner_text() == f"ball {nearest}"
+        page.close()
+
+
+def test_names_titles_and_prompts_of_others_run_no_script(browser, ball_page, tmp_path):
+    scene = ball_page.scene
+    scene.views = {HOSTILE if name == "view0" else name: view for name, view in scene.views.items()}
+    words = vocabulary.everyday_phrases(False)
+    vocabulary.everyday_phrases = lambda bundled: {HOSTILE.lower(): "a", **words}  # undone by the fixture
+    for single in (False, True):
+        target = tmp_path / ("hostile.html" if single else "hostile")
+        ball_page(target, title=HOSTILE, description=HOSTILE, start_view=HOSTILE, single_file=single)
+    with serving(tmp_path / "hostile") as address:
+        for place in (address, f"{address}#q={HOSTILE}&view={HOSTILE}", (tmp_path / "hostile.html").as_uri()):
+            page = open_page(browser, place)
+            page.keyboard.press("v")
+            page.fill(".search input", "<img")
+            until(page, "document.querySelectorAll('#completions li').length > 0")
+            ask(page, HOSTILE.replace(",", ""))
+            assert page.evaluate("window.pwned") is None
+            assert page.title() == " ".join(HOSTILE.split())
+            assert page.locator("h1").inner_text() == " ".join(HOSTILE.split())
+            assert page.locator("main img").count() == 0
+            page.close()
+
+
+def test_on_a_phone_nothing_is_cut_off_and_the_answer_is_not_covered(browser, address):
+    page = open_page(browser, address, 390, 844)
+    ask(page, "red apple")
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    boxes = {name: page.locator(name).first.bounding_box() for name in (".search", ".sheet", ".tools")}
+    for box in boxes.values():
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+        assert box["y"] + box["height"] <= 845
+    assert boxes[".sheet"]["height"] < 0.42 * 844 + 1
+    spot = page.evaluate("(() => lexsplat.app.stage.pixel(lexsplat.app.answers[0].places[0].center))()")
+    assert boxes[".search"]["y"] + boxes[".search"]["height"] < spot["y"] < boxes[".sheet"]["y"]
+    assert 0 < spot["x"] < boxes[".tools"]["x"]
+    page.close()
+
+
+def test_a_single_file_opens_by_double_click_and_a_folder_says_what_to_do(browser, ball_page, tmp_path):
+    single = ball_page(tmp_path / "balls.html", single_file=True)
+    page = open_page(browser, single.as_uri())
+    ask(page, "ball 3")
+    assert "here" in page.locator(".card").inner_text()
+    assert not [url for url in page.requested if not url.startswith(("file:", "blob:", "data:"))]
+    page.close()
+    page = open_page(browser, (ball_page() / "index.html").as_uri())
+    assert "python -m http.server" in page.locator(".failure").inner_text()
+    page.close()
+
+
+def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser, ball_page, tmp_path):
+    folder = ball_page()
+    damaged = tmp_path / "damaged"
+    shutil.copytree(folder, damaged)
+    content = bytearray((damaged / "codes.bin").read_bytes())
+    content[100] ^= 1
+    (damaged / "codes.bin").write_bytes(content)
+    with serving(damaged) as address:
+        page = open_page(browser, address)
+        assert page.locator(".failure").inner_text().startswith("codes.bin: expected the")
+        page.close()
+    with serving(folder) as address:
+        page = open_page(browser, address, script="HTMLCanvasElement.prototype.getContext = () => null")
+        assert "needs WebGL 2" in page.locator(".failure").inner_text()
+        page.close()

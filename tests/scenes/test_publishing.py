@@ -1,0 +1,233 @@
+"""Published folders: what is in them, and what is refused. tests/scenes/test_published_page.py opens them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.viewer_scene import ball_scene
+
+from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.runtime.files import write_json
+from lexsplat.scenes import publishing
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.language import stored_language
+from lexsplat.scenes.publishing import PublishOptions, publish, sidecar, splat_file, vocabulary
+
+WEB = Path(__file__).parents[2] / "web"
+BUNDLE = Path(publishing.__file__).parent / "page"
+
+
+@pytest.fixture(scope="module")
+def balls():
+    return ball_scene()[0]
+
+
+@pytest.fixture
+def small_dictionary(monkeypatch):
+    monkeypatch.setattr(
+        vocabulary, "everyday_phrases", lambda bundled: dict.fromkeys(["ball 1", "chair"], "n")
+    )
+
+
+def published(scene, folder, **options) -> dict:
+    publish(scene, folder, PublishOptions(**options))
+    return json.loads((folder / "manifest.json").read_text())
+
+
+def test_there_are_five_thousand_everyday_phrases_without_repetition():
+    phrases = list(vocabulary.everyday_phrases())
+    assert len(phrases) > 5000
+    assert all(phrase == " ".join(phrase.split()).lower() for phrase in phrases)
+
+
+def test_the_codes_of_the_page_give_the_scores_of_the_field(balls):
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(500, 4, generator=generator).sort(1, descending=True).values
+    weights /= weights.sum(1, keepdim=True)
+    weights[:50] = 0  # seen by no view
+    language = stored_language(balls.field, {}).select(torch.arange(500))
+    exact = type(language)(language.codes, weights, language.uncertainties, language.codewords, {})
+    content = np.frombuffer(sidecar.splat_codes(exact), np.uint8).reshape(2, 500, 4)
+    shares = content[1].astype(float) / 255 / [1, 2, 3, 4]
+    shares[:, 0] -= shares[:, 1:].sum(1)
+    assert np.array_equal(content[0], language.codes.numpy())
+    # Scores of the worst table, which has 0 and 1 only, differ by the sum of errors of one sign.
+    errors = shares - weights.numpy()
+    assert np.maximum(errors, 0).sum(1).max() <= 0.55 / 255
+    assert np.maximum(-errors, 0).sum(1).max() <= 0.55 / 255
+
+
+def test_the_manifest_lists_every_file_with_its_checksum(balls, tmp_path, small_dictionary):
+    manifest = published(balls, tmp_path / "page", words_only=True, title="Balls")
+    files = {path.name for path in (tmp_path / "page").iterdir()} - {"manifest.json", "index.html"}
+    assert files == set(manifest["files"]) - {"index.html"}
+    for name in files:
+        content = (tmp_path / "page" / name).read_bytes()
+        assert manifest["files"][name]["bytes"] == len(content)
+        assert manifest["files"][name]["crc32"] == zlib.crc32(content)
+    assert manifest["text"] is None
+    assert (
+        manifest["words"]["count"] * manifest["language"]["num_codes"]
+        == manifest["files"]["words.bin"]["bytes"]
+    )
+
+
+def test_without_the_library_for_spz_the_splats_are_a_ply_of_the_same_order(balls, tmp_path, monkeypatch):
+    from plyfile import PlyData
+
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    path, rotation = splat_file.write_splats(balls.gaussians, tmp_path)
+    assert (path.name, rotation) == ("scene.ply", splat_file.IDENTITY)
+    assert np.array_equal(PlyData.read(path)["vertex"]["x"], balls.gaussians.means[:, 0].numpy())
+
+
+def test_an_spz_in_another_order_is_not_taken(balls, tmp_path):
+    pytest.importorskip("gaussforge")
+    path, _ = splat_file.write_splats(balls.gaussians, tmp_path)
+    assert path.name == "scene.spz"
+    content = path.read_bytes()
+    assert splat_file._in_order(balls.gaussians.means, content)
+    assert not splat_file._in_order(balls.gaussians.means.flip(0), content)
+
+
+def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, small_dictionary):
+    gaussians = balls.gaussians.map(torch.clone)
+    gaussians.log_scales[1::2] -= 3
+    thinned = type(balls)(gaussians, balls.field, balls.views, balls.clip)
+    half = (len(gaussians) + 1) // 2
+    assert splat_file.most_visible(gaussians, half).tolist() == list(range(0, len(gaussians), 2))
+    manifest = published(thinned, tmp_path / "page", words_only=True, max_splats=half)
+    assert (manifest["scene"]["gaussians"], manifest["scene"]["of"]) == (half, len(gaussians))
+    assert manifest["files"]["codes.bin"]["bytes"] == 8 * half
+
+
+def test_publishing_again_replaces_the_page_and_keeps_no_file_of_before(
+    balls, tmp_path, small_dictionary, monkeypatch
+):
+    folder = tmp_path / "page"
+    published(balls, folder, words_only=True)
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    manifest = published(balls, folder, words_only=True, title="again")
+    assert {path.name for path in folder.iterdir()} == set(manifest["files"]) | {"manifest.json"}
+    assert not (folder / "scene.spz").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["page"]
+
+
+def test_what_was_asked_in_the_viewer_comes_first_as_plain_text(balls, tmp_path):
+    write_json(tmp_path / "viewer.json", {"history": ["Blue\n<b>Ball</b>", "ball  2", 7, "x" * 300]})
+    scene = balls.with_content(balls.gaussians, balls.field)
+    scene.folder = SceneFolder(tmp_path)
+    phrases = vocabulary.page_phrases(vocabulary.asked_phrases(scene))
+    assert list(phrases)[:2] == ["blue <b>ball</b>", "ball 2"]
+    assert max(map(len, phrases)) <= 120
+    lines = vocabulary.words_file(phrases, ["y"] * len(phrases)).decode().splitlines()
+    assert lines[:2] == ["ayblue <b>ball</b>", "ayball 2"]
+    assert len(lines) == len(phrases)
+
+
+@pytest.mark.parametrize(
+    ("make", "found"),
+    [
+        (lambda folder: (folder / "holiday.jpg").write_text("mine"), "holiday.jpg"),
+        (
+            lambda folder: (folder / "manifest.json").write_text('{"name": "another program"}'),
+            "manifest.json",
+        ),
+    ],
+)
+def test_a_folder_with_files_of_others_is_refused_and_left_alone(balls, tmp_path, make, found):
+    make(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(SceneFolderError, match=found):
+        publish(balls, tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_single_files_need_a_name_in_html_and_replace_no_other_file(balls, tmp_path):
+    single = PublishOptions(single_file=True)
+    with pytest.raises(SceneFolderError, match=r"\.html"):
+        publish(balls, tmp_path / "page", single)
+    (tmp_path / "mine.html").write_text("<p>mine</p>")
+    with pytest.raises(SceneFolderError, match="another file"):
+        publish(balls, tmp_path / "mine.html", single)
+
+
+def test_a_single_file_that_would_be_too_large_is_refused(balls, tmp_path, small_dictionary, monkeypatch):
+    monkeypatch.setattr("lexsplat.scenes.publishing.writing.SINGLE_FILE_BYTES", 1000)
+    with pytest.raises(SceneFolderError, match="for a single file"):
+        publish(balls, tmp_path / "page.html", PublishOptions(single_file=True, words_only=True))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_scene_of_no_or_one_gaussian_is_refused(balls, tmp_path, count):
+    few = balls.with_content(
+        balls.gaussians.select(torch.arange(count)), balls.field.select(torch.arange(count))
+    )
+    with pytest.raises(QueryError, match=f"at least 2 Gaussians, found {count}"):
+        publish(few, tmp_path / "page")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_with_nan_and_one_too_large_are_refused(balls, tmp_path, monkeypatch):
+    gaussians = balls.gaussians.map(torch.clone)
+    gaussians.means[3] = torch.nan
+    with pytest.raises(QueryError, match="NaN or Inf in means"):
+        publish(balls.with_content(gaussians, balls.field), tmp_path / "page")
+    monkeypatch.setattr("lexsplat.scenes.publishing.writing.MOST_SPLATS", 100)
+    with pytest.raises(QueryError, match="--max-splats"):
+        publish(balls, tmp_path / "page")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_start_view_is_refused(balls, tmp_path):
+    with pytest.raises(QueryError, match="view 'nowhere'"):
+        publish(balls, tmp_path / "page", PublishOptions(start_view="nowhere"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_without_language_is_refused_in_one_line(tmp_path, capsys):
+    from lexsplat import cli
+    from lexsplat.scenes.folder import BUNDLED_SCENE
+
+    for name in ("scene.json", "cameras.json", "gaussians.ply"):
+        shutil.copyfile(BUNDLED_SCENE / name, tmp_path / name)
+    assert cli.main(["publish", str(tmp_path), str(tmp_path / "page")]) == 1
+    line = capsys.readouterr().err
+    assert line.startswith("error: ")
+    assert "language" in line
+    assert line.count("\n") == 1
+    assert not (tmp_path / "page").exists()
+
+
+def _npx(*arguments: str) -> str:
+    if shutil.which("node") is None or not (WEB / "node_modules").is_dir():
+        pytest.skip("needs node and: npm ci --prefix web")
+    done = subprocess.run(arguments, cwd=WEB, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_bundle_is_what_its_source_gives(tmp_path):
+    _npx("node", "build.mjs", str(tmp_path))
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (BUNDLE / path.name).read_bytes(), path.name
+
+
+@pytest.mark.slow
+def test_the_source_of_the_page_passes_the_type_checker_and_the_linter():
+    _npx("npm", "run", "--silent", "check")
+
+
+def test_the_code_of_the_page_is_at_most_1_4_megabytes_compressed():
+    sizes = [len(zlib.compress((BUNDLE / name).read_bytes(), 9)) for name in ("page.js", "page.css")]
+    assert sum(sizes) < 1.4e6

@@ -1,0 +1,77 @@
+"""Published pages in a headless Chromium with software WebGL, served by the standard library's server."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import http.server
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *arguments):
+        pass
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """The address of a server of a folder."""
+    handler = functools.partial(_Quiet, directory=str(folder))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator:
+    """A running browser."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+def open_page(browser, address: str, width: int = 480, height: int = 360, script: str = ""):
+    """A page that has started or failed; ``page.requested`` and ``page.complaints`` are filled."""
+    page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion="reduce")
+    page.set_default_timeout(60_000)
+    page.requested, page.complaints = [], []
+    page.on("request", lambda request: page.requested.append(request.url))
+    page.on("requestfailed", lambda request: page.complaints.append(request.url))
+    page.on("console", lambda m: page.complaints.append(m.text) if m.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    if script:
+        page.add_init_script(script)
+    page.goto(address)
+    until(page, "Boolean(window.lexsplat?.app || document.querySelector('.failure'))")
+    return page
+
+
+def until(page, condition: str, seconds: float = 60.0):
+    """Wait until an expression of the page is true; its policy forbids Playwright's own way of waiting."""
+    end = time.monotonic() + seconds
+    while not (value := page.evaluate(condition)):
+        assert time.monotonic() < end, f"timed out: {condition}"
+        page.wait_for_timeout(50)
+    return value
+
+
+def ask(page, text: str) -> None:
+    """Ask in the search bar and wait for the answer."""
+    page.evaluate("document.querySelector('.answers').replaceChildren()")
+    page.fill(".search input", text)
+    page.keyboard.press("Enter")
+    until(page, "Boolean(document.querySelector('.card'))")

@@ -1,0 +1,251 @@
+// The splats on the CPU: what a ray meets, and where a selection is. All points are in the axes of the scene.
+
+import type { SplatMesh } from "@sparkjsdev/spark";
+import * as THREE from "three";
+import { largest } from "./rules";
+
+/** A selection's cluster: where it is and how large. */
+export interface Place {
+  center: THREE.Vector3;
+  radius: number;
+  splats: number[];
+}
+
+/** A smaller cluster than this share of the largest one's opacity is a speck. */
+const SMALLEST_SHARE = 0.1;
+/** Smallest peak of a cluster above the threshold, as a share of the best one's (lexsplat.queries.selection). */
+const CONVINCING = 0.65;
+const PEAK_COUNT = 20;
+/** Largest distance between linked splats, in usual distances to the sixth neighbor. */
+const LINK = 2.5;
+/** Splats that are linked, at most; the others of a larger selection join them. */
+const MOST_LINKED = 20_000;
+/** Splats of lower opacity join clusters but do not link them. */
+const FAINT = 0.1;
+/** A splat belongs to the surface of a hit if its depth differs by at most this share. */
+const SAME_SURFACE = 0.05;
+
+export class Geometry {
+  readonly centers: Float32Array;
+  readonly opacities: Float32Array;
+  readonly #scales: Float32Array;
+  readonly #quats: Float32Array;
+
+  constructor(mesh: SplatMesh, count: number) {
+    this.centers = new Float32Array(3 * count);
+    this.opacities = new Float32Array(count);
+    this.#scales = new Float32Array(3 * count);
+    this.#quats = new Float32Array(4 * count);
+    const turn = mesh.quaternion.clone();
+    const point = new THREE.Vector3();
+    const quat = new THREE.Quaternion();
+    mesh.forEachSplat((i, center, scales, quaternion, opacity) => {
+      point.copy(center).applyQuaternion(turn).toArray(this.centers, 3 * i);
+      scales.toArray(this.#scales, 3 * i);
+      quat.copy(turn).multiply(quaternion).toArray(this.#quats, 4 * i);
+      this.opacities[i] = opacity;
+    });
+  }
+
+  get count(): number {
+    return this.opacities.length;
+  }
+
+  center(splat: number, out = new THREE.Vector3()): THREE.Vector3 {
+    return out.fromArray(this.centers, 3 * splat);
+  }
+
+  /** The middle of most splats and the radius around it that holds them. */
+  bounds(): { center: THREE.Vector3; radius: number } {
+    const step = Math.max(1, Math.floor(this.count / 20000));
+    const axis = (a: number): number[] => {
+      const values: number[] = [];
+      for (let i = 0; i < this.count; i += step) if (this.opacities[i] >= FAINT) values.push(this.centers[3 * i + a]);
+      values.sort((x, y) => x - y);
+      return [values[Math.floor(values.length * 0.1)] ?? 0, values[Math.floor(values.length * 0.9)] ?? 0];
+    };
+    const [x, y, z] = [axis(0), axis(1), axis(2)];
+    const center = new THREE.Vector3((x[0] + x[1]) / 2, (y[0] + y[1]) / 2, (z[0] + z[1]) / 2);
+    return { center, radius: Math.hypot(x[1] - x[0], y[1] - y[0], z[1] - z[0]) / 2 || 1 };
+  }
+
+  /**
+   * The surface that a ray meets: the depth behind which less than half of the light is left, and the splats there
+   * with their shares of it. Null if the ray meets less than 0.3 of a surface.
+   */
+  hit(ray: THREE.Ray): { point: THREE.Vector3; depth: number; splats: number[]; shares: number[] } | null {
+    const { origin, direction } = ray;
+    const met: { splat: number; depth: number; alpha: number }[] = [];
+    const quat = new THREE.Quaternion();
+    const toward = new THREE.Vector3();
+    const offset = new THREE.Vector3();
+    for (let i = 0, c = 0; i < this.count; i++, c += 3) {
+      offset.set(this.centers[c] - origin.x, this.centers[c + 1] - origin.y, this.centers[c + 2] - origin.z);
+      const along = offset.dot(direction);
+      if (along <= 0) continue;
+      const s = this.#scales;
+      const reach = 3 * Math.max(s[c], s[c + 1], s[c + 2]);
+      if (offset.lengthSq() - along * along > reach * reach) continue;
+      quat.fromArray(this.#quats, 4 * i).conjugate();
+      offset.applyQuaternion(quat).negate();
+      toward.copy(direction).applyQuaternion(quat);
+      for (const [n, axis] of (["x", "y", "z"] as const).entries()) {
+        const scale = Math.max(s[c + n], 1e-7);
+        offset[axis] /= scale;
+        toward[axis] /= scale;
+      }
+      const depth = -offset.dot(toward) / toward.lengthSq();
+      const apart = offset.lengthSq() - depth * depth * toward.lengthSq();
+      const alpha = Math.min(0.99, this.opacities[i] * Math.exp(-0.5 * Math.max(0, apart)));
+      if (alpha > 1 / 255 && depth > 0) met.push({ splat: i, depth, alpha });
+    }
+    met.sort((a, b) => a.depth - b.depth);
+    let light = 1;
+    const shares = met.map(({ alpha }) => {
+      const share = light * alpha;
+      light *= 1 - alpha;
+      return share;
+    });
+    const total = 1 - light;
+    if (total < 0.3) return null;
+    let sum = 0;
+    const half = met[shares.findIndex((share) => (sum += share) >= total / 2)].depth;
+    const near = met.map((_, n) => n).filter((n) => Math.abs(met[n].depth - half) <= SAME_SURFACE * half);
+    return {
+      point: ray.at(half, new THREE.Vector3()),
+      depth: half,
+      splats: near.map((n) => met[n].splat),
+      shares: near.map((n) => shares[n]),
+    };
+  }
+
+  /**
+   * The places that a threshold selects, the surest first: connected cells of a grid, without specks and without
+   * clusters that score far worse than the best one.
+   */
+  places(scores: Float32Array, threshold: number): Place[] {
+    const chosen: number[] = [];
+    for (let i = 0; i < this.count; i++) if (scores[i] >= threshold) chosen.push(i);
+    if (chosen.length === 0) return [];
+    const clusters = this.#clusters(chosen).map((splats) => ({
+      splats,
+      mass: splats.reduce((sum, i) => sum + this.opacities[i], 0),
+      peak: mean(largest(scores, splats, PEAK_COUNT).map((i) => scores[i])),
+    }));
+    const most = Math.max(...clusters.map((cluster) => cluster.mass));
+    const firm = clusters.filter((cluster) => cluster.mass >= SMALLEST_SHARE * most);
+    const limit = threshold + CONVINCING * (Math.max(...firm.map((cluster) => cluster.peak)) - threshold);
+    return firm
+      .filter((cluster) => cluster.peak >= limit)
+      .sort((a, b) => b.peak * Math.sqrt(b.mass) - a.peak * Math.sqrt(a.mass))
+      .map(({ splats }) => this.#place(splats));
+  }
+
+  /**
+   * Splats that are linked: nearer than 2.5 times the usual distance to the sixth neighbor. Faint splats, and of large
+   * selections those that are not in a sample, join the cluster of a linked one nearby.
+   */
+  #clusters(chosen: number[]): number[][] {
+    const firm = chosen.filter((i) => this.opacities[i] >= FAINT);
+    const all = firm.length ? firm : chosen;
+    const step = Math.ceil(all.length / MOST_LINKED);
+    const makers = step > 1 ? all.filter((_, n) => n % step === 0) : all;
+    const link = LINK * this.#spacing(makers);
+    const grid = new Grid(this.centers, makers, link);
+    const parents = new Map<number, number>(makers.map((i) => [i, i]));
+    const root = (i: number): number => {
+      let top = i;
+      for (let up = parents.get(top)!; up !== top; up = parents.get(top)!) top = up;
+      for (let up = parents.get(i)!; up !== top; up = parents.get(i)!) {
+        parents.set(i, top);
+        i = up;
+      }
+      return top;
+    };
+    for (const i of makers) grid.near(i, (j) => j < i && parents.set(root(i), root(j)) && false);
+    const clusters = new Map<number, number[]>();
+    for (const i of chosen) {
+      let own: number | null = parents.has(i) ? i : null;
+      if (own === null) grid.near(i, (j) => (own = j) !== null);
+      if (own === null) continue;
+      const top = root(own);
+      const cluster = clusters.get(top);
+      if (cluster) cluster.push(i);
+      else clusters.set(top, [i]);
+    }
+    return [...clusters.values()];
+  }
+
+  /** Median distance to the sixth neighbor, of a sample. */
+  #spacing(splats: number[]): number {
+    const step = Math.max(1, Math.ceil((splats.length * splats.length) / 4e6));
+    const found: number[] = [];
+    for (let n = 0; n < splats.length; n += step) {
+      const nearest = new Array<number>(7).fill(Infinity); // itself and six others
+      for (const j of splats) {
+        const apart = squared(this.centers, splats[n], j);
+        if (apart >= nearest[6]) continue;
+        let place = 6;
+        for (; place > 0 && nearest[place - 1] > apart; place--) nearest[place] = nearest[place - 1];
+        nearest[place] = apart;
+      }
+      found.push(Math.sqrt(nearest.findLast(Number.isFinite) ?? 0));
+    }
+    found.sort((a, b) => a - b);
+    return found[Math.floor(found.length / 2)] || Math.max(...this.#scales.subarray(3 * splats[0], 3 * splats[0] + 3));
+  }
+
+  #place(splats: number[]): Place {
+    const center = new THREE.Vector3();
+    const point = new THREE.Vector3();
+    let sum = 0;
+    for (const i of splats) {
+      center.addScaledVector(this.center(i, point), this.opacities[i]);
+      sum += this.opacities[i];
+    }
+    center.divideScalar(sum || 1);
+    const apart = splats.map((i) => this.center(i, point).distanceTo(center)).sort((a, b) => a - b);
+    return { center, radius: apart[Math.floor(apart.length * 0.95)] || 0.01, splats };
+  }
+}
+
+function squared(centers: Float32Array, i: number, j: number): number {
+  const x = centers[3 * i] - centers[3 * j];
+  const y = centers[3 * i + 1] - centers[3 * j + 1];
+  const z = centers[3 * i + 2] - centers[3 * j + 2];
+  return x * x + y * y + z * z;
+}
+
+/** Splats in cubes, to find those within a distance. */
+class Grid {
+  readonly #cells = new Map<number, number[]>();
+
+  constructor(readonly centers: Float32Array, splats: number[], readonly side: number) {
+    for (const i of splats) {
+      const key = this.#key(i, 0, 0, 0);
+      const cell = this.#cells.get(key);
+      if (cell) cell.push(i);
+      else this.#cells.set(key, [i]);
+    }
+  }
+
+  /** Visit the splats within one side of a splat, until `visit` is true. */
+  near(splat: number, visit: (other: number) => boolean): void {
+    const limit = this.side * this.side;
+    for (let n = 0; n < 27; n++) {
+      const cell = this.#cells.get(this.#key(splat, (n % 3) - 1, (Math.floor(n / 3) % 3) - 1, Math.floor(n / 9) - 1));
+      for (const other of cell ?? []) if (squared(this.centers, splat, other) <= limit && visit(other)) return;
+    }
+  }
+
+  /** A number for each cube within 2^16 sides of the origin; cubes farther away share numbers. */
+  #key(splat: number, x: number, y: number, z: number): number {
+    const at = (axis: number, shift: number): number =>
+      ((Math.floor(this.centers[3 * splat + axis] / this.side) + shift) & 0x1ffff) >>> 0;
+    return (at(0, x) * 0x20000 + at(1, y)) * 0x20000 + at(2, z);
+  }
+}
+
+function mean(values: number[]): number {
+  return values.reduce((a, b) => a + b, 0) / (values.length || 1);
+}

@@ -1,0 +1,147 @@
+// What the folder holds: manifest.json, and reading its files with their checksums.
+
+/** A message for the visitor in one line: what was expected, what was found, what to do. */
+export class PageError extends Error {}
+
+export interface FileEntry {
+  bytes: number;
+  crc32: number;
+}
+
+/** An original camera: OpenCV axes, world to camera, row by row. */
+export interface ViewEntry {
+  name: string;
+  width: number;
+  height: number;
+  focal: [number, number];
+  viewmat: number[];
+}
+
+/** The constants of lexsplat.queries.everyday and lexsplat.queries.presence, and the peak of the scene. */
+export interface EverydayRule {
+  border: number;
+  steepness: number;
+  offset: number;
+  peak_share: number;
+  peak: number;
+  yes: number;
+  no: number;
+}
+
+export interface Manifest {
+  format: "lexsplat-page";
+  format_version: number;
+  lexsplat: string;
+  title: string;
+  description: string;
+  scene: {
+    file: string;
+    gaussians: number;
+    of: number;
+    /** Quaternion xyzw from the axes of the splat file to those of the scene. */
+    rotation: [number, number, number, number];
+    antialiased: boolean;
+    up: [number, number, number];
+    meters_per_unit: number | null;
+    start_view: string;
+  };
+  language: { codes: string; num_codes: number; method: string };
+  words: { phrases: string; table: string; count: number };
+  text: {
+    weights: string;
+    tokenizer: string;
+    heads: number;
+    activation: string;
+    templates: string[];
+    everyday: EverydayRule;
+  } | null;
+  views: ViewEntry[];
+  files: Record<string, FileEntry>;
+  licenses: Record<string, string>;
+  provenance: Record<string, unknown>;
+}
+
+const FORMAT_VERSION = 1;
+
+/** Where the files are: beside the page, or inside it (`--single-file`). */
+export class Files {
+  #manifest: Manifest | null = null;
+
+  get inside(): boolean {
+    return document.getElementById("file:manifest.json") !== null;
+  }
+
+  async manifest(): Promise<Manifest> {
+    if (location.protocol === "file:" && !this.inside) {
+      throw new PageError(
+        "This page needs a web server, because browsers do not let a file read its neighbors. " +
+          "In this folder run: python -m http.server, then open http://localhost:8000. " +
+          "Or publish with --single-file.",
+      );
+    }
+    let manifest: Manifest;
+    try {
+      manifest = JSON.parse(new TextDecoder().decode(await this.#raw("manifest.json"))) as Manifest;
+    } catch (error) {
+      if (error instanceof PageError) throw error;
+      throw new PageError("manifest.json: expected JSON, found something else; publish the scene again.");
+    }
+    if (manifest.format !== "lexsplat-page" || manifest.format_version !== FORMAT_VERSION) {
+      throw new PageError(
+        `manifest.json: expected version ${FORMAT_VERSION} of a lexsplat page, ` +
+          `found ${manifest.format_version}; publish the scene again.`,
+      );
+    }
+    this.#manifest = manifest;
+    return manifest;
+  }
+
+  /** A file of the manifest. Damaged files are refused by length and CRC-32. */
+  async read(name: string): Promise<Uint8Array<ArrayBuffer>> {
+    const entry = this.#manifest?.files[name];
+    if (!entry) throw new PageError(`${name}: the manifest does not list it; publish the scene again.`);
+    const content = await this.#raw(name);
+    if (content.length !== entry.bytes || crc32(content) !== entry.crc32) {
+      const found = content.length === entry.bytes ? "other content" : `${content.length} bytes`;
+      throw new PageError(
+        `${name}: expected the ${entry.bytes} bytes that were published, found ${found}; copy the folder again.`,
+      );
+    }
+    return content;
+  }
+
+  async #raw(name: string): Promise<Uint8Array<ArrayBuffer>> {
+    if (this.inside) {
+      const element = document.getElementById(`file:${name}`);
+      if (!element) throw new PageError(`${name}: not inside this page; publish the scene again.`);
+      return decodeBase64(element.textContent ?? "");
+    }
+    let answer: Response;
+    try {
+      answer = await fetch(name, { credentials: "same-origin" });
+    } catch {
+      throw new PageError(`${name}: the server does not answer; reload the page.`);
+    }
+    if (!answer.ok) throw new PageError(`${name}: the server answered ${answer.status}; copy the folder again.`);
+    return new Uint8Array(await answer.arrayBuffer());
+  }
+}
+
+function decodeBase64(text: string): Uint8Array<ArrayBuffer> {
+  const binary = atob(text.trim());
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < binary.length; i++) bytes[i] = binary.charCodeAt(i);
+  return bytes;
+}
+
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
+  for (let k = 0; k < 8; k++) n = n & 1 ? 0xedb88320 ^ (n >>> 1) : n >>> 1;
+  return n;
+});
+
+/** CRC-32 as of zlib. `crypto.subtle` would need https, which a server in one's own network rarely has. */
+export function crc32(bytes: Uint8Array): number {
+  let crc = 0xffffffff;
+  for (let i = 0; i < bytes.length; i++) crc = CRC_TABLE[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
+  return (crc ^ 0xffffffff) >>> 0;
+}

@@ -1,0 +1,71 @@
+// "Not here" and relevancy for phrases that are in no dictionary, relative to everyday words as
+// lexsplat.queries.everyday and lexsplat.queries.presence have it. tests/scenes/test_published_page.py compares them.
+
+import { type Language, type Table, dot } from "./language";
+import type { EverydayRule } from "./manifest";
+
+export type Presence = "yes" | "no" | "unsure";
+
+/** Relevancy at the border: the automatic threshold of every prompt. */
+export const BORDER = 0.5;
+const PEAK_SHARE = 5e-4;
+const PEAK_COUNT = 20;
+const LEAST = 1e-6;
+
+/** How well a phrase describes each code, above its own offset. */
+export type Heights = Float32Array;
+
+/**
+ * Heights of a phrase: its cosines with the codes, less those of the mean everyday word, less their quantile.
+ * `codewords` is [K, D] of unit length, `text` and `mean` are [D].
+ */
+export function heightsOf(codewords: Float32Array, text: Float32Array, mean: Float32Array, rule: EverydayRule): Heights {
+  const width = text.length;
+  const shared = new Float32Array(codewords.length / width);
+  for (let k = 0; k < shared.length; k++) {
+    let sum = 0;
+    for (let d = 0; d < width; d++) sum += codewords[k * width + d] * (text[d] - mean[d]);
+    shared[k] = sum;
+  }
+  const sorted = shared.slice().sort();
+  const place = rule.offset * (sorted.length - 1);
+  const low = Math.floor(place);
+  const offset = sorted[low] + (place - low) * (sorted[Math.min(low + 1, sorted.length - 1)] - sorted[low]);
+  return shared.map((value) => value - offset);
+}
+
+/** Relevancy of each code for a phrase with these heights; `best` is the best height of an everyday word there. */
+export function relevancyOf(heights: Heights, best: Float32Array, rule: EverydayRule): Table {
+  const count = Math.max(1, Math.round(rule.peak_share * heights.length));
+  const highest = heights.slice().sort().subarray(-count);
+  const peak = Math.max(LEAST, highest.reduce((sum, value) => sum + value, 0) / count);
+  return heights.map((height, k) => {
+    const ratio = Math.min(height / peak, height / best[k]);
+    return 1 / (1 + Math.exp(-rule.steepness * (ratio - rule.border)));
+  });
+}
+
+/** Whether the scene holds a phrase: how well it describes the splats that score best. */
+export function presenceOf(
+  scores: Float32Array, heights: Heights, best: Float32Array, rule: EverydayRule, language: Language, shown: Uint32Array,
+): Presence {
+  if (shown.length === 0) return "no";
+  const count = Math.min(shown.length, Math.max(PEAK_COUNT, Math.floor(PEAK_SHARE * shown.length)));
+  const place = language.distribution(largest(scores, shown, count));
+  const reached = dot(place, heights);
+  const ratio = Math.max(0, reached / Math.max(dot(place, best), LEAST));
+  const strength = Math.sqrt(ratio * Math.max(0, reached / rule.peak));
+  return strength >= rule.yes ? "yes" : strength < rule.no ? "no" : "unsure";
+}
+
+/** The `count` indices among `of` with the largest values, without sorting them all. */
+export function largest(values: Float32Array, of: ArrayLike<number> & Iterable<number>, count: number): number[] {
+  const counts = new Uint32Array(4096);
+  const bin = (value: number): number => Math.min(4095, Math.max(0, Math.floor(value * 4096)));
+  for (const i of of) counts[bin(values[i])]++;
+  let border = 4095;
+  for (let sum = counts[border]; sum < count && border > 0; sum += counts[--border]);
+  const candidates: number[] = [];
+  for (const i of of) if (bin(values[i]) >= border) candidates.push(i);
+  return candidates.sort((a, b) => values[b] - values[a]).slice(0, count);
+}

@@ -1,0 +1,231 @@
+// The picture: three.js, Spark, the camera and its ways to move. Axes and units are those of the scene.
+
+import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import type { Place } from "./geometry";
+import { type Manifest, PageError, type ViewEntry } from "./manifest";
+
+/** Scenes of more splats are stored with less precise centers, to fit into the memory of phones. */
+const MOST_PRECISE = 1_500_000;
+const FLIGHT_MS = 700;
+
+const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY };
+
+export class Stage {
+  readonly camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
+  readonly renderer: THREE.WebGLRenderer;
+  readonly scene = new THREE.Scene();
+  mesh!: SplatMesh;
+  /** Called after the camera moved. */
+  onMove: () => void = () => undefined;
+  /** Called after every picture. */
+  onDraw: () => void = () => undefined;
+  readonly #controls: OrbitControls;
+  readonly #spark: SparkRenderer;
+  #wanted = false;
+  #flight = 0;
+  #bottom = 0;
+
+  constructor(readonly canvas: HTMLCanvasElement, readonly manifest: Manifest) {
+    try {
+      this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    } catch {
+      throw new PageError(
+        "This page needs WebGL 2, which this browser does not offer; use a newer browser or allow hardware acceleration.",
+      );
+    }
+    const { antialiased } = manifest.scene;
+    this.#spark = new SparkRenderer({
+      renderer: this.renderer,
+      sortRadial: false, // scenes are trained with splats in the order of depth
+      preBlurAmount: antialiased ? 0 : 0.3,
+      blurAmount: antialiased ? 0.3 : 0,
+      onDirty: () => this.draw(),
+    });
+    this.scene.add(this.#spark);
+    this.camera.up.fromArray(manifest.scene.up);
+    this.#controls = new OrbitControls(this.camera, canvas);
+    this.#controls.enableDamping = !calm();
+    this.#controls.dampingFactor = 0.12;
+    this.#controls.zoomToCursor = true;
+    this.#controls.addEventListener("change", () => {
+      this.draw();
+      this.onMove();
+    });
+    this.#controls.addEventListener("start", () => this.#flight++); // the visitor's hand stops a flight
+    new ResizeObserver(() => this.resize()).observe(canvas);
+  }
+
+  async load(content: Uint8Array<ArrayBuffer>): Promise<void> {
+    const { file, rotation, gaussians } = this.manifest.scene;
+    this.mesh = new SplatMesh({
+      fileBytes: content,
+      fileType: TYPES[file.split(".").at(-1)!],
+      extSplats: gaussians <= MOST_PRECISE,
+      raycastable: false,
+      lod: false,
+    });
+    this.mesh.quaternion.set(...rotation);
+    await this.mesh.initialized;
+    this.scene.add(this.mesh);
+  }
+
+  /** Draw soon. Nothing is drawn while nothing changes. */
+  draw(): void {
+    if (this.#wanted) return;
+    this.#wanted = true;
+    requestAnimationFrame(() => {
+      this.#wanted = false;
+      this.#controls.update();
+      this.renderer.render(this.scene, this.camera);
+      this.onDraw();
+    });
+  }
+
+  resize(): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (width === 0 || height === 0) return;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    // What covers the bottom of the picture on phones moves its middle up.
+    if (this.#bottom > 0) this.camera.setViewOffset(width, height, 0, this.#bottom / 2, width, height);
+    else this.camera.clearViewOffset();
+    this.camera.updateProjectionMatrix();
+    this.draw();
+  }
+
+  /** Pixels at the bottom that a sheet covers. */
+  set covered(pixels: number) {
+    if (pixels === this.#bottom) return;
+    this.#bottom = pixels;
+    this.resize();
+  }
+
+  set background(color: string) {
+    this.scene.background = new THREE.Color(color);
+    this.draw();
+  }
+
+  get target(): THREE.Vector3 {
+    return this.#controls.target;
+  }
+
+  /** The ray through a point of the page. */
+  ray(x: number, y: number): THREE.Ray {
+    const box = this.canvas.getBoundingClientRect();
+    const point = new THREE.Vector2(((x - box.left) / box.width) * 2 - 1, 1 - ((y - box.top) / box.height) * 2);
+    const caster = new THREE.Raycaster();
+    caster.setFromCamera(point, this.camera);
+    return caster.ray;
+  }
+
+  /** Where a point of the scene is on the page; null behind the camera. */
+  pixel(point: THREE.Vector3): { x: number; y: number } | null {
+    const seen = point.clone().project(this.camera);
+    if (seen.z > 1) return null;
+    const box = this.canvas.getBoundingClientRect();
+    return { x: box.left + ((seen.x + 1) / 2) * box.width, y: box.top + ((1 - seen.y) / 2) * box.height };
+  }
+
+  /** Stand where a photo was taken. `depth` is how far away the scene is there. */
+  jump(view: ViewEntry, depth: number, fly = true): void {
+    const { position, forward } = pose(view);
+    const tall = this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight) < view.width / view.height;
+    // The photo fits into the window: its width decides in narrow windows, its height in wide ones.
+    const half = tall
+      ? ((view.width / 2 / view.focal[0]) * this.canvas.clientHeight) / Math.max(1, this.canvas.clientWidth)
+      : view.height / 2 / view.focal[1];
+    const fov = Math.min(100, THREE.MathUtils.radToDeg(2 * Math.atan(half)));
+    void this.fly(position, position.clone().addScaledVector(forward, depth), fly, fov);
+  }
+
+  /** Fly to where a place fills a third of the picture, coming from where the nearest photo was taken. */
+  flyTo(place: Place, from: THREE.Vector3): void {
+    const half = THREE.MathUtils.degToRad(this.camera.fov / 2);
+    const wide = Math.min(1, this.camera.aspect);
+    const away = from.clone().sub(place.center);
+    const distance = Math.max(this.camera.near * 4, Math.min(away.length(), (place.radius * 2.6) / (Math.tan(half) * wide)));
+    void this.fly(place.center.clone().addScaledVector(away.normalize(), distance), place.center);
+  }
+
+  /** Move the camera; at once where motion is not wanted. */
+  async fly(position: THREE.Vector3, target: THREE.Vector3, smooth = true, fov = this.camera.fov): Promise<void> {
+    const flight = ++this.#flight;
+    const from = { position: this.camera.position.clone(), target: this.target.clone(), fov: this.camera.fov };
+    const start = performance.now();
+    for (let share = 0; share < 1; ) {
+      share = smooth && !calm() ? Math.min(1, (performance.now() - start) / FLIGHT_MS) : 1;
+      const eased = share * share * (3 - 2 * share);
+      this.camera.position.lerpVectors(from.position, position, eased);
+      this.target.lerpVectors(from.target, target, eased);
+      this.camera.fov = from.fov + (fov - from.fov) * eased;
+      this.camera.updateProjectionMatrix();
+      this.#controls.update();
+      this.draw();
+      if (share < 1) await new Promise(requestAnimationFrame);
+      if (flight !== this.#flight) return;
+    }
+    this.onMove();
+  }
+
+  /** Turn, shift or approach with the keyboard. */
+  key(name: string, shift: boolean): boolean {
+    const offset = this.camera.position.clone().sub(this.target);
+    const right = new THREE.Vector3().crossVectors(this.camera.up, offset).normalize();
+    const step = offset.length() * 0.06;
+    const sideways = { ArrowLeft: -1, ArrowRight: 1 }[name];
+    const upward = { ArrowUp: 1, ArrowDown: -1 }[name];
+    if (name === "+" || name === "=") offset.multiplyScalar(0.88);
+    else if (name === "-") offset.multiplyScalar(1.14);
+    else if (sideways && shift) this.target.addScaledVector(right, sideways * step);
+    else if (upward && shift) this.target.addScaledVector(this.camera.up, upward * step);
+    else if (sideways) offset.applyAxisAngle(this.camera.up, sideways * 0.09);
+    else if (upward) {
+      const angle = offset.angleTo(this.camera.up);
+      const turned = THREE.MathUtils.clamp(angle - upward * 0.09, 0.05, Math.PI - 0.05);
+      offset.applyAxisAngle(right, turned - angle);
+    } else return false;
+    this.#flight++;
+    this.camera.position.copy(this.target).add(offset);
+    this.#controls.update();
+    this.draw();
+    this.onMove();
+    return true;
+  }
+
+  /** Resolves when the picture shows the latest state: drawn, and the splats sorted for it. */
+  async settled(): Promise<void> {
+    for (let quiet = 0; quiet < 3; quiet++) {
+      await new Promise(requestAnimationFrame);
+      const { dirty, sorting, sortDirty } = this.#spark;
+      if (this.#wanted || dirty || sorting || sortDirty) quiet = -1;
+    }
+  }
+
+  /** The picture as a PNG. */
+  async picture(): Promise<Blob> {
+    await this.settled();
+    this.renderer.render(this.scene, this.camera); // a canvas can only be read right after it was drawn
+    return new Promise((resolve, reject) =>
+      this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture"))), "image/png"),
+    );
+  }
+}
+
+/** Whether the visitor asked for less motion. */
+function calm(): boolean {
+  return matchMedia("(prefers-reduced-motion: reduce)").matches;
+}
+
+/** Position, forward and up of a view, in the axes of the scene. */
+export function pose(view: ViewEntry): { position: THREE.Vector3; forward: THREE.Vector3 } {
+  const m = view.viewmat;
+  const position = new THREE.Vector3(
+    -(m[0] * m[3] + m[4] * m[7] + m[8] * m[11]),
+    -(m[1] * m[3] + m[5] * m[7] + m[9] * m[11]),
+    -(m[2] * m[3] + m[6] * m[7] + m[10] * m[11]),
+  );
+  return { position, forward: new THREE.Vector3(m[8], m[9], m[10]).normalize() };
+}

@@ -1,0 +1,190 @@
+// The text tower of CLIP in plain TypeScript: a phrase to its relevancy for every code, without a server.
+
+import type { Table } from "./language";
+import type { EverydayRule, Manifest } from "./manifest";
+import { type Heights, heightsOf, relevancyOf } from "./rules";
+import { Tokenizer } from "./tokenizer";
+
+/** What a phrase means to the codes of the scene. */
+export interface Description {
+  table: Table;
+  heights: Heights;
+  best: Float32Array;
+  rule: EverydayRule;
+}
+
+interface Matrix {
+  data: Float32Array | Int8Array;
+  /** Factor of each row of 8-bit weights. */
+  factors: Float32Array | null;
+  rows: number;
+  columns: number;
+}
+
+/** The tensors of a safetensors file: half precision becomes float32, 8-bit weights stay and have factors. */
+export function readSafetensors(content: Uint8Array<ArrayBuffer>): Map<string, Matrix> {
+  const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
+  const length = Number(view.getBigUint64(0, true));
+  const header = JSON.parse(new TextDecoder().decode(content.subarray(8, 8 + length))) as Record<
+    string,
+    { dtype: string; shape: number[]; data_offsets: [number, number] }
+  >;
+  const tensors = new Map<string, Matrix>();
+  for (const [name, entry] of Object.entries(header)) {
+    if (name === "__metadata__") continue;
+    const [start, end] = entry.data_offsets.map((offset) => offset + 8 + length);
+    const bytes = content.slice(start, end).buffer;
+    const data =
+      entry.dtype === "F16" ? fromHalf(new Uint16Array(bytes)) : entry.dtype === "I8" ? new Int8Array(bytes) : new Float32Array(bytes);
+    const columns = entry.shape.at(-1) ?? 1;
+    tensors.set(name, { data, factors: null, rows: data.length / columns, columns });
+  }
+  for (const [name, tensor] of tensors) tensor.factors = (tensors.get(`${name}.factor`)?.data as Float32Array) ?? null;
+  return tensors;
+}
+
+function fromHalf(halves: Uint16Array): Float32Array {
+  return Float32Array.from(halves, (half) => {
+    const sign = half & 0x8000 ? -1 : 1;
+    const exponent = (half >> 10) & 31;
+    const fraction = half & 1023;
+    if (exponent === 31) return fraction ? NaN : sign * Infinity;
+    return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
+  });
+}
+
+const QUICK_GELU = (x: number): number => x / (1 + Math.exp(-1.702 * x));
+const GELU = (x: number): number => 0.5 * x * (1 + erf(x * Math.SQRT1_2));
+
+/** Abramowitz and Stegun 7.1.26; the error is below 1.5e-7. */
+function erf(x: number): number {
+  const t = 1 / (1 + 0.3275911 * Math.abs(x));
+  const poly = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
+  return Math.sign(x) * (1 - poly * Math.exp(-x * x));
+}
+
+/** The mean direction of vectors. */
+function unit(vectors: Float32Array[]): Float32Array {
+  const sum = vectors[0].map((_, d) => vectors.reduce((total, vector) => total + vector[d], 0));
+  const length = Math.sqrt(sum.reduce((total, value) => total + value * value, 0));
+  return sum.map((value) => value / length);
+}
+
+export class TextTower {
+  readonly #tensors: Map<string, Matrix>;
+  readonly #tokenizer: Tokenizer;
+  readonly #text: NonNullable<Manifest["text"]>;
+  readonly #heads: number;
+  readonly #activation: (x: number) => number;
+  readonly #layers: number;
+
+  constructor(weights: Uint8Array<ArrayBuffer>, tokenizer: Uint8Array, manifest: Manifest) {
+    this.#tensors = readSafetensors(weights);
+    const positions = this.#get("embeddings.position_embedding.weight").rows;
+    this.#tokenizer = new Tokenizer(JSON.parse(new TextDecoder().decode(tokenizer)), positions);
+    this.#text = manifest.text!;
+    this.#heads = this.#text.heads;
+    this.#activation = this.#text.activation === "quick_gelu" ? QUICK_GELU : GELU;
+    let layers = 0;
+    while (this.#tensors.has(`encoder.layers.${layers}.layer_norm1.weight`)) layers++;
+    this.#layers = layers;
+  }
+
+  /** Heights and relevancy of a phrase for every code. */
+  describe(phrase: string): Description {
+    const { templates, everyday } = this.#text;
+    const embedding = unit(templates.map((template) => this.embed(template.replace("{}", phrase))));
+    const [codewords, mean, best] = ["codewords", "mean", "best"].map((name) => this.#get(name).data as Float32Array);
+    const heights = heightsOf(codewords, embedding, mean, everyday);
+    return { table: relevancyOf(heights, best, everyday), heights, best, rule: everyday };
+  }
+
+  /** The embedding of a phrase, of unit length. */
+  embed(phrase: string): Float32Array {
+    const tokens = this.#tokenizer.encode(phrase);
+    const words = this.#get("embeddings.token_embedding.weight");
+    const positions = this.#get("embeddings.position_embedding.weight");
+    const width = words.columns;
+    let x = new Float32Array(tokens.length * width);
+    tokens.forEach((token, t) => {
+      const [a, b] = [words.factors?.[token] ?? 1, positions.factors?.[t] ?? 1];
+      for (let d = 0; d < width; d++) x[t * width + d] = words.data[token * width + d] * a + positions.data[t * width + d] * b;
+    });
+    for (let layer = 0; layer < this.#layers; layer++) x = this.#block(x, tokens.length, `encoder.layers.${layer}.`);
+    const last = this.#norm(x.slice(-width), "final_layer_norm"); // the end token is the last one
+    const out = this.#linear(last, 1, "text_projection");
+    return unit([out]);
+  }
+
+  #block(x: Float32Array<ArrayBuffer>, count: number, name: string): Float32Array<ArrayBuffer> {
+    const attended = this.#attend(this.#norm(x, `${name}layer_norm1`), count, `${name}self_attn.`);
+    const middle = x.map((value, i) => value + attended[i]);
+    const hidden = this.#linear(this.#norm(middle, `${name}layer_norm2`), count, `${name}mlp.fc1`);
+    const out = this.#linear(hidden.map(this.#activation), count, `${name}mlp.fc2`);
+    return middle.map((value, i) => value + out[i]);
+  }
+
+  /** Causal self-attention of `count` tokens. */
+  #attend(x: Float32Array, count: number, name: string): Float32Array {
+    const [q, k, v] = ["q_proj", "k_proj", "v_proj"].map((part) => this.#linear(x, count, name + part));
+    const width = x.length / count;
+    const size = width / this.#heads;
+    const blended = new Float32Array(x.length);
+    for (let head = 0; head < width; head += size) {
+      for (let t = 0; t < count; t++) {
+        const row = q.subarray(t * width + head, t * width + head + size);
+        const weights: number[] = [];
+        for (let s = 0; s <= t; s++) {
+          let sum = 0;
+          for (let d = 0; d < size; d++) sum += row[d] * k[s * width + head + d];
+          weights.push(sum / Math.sqrt(size));
+        }
+        const peak = Math.max(...weights);
+        const powers = weights.map((weight) => Math.exp(weight - peak));
+        const total = powers.reduce((a, b) => a + b, 0);
+        powers.forEach((power, s) => {
+          for (let d = 0; d < size; d++) blended[t * width + head + d] += (power / total) * v[s * width + head + d];
+        });
+      }
+    }
+    return this.#linear(blended, count, `${name}out_proj`);
+  }
+
+  #linear(x: Float32Array, count: number, name: string): Float32Array<ArrayBuffer> {
+    const { data, factors, rows, columns } = this.#get(`${name}.weight`);
+    const bias = this.#tensors.get(`${name}.bias`)?.data;
+    const out = new Float32Array(count * rows);
+    for (let row = 0; row < rows; row++) {
+      const weights = data.subarray(row * columns, (row + 1) * columns);
+      const factor = factors?.[row] ?? 1;
+      for (let t = 0; t < count; t++) {
+        let sum = 0;
+        for (let d = 0, i = t * columns; d < columns; d++, i++) sum += weights[d] * x[i];
+        out[t * rows + row] = sum * factor + (bias ? bias[row] : 0);
+      }
+    }
+    return out;
+  }
+
+  #norm(x: Float32Array, name: string): Float32Array {
+    const weight = this.#get(`${name}.weight`).data;
+    const bias = this.#get(`${name}.bias`).data;
+    const width = weight.length;
+    const out = new Float32Array(x.length);
+    for (let start = 0; start < x.length; start += width) {
+      let mean = 0;
+      let square = 0;
+      for (let d = 0; d < width; d++) mean += x[start + d] / width;
+      for (let d = 0; d < width; d++) square += (x[start + d] - mean) ** 2 / width;
+      const scale = 1 / Math.sqrt(square + 1e-5);
+      for (let d = 0; d < width; d++) out[start + d] = (x[start + d] - mean) * scale * weight[d] + bias[d];
+    }
+    return out;
+  }
+
+  #get(name: string): Matrix {
+    const tensor = this.#tensors.get(name);
+    if (!tensor) throw new Error(`the text tower lacks ${name}`);
+    return tensor;
+  }
+}
