@@ -1,8 +1,6 @@
 """A built scene, open for queries: the Python face of lexsplat.
 
-import lexsplat
-scene = lexsplat.open_scene("output/demo")
-relevancy = scene.relevancy("red apple", view="frame_0005.jpg")  # [1, H, W]
+scene = lexsplat.open_scene("demo")
 answers = scene.ask(["red apple", "mug"])  # scores, thresholds and presence of each prompt
 apple = scene.find("red apple left of the mug")  # a Selection: instances, boxes, best view
 """
@@ -150,38 +148,30 @@ class Scene:
             return self._given_encode_text(texts)
         known = self._encoder_hash
         if self.folder is None or known is None:
-            return encode_each(self._load_encoder(known), texts)
+            return encode_each(self.preload(), texts)
         if self._cache is None:
             writable = not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
             self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
-        return self._cache.encode(known, texts, lambda: self._load_encoder(known))
-
-    @property
-    def encoder(self) -> TextTower:
-        """The text encoder that belongs to the language, loaded at first use (`preload`)."""
-        return self._load_encoder(self._encoder_hash)
+        return self._cache.encode(known, texts, self.preload)
 
     def encoder_identity(self) -> dict[str, str]:
         """Name and content hash (if known) of the text encoder, for files of other programs."""
         known = self._encoder_hash
         return {"encoder": self.clip, **({"encoder_hash": known} if known else {})}
 
-    def preload(self) -> None:
-        """Load the text encoder, so that the first query does not wait for it.
-
-        Raises:
-            ModelError: If it cannot be loaded.
-        """
-        self._load_encoder(self._encoder_hash)
-
     @property
     def _encoder_hash(self) -> str | None:
         return self.folder.record["stages"].get("features", {}).get("clip_hash") if self.folder else None
 
-    def _load_encoder(self, known: str | None) -> TextTower:
+    def preload(self) -> TextTower:
+        """Load the text encoder that belongs to the language, so that the first query does not wait for it.
+
+        Raises:
+            ModelError: If it cannot be loaded, or is another one.
+        """
         if self._encoder is None:
             self._encoder = load_text(self.clip, str(self.gaussians.device))
-        if known is not None and self._encoder.content_hash != known:
+        if self._encoder_hash not in (None, self._encoder.content_hash):
             raise ModelError(
                 self.clip,
                 expected="the encoder that the scene was built with",
@@ -223,8 +213,7 @@ class Scene:
         new = [prompt for prompt, word in found.items() if word is None]
         if new:
             with self._working:
-                made = zip(new, self._new_words(new))
-                found.update((prompt, words_of.put(prompt, word)) for prompt, word in made)
+                found.update((p, words_of.put(p, word)) for p, word in zip(new, self._new_words(new)))
         words = [word for prompt in prompts if (word := found[prompt]) is not None]
         presences = tuple(word.presence for word in words)
         scores = torch.stack([word.scores for word in words])

@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 
 from lexsplat.features.clip import ClipEncoder
-from lexsplat.features.clip_text import ClipText
-from lexsplat.features.encoders import load_clip
 from lexsplat.features.encoders import load_clip
 from lexsplat.queries import everyday, presence
 from lexsplat.runtime.files import save_tensors

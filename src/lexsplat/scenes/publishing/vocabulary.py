@@ -91,7 +91,7 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
     tables, presences = [], []
     for start in range(0, len(phrases), _BATCH):
         texts = embed_prompts(
-            phrases[start : start + _BATCH], scene.encoder.encode_text, scene.query.templates
+            phrases[start : start + _BATCH], scene.preload().encode_text, scene.query.templates
         )
         relevancy = scale.relevancy(codewords, texts.to(codewords.device))
         tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
