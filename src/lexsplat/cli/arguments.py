@@ -33,6 +33,9 @@ ESSENTIAL_SETTINGS = (
 """Settings of a build that people use."""
 
 _PLACEHOLDERS = {
+    "title": "TEXT",
+    "description": "TEXT",
+    "start_view": "VIEW",
     "clip": "NAME", "dino": "NAME", "view": "NAME", "test_views": "NAME", "name": "NAME", "host": "ADDRESS",
     "select": "PHRASE", "height_of": "PHRASE", "between": "PHRASE PHRASE", "negatives": "PHRASE",
     "template": "SENTENCE", "points": "X,Y,Z X,Y,Z", "up": "X,Y,Z", "memory": "SIZE",
@@ -159,7 +162,7 @@ def _in_words(name: str, kind: Any, default: Any, defaults: dict[str, str]) -> A
     hint, placeholder = None, _PLACEHOLDERS.get(name)
     if placeholder and get_origin(kind) is tuple and Ellipsis in get_args(kind):
         placeholder += " ..."
-    if default is None or default == ():
+    if default is None or default in ((), ""):
         words = {**_DEFAULTS, **defaults}
         hint = f"(default: {words.get(name, 'none')})"
     elif default is False or default is True:

@@ -12,7 +12,9 @@ import tyro
 from lexsplat.cli.options import Device
 from lexsplat.runtime.errors import BackendError
 
-Scenes = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...")]]
+Scenes = tyro.conf.Positional[
+    Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...", help_behavior_hint="(required)")]
+]
 
 
 @dataclasses.dataclass
