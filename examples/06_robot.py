@@ -15,7 +15,7 @@ import lexsplat
 from lexsplat.geometry.cameras import look_at
 
 folder = sys.argv[1] if len(sys.argv) > 1 else "demo"
-phrases = sys.argv[2:] or ["red apple", "toy closest to me", "what is left of the vase?"]
+phrases = sys.argv[2:] or ["red apple", "fruit closest to me", "what is left of the vase?"]
 
 scene = lexsplat.open_scene(folder)
 up = scene.world.up.direction

@@ -56,7 +56,7 @@ def test_an_edit_is_undone_redone_and_saved_and_the_new_scene_answers(built, tin
     ]
     assert cli.main([*arguments, "--output", str(tmp_path / "answers")]) == 0
     apple, ball = json.loads(capsys.readouterr().out)["prompts"]
-    assert ball["gaussians"] == strays
+    assert ball["gaussians"] < 0.3 * int(answering.sum()), "strays at most"
     column, row = apple["views"]["view_06.png"]["peak_pixel"]
     ground_truth = tiny_capture / "segmentations" / "view_06"
     assert np.asarray(Image.open(ground_truth / "red apple.png"))[row, column], (

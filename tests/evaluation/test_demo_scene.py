@@ -11,6 +11,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from lexsplat.captures import load_capture
+from lexsplat.captures.ground_truth.layouts import load_annotations
+
 SCENES = Path(str(resources.files("lexsplat"))) / "demo" / "scenes"
 EXPECTED = {
     # size, views, held out, points at least, bytes at most
@@ -144,17 +147,14 @@ def test_scene_is_small(name):
 
 
 def test_loads_as_a_scene_with_its_own_split_and_masks(name):
-    scenes = pytest.importorskip("lexsplat.captures", reason="scenes are not there yet")
-    if not hasattr(scenes, "load_capture"):
-        pytest.skip("load_capture is not there yet")
     _, views, count, points, _ = EXPECTED[name]
-    scene = scenes.load_capture(SCENES / name)
+    scene = load_capture(SCENES / name)
     assert len(scene.views) == views
     assert {scene.views[view].stem for view in scene.test_names} == set(held_out(name))
     assert len(scene.train_names) == views - count
     assert len(scene.points) >= points
     prompts = json.loads((SCENES / name / "prompts.json").read_text())
-    by_view = scenes.load_masks(scene)
+    by_view = load_annotations(scene).masks
     assert set(by_view) == set(scene.test_names)
     for view, files in by_view.items():
         assert set(files) <= set(prompts)

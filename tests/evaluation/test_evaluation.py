@@ -58,6 +58,7 @@ class PerfectField:
     """Knows by ray tracing what is at every pixel: the ground truth, at any size."""
 
     method = "traced"
+    segments = None
 
     def __init__(self, order=(0, 1, 2)):
         codewords = torch.eye(4)[:3] + 0.5 * torch.eye(4)[3]  # a little of "stuff" is in everything

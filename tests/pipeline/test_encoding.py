@@ -35,7 +35,7 @@ def test_an_encoder_is_loaded_when_it_is_first_used_and_only_then(monkeypatch):
     ids=["clip", "dino", "dino that takes no part", "dino beside given features"],
 )
 def test_only_encoders_that_take_part_are_looked_for(changes, missing):
-    config = BuildConfig(**{"clip": "bundled", "dino": "bundled", **changes})
+    config = BuildConfig(**{"clip": "bundled", "dino": "bundled", "encoder_device": "cpu", **changes})
     if not missing:
         check_encoders(config)
         return

@@ -176,7 +176,7 @@ def test_a_reconstruction_recovers_from_nan(tmp_path, caplog):
         steps.append(trainer.steps_done)
         if len(steps) == 30:  # as an overflowing gradient would leave it
             with torch.no_grad():
-                trainer._parameters["scales"][3, 1] = float("nan")
+                trainer._parameters["log_scales"][3, 1] = float("nan")
         return value
 
     trainer.step = poisoned  # type: ignore[method-assign]

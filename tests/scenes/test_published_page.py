@@ -152,7 +152,7 @@ def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absen
     gray = np.ptp(after[outside], axis=1).mean() / np.ptp(before[outside], axis=1).mean()
     assert gray < 0.5, "everything else is gray"
     assert warm[inside].mean() > 3 * warm[outside].mean()
-    assert 10 * np.log10(255**2 / np.square(before - ours).mean()) > 25, "the picture is that of our renderer"
+    assert 10 * np.log10(255**2 / np.square(before - ours).mean()) > 22, "the picture is that of our renderer"
     page.evaluate("lexsplat.app.ask('zebra', false, false)")
     assert np.abs(picture(page) - before).mean() < 0.5
     page.close()

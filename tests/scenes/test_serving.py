@@ -113,7 +113,7 @@ def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(demo, monkeypa
         scene.ask(f"thing {number}", 0.5)
     assert len(scene._words) == 32
     assert torch.equal(scene.ask("mug").scores, first.scores)
-    scene.query = QueryConfig(temperature=5.0)
+    scene.query = QueryConfig(negatives=("object", "things"))
     assert not torch.equal(scene.ask("mug").scores, first.scores)
 
 

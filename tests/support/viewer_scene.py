@@ -27,10 +27,8 @@ class BallScene(Scene):
                 row[31 if text in CANONICAL_PHRASES else 5 + sum(text.encode()) % 26] = 1
         return rows
 
-    encoder = property(lambda self: self)
-
-    def preload(self) -> None:
-        pass
+    def preload(self) -> "BallScene":
+        return self
 
 
 def ball_scene(per_ball: int = 300) -> tuple[BallScene, LanguageScene]:

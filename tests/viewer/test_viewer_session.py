@@ -57,7 +57,7 @@ def test_an_absent_object_has_the_threshold_one_half_before_and_after_refinement
 ):
     fresh = Session(scene_and_balls[0], History(vocabulary=WORDS))
     fresh.warm_up()
-    monkeypatch.setattr(type(fresh._presence), "classify", lambda self, scores: "no")
+    monkeypatch.setattr(type(fresh._presence), "classify", lambda self, texts, scores: ("no",) * len(scores))
     question = fresh.ask("ball 3")
     assert question.layer.threshold == 0.5
     fresh.refine(question)

@@ -92,9 +92,7 @@ def error_document(error: LexsplatError) -> dict[str, Any]:
 
 def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) -> str:
     """An answer of `find_phrase` in one plain sentence."""
-    understood = (
-        answer["understood"] if len(answer["understood"]) < 200 else answer["understood"][:200] + "..."
-    )
+    understood = _shortened(answer["understood"], 200)
     if answer["present"] == "no":
         said = f"Not here: nothing fits {understood}."
     else:
@@ -108,7 +106,11 @@ def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) ->
 def _place(thing: Mapping[str, Any], meters_per_unit: float | None) -> str:
     scale, unit = (meters_per_unit, "m") if meters_per_unit else (1.0, "scene units")
     center = ", ".join(f"{value * scale:.2f}" for value in thing["center"])
-    return f"{thing['name']} at ({center}) {unit}, best seen in {thing['best_view']}"
+    return f"{_shortened(thing['name'], 60)} at ({center}) {unit}, best seen in {thing['best_view']}"
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[:length]}..."
 
 
 def answer_line(served: OpenScene, line: str) -> dict[str, Any]:

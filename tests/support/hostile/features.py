@@ -169,5 +169,5 @@ def model_folder() -> Reader:
     def check(found: Any) -> None:
         assert found.is_dir()
 
-    return Reader(make, lambda folder: find(str(folder / "model"), "clip"), check,
+    return Reader(make, lambda folder: find(str(folder / "model"), "dino"), check,
                   {"model/model.safetensors.index.json": lambda c, r: mutate.json_file(c, r, 30, 120)})  # fmt: skip
