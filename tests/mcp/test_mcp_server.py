@@ -19,7 +19,6 @@ from mcp import Client
 from mcp.client.stdio import StdioServerParameters
 
 from lexsplat.mcp.server import http_app, make_server
-from lexsplat.queries.relevancy import CANONICAL_PHRASES, QueryConfig
 from lexsplat.runtime.files import read_json
 from lexsplat.scenes.serving import open_scenes
 
@@ -33,10 +32,7 @@ READING = {
 
 @pytest.fixture(scope="module")
 def scenes():
-    found = open_scenes(["demo"])
-    # The layout's answers do not depend on what relevancy is relative to.
-    found["demo"].scene.query = QueryConfig(negatives=CANONICAL_PHRASES)
-    return found
+    return open_scenes(["demo"])
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +69,18 @@ def test_the_tools_are_described_and_read_only(server):
         Draft202012Validator.check_schema(tool.input_schema)
 
 
+THINGS = {
+    "apple",
+    "banana",
+    "mug",
+    "vase",
+    "pumpkin",
+    "rubber duck",
+    "teddy bear",
+    "toy car",
+    "table lamp",
+    "bottle",
+}
 DIALOGUE = [  # from the layout of the bundled scene
     ("find", {"phrase": "where can I find the lamp?"}, lambda a: place(a["phrases"][0]["instances"][0]) == pytest.approx([1.5, 0.95], abs=0.2)),
     ("find", {"phrase": "is there a dog?"}, lambda a: a["phrases"][0]["present"] == "no" and not a["phrases"][0]["instances"]),
@@ -81,7 +89,7 @@ DIALOGUE = [  # from the layout of the bundled scene
     ("find", {"phrase": "why is the sky blue"}, lambda a: "not understood" in a["phrases"][0]["note"]),
     ("count", {"phrase": "how many fruits are there?"}, lambda a: a["count"] == 2),
     ("count", {"phrase": "unicorns"}, lambda a: (a["count"], a["present"]) == (0, "no")),
-    ("list_objects", {}, lambda a: a["phrases"][0]["count"] == 14),
+    ("list_objects", {}, lambda a: THINGS <= {thing["name"] for thing in a["phrases"][0]["instances"]}),
     ("list_scenes", {}, lambda a: [s["name"] for s in a["scenes"]] == ["demo"]),
     ("describe_scene", {"scene": "demo"}, lambda a: {"banana", "toy car"} <= set(a["things"]) and len(a["view_names"]) == 72),
     ("relate", {"first": "apple", "relation": "on", "second": "cloth"}, lambda a: a["holds"] == "yes"),
@@ -103,15 +111,18 @@ def test_a_dialogue_of_twenty_questions_is_answered_rightly(server):
         return [await client.call_tool(tool, arguments) for tool, arguments, _ in DIALOGUE]
 
     assert len(DIALOGUE) == 20
+    wrong = []
     for (tool, arguments, holds), reply in zip(DIALOGUE, talk(server, dialogue)):
         assert not reply.is_error, reply
-        assert holds(reply.structured_content), (tool, arguments, reply.structured_content)
+        if not holds(reply.structured_content):
+            wrong.append((tool, arguments, reply.structured_content))
         assert reply.content[0].text.endswith((".", ")"))
         if tool == "find":
             validator = Draft202012Validator(read_json(SCHEMAS / "find.json"))
             assert not list(validator.iter_errors(reply.structured_content))
         if tool == "render":
             assert reply.content[1].mime_type == "image/png"
+    assert not wrong
 
 
 HOSTILE = [
