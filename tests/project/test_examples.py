@@ -61,8 +61,8 @@ def test_05_builds_a_scene(run, tmp_path):
     assert (tmp_path / "scene" / "language.safetensors").exists()
 
 
-def test_06_asks_while_it_moves(tmp_path):
-    output = run("06_robot.py", tmp_path)
+def test_06_asks_while_it_moves(run):
+    output = run("06_robot.py")
     assert "red apple: yes: red apple at" in output
     assert "fruit closest to me: yes" in output
     assert "of 20 answers were late" in output
