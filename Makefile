@@ -9,7 +9,7 @@ OUTPUT ?= output/demo
 # Two workers: more only fight over the cores that the kernels already use.
 PYTEST_WORKERS ?= 2
 
-.PHONY: demo test test-fast lint install clean help
+.PHONY: demo test test-fast lint site install clean help
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -27,6 +27,9 @@ lint: $(VENV)/.dev  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+site: $(VENV)/.runtime  ## write the documentation and the published demo as a static site to output/site
+	$(BIN)/python tools/write_site.py output/site
 
 install: $(VENV)/.runtime  ## only set up the environment
 

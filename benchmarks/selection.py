@@ -100,7 +100,7 @@ def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
     classifier = scene.presence_classifier
 
     def of(phrases: list[str]) -> dict:
-        found = classifier.evidence(scene.embed(phrases), scene.scores(phrases))
+        found = classifier.evidence(phrases, scene.embed(phrases), scene.scores(phrases))
         return dict(zip(phrases, found))
 
     return of(prompts), of(absent), of(recolored)

@@ -1,14 +1,14 @@
-"""Response time of the viewer, from a prompt to the last byte sent to the page, and bytes sent.
+"""Response time of the viewer's server, from a prompt to the last byte of its answer, and bytes sent.
 
-    python benchmarks/viewer.py output/demo                             # a scene folder
-    python benchmarks/viewer.py --synthetic 3000000 --quick             # random Gaussians with language
-    python benchmarks/viewer.py --synthetic 3000000 --quick --browser   # until Chromium (software WebGL) drew them
+    python benchmarks/viewer.py output/demo             # a scene folder
+    python benchmarks/viewer.py --synthetic 3000000     # random Gaussians with language
 
 "cpu" is processor time of all threads of the process, which hardly depends on other programs on the machine.
 """
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import resource
@@ -25,9 +25,9 @@ from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField
 from lexsplat.scenes.folder import StoredView
+from lexsplat.scenes.publishing.index import page_file
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
-from lexsplat.viewer.splats import BYTES_PER_SPLAT
 
 PROMPTS = (
     "red apple",
@@ -79,81 +79,46 @@ def synthetic(count: int) -> Scene:
     return Synthetic(gaussians, field, views, "none")
 
 
-def browser_seconds(viewer: ViewerServer) -> dict[str, float]:
-    """Seconds until a page shows its controls, and until it has drawn the scene."""
-    import shutil
-
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        flags = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
-        page = browser.new_page(viewport={"width": 900, "height": 500})
-        started = time.perf_counter()
-        page.goto(viewer.url)
-        page.wait_for_selector("text=Find", timeout=300_000)
-        controls = time.perf_counter() - started
-        while not viewer.viser.get_clients():
-            time.sleep(0.1)
-        (client,) = viewer.viser.get_clients().values()
-        while True:  # an empty page responds, too: wait until the image is not uniform
-            picture = viewer.display.image(client, 240)
-            if np.ptp(picture.reshape(-1, picture.shape[-1]), axis=0).max() > 30:
-                break
-            if time.perf_counter() - started > 500:
-                raise SystemExit("the page drew nothing in 500 s")
-        drawn = time.perf_counter() - started
-        browser.close()
-    return {"browser_controls_s": round(controls, 2), "browser_drawn_s": round(drawn, 2)}
-
-
 def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("scene", nargs="?")
     parser.add_argument("--synthetic", type=int)
     parser.add_argument("--splats", type=int, default=1_000_000)
-    parser.add_argument("--quick", action="store_true", help="skip thresholds and selections")
-    parser.add_argument("--browser", action="store_true")
     options = parser.parse_args()
     scene = synthetic(options.synthetic) if options.synthetic else lexsplat.open_scene(options.scene)
     started = time.perf_counter()
     viewer = ViewerServer(scene, ViewerConfig(port=0, splats=options.splats))
-    result: dict[str, object] = {
-        "gaussians": len(scene.gaussians),
-        "drawn": viewer.display.splats.drawn,
-        "start_s": round(time.perf_counter() - started, 2),
-        "first_page_bytes": viewer.display.splats.drawn * BYTES_PER_SPLAT,
-    }
-    viewer.panels.wait()  # until the text encoder and the vocabulary are loaded
+    start = time.perf_counter() - started
+    viewer.session.warm_up()
     scene.embed(PROMPTS)  # not timed: the cost of new words is that of the encoder
-    if options.browser:
-        result |= browser_seconds(viewer)
-        print(json.dumps(result, indent=2), flush=True)
-    asked, spent, refined, sent = [], [], [], []
-    draw = viewer.display.draw
-    viewer.display.draw = lambda colors: sent.append(draw(colors)) or sent[-1]  # type: ignore[method-assign]
+    connection = http.client.HTTPConnection("127.0.0.1", viewer.port)
+    own = {"Origin": f"http://127.0.0.1:{viewer.port}"}
+    answered, spent, sent = [], [], []
     for prompt in PROMPTS:
-        for question in viewer.session.all_questions():
-            viewer.session.remove(question)
-        busy = time.process_time()
-        viewer.panels.ask(prompt)
+        busy, started = time.process_time(), time.perf_counter()
+        connection.request("POST", "/ask", json.dumps({"prompt": prompt, "version": 1}), own)
+        response = connection.getresponse()
+        content = response.read()
+        assert response.status == 200, content
+        answered.append(time.perf_counter() - started)
         spent.append(time.process_time() - busy)
-        asked.append(viewer.panels.seconds["ask"])
-        if not options.quick:
-            viewer.panels.wait()
-            refined.append(viewer.panels.seconds["refine"])
-    result |= {
-        "recolor_median_ms": round(1e3 * statistics.median(asked), 1),
-        "recolor_max_ms": round(1e3 * max(asked), 1),
-        "recolor_cpu_median_ms": round(1e3 * statistics.median(spent), 1),
-        "recolor_bytes_max": max(sent),
-        "threshold_and_selection_median_ms": round(1e3 * statistics.median(refined), 1) if refined else None,
+        sent.append(len(content))
+    files = viewer.session.content.files
+    result = {
+        "gaussians": len(scene.gaussians),
+        "drawn": len(viewer.session.content.drawn),
+        "start_s": round(start, 2),
+        "first_page_bytes": sum(map(len, files.values())) + len(page_file("page.js")),
+        "answer_median_ms": round(1e3 * statistics.median(answered), 1),
+        "answer_max_ms": round(1e3 * max(answered), 1),
+        "answer_cpu_median_ms": round(1e3 * statistics.median(spent), 1),
+        "answer_bytes_max": max(sent),
         "load_average": round(os.getloadavg()[0], 1),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
     print(json.dumps(result, indent=2), flush=True)
     write_record(options.json, [result])
-    os._exit(0)  # do not wait for the worker, which still refines the last prompt
+    viewer.stop()
 
 
 if __name__ == "__main__":

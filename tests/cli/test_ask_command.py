@@ -21,8 +21,8 @@ def test_each_line_of_the_input_is_answered_with_a_line(monkeypatch, capsys):
 
 
 def test_a_question_on_the_command_line_is_answered_with_a_sentence(capsys):
-    assert cli.main(["ask", "demo", "how many rubber ducks are there?", "--device", "cpu"]) == 0
-    assert capsys.readouterr().out.startswith('1 found for "rubber duck": rubber duck at (')
+    assert cli.main(["ask", "demo", "how many apples are there?", "--device", "cpu"]) == 0
+    assert capsys.readouterr().out.startswith('1 found for "apple": apple at (')
 
 
 @pytest.mark.parametrize("arguments", [["ask", "demo"], ["ask", "demo", "mug", "--stdin"], ["mcp"]])

@@ -1,9 +1,11 @@
 """``lexsplat query`` and ``lexsplat find``: answers for people and as JSON."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
 from PIL import Image
 from support.command_line import fails_in_one_line
 
@@ -43,6 +45,27 @@ def test_query_without_pictures_writes_no_file(built, tmp_path, monkeypatch, cap
     assert cli.main(arguments) == 0
     assert "images" not in capsys.readouterr().out
     assert not (tmp_path / "images").exists()
+
+
+def test_query_writes_the_features_of_a_view(built, tmp_path, capsys):
+    arguments = [
+        "query",
+        str(built),
+        "red apple",
+        "--view",
+        "view_02",
+        "--output",
+        str(tmp_path),
+        "--features",
+    ]
+    assert cli.main([*arguments, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    schema = Path(__file__).resolve().parents[2] / "docs" / "schemas" / "query.json"
+    assert not list(Draft202012Validator(json.loads(schema.read_text())).iter_errors(answer))
+    assert Image.open(answer["features"]["view_02.png"]["picture"]).size == (96, 72)
+    with pytest.raises(SystemExit):
+        cli.main([*arguments, "--no-pictures"])
+    assert "leave --no-pictures out" in capsys.readouterr().err
 
 
 def test_find_prints_positions_in_3d(built, capsys):

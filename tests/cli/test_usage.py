@@ -35,6 +35,8 @@ from lexsplat.pipeline.config import BuildConfig
         ["build", "x", "--output", "y", "--seed", str(2**70)],
         ["build", "x", "--output", "y", "--reconstruction.max-gaussians", "0"],
         ["language", "x", "--output", "y", "--splats", "z.ply", "--joint", "--method", "trained"],
+        ["language", "--output", "y"],
+        ["embed", "--splats", "z.ply", "--output", "y", "--test-views", "a"],
         ["poses", "x", "--output", "y", "--memory", "plenty"],
         ["poses", "x", "--output", "y", "--seed", "-1"],
         ["demo", "--iterations", "0"],

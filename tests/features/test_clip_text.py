@@ -1,11 +1,20 @@
 """The light text tower against the model of transformers."""
 
+import json
+import shutil
+
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
+from support.encoder_folders import in_open_clip_names, save_model, seeded
 
-from lexsplat.features.clip_text import ClipText
+from lexsplat.features.clip_text import ClipText, open_clip_text
 from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import model_folder
+from lexsplat.features.text import load_text
+from lexsplat.runtime.errors import ModelError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 TEXTS = [
     "apple",
@@ -17,22 +26,78 @@ TEXTS = [
 ]
 
 
-@pytest.mark.slow
-def test_the_light_tower_gives_the_embeddings_of_the_whole_model():
-    light, whole = ClipText(model_folder("bundled", "clip")), load_clip("bundled")
+def assert_same_embeddings(folder) -> None:
+    light, whole = load_text(str(folder)), load_clip(str(folder))
+    assert isinstance(light, ClipText)
     expected = torch.cat([whole.encode_text([text]) for text in TEXTS])
     torch.testing.assert_close(light.encode_text(TEXTS), expected, atol=1e-6, rtol=0)
     assert light.content_hash == whole.content_hash
 
 
-@pytest.mark.slow
-def test_a_question_of_the_bundled_encoder_needs_no_transformers():
-    import subprocess
-    import sys
+def changed_config(folder, target, **text):
+    copy = shutil.copytree(folder, target)
+    config = json.loads((copy / "config.json").read_text())
+    config["text_config"].update(text)
+    (copy / "config.json").write_text(json.dumps(config))
+    return copy
 
-    code = (
-        "import sys, lexsplat; lexsplat.open_scene('demo', device='cpu').embed('mug'); "
-        "print([m for m in ('transformers', 'simplemma') if m in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+
+@pytest.mark.slow
+def test_the_light_tower_gives_the_embeddings_of_the_bundled_model():
+    assert_same_embeddings(model_folder("bundled", "clip"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [{}, {"hidden_act": "gelu"}, {"eos_token_id": 2}])
+def test_the_light_tower_gives_the_embeddings_of_transformers_in_all_variants(clip_folder, tmp_path, text):
+    # 2 is the end token of OpenAI's and LAION's files; the model then takes the largest number.
+    assert_same_embeddings(changed_config(clip_folder, tmp_path / "copy", **text))
+
+
+@pytest.mark.slow
+def test_the_light_tower_reads_the_names_of_open_clip_and_half_precision(clip_folder, tmp_path):
+    from transformers import CLIPModel
+
+    copy = shutil.copytree(clip_folder, tmp_path / "copy")
+    (copy / "model.safetensors").unlink()
+    foreign = in_open_clip_names(CLIPModel.from_pretrained(clip_folder))
+    save_file({name: value.half() for name, value in foreign.items()}, copy / "open_clip_model.safetensors")
+    assert_same_embeddings(copy)
+
+
+@pytest.mark.slow
+def test_the_light_tower_equals_transformers_at_the_size_of_vit_b_16(clip_folder, tmp_path):
+    from transformers import CLIPConfig, CLIPModel
+
+    config = CLIPConfig.from_pretrained(clip_folder)
+    config.text_config.update({
+        "hidden_size": 512, "intermediate_size": 2048, "num_hidden_layers": 12, "num_attention_heads": 8,
+        "max_position_embeddings": 77, "hidden_act": "gelu",
+    })  # fmt: skip
+    config.projection_dim = 512
+    folder = shutil.copytree(clip_folder, tmp_path / "large")
+    save_model(seeded(lambda: CLIPModel(config)), folder)
+    assert_same_embeddings(folder)
+
+
+def test_what_the_light_tower_does_not_know_is_left_to_transformers(clip_folder, tmp_path):
+    def refused(**text) -> bool:
+        place = tmp_path / str(len(list(tmp_path.iterdir())))
+        return open_clip_text(changed_config(clip_folder, place, **text), "test") is None
+
+    assert not refused()
+    assert refused(hidden_act="relu")
+    assert refused(num_hidden_layers=1)
+    assert refused(num_hidden_layers=10**9)
+    assert refused(num_attention_heads=5)
+    assert refused(hidden_size="24")
+    assert refused(vocab_size=999)
+
+
+def test_a_text_tower_that_is_not_whole_is_refused(clip_folder, tmp_path):
+    copy = shutil.copytree(clip_folder, tmp_path / "copy")
+    state = load_file(copy / "model.safetensors")
+    name = "text_model.encoder.layers.0.mlp.fc1.weight"
+    save_file({key: value for key, value in state.items() if key != name}, copy / "model.safetensors")
+    with pytest.raises(ModelError, match="1 missing"):
+        load_text(str(copy))

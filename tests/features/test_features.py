@@ -27,6 +27,7 @@ from lexsplat.features.cache import resize_grid
 from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError
+from lexsplat.runtime.files import write_tensors
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -513,7 +514,7 @@ def test_texts_are_encoded_one_by_one_and_the_cache_is_written_once(tmp_path, mo
     from lexsplat.features import text
 
     def write(path, tensors, metadata):
-        written.append(len(tensors))
+        written.append(len(tensors["embeddings"]))
 
     monkeypatch.setattr(text, "write_tensors", write)
     TextCache(tmp_path).encode("color", ["apple", "pear", "apple"], Watched)
@@ -548,6 +549,44 @@ def test_text_of_another_model_is_never_used(tmp_path):
         TextCache(tmp_path).encode("third", ["apple"], ColorEncoder)
 
 
+def test_words_are_shared_by_folders_and_a_read_only_one_is_never_written(tmp_path, monkeypatch):
+    def never():
+        raise AssertionError("the encoder is not needed")
+
+    shipped, user, scene = tmp_path / "shipped", tmp_path / "user", tmp_path / "scene"
+    TextCache(shipped).encode("color", ["red apple"], ColorEncoder)
+    before = {path: path.read_bytes() for path in shipped.iterdir()}
+    first = TextCache(user, read_only=shipped).encode("color", ["red apple", "pear"], ColorEncoder)
+    assert {path: path.read_bytes() for path in shipped.iterdir()} == before
+    again = TextCache(user).encode("color", ["red apple", "pear"], never)
+    assert torch.equal(first, again)
+    # Another scene of the same encoder needs none either, and carries what it was asked.
+    TextCache(scene, user).encode("color", ["pear"], never)
+    TextCache(scene).encode("color", ["pear"], never)
+    with pytest.raises(AssertionError, match="not needed"):
+        TextCache(scene).encode("color", ["red apple"], never)
+
+
+def test_a_text_cache_is_bounded_and_forgets_what_came_first(tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.features.text._MAX_STORED", 3)
+    for word in ("a", "b", "c", "d", "x" * 2000):
+        TextCache(tmp_path).encode("color", [word], ColorEncoder)
+    counter = ColorEncoder()
+    TextCache(tmp_path).encode("color", ["b", "c", "d"], lambda: counter)
+    assert counter.texts == 0
+    TextCache(tmp_path).encode("color", ["a"], lambda: counter)
+    assert counter.texts == 1
+
+
+def test_vectors_of_another_size_in_a_cache_are_not_mixed_with_the_models(tmp_path):
+    write_tensors(
+        tmp_path / "text-color.safetensors", {"embeddings": torch.ones(1, 9)}, {"texts": '["pear"]'}
+    )
+    found = TextCache(tmp_path).encode("color", ["apple", "pear"], ColorEncoder)
+    torch.testing.assert_close(found, ColorEncoder().encode_text(["apple", "pear"]))
+    torch.testing.assert_close(TextCache(tmp_path).encode("color", ["pear"], ColorEncoder), found[1:])
+
+
 def test_a_damaged_text_cache_is_replaced_and_empty_prompts_are_refused(tmp_path):
     TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
     (file,) = tmp_path.iterdir()
@@ -563,6 +602,32 @@ def test_the_sparse_settings_take_a_sixth_of_the_crops():
         return sum(map(len, grid_levels(1297, 840, config.crop_sizes, config.crop_strides)))
 
     assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
+    photo = grid_levels(
+        1440, 1080, FeatureConfig.sparse(14).crop_sizes, FeatureConfig.sparse(14).crop_strides
+    )
+    before = grid_levels(1440, 1080, FeatureConfig.sparse().crop_sizes, FeatureConfig.sparse().crop_strides)
+    assert sum(map(len, photo)) * 5 <= sum(map(len, before)), "patches are read from a fifth of these at most"
+
+
+@pytest.mark.slow
+def test_a_cpu_finds_what_is_six_percent_of_the_photo(tmp_path):
+    from lexsplat.captures import load_capture
+    from lexsplat.evaluation.demo import demo_capture
+    from lexsplat.features.encoders import load_clip
+
+    clip, root = load_clip("bundled"), demo_capture("second")
+    name = "view_002.jpg"
+    masked = np.asarray(Image.open(root / "segmentations/view_002/bear_nose.png").convert("L")) > 127
+    assert np.ptp(np.nonzero(masked)[0]) < 0.06 * len(masked)
+    view = load_capture(root).views[name]
+    settings = FeatureConfig.sparse(clip.patches)
+    maps = extract_features(SimpleNamespace(views={name: view}), clip, None, settings, cache_dir=tmp_path)
+    relevancy = (maps[name].clip @ clip.encode_text(["bear nose"]).T)[..., 0]
+    row, column = divmod(int(relevancy.argmax()), relevancy.shape[1])
+    cell = np.array(masked.shape) / relevancy.shape
+    peak = (np.array([row, column]) + 0.5) * cell
+    inside = np.argwhere(masked) + 0.5
+    assert np.abs(inside - peak).max(1).min() < cell.max(), "the peak lies on it, or in the next cell"
 
 
 @pytest.mark.slow

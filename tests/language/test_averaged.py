@@ -76,6 +76,34 @@ def test_each_gaussian_has_the_weighted_mean_of_its_features(small) -> None:
     )  # half precision
 
 
+def test_the_dino_half_is_averaged_with_the_weights_of_the_clip_half(small) -> None:
+    clip, dino = random_features(small.cameras), random_features(small.cameras, dimensions=5, seed=1)
+    both = {name: FeatureMap(clip[name].clip, dino[name].clip) for name in clip}
+    found = average_features(small.gaussians, small.cameras, both, replace(FULL_SIZE, dino=True))
+    halves = found.halves(slice(None))
+    assert [half.shape[1] for half in halves] == [7, 5]
+    assert torch.equal(halves[0], found.rows(slice(None)))
+    for half, maps in zip(halves, (clip, dino)):
+        sums, totals = reference(small.gaussians, small.cameras, maps)
+        seen = totals > 0.01
+        np.testing.assert_allclose(half[torch.from_numpy(seen)], sums[seen] / totals[seen, None], atol=2e-3)
+    without = average_features(small.gaussians, small.cameras, both, FULL_SIZE)
+    assert without.means.shape[1] == 7
+
+
+def test_things_that_are_alike_to_clip_get_codes_of_their_own_by_dino() -> None:
+    clip = np.repeat(np.array([[1, 0], [1, 0], [0, 1]], np.float16), 20, axis=0)
+    dino = np.repeat(np.array([[1, 0], [0, 1], [1, 0]], np.float16), 20, axis=0)
+    config, codes = AveragedConfig(top=1, dino=True), CodebookConfig(num_codes=3)
+    both = MeanFeatures(np.concatenate([clip, dino], 1), torch.ones(60), dino=2)
+    found = field_from_means(both, codes, config).codes[:, 0].reshape(3, 20)
+    assert len(found.unique()) == 3
+    assert all(len(row.unique()) == 1 for row in found)
+    blind = field_from_means(MeanFeatures(clip, torch.ones(60)), replace(codes, num_codes=2), config)
+    assert blind.codebook.clip.shape == (2, 2)
+    assert torch.equal(blind.codes[:20], blind.codes[20:40])
+
+
 def test_cells_without_a_feature_are_ignored(small) -> None:
     maps = random_features(small.cameras)
     for name, found in maps.items():
@@ -117,7 +145,7 @@ def test_masked_pixels_are_ignored_also_within_a_cell(small) -> None:
     assert set(asked) == {(20, 15)}
 
 
-@pytest.mark.parametrize("memory", [1, 30 * 4 * 67, 30 * 4 * 70])
+@pytest.mark.parametrize("memory", [1, 30 * 8 * 3, 30 * 8 * 4])
 def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_path) -> None:
     maps = random_features(small.cameras)
     whole = average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
@@ -128,7 +156,7 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
     )  # fmt: skip
     assert torch.equal(found.totals, whole.totals)
     np.testing.assert_allclose(np.asarray(found.means, float), np.asarray(whole.means, float), atol=1e-3)
-    assert (received[-1].done, received[-1].total) == ({1: 21, 30 * 4 * 67: 9, 30 * 4 * 70: 6}[memory],) * 2
+    assert (received[-1].done, received[-1].total) == ({1: 21, 30 * 8 * 3: 9, 30 * 8 * 4: 6}[memory],) * 2
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
 
 

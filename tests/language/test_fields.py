@@ -222,9 +222,27 @@ def test_stored_fields_of_earlier_versions_open(balls, method) -> None:
     field = make_trained(balls) if method in ("lifted+tuned", "trained") else make_coded(balls)
     kind = "trained" if isinstance(field, TrainedField) else "lifted"
     metadata = {"kind": kind, "method": method, "dropped": "0.0312"}
-    again = field_from_tensors(field.tensors(), metadata)
+    tensors = field.tensors()
+    if isinstance(field, CodeField):  # they hold floats
+        tensors |= {"weights": field.weights, "uncertainties": field.uncertainties}
+    again = field_from_tensors(tensors, metadata)
     assert type(again) is type(field)
     assert again.method == method
+    assert torch.equal(again.uncertainties, field.uncertainties)
+
+
+def test_codes_weights_and_u_take_nine_bytes_a_gaussian_and_keep_the_sum_of_the_weights(balls) -> None:
+    field = make_coded(balls)
+    stored = field.tensors()
+    sizes = [stored[name].nbytes for name in ("codes", "weights", "uncertainties")]
+    assert sum(sizes) == 9 * len(balls.gaussians)
+    again = field_from_tensors(stored, field.metadata())
+    assert isinstance(again, CodeField)
+    sums = torch.ones(len(field.codes)).index_fill(0, torch.tensor([3]), 0)
+    torch.testing.assert_close(again.weights.sum(1), sums, rtol=0, atol=1e-6)
+    assert float((again.weights - field.weights).abs().max()) < 1 / 255
+    assert float((again.uncertainties - field.uncertainties).abs().max()) <= 0.5 / 255 + 1e-6
+    assert all(torch.equal(value, again.tensors()[name]) for name, value in stored.items()), "stored again"
 
 
 @pytest.mark.parametrize("make", [make_trained, make_coded])
@@ -239,11 +257,12 @@ def test_a_field_survives_a_safetensors_file(balls, make, tmp_path) -> None:
     assert again.method == "renamed"
     assert again.codebook.lambda_dino == field.codebook.lambda_dino
     camera = balls.cameras["view0"]
-    assert torch.equal(
-        again.render_code_probabilities(balls.gaussians, camera),
-        field.render_code_probabilities(balls.gaussians, camera),
-    )
-    assert torch.equal(again.uncertainties, field.uncertainties)
+    steps = 1 / 255 if isinstance(field, CodeField) else 0
+    for found, wanted in (
+        (f.render_code_probabilities(balls.gaussians, camera) for f in (again, field)),
+        (f.uncertainties for f in (again, field)),
+    ):
+        torch.testing.assert_close(found, wanted, rtol=0, atol=steps)
 
 
 def test_settings_of_a_trained_field_are_stored(balls) -> None:

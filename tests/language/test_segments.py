@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import connected_components
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField, field_from_tensors
-from lexsplat.language.segments import Segments, join_linked, make_segments
+from lexsplat.language.segment_kernels import join_linked
+from lexsplat.language.segments import Segments, make_segments
 
 SIDE = 24
 

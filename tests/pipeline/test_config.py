@@ -1,5 +1,6 @@
 """Settings of a build: sizes as text, and what is chosen for open settings."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureConfig
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
@@ -33,7 +35,7 @@ def test_invalid_sizes_are_refused(text):
 
 @given(width=st.integers(1, 20_000), height=st.integers(1, 20_000))
 def test_photos_are_never_enlarged_and_suit_the_device(width, height):
-    resolved = BuildConfig().resolved("cpu", (width, height))
+    resolved = BuildConfig(clip="bundled").resolved("cpu", (width, height))
     assert resolved.downscale >= 1
     pixels = width * height / resolved.downscale**2
     assert pixels <= CPU_PIXELS * 1.8  # factors are whole halves
@@ -54,8 +56,37 @@ def test_the_number_of_steps_suits_the_device():
 def test_features_suit_the_encoder_and_the_device():
     bundled = BuildConfig(clip="bundled").resolved("cpu", (10, 10))
     assert bundled.features == FeatureConfig.bundled()
-    assert BuildConfig().resolved("cpu", (10, 10)).features == FeatureConfig.sparse()
     assert BuildConfig().resolved("cuda", (10, 10)).features == FeatureConfig()
+
+
+def _folder_of(path, kind, **vision):
+    path.mkdir()
+    (path / "config.json").write_text(json.dumps({"model_type": kind, "vision_config": vision}))
+    return str(path)
+
+
+def test_features_on_a_cpu_suit_the_patches_of_the_encoder(tmp_path):
+    def features(clip, **changes):
+        config = BuildConfig(clip=clip, features=FeatureConfig(**changes))
+        resolved = config.resolved("cpu", (10, 10))
+        assert resolved.resolved("cpu", (10, 10)) == resolved
+        return resolved.features
+
+    base = _folder_of(
+        tmp_path / "b16", "clip", patch_size=16
+    )  # transformers leaves out the default of 224 pixels
+    assert features(base).crop_sizes == pytest.approx((0.36,))
+    assert features(base).tokens == "both"
+    small = features(_folder_of(tmp_path / "b32", "clip", image_size=224, patch_size=32))
+    assert small.crop_sizes == pytest.approx((0.18,)), "a patch covers as much of the photo as with B/16"
+    large = features(_folder_of(tmp_path / "l336", "clip", image_size=336, patch_size=14))
+    assert large.crop_sizes == (0.5,)
+    other = features(_folder_of(tmp_path / "siglip", "siglip", image_size=224, patch_size=16))
+    assert other == FeatureConfig.sparse()
+    assert other.tokens == "class"
+    assert features(base, crop_tokens="class") == replace(FeatureConfig.sparse(), crop_tokens="class")
+    assert features(base, mode="random") == replace(FeatureConfig.sparse(), mode="random")
+    assert features(str(tmp_path / "nothing")) == FeatureConfig.sparse()
 
 
 @pytest.mark.parametrize(("clip", "suited"), [("bundled", "bundled"), ("some/clip", "sparse")])
@@ -114,11 +145,34 @@ def test_result_settings_keep_the_features_that_take_part():
     assert coarse.result_settings() == without.result_settings()
 
 
+def test_dino_is_loaded_where_it_takes_part():
+    assert not BuildConfig().uses_dino
+    assert BuildConfig(method="trained").uses_dino
+    asked = BuildConfig(averaged=AveragedConfig(dino=True))
+    assert asked.uses_dino
+    assert not replace(asked, dino="none").uses_dino
+
+
 def test_result_settings_keep_those_of_the_chosen_method_only():
     trained = BuildConfig(method="trained")
     assert replace(trained, averaged=AveragedConfig(top=3)).result_settings() == trained.result_settings()
     longer = replace(trained, trained=TrainedConfig(iterations=9))
     assert longer.result_settings() != trained.result_settings()
+
+
+def test_as_in_paper_stands_for_the_settings_of_the_paper_and_keeps_those_that_are_given():
+    paper = BuildConfig(as_in_paper=True, dino="none").spelled_out()
+    assert paper.spelled_out() == paper
+    assert (paper.method, paper.joint, paper.iterations) == ("trained", True, 30_000)
+    assert (paper.codebook.num_codes, paper.codebook.init, paper.features.mode) == (128, "uniform", "random")
+    assert (paper.trained.iterations, paper.trained.pixel_sample) == (30_000, 0)
+    assert not paper.reconstruction.antialiased, "the rasterization of 3DGS has no mip filter"
+    resolved = replace(paper, clip="bundled").resolved("cpu", (800, 600))
+    assert (resolved.iterations, resolved.features.tokens) == (30_000, "class")
+    codebook, trained = CodebookConfig(num_codes=64), TrainedConfig(iterations=9)
+    short = BuildConfig(as_in_paper=True, iterations=50, codebook=codebook, trained=trained).spelled_out()
+    assert (short.iterations, short.codebook.num_codes, short.trained.iterations) == (50, 64, 9)
+    assert BuildConfig().spelled_out() == BuildConfig()
 
 
 def test_unknown_methods_and_impossible_joint_training_are_refused():

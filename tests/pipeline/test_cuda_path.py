@@ -267,23 +267,22 @@ def test_a_scene_is_edited_on_the_gpu(on_gpu):
 def test_the_viewer_answers_on_the_gpu(on_gpu):
     from lexsplat.viewer.coloring import MODES
     from lexsplat.viewer.history import History
+    from lexsplat.viewer.requests import Asked
     from lexsplat.viewer.session import Session
 
     scene, ground_truth = on_gpu
-    session = Session(scene, History(vocabulary=[*WORDS, "spoon"]))
+    session = Session(scene, 1_000_000, History(vocabulary=[*WORDS, "spoon"]))
     session.warm_up()
-    question = session.ask("ball 2")
-    session.refine(question)
-    assert np.array_equal(question.selection.mask.cpu().numpy(), ground_truth.labels == 2)
-    session.set_threshold(question, 0.6)
-    session.refine(question)
-    for session.mode in MODES:
-        assert session.colors().shape == (len(ground_truth.labels), 3)
-    view, _ = question.selection.view_shares[0]
-    assert session.thumbnail(view, question.selection).dtype == np.uint8
-    assert session.what_is(ground_truth.cameras[view], 48.0, 36.0) is not None
+    count = len(ground_truth.labels)
+    labels = np.frombuffer(session.ask(Asked("ball 2")), np.uint8)[-count:]
+    assert np.array_equal(labels > 0, ground_truth.labels == 2)
+    for mode in MODES:
+        assert len(session.colors(mode)) == 3 * count
+    view = session.details(Asked("ball 2"))["views"][0]["name"]
+    assert session.what_is(Asked(camera=ground_truth.cameras[view], click=(48.0, 36.0)))
     for ending in (".ply", ".splat"):
-        assert session.export(question.selection, ending)[1]
+        assert session.export(Asked("ball 2"), ending)[1]
+    assert session.edit("delete", Asked("ball 2"), {})["scene"]["gaussians"] < count
 
 
 # -- the command line

@@ -118,8 +118,8 @@ def test_the_time_of_the_features_is_told_first(clip_folder, tmp_path, caplog):
     config = replace(CONFIG, clip=str(clip_folder)).resolved("cpu", (400, 300))
     with caplog.at_level(NOTE, logger="lexsplat"):
         check_encoders(config, tmp_path, 50, (400, 300))
-    # Crops of 60 pixels every 30 or less: 13 x 9. Crops of 120 every 60 or less: 6 x 4.
-    assert "features on cpu: 141 crops and about" in caplog.text
+    # The encoder has patches. Crops of 46 pixels every 27.6 or less: 14 x 11.
+    assert "features on cpu: 154 crops and about" in caplog.text
     assert "for 50 training photos" in caplog.text
     assert "words match bundled pictures by" in caplog.text, "random weights match no words"
 

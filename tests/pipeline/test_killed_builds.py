@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support import TESTS_ON_PATH
 from support.tiny_capture import write_capture
 
-SCRIPT = Path(__file__).parents[1] / "support" / "killed_builds.py"
 KILLS = 15
 """For each method; at most four a scene, so that there are as many scenes as stages."""
 
@@ -57,13 +58,15 @@ def test_kills_over_all_stages_do_not_change_the_result(options, tmp_path, metho
     subprocess.run(undisturbed, capture_output=True, check=True, timeout=600)
     command = [
         sys.executable,
-        str(SCRIPT),
+        "-m",
+        "support.killed_builds",
         str(tmp_path / "killed"),
         str(KILLS),
         "3",
         ",".join(STAGES[method]),
     ]
-    run = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=900)
+    environment = {**os.environ, **TESTS_ON_PATH}
+    run = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=900, env=environment)
     assert run.returncode == 0, run.stderr[-2000:]
     report = json.loads(run.stdout.splitlines()[-1])
     assert "failed" not in report

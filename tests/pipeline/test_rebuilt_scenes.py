@@ -48,7 +48,8 @@ class Builder:
     def end(self, version: int) -> None:
         """The second half: the language that belongs to them."""
         self.folder.reopen("language")
-        tensors = {**self.tensors, "uncertainties": torch.full_like(self.tensors["uncertainties"], version)}
+        own = torch.full(self.tensors["uncertainties"].shape, float(version))
+        tensors = {**self.tensors, "uncertainties": own}
         metadata = {**self.metadata, "reconstruction": f"version {version}"}
         write_tensors(self.folder.language_path, tensors, metadata)
         self.folder.finish("language", f"language {version}", 0.0)

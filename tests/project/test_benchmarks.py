@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from lexsplat.rendering import render
 
 BENCHMARKS = [
     script
@@ -39,3 +42,31 @@ def test_the_gpu_benchmark_runs_on_a_cpu_and_records_its_conditions(monkeypatch,
     assert record["machine"]["cores"] >= 1
     rates = record["rows"][0]
     assert all(rates[name] > 0 for name in ("rgb", "prompt", "paper", "training", "memory"))
+
+
+def test_the_peer_of_gsplats_torch_functions_renders_our_image(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import peers
+    from support.rendering_reference import front_camera, random_gaussians
+
+    gaussians, camera = random_gaussians(60, 3, antialiased=True), front_camera()
+    background = torch.tensor([0.1, 0.5, 0.9])
+    projection = peers.project(gaussians, camera, 0.01)
+    colors = peers.shade(gaussians, camera, projection, 3)
+    image, alpha = peers.blend(projection, peers.find_tiles(projection, camera), colors, None, background)
+    expected = render(gaussians, camera, background=background)
+    # gsplat's boxes end at 3.33 standard deviations, where alpha can still exceed 1/255.
+    assert (image - expected.image).abs().mean() < 2e-4
+    assert (image - expected.image).abs().max() < 2e-2
+    assert (alpha - expected.alpha).abs().max() < 2e-2
+
+
+def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import features
+
+    layer = torch.nn.Sequential(torch.nn.Conv2d(3, 8, 4, 4), torch.nn.Flatten(2), torch.nn.Linear(4, 5))
+    with torch.inference_mode(), features.Products() as products:
+        layer(torch.rand(2, 3, 8, 8))
+    # The convolution has 2 x 4 outputs of 48 inputs, the linear layer 2 x 8 rows.
+    assert dict(products.sizes) == {(1, 8, 48, 8): 1, (1, 16, 4, 5): 1}

@@ -4,12 +4,19 @@ import pytest
 import torch
 from support.language_scene import make_scene
 
+from lexsplat.codebook import Codebook
 from lexsplat.language.fields import CodeField
+from lexsplat.language.segments import Segments
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.presence import NO, YES, Evidence, PresenceClassifier
 from lexsplat.queries.relevancy import Question, gaussian_relevancy
+from lexsplat.queries.vocabulary import is_part
 
 unit = torch.nn.functional.normalize
+
+
+def embed_nothing(texts):
+    raise AssertionError("a field without segments needs no words")
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +34,9 @@ def evidence_of(parts, texts: torch.Tensor) -> list[Evidence]:
     gaussians, field, words = parts
     scale = EverydayScale.of(field.codebook.clip, words)
     scores = gaussian_relevancy(field, Question(texts, words, scale=scale))
-    return PresenceClassifier(gaussians, field, scale).evidence(texts, scores)
+    return PresenceClassifier(gaussians, field, scale, embed_nothing).evidence(
+        ["phrase"] * len(texts), texts, scores
+    )
 
 
 def test_what_is_there_is_told_from_what_is_not(parts):
@@ -51,9 +60,18 @@ def test_evidence_by_hand(parts):
 
 @pytest.mark.parametrize(
     ("ratio", "height", "presence"),
-    [(YES, YES, "yes"), (1.2, 0.5, "yes"), (NO, NO - 0.01, "no"), (0.65, 0.65, "unsure"), (-1, -1, "no")],
+    [
+        (YES, YES, "yes"),
+        (1.2, 0.5, "yes"),
+        (0.65, 1.2, "unsure"),
+        (NO, NO - 0.01, "no"),
+        (0.65, 0.65, "unsure"),
+        (-1, -1, "no"),
+    ],
 )
-def test_the_answer_is_the_geometric_mean_of_the_evidence(ratio, height, presence):
+def test_the_answer_is_the_geometric_mean_of_the_evidence_but_no_better_than_the_ratio(
+    ratio, height, presence
+):
     assert Evidence(ratio, height).presence == presence
 
 
@@ -61,5 +79,72 @@ def test_an_empty_scene_holds_nothing(parts):
     gaussians, field, words = parts
     nothing = torch.zeros(500, dtype=torch.bool)
     scale = EverydayScale.of(field.codebook.clip, words)
-    classifier = PresenceClassifier(gaussians.select(nothing), field.select(nothing), scale)
-    assert classifier.classify(words[:1], torch.zeros(1, 0)) == ("no",)
+    classifier = PresenceClassifier(gaussians.select(nothing), field.select(nothing), scale, embed_nothing)
+    assert classifier.classify(["phrase"], words[:1], torch.zeros(1, 0)) == ("no",)
+
+
+WORDS = 6
+"""Everyday words of the scene below: 0 to 3 name its things, 4 and 5 nothing."""
+
+
+class Words:
+    """Axes of a space as embeddings: word n is axis n, and "red WORD" leans half as far to the axis of red."""
+
+    def __call__(self, texts):
+        return torch.stack([self.of(text) for text in texts])
+
+    def of(self, text):
+        vector = torch.zeros(12)
+        for word in text.split():
+            vector += torch.eye(12)[{"red": 8, "green": 9}.get(word, int(word) if word.isdigit() else 11)]
+        return unit(vector, dim=0)
+
+
+@pytest.fixture
+def judge(monkeypatch):
+    """A red 0, a green 1, a ball 2 with one stripe like 3, and much of nothing."""
+    from lexsplat.queries import presence
+
+    monkeypatch.setattr(presence, "everyday_words", lambda: tuple(map(str, range(WORDS))))
+    monkeypatch.setattr(presence, "COLORS", frozenset({"red", "green"}))
+    embed = Words()
+    codewords = torch.stack(
+        [*map(embed.of, ("0 red", "1 green", "2", "3")), *torch.eye(12)[6:8].repeat(4, 1)]
+    )
+    made = make_scene(per_ball=100)
+    codes = torch.arange(500) // 100  # a thing of 100 Gaussians for each code; of the fourth only a stripe
+    codes[300:490], codes[490:] = 2, 3
+    codes[400:490] = 4 + torch.arange(90) % 8
+    labels = codes.clamp(max=4)
+    # From below: the stripe is a segment of its own, then part of the ball.
+    segments = Segments(labels, torch.ones(500), torch.tensor([[0, 1, 2, 3, 4], [0, 1, 2, 2, 4]]))
+    field = CodeField(Codebook(codewords, codewords), codes.to(torch.uint8)[:, None], torch.ones(500, 1),
+                      torch.zeros(500), segments=segments)  # fmt: skip
+    scale = EverydayScale.of(codewords, embed([str(word) for word in range(WORDS)]))
+    classifier = PresenceClassifier(made.gaussians, field, scale, embed)
+
+    def strength(phrase):
+        return classifier.evidence([phrase], embed([phrase]), torch.zeros(1, 500))[0].strength
+
+    return strength
+
+
+def test_objects_are_judged_and_not_their_parts(judge):
+    assert judge("2") > YES
+    assert judge("3") < NO, "a stripe of the ball"
+
+
+def test_a_color_is_that_of_the_thing(judge):
+    assert min(judge("red 0"), judge("green 1")) > YES
+    assert max(judge("green 0"), judge("red 1")) < YES
+
+
+@pytest.mark.parametrize(
+    ("phrase", "part"),
+    [
+        ("mug handle", True), ("bear nose", True), ("bottle cap", True), ("mug", False), ("red mug", False),
+        ("stack of books", False), ("table lamp", False), ("mug red", False), ("something to drink from", False),
+    ],
+)  # fmt: skip
+def test_a_part_is_named_behind_its_thing(phrase, part):
+    assert is_part(phrase) == part

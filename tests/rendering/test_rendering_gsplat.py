@@ -14,7 +14,15 @@ import torch
 from support import gsplat_kernels
 from support.rendering_reference import front_camera, random_gaussians
 
-from lexsplat.rendering import accumulate_weights, back_project, backends, gsplat_backend, prepare, render
+from lexsplat.rendering import (
+    accumulate_weights,
+    back_project,
+    backends,
+    gsplat_backend,
+    prepare,
+    render,
+    weigh_cells,
+)
 from lexsplat.runtime.errors import BackendError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -75,6 +83,22 @@ def test_the_gsplat_backend_agrees_with_the_cpu(on_gsplat, antialiased, degree, 
     for name in cpu.keys() - {"image", "features", "alpha", "depth"}:
         error = (cpu[name] - twin[name]).norm() / cpu[name].norm().clamp_min(1e-9)
         assert error < 5e-3, (name, float(error))
+
+
+def test_cells_are_weighed_on_the_gsplat_backend_as_on_the_cpu(on_gsplat):
+    gaussians, camera = random_gaussians(COUNT, 3), front_camera(WIDTH, HEIGHT)
+    values = torch.randn(35, 70, generator=torch.Generator().manual_seed(0))
+    counts = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
+
+    def found():
+        weights = weigh_cells(gaussians, camera, (5, 7), counts, prepare(gaussians, camera))
+        sums = torch.zeros(COUNT, 70)
+        weights.add_to(sums, values)
+        return torch.cat([sums, weights.totals()[:, None]], 1)
+
+    cpu = found()
+    on_gsplat()
+    assert (cpu - found()).norm() < 5e-3 * cpu.norm()
 
 
 def test_features_yield_no_gradient_of_the_geometry_on_the_gsplat_backend(on_gsplat):

@@ -18,7 +18,7 @@ from numba.core.caching import NullCache
 from support.rendering_reference import front_camera, random_gaussians
 
 from lexsplat.geometry.cameras import look_at
-from lexsplat.rendering import Projection, cpu_backend, pairs
+from lexsplat.rendering import Projection, cpu_backend, pairs, render
 from lexsplat.rendering.kernels import binning, blending, gradients, lanes
 from lexsplat.rendering.kernels.jit import parallel
 
@@ -142,11 +142,13 @@ def found_pairs(ellipses: tuple[np.ndarray, ...], width: int, height: int) -> pa
 @pytest.fixture
 def poisoned_memory(monkeypatch):
     """Fills the memory of np.empty with values that must never be read: NaN, or an index far out of range."""
+    leaves = random_gaussians(4, 0).map(lambda t: t.requires_grad_())
+    render(leaves, front_camera()).image.sum().backward()  # Numba compiles before np.empty is replaced
     empty = np.empty
 
     def poisoned(shape, dtype=float, *args, **options):
         array = empty(shape, dtype, *args, **options)
-        array.fill(np.nan if array.dtype.kind == "f" else -(2**30))
+        array.fill({"f": np.nan, "u": 255}.get(array.dtype.kind, -(2**30)))
         return array
 
     monkeypatch.setattr(np, "empty", poisoned)
@@ -170,16 +172,36 @@ def test_pair_lists_are_complete_permutations(poisoned_memory):
         assert np.array_equal(owner[found.pairs], found.members)
         tile = np.repeat(np.arange(found.tiles), np.diff(found.tile_offsets))
         assert (np.diff(tile.astype(np.int64) * count + found.members) > 0).all()
-        # Exactly the tiles with a pixel center inside the box of the ellipse.
-        n = found.order
-        columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
-        in_x = np.abs(columns - means[n, :1].astype(float)) <= reach[n, :1] + binning.SLACK
-        in_y = np.abs(rows - means[n, 1:].astype(float)) <= reach[n, 1:] + binning.SLACK
-        tiles_x = np.stack([in_x[:, i : i + 16].any(1) for i in range(0, width, 16)], 1)
-        tiles_y = np.stack([in_y[:, i : i + 16].any(1) for i in range(0, height, 16)], 1)
-        expected = np.stack(np.nonzero((tiles_y[:, :, None] & tiles_x[:, None]).reshape(len(n), -1)), 1)
-        listed = np.stack([found.members, tile], 1)
-        assert np.array_equal(listed[np.lexsort((tile, found.members))], expected)
+
+
+def test_pairs_reach_every_row_with_a_contribution_and_hardly_any_other():
+    rng = np.random.default_rng(2)
+    contributions = listed_rows = 0
+    for _ in range(60):
+        count, width, height = int(rng.integers(1, 60)), int(rng.integers(1, 90)), int(rng.integers(1, 90))
+        ellipses = random_ellipses(count, width, height, rng)
+        found = found_pairs(ellipses, width, height)
+        listed = np.zeros((len(found.order), -(-height // 16) * 16, found.tiles_x), bool)
+        for tile in range(found.tiles):
+            for slot in range(found.tile_offsets[tile], found.tile_offsets[tile + 1]):
+                first, last = (tile // found.tiles_x * 16 + int(row) for row in found.rows[slot])
+                assert last > first
+                listed[found.members[slot], first:last, tile % found.tiles_x] = True
+        means, conics, opacities = (array[found.order].astype(float) for array in ellipses[:3])
+        dx, dy = (np.arange(size) + 0.5 - means[:, i : i + 1] for i, size in enumerate((width, height)))
+        dx, dy = dx[:, None], dy[:, :, None]
+        a, b, c, opacity = (array[:, None, None] for array in (*conics.T, opacities))
+        visible = opacity * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy) >= 1 / 255
+        rows = np.stack([visible[:, :, left : left + 16].any(2) for left in range(0, width, 16)], 2)
+        assert not (rows & ~listed[:, :height]).any()
+        # Tight: in a listed row, the ellipse reaches between the first and last pixel of the tile.
+        left = np.arange(found.tiles_x) * 16 + 0.5 - means[:, :1] - 0.01
+        nearest = np.clip(-b * dy / a, left[:, None], left[:, None] + 15.02)
+        level = 0.5 * (a * nearest * nearest + c * dy * dy) + b * nearest * dy
+        reached = level <= np.log(255 * opacity) * 1.05 + 0.05
+        assert not (listed[:, :height] & ~reached).any()
+        contributions, listed_rows = contributions + rows.sum(), listed_rows + listed.sum()
+    assert contributions > 0.8 * listed_rows
 
 
 def test_no_uninitialized_memory_is_read(poisoned_memory):
@@ -194,15 +216,19 @@ def test_no_uninitialized_memory_is_read(poisoned_memory):
         projected = random_ellipses(count, width, height, rng)
         found = found_pairs(projected, width, height)
         values = rng.uniform(size=(len(found.order), channels)).astype(np.float32)
-        lists = (found.ellipses, found.boxes, found.tile_offsets, found.members)
+        lists = (found.ellipses, found.tile_offsets, found.members)
         image, alpha = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
-        blending.blend(0, found.tiles, *lists, values, np.ones(3, np.float32), found.tiles_x, image, alpha)
+        ones = np.ones(3, np.float32)
+        passed, last = np.empty((2, found.tiles * blending.PIXELS), np.float32)
+        blending.blend(
+            0, found.tiles, *lists, found.rows, values, ones, found.tiles_x, image, alpha, passed, last
+        )
         assert np.isfinite(image).all()
         assert np.isfinite(alpha).all()
         rows = np.empty(len(found.members) * gradients.row_width(channels), np.float32)
         gradients.blend_backward(
-            0, found.tiles, *lists, found.pairs, values, found.tiles_x, 3, True,
-            image, alpha, np.ones_like(image), np.ones_like(alpha), rows,
+            0, found.tiles, *lists, found.pairs, found.rows, values, ones, found.tiles_x, 3, True, passed, last,
+            np.ones_like(image), np.ones_like(alpha), rows,
         )  # fmt: skip
         assert np.isfinite(rows).all()
 

@@ -15,6 +15,7 @@ from support.tiny_capture import QUICK_BUILD as QUICK
 from lexsplat import cli, open_scene
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.visibility import whole_things
 from lexsplat.scenes.exporting import best_labels, export_gaussians
 from lexsplat.scenes.formats.ply import read_ply
 from lexsplat.scenes.formats.reading import read_splats
@@ -25,9 +26,11 @@ def export(*arguments) -> int:
     return cli.main(["export", *map(str, arguments)])
 
 
-@pytest.mark.parametrize("ending", [".ply", ".splat", ".points.ply", ".glb", ".spz", ".compressed.ply"])
+@pytest.mark.parametrize(
+    "ending", [".ply", ".splat", ".points.ply", ".glb", ".spz", ".v3.spz", ".sog", ".compressed.ply"]
+)
 def test_a_scene_is_written_in_every_format(built, tmp_path, ending, capsys):
-    if ending in (".spz", ".compressed.ply"):
+    if ending == ".compressed.ply":
         pytest.importorskip("gaussforge")
     assert export(built, tmp_path / f"all{ending}") == 0
     assert [path.name for path in tmp_path.iterdir()] == [f"all{ending}"]
@@ -38,8 +41,10 @@ def test_exporting_a_selection_writes_only_the_gaussians_found(built, tmp_path):
     limit = float(open_scene(built).scores(["red apple"]).quantile(0.8))
     arguments = ["--select", "red apple", "--language", "--threshold", limit]
     assert export(built, tmp_path / "apple.ply", *arguments) == 0
-    found = open_scene(built).select("red apple", limit)
-    assert 0 < len(found) < len(found.mask)
+    scene = open_scene(built)
+    chosen = scene.select("red apple", limit)
+    found = whole_things(chosen, scene.hidden, scene.field.segments)
+    assert 0 < len(chosen) <= len(found) < len(found.mask)
     assert torch.equal(read_ply(tmp_path / "apple.ply").means, found.selected.means)
     vertex = pytest.importorskip("plyfile").PlyData.read(tmp_path / "apple.ply")["vertex"]
     codes = open_scene(built).field.select(found.mask).code_probabilities().argmax(1)
@@ -118,9 +123,8 @@ def test_impossible_exports_are_refused_in_one_line(built, tmp_path, arguments, 
 
 
 def written_by_others(ending: str, gaussians: Gaussians, path: Path) -> None:
-    """Splats as gsplat (PLY, .splat) and GaussForge (SPZ) write them."""
-    if ending == ".spz":
-        pytest.importorskip("gaussforge")
+    """Splats as gsplat writes them (PLY, .splat), or as lexsplat does."""
+    if ending in (".spz", ".sog", ".glb"):
         export_gaussians(gaussians, path)
         return
     exporter = pytest.importorskip("gsplat.exporter")
@@ -135,7 +139,7 @@ def written_by_others(ending: str, gaussians: Gaussians, path: Path) -> None:
         )
 
 
-@pytest.mark.parametrize("ending", [".ply", ".splat", ".spz"])
+@pytest.mark.parametrize("ending", [".ply", ".splat", ".spz", ".sog", ".glb"])
 def test_splats_of_another_program_receive_language_and_keep_their_geometry(
     built, tiny_capture, tmp_path, ending
 ):

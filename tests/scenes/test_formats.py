@@ -1,14 +1,13 @@
 """Splat formats: what we write other programs read, what they write we read, values compared."""
 
 import csv
-import gzip
 import struct
 
 import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
-from support.splats import make
+from support.splats import make, tame
 
 from lexsplat.codebook import Codebook
 from lexsplat.geometry.boxes import Up
@@ -16,12 +15,13 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
 from lexsplat.language.fields import CodeField
 from lexsplat.runtime.errors import BackendError, FileFormatError
+from lexsplat.scenes.formats import compressed
 from lexsplat.scenes.formats.compressed import COMPRESSED, read_compressed, write_compressed
 from lexsplat.scenes.formats.gltf import write_glb
 from lexsplat.scenes.formats.language import codebook_path, ply_columns, stored_language, write_codebook
 from lexsplat.scenes.formats.ply import read_ply, write_ply
 from lexsplat.scenes.formats.reading import read_splats
-from lexsplat.scenes.formats.splat import read_splat, write_splat
+from lexsplat.scenes.formats.splat import write_splat
 from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
 
 
@@ -37,12 +37,6 @@ def language(count: int, codes_each: int = 3, num_codes: int = 6):
         torch.rand(count, generator=g),
     )
     return field, stored_language(field, {"encoder": "some/clip", "encoder_hash": "abc"})
-
-
-def tame(count: int, degree: int = 0) -> Gaussians:
-    """Gaussians whose colors and sizes are in the range of 8-bit formats."""
-    g = make(count, degree)
-    return Gaussians(g.means, g.quats, g.log_scales * 0.3 - 3, g.opacity_logits, g.sh0 * 0.4, g.shN * 0.1)
 
 
 def distances_of_rotations(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -103,10 +97,10 @@ def test_a_splat_file_of_gsplat_is_read(tmp_path):
 def test_files_other_than_splats_are_refused(tmp_path, content):
     (tmp_path / "g.splat").write_bytes(content)
     with pytest.raises(FileFormatError):
-        read_splat(tmp_path / "g.splat")
+        read_splats(tmp_path / "g.splat")
 
 
-# SPZ and its like
+# Compressed PLY and ksplat
 
 
 @pytest.mark.parametrize("ending", list(COMPRESSED))
@@ -133,21 +127,23 @@ def test_a_compressed_ply_is_recognized_by_its_content(tmp_path):
     assert len(read_splats(tmp_path / "plain_name.ply")) == 50
 
 
-def test_the_headers_of_compressed_files_are_those_of_their_formats(tmp_path):
+def test_plyfile_reads_the_header_and_the_mip_filter_of_a_compressed_ply(tmp_path):
     pytest.importorskip("gaussforge")
     plyfile = pytest.importorskip("plyfile")
-    write_compressed(tame(300, 1), tmp_path / "g.spz", "spz")
-    magic, _, count, degree = struct.unpack_from("<IIIB", gzip.decompress((tmp_path / "g.spz").read_bytes()))
-    assert (magic, count, degree) == (0x5053474E, 300, 1)
-    # 24-bit fixed point, 12 of them behind the point; y and z run the other way than in a PLY.
-    raw = gzip.decompress((tmp_path / "g.spz").read_bytes())
-    triple = np.frombuffer(raw, np.uint8, 9, offset=16).reshape(3, 3).astype(int) @ [1, 1 << 8, 1 << 16]
-    first = np.where(triple >= 1 << 23, triple - (1 << 24), triple) / (1 << raw[13])
-    assert first == pytest.approx(tame(300, 1).means[0].numpy() * [1, -1, -1], abs=1e-3)
-    write_compressed(tame(300, 1), tmp_path / "g.compressed.ply", "compressed.ply")
+    write_compressed(tame(300, 1, antialiased=True), tmp_path / "g.compressed.ply", "compressed.ply")
     content = plyfile.PlyData.read(tmp_path / "g.compressed.ply")
     assert {element.name: element.count for element in content}["vertex"] == 300
     assert content["vertex"]["packed_position"].dtype == np.uint32
+    assert "SplatRenderMode: mip" in content.comments
+    assert read_splats(tmp_path / "g.compressed.ply").antialiased
+
+
+def test_a_crash_of_the_library_is_a_refused_file(tmp_path, monkeypatch):
+    pytest.importorskip("gaussforge")
+    (tmp_path / "g.ksplat").write_bytes(b"anything")
+    monkeypatch.setattr(compressed, "_CONVERT", "import os; os.abort()")
+    with pytest.raises(FileFormatError, match=r"g\.ksplat: expected a ksplat file, found damaged content"):
+        read_splats(tmp_path / "g.ksplat")
 
 
 @pytest.mark.parametrize("ending", list(COMPRESSED))
@@ -161,9 +157,10 @@ def test_damaged_compressed_files_are_refused(tmp_path, ending):
 
 
 def test_a_missing_library_is_reported_with_its_remedy(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "gaussforge", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    (tmp_path / "g.ksplat").write_bytes(b"anything")
     with pytest.raises(BackendError, match="pip install"):
-        read_compressed(tmp_path / "g.spz", "spz")
+        read_compressed(tmp_path / "g.ksplat", "ksplat")
 
 
 def test_infinite_opacity_logits_of_other_programs_become_opacities_0_and_1(tmp_path):

@@ -9,8 +9,8 @@ import torch
 
 from lexsplat import open_scene
 from lexsplat.queries.selection import Selection
-from lexsplat.scenes.answers import scene_facts
 from lexsplat.scenes.editing import Editor
+from lexsplat.scenes.facts import scene_facts
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.records import read_record
 

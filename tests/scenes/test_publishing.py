@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -19,7 +18,9 @@ from lexsplat.runtime.files import write_json
 from lexsplat.scenes import publishing
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import stored_language
+from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.publishing import PublishOptions, publish, sidecar, splat_file, vocabulary
+from lexsplat.scenes.publishing.manifest import FORMAT
 
 WEB = Path(__file__).parents[2] / "web"
 BUNDLE = Path(publishing.__file__).parent / "page"
@@ -80,22 +81,11 @@ def test_the_manifest_lists_every_file_with_its_checksum(balls, tmp_path, small_
     )
 
 
-def test_without_the_library_for_spz_the_splats_are_a_ply_of_the_same_order(balls, tmp_path, monkeypatch):
-    from plyfile import PlyData
-
-    monkeypatch.setitem(sys.modules, "gaussforge", None)
+def test_the_splats_are_an_spz_in_the_order_of_the_codes(balls, tmp_path):
     path, rotation = splat_file.write_splats(balls.gaussians, tmp_path)
-    assert (path.name, rotation) == ("scene.ply", splat_file.IDENTITY)
-    assert np.array_equal(PlyData.read(path)["vertex"]["x"], balls.gaussians.means[:, 0].numpy())
-
-
-def test_an_spz_in_another_order_is_not_taken(balls, tmp_path):
-    pytest.importorskip("gaussforge")
-    path, _ = splat_file.write_splats(balls.gaussians, tmp_path)
-    assert path.name == "scene.spz"
-    content = path.read_bytes()
-    assert splat_file._in_order(balls.gaussians.means, content)
-    assert not splat_file._in_order(balls.gaussians.means.flip(0), content)
+    assert (path.name, rotation) == ("scene.spz", (1, 0, 0, 0))
+    assert path.read_bytes()[:2] == b"\x1f\x8b", "the page's renderer reads gzip, not version 4"
+    assert np.allclose(read_splats(path).means, balls.gaussians.means, atol=1e-4)
 
 
 def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, small_dictionary):
@@ -114,7 +104,7 @@ def test_publishing_again_replaces_the_page_and_keeps_no_file_of_before(
 ):
     folder = tmp_path / "page"
     published(balls, folder, words_only=True)
-    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    monkeypatch.setattr(splat_file, "NAME", "other.spz")
     manifest = published(balls, folder, words_only=True, title="again")
     assert {path.name for path in folder.iterdir()} == set(manifest["files"]) | {"manifest.json"}
     assert not (folder / "scene.spz").exists()
@@ -149,6 +139,25 @@ def test_a_folder_with_files_of_others_is_refused_and_left_alone(balls, tmp_path
     with pytest.raises(SceneFolderError, match=found):
         publish(balls, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("files", [{"../mine.txt": {}}, {"..": {}}, [["scene.spz"]], 7])
+def test_a_manifest_that_names_files_outside_its_folder_is_not_an_earlier_page(balls, tmp_path, files):
+    (tmp_path / "mine.txt").write_text("mine")
+    folder = tmp_path / "page"
+    folder.mkdir()
+    write_json(folder / "manifest.json", {"format": FORMAT, "files": files})
+    with pytest.raises(SceneFolderError, match=r"foreign files: manifest\.json"):
+        publish(balls, folder, PublishOptions(words_only=True))
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_a_folder_that_has_the_name_of_a_file_of_the_page_is_refused(balls, tmp_path):
+    write_json(tmp_path / "manifest.json", {"format": FORMAT, "files": {"page.js": {}}})
+    (tmp_path / "page.js").mkdir()
+    with pytest.raises(SceneFolderError, match=r"foreign files: page\.js"):
+        publish(balls, tmp_path, PublishOptions(words_only=True))
+    assert (tmp_path / "page.js").is_dir()
 
 
 def test_single_files_need_a_name_in_html_and_replace_no_other_file(balls, tmp_path):

@@ -58,7 +58,10 @@ def test_one_known_distance_gives_sizes_in_meters(scene_folder, capsys):
         [0.5] * 3
     )
     assert run("export", scene_folder, scene_folder.parent / "all.ply") == 0
-    assert (scene_folder.parent / "all.ply").read_bytes() == (scene_folder / "gaussians.ply").read_bytes()
+    files = (scene_folder.parent / "all.ply", scene_folder / "gaussians.ply")
+    exported, kept = (file.read_bytes().partition(b"end_header\n")[2] for file in files)
+    is_same = exported == kept  # a plain value: a difference of megabytes takes minutes to print
+    assert is_same
 
 
 @pytest.mark.slow

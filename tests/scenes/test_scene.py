@@ -37,7 +37,9 @@ def test_answers_contain_scores_thresholds_and_presences(scene):
     assert question.scale is not None
     assert torch.equal(answers.scores, gaussian_relevancy(scene.field, question))
     assert answers.thresholds.tolist() == [0.5] * 3
-    assert answers.presences == scene.presence_classifier.classify(question.positives, answers.scores)
+    assert answers.presences == scene.presence_classifier.classify(
+        answers.prompts, question.positives, answers.scores
+    )
     assert answers.prompts == tuple(BALLS)
     assert len(answers) == 3
 
@@ -158,7 +160,7 @@ def test_invalid_prompts_are_refused(scene, wrong):
 
 
 def test_an_absent_object_has_no_instances_in_json(scene):
-    scene.presence_classifier.classify = lambda texts, scores: ("no",) * len(scores)
+    scene.presence_classifier.classify = lambda phrases, texts, scores: ("no",) * len(scores)
     (entry,) = find_phrases(scene, "ball 0")["phrases"]
     assert (entry["present"], entry["count"], entry["instances"]) == ("no", 0, [])
     assert entry["threshold"] == 0.5
@@ -235,7 +237,7 @@ def test_an_unknown_device_is_refused():
 
 
 def test_the_package_exports_the_public_names():
-    names = {"open_scene", "build", "Scene", "Selection"}
+    names = {"Library", "Scene", "Selection", "build", "open_library", "open_scene"}
     assert names <= set(dir(lexsplat))
     assert names <= set(lexsplat.__all__)
     assert all(callable(getattr(lexsplat, name)) for name in names)

@@ -38,5 +38,6 @@ class ColorDino:
 def install(patch):
     """Replace the functions that load encoders by these encoders."""
     patch.setattr("lexsplat.features.encoders.load_clip", lambda *_: ColorClip())
+    patch.setattr("lexsplat.scenes.scene.load_text", lambda *_: ColorClip())
     patch.setattr("lexsplat.features.encoders.load_dino", lambda *_: ColorDino())
     patch.setattr("lexsplat.pipeline.encoding.model_folder", lambda *_: None)

@@ -11,11 +11,12 @@ import json
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from support.forks import outcome
 
 KILLS_A_SCENE = 4
 LONGEST_SECONDS = 1.2
@@ -58,15 +59,7 @@ def attempt(
             status = cli.main(arguments)
         finally:
             os._exit(status)
-    deadline = None if seconds is None else time.monotonic() + seconds
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG if deadline else 0)
-        if done:
-            return "killed" if os.WIFSIGNALED(status) else "finished" if status == 0 else "failed"
-        if deadline and time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            deadline = None
-        time.sleep(0.002)
+    return outcome(child, seconds)
 
 
 def main() -> None:

@@ -1,16 +1,18 @@
-"""Who may talk to the viewer: the rules alone, then a running server with a websocket client."""
+"""Who may talk to the viewer: the rules alone, then a running server."""
 
-import asyncio
 import http.client
+import json
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.viewer_scene import ball_scene
 
-from lexsplat.viewer.guard import RequestGuard, host_name, origin_host, restrict_messages
+from lexsplat.viewer import server as serving
+from lexsplat.viewer.guard import MAX_BODY_BYTES, Guard, host_name, origin_host
+from lexsplat.viewer.server import ViewerConfig, ViewerServer
 
-GUARD = RequestGuard(names=("splats.example",))
+GUARD = Guard(None, names=("splats.example",))
 
 
 @pytest.mark.parametrize(
@@ -26,8 +28,8 @@ GUARD = RequestGuard(names=("splats.example",))
     ],
 )
 def test_addresses_localhost_and_allowed_names_are_served(host):
-    assert GUARD.refusal([host], [], websocket=False) is None
-    assert GUARD.refusal([host], [f"http://{host}"], websocket=True) is None
+    assert GUARD.refusal([host], [], "GET") is None
+    assert GUARD.refusal([host], [f"http://{host}"], "POST") is None
 
 
 @pytest.mark.parametrize(
@@ -36,8 +38,8 @@ def test_addresses_localhost_and_allowed_names_are_served(host):
      "127.0.0.1/path", "127.0.0.1:port", "[::1", "127.0.0.1#x", "sub.splats.example", "0x7f.1.evil"],
 )  # fmt: skip
 def test_names_that_could_be_rebound_are_refused(host):
-    assert GUARD.refusal([host], [], websocket=False)
-    assert GUARD.refusal([host], [f"http://{host}"], websocket=True)
+    assert GUARD.refusal([host], [], "GET")
+    assert GUARD.refusal([host], [f"http://{host}"], "POST")
 
 
 @pytest.mark.parametrize(
@@ -47,21 +49,22 @@ def test_names_that_could_be_rebound_are_refused(host):
      "http://127.0.0.1", "http://127.0.0.1:8080.evil.example", "http://127.0.0.1:8080/page",
      "chrome-extension://abc", ""],
 )  # fmt: skip
-def test_a_page_of_another_origin_cannot_connect(origin):
-    assert GUARD.refusal(["127.0.0.1:8080"], [origin], websocket=True)
+def test_a_page_of_another_origin_is_refused(origin):
+    assert GUARD.refusal(["127.0.0.1:8080"], [origin], "GET")
+    assert GUARD.refusal(["127.0.0.1:8080"], [origin], "POST")
 
 
-def test_a_websocket_without_or_with_two_origins_or_hosts_is_refused():
+def test_a_post_without_or_with_two_origins_or_hosts_is_refused():
     own = "127.0.0.1:8080"
-    assert GUARD.refusal([own], [], websocket=True)
-    assert GUARD.refusal([own], [f"http://{own}"] * 2, websocket=True)
-    assert GUARD.refusal([own, own], [f"http://{own}"], websocket=True)
-    assert GUARD.refusal([], [f"http://{own}"], websocket=True)
+    assert GUARD.refusal([own], [], "POST")
+    assert GUARD.refusal([own], [f"http://{own}"] * 2, "POST")
+    assert GUARD.refusal([own, own], [f"http://{own}"], "POST")
+    assert GUARD.refusal([], [f"http://{own}"], "POST")
 
 
 @given(st.text(max_size=40), st.text(max_size=60))
 def test_arbitrary_headers_pass_only_by_the_rules(host, origin):
-    reason = GUARD.refusal([host], [origin], websocket=True)
+    reason = GUARD.refusal([host], [origin], "POST")
     if reason is None:
         name = host_name(host)
         assert name in GUARD.names or name.replace(".", "").isdigit() or ":" in name
@@ -72,131 +75,102 @@ def test_arbitrary_headers_pass_only_by_the_rules(host, origin):
 
 
 @pytest.fixture(scope="module")
-def server():
-    """viser behind the guard, without a scene."""
-    viser = pytest.importorskip("viser")
-    guard = RequestGuard(max_message_bytes=100_000)
-    with guard.wrap_server():
-        running = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    assert guard.in_place
-    restrict_messages(running)
+def viewer():
+    running = ViewerServer(ball_scene(per_ball=20)[0], ViewerConfig(port=0))
     yield running
     running.stop()
 
 
-def ask(port: int, **headers) -> http.client.HTTPResponse:
+def send(port: int, method: str = "GET", path: str = "/", body: bytes = b"", **headers):
+    """A request with exactly these headers; the response has ``status``, ``headers`` and ``body``."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.putrequest("GET", "/", skip_host=True)
+    connection.putrequest(method, path, skip_host=True)
     for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders()
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders(body or None)
     response = connection.getresponse()
     response.body = response.read()
     connection.close()
     return response
 
 
-def test_the_page_is_served_for_its_own_host_only_and_not_in_frames(server):
-    port = server.get_port()
-    page = ask(port, Host=f"127.0.0.1:{port}")
+def ask(port: int, body: bytes, **headers):
+    return send(port, "POST", "/ask", body, **{"Content_Length": str(len(body)), **headers})
+
+
+def test_the_page_is_served_for_its_own_host_only_and_not_in_frames(viewer):
+    own = f"127.0.0.1:{viewer.port}"
+    page = send(viewer.port, Host=own)
     assert page.status == 200
     assert b"<html" in page.body[:200]
     assert page.headers["X-Frame-Options"] == "DENY"
     assert "frame-ancestors 'none'" in page.headers["Content-Security-Policy"]
-    assert ask(port, Host="evil.example").status == 403
-    assert ask(port).status == 403
-    assert ask(port, Host=f"127.0.0.1:{port}", Origin="http://evil.example").status == 403
+    assert page.headers["X-Content-Type-Options"] == "nosniff"
+    assert send(viewer.port, Host="evil.example").status == 403
+    assert send(viewer.port).status in (400, 403)
+    assert send(viewer.port, Host=own, Origin="http://evil.example").status == 403
 
 
-async def connect(port: int, origin: str | None):
-    import viser
-    from websockets.asyncio.client import connect as dial
-
-    protocols = [f"viser-v{viser.__version__}"]
-    return await dial(f"ws://127.0.0.1:{port}", origin=origin, subprotocols=protocols, max_size=None)
-
-
-def test_only_the_viewers_own_page_opens_a_websocket(server):
-    from websockets.exceptions import InvalidStatus
-
-    port = server.get_port()
-
-    async def try_all() -> list[int]:
-        statuses = []
-        for origin in ("http://evil.example", None, "null", "http://localhost:1", f"http://127.0.0.1:{port}"):
-            try:
-                async with await connect(port, origin):
-                    statuses.append(101)
-            except InvalidStatus as refused:
-                statuses.append(refused.response.status_code)
-        return statuses
-
-    assert asyncio.run(try_all()) == [403, 403, 403, 403, 101]
+def test_only_the_viewers_own_page_may_ask(viewer):
+    own = f"127.0.0.1:{viewer.port}"
+    body = json.dumps({"prompt": "ball 1", "version": 1}).encode()
+    for origin in ("http://evil.example", "null", "http://localhost:1", "http://127.0.0.1"):
+        assert ask(viewer.port, body, Host=own, Origin=origin).status == 403
+    assert ask(viewer.port, body, Host=own).status == 403
+    assert ask(viewer.port, body, Host=own, Origin=f"http://{own}").status == 200
+    assert send(viewer.port, "GET", "/ask", Host=own).status in (404, 405)
 
 
-async def talk(port: int, messages: list[bytes | str]) -> int | None:
-    """Sends messages, then reads for a second; the code with which the server closed, None if it did not."""
-    from websockets.exceptions import ConnectionClosed
-
-    async with await connect(port, f"http://127.0.0.1:{port}") as page:
-        try:
-            for message in messages:
-                await page.send(message)
-            end = asyncio.get_running_loop().time() + 1
-            while (left := end - asyncio.get_running_loop().time()) > 0:
-                await asyncio.wait_for(page.recv(), left)
-        except ConnectionClosed as closed:
-            return closed.rcvd.code if closed.rcvd else 1006
-        except asyncio.TimeoutError:
-            return None
-    return None
-
-
-def packed(**content) -> bytes:
-    return msgspec.msgpack.encode(content)
-
-
-def test_forged_messages_open_no_tunnel_and_store_no_file(server, monkeypatch):
-    shared = []
-    monkeypatch.setattr(server, "request_share_url", lambda *_: shared.append(1))
-    monkeypatch.setattr(server, "disconnect_share_url", lambda *_: shared.append(1))
-    control = server.gui.add_text("text", "")._impl.uuid
-    upload = packed(type="FileTransferStartUpload", source_component_uuid=control, transfer_uuid="a", filename="f",
-                    mime_type="text/plain", part_count=2, size_bytes=9)  # fmt: skip
-    messages = [packed(type="ShareUrlRequest"), packed(type="ShareUrlDisconnect"), upload]
-    assert asyncio.run(talk(server.get_port(), messages)) is None
-    assert shared == []
-    assert server.gui._current_file_upload_states == {}
-
-
-def test_a_page_sets_the_value_of_a_control_and_no_other_attribute(server):
-    control = server.gui.add_text("text", "before")
-    uuid = control._impl.uuid
-    callbacks = control._impl.update_cb
-    forged = [
-        packed(type="GuiUpdateMessage", uuid=uuid, updates={"update_cb": [], "value": "forged"}),
-        packed(type="GuiUpdateMessage", uuid=uuid, updates={"uuid": "forged"}),
-        packed(type="GuiUpdateMessage", uuid=uuid, updates={}),
-    ]
-    asyncio.run(talk(server.get_port(), forged))
-    assert control.value == "before"
-    assert control._impl.uuid == uuid
-    assert control._impl.update_cb is callbacks
-    asyncio.run(
-        talk(server.get_port(), [packed(type="GuiUpdateMessage", uuid=uuid, updates={"value": "after"})])
+def test_large_bodies_and_bodies_of_unknown_length_are_refused_unread(viewer):
+    own = f"127.0.0.1:{viewer.port}"
+    headers = {"Host": own, "Origin": f"http://{own}"}
+    assert ask(viewer.port, b" ", **headers, Content_Length=str(MAX_BODY_BYTES + 1)).status == 413
+    assert ask(viewer.port, b"0", **headers, Transfer_Encoding="chunked", Content_Length="1").status in (
+        400,
+        413,
     )
-    assert control.value == "after"
 
 
 @pytest.mark.parametrize(
-    "message", [b"\xc1", b"", b"\x00" * 5000, "text", packed(kind="x"), packed(type=["ViewerCameraMessage"]),
-                packed(type="GuiUpdateMessage", uuid="a", updates=7)],
+    "body", [b"", b"\xff\xfe", b"[]", b"7", b"{", b'{"version": 1}', b'{"version": 1, "prompt": 3}',
+             b"[" * 60_000, b'{"version": 1, "prompt": "x", "threshold": NaN}',
+             b'{"version": 1, "prompt": "x", "camera": {"viewmat": [1], "lens": []}}',
+             b'{"version": 1, "prompt": "x", "instance": -1}', b'{"version": 1, "click": [1, 2]}'],
 )  # fmt: skip
-def test_a_malformed_message_does_not_stop_the_server(server, message):
-    port = server.get_port()
-    asyncio.run(talk(port, [message]))
-    assert ask(port, Host=f"127.0.0.1:{port}").status == 200
+def test_a_malformed_question_is_answered_with_one_line_and_does_not_stop_the_server(viewer, body):
+    own = f"127.0.0.1:{viewer.port}"
+    answer = ask(viewer.port, body, Host=own, Origin=f"http://{own}")
+    assert answer.status == 400
+    assert "\n" not in json.loads(answer.body)["error"]["message"]
+    assert send(viewer.port, Host=own).status == 200
 
 
-def test_a_message_over_the_size_limit_closes_the_connection(server):
-    assert asyncio.run(talk(server.get_port(), [b"\x00" * 200_000])) == 1009
+def test_the_server_upgrades_no_connection(viewer):
+    own = f"127.0.0.1:{viewer.port}"
+    asked = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec_WebSocket_Key": "x",
+        "Sec_WebSocket_Version": "13",
+    }
+    assert send(viewer.port, Host=own, Origin=f"http://{own}", **asked).status != 101
+
+
+def test_elsewhere_than_on_loopback_a_visitor_needs_the_token_of_the_printed_address(monkeypatch):
+    monkeypatch.setattr(serving, "_is_loopback", lambda _: False)
+    running = ViewerServer(ball_scene(per_ball=20)[0], ViewerConfig(port=0))
+    try:
+        own = {"Host": f"127.0.0.1:{running.port}"}
+        assert len(running.token) >= 20
+        assert running.url.endswith(f"/?token={running.token}")
+        assert send(running.port, **own).status == 403
+        assert send(running.port, path="/?token=wrong", **own).status == 403
+        assert send(running.port, **own, Cookie="lexsplat=wrong").status == 403
+        entered = send(running.port, path=f"/?token={running.token}", **own)
+        assert (entered.status, entered.headers["Location"]) == (303, "/")
+        cookie = entered.headers["Set-Cookie"]
+        assert "HttpOnly" in cookie
+        assert send(running.port, **own, Cookie=cookie.split(";")[0]).status == 200
+        assert send(running.port, path=f"/?token={running.token}", Host="evil.example").status == 403
+    finally:
+        running.stop()

@@ -1,66 +1,59 @@
-// The answers to prompts: how they are found, and their cards beside the picture.
+// The answers to prompts: what they say, and their cards beside the picture.
 
-import type { Geometry, Place } from "./geometry";
 import { h, iconButton } from "./dom";
-import { Dictionary, normalize } from "./dictionary";
-import type { Language, Table } from "./language";
+import type { Place } from "./geometry";
 import { COLORS } from "./painter";
-import { BORDER, type Presence, presenceOf } from "./rules";
-import type { Description } from "./tower";
+import type { Presence } from "./rules";
 
 export interface Answer {
-  /** What was typed, and the phrase that was looked up. */
+  /** What was typed, and how it was understood. */
   prompt: string;
   phrase: string;
-  /** "dictionary" or "text tower": where the table comes from. */
+  /** What was mended or not understood; "" for nothing. */
+  note: string;
+  /** "dictionary", "text tower", "server", or "click" for what was clicked. */
   from: string;
-  table: Table;
   scores: Float32Array;
   presence: Presence;
   automatic: number;
   threshold: number;
   color: string;
+  hidden: boolean;
   /** Shown although the scene does not hold it. */
   anyway: boolean;
   places: Place[] | null;
   /** The place that the camera looks at. */
   place: number;
+  /** What the server was asked. */
+  asked: object | null;
 }
 
-/** What answers prompts: the dictionary, then the text tower. */
-export class Answerer {
-  constructor(
-    readonly dictionary: Dictionary,
-    readonly language: Language,
-    readonly shown: Uint32Array,
-    /** What any phrase means; null where the page has no text tower. */
-    readonly tower: ((phrase: string) => Promise<Description | null>) | null,
-  ) {}
+export type Found = Pick<Answer, "phrase" | "from" | "scores" | "presence" | "threshold"> & Partial<Answer>;
 
-  /** The answer to a prompt; null if nothing in this page can tell what it means. */
-  async answer(prompt: string, color: string): Promise<Answer | null> {
-    const known = this.dictionary.find(prompt);
-    if (known >= 0) {
-      const table = this.dictionary.table(known);
-      const scores = this.language.scores(table);
-      const phrase = this.dictionary.phrases[known];
-      return answered(prompt, phrase, "dictionary", table, scores, this.dictionary.presence(known), color);
-    }
-    const phrase = normalize(prompt);
-    const described = (await this.tower?.(phrase)) ?? null;
-    if (!described) return null;
-    const { table, heights, best, rule } = described;
-    const scores = this.language.scores(table);
-    const presence = presenceOf(scores, heights, best, rule, this.language, this.shown);
-    return answered(prompt, phrase, "text tower", table, scores, presence, color);
-  }
+/** An answer as it is first shown. */
+export function answered(prompt: string, color: string, found: Found): Answer {
+  const fresh = { note: "", hidden: false, anyway: false, places: null, place: 0, asked: null };
+  return { ...fresh, prompt, color, automatic: found.threshold, ...found };
 }
 
-function answered(
-  prompt: string, phrase: string, from: string, table: Table, scores: Float32Array, presence: Presence, color: string,
-): Answer {
-  const found = { automatic: BORDER, threshold: BORDER, anyway: false, places: null, place: 0 };
-  return { prompt, phrase, from, table, scores, presence, color, ...found };
+/** What a click met: names, the surest first, and where. */
+export interface Clicked {
+  names: { phrase: string; score: number }[];
+  point: [number, number, number];
+  /** The clicked object; null where only the server knows it. */
+  found: Found | null;
+}
+
+/** Who answers: the tables of the page, or the server behind it. */
+export interface Source {
+  readonly examples: string[];
+  complete(text: string): string[];
+  /** The answer to a prompt; null if nothing can tell what it means. */
+  answer(prompt: string, color: string): Promise<Answer | null>;
+  /** Find the places of an answer, for its threshold. */
+  refine(answer: Answer): Promise<void>;
+  /** What is at a point of the page; null if nothing is. */
+  whatIs(x: number, y: number): Promise<Clicked | null>;
 }
 
 /** The first color that no answer has. */
@@ -70,13 +63,7 @@ export function freeColor(answers: Answer[]): string {
 
 /** Whether an answer is painted: a thing that is not here is not, unless the visitor wants to see the best guess. */
 export function painted(answer: Answer): boolean {
-  return answer.presence !== "no" || answer.anyway;
-}
-
-/** The places of an answer; they are found once for each threshold. */
-export function placesOf(answer: Answer, geometry: Geometry): Place[] {
-  answer.places ??= painted(answer) ? geometry.places(answer.scores, answer.threshold) : [];
-  return answer.places;
+  return !answer.hidden && (answer.presence !== "no" || answer.anyway);
 }
 
 /** What an answer says, in words. */
@@ -91,23 +78,40 @@ export function spoken(answer: Answer): string {
 export interface CardHost {
   show(answer: Answer, step: number): void;
   remove(answer: Answer): void;
-  /** The threshold or `anyway` changed. */
+  /** The threshold or `anyway` changed: other splats are meant. */
   changed(answer: Answer): void;
+  /** The color or whether it is shown changed. */
+  repaint(answer: Answer): void;
+  /** What else can be done with an answer; null for nothing. */
+  further(answer: Answer): HTMLElement | null;
 }
 
 /** The card of an answer: what was asked, whether it is here, and controls. */
 export function card(answer: Answer, host: CardHost): HTMLElement {
   const count = answer.places?.length ?? 0;
-  const swatch = h("span", { class: "swatch", "aria-hidden": "true" });
-  swatch.style.background = answer.color;
+  const swatch = h("input", {
+    type: "color",
+    class: "swatch",
+    value: answer.color,
+    "aria-label": `Color of ${answer.prompt}`,
+    oninput: (event: Event) => {
+      answer.color = (event.target as HTMLInputElement).value;
+      host.repaint(answer);
+    },
+  });
   const state = h("span", { class: `state ${answer.presence}`, text: spoken(answer) });
-  const understood = answer.phrase !== answer.prompt.trim().toLowerCase() && h("span", { class: "understood", text: `as “${answer.phrase}”` });
+  const other = answer.phrase.toLowerCase() !== answer.prompt.trim().toLowerCase();
+  const understood = other && h("span", { class: "understood", text: `as “${answer.phrase}”` });
   const head = h(
     "div",
     { class: "head" },
     swatch,
     h("strong", { text: answer.prompt }),
     understood,
+    iconButton(answer.hidden ? "hidden" : "shown", `${answer.hidden ? "Show" : "Hide"} ${answer.prompt}`, () => {
+      answer.hidden = !answer.hidden;
+      host.repaint(answer);
+    }),
     iconButton("close", `Remove ${answer.prompt}`, () => host.remove(answer)),
   );
   const row = h("div", { class: "row" }, state);
@@ -132,8 +136,10 @@ export function card(answer: Answer, host: CardHost): HTMLElement {
       }),
     );
   }
-  const element = h("li", { class: "card" }, head, row);
+  const element = h("li", { class: "card" }, head, row, answer.note !== "" && h("p", { class: "fine", text: answer.note }));
   if (painted(answer)) element.append(thresholdRow(answer, host));
+  const further = count > 0 ? host.further(answer) : null;
+  if (further) element.append(further);
   return element;
 }
 

@@ -1,84 +1,78 @@
 // The page: one picture, one search bar, and what was found.
 
 import * as THREE from "three";
-import { type Answer, Answerer, card, freeColor, painted, placesOf, spoken } from "./answers";
-import { Dictionary } from "./dictionary";
-import { h, icon, iconButton, save } from "./dom";
-import { Geometry, type Place } from "./geometry";
-import { Language, shownSplats } from "./language";
-import type { Manifest, ViewEntry } from "./manifest";
+import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
+import { h, icon, save } from "./dom";
+import type { Geometry, Place } from "./geometry";
+import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./manifest";
+import { Measure } from "./measure";
 import { Overlay } from "./overlay";
-import { MOST_PROMPTS, type Mode, Painter } from "./painter";
+import { objectsPanel, viewsPanel } from "./panels";
+import { MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
+import { Server } from "./server";
 import { type Stage, pose } from "./stage";
 import { readState, writeState } from "./state";
-import { helpDialog, viewsPanel } from "./panels";
-import type { TowerLoader } from "./tower-loader";
-
-export interface Content {
-  codes: Uint8Array;
-  phrases: string;
-  table: Uint8Array;
-}
+import { Tables } from "./tables";
+import { toolbar } from "./tools";
+import { workbench } from "./workbench";
 
 /** In larger scenes, colors appear before the places are found. */
 const MOST_AT_ONCE = 200_000;
 
 export class App {
   readonly answers: Answer[] = [];
-  readonly answerer: Answerer;
-  readonly language: Language;
-  readonly geometry: Geometry;
+  readonly search: SearchBar;
+  readonly measure: Measure;
+  readonly views: ReturnType<typeof viewsPanel>;
+  readonly objects: ReturnType<typeof objectsPanel>;
+  readonly server: Server | null;
   readonly #painter: Painter;
   readonly #overlay: Overlay;
-  readonly #search: SearchBar;
   readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
   readonly #sheet: HTMLElement;
   readonly #status = h("div", { class: "status", role: "status", "aria-live": "polite" });
-  readonly #views: ReturnType<typeof viewsPanel>;
   readonly #bounds: { center: THREE.Vector3; radius: number };
+  readonly #life = new AbortController();
   #mode: Mode = "marks";
+  #preview: Preview | null = null;
+  #colors = 0;
   #view = "";
-  #measuring = false;
-  #points: THREE.Vector3[] = [];
   #written = "";
 
   constructor(
     readonly stage: Stage,
+    readonly geometry: Geometry,
     readonly manifest: Manifest,
-    content: Content,
-    readonly loader: TowerLoader | null,
+    readonly source: Source,
     root: HTMLElement,
   ) {
-    const numCodes = manifest.language.num_codes;
-    this.language = new Language(content.codes, numCodes);
-    this.geometry = new Geometry(stage.mesh, this.language.count);
-    this.#painter = new Painter(stage.mesh, this.language);
-    this.#bounds = this.geometry.bounds();
-    const shown = shownSplats(this.geometry.opacities);
-    const dictionary = new Dictionary(content.phrases, content.table, numCodes);
-    dictionary.rank(this.language, shown);
-    const tower = loader ? async (phrase: string) => (await loader.load())?.describe(phrase) ?? null : null;
-    this.answerer = new Answerer(dictionary, this.language, shown, tower);
-
-    const examples = dictionary.examples(4);
-    this.#search = new SearchBar(
-      { complete: (text) => dictionary.complete(text), ask: (text, add) => void this.ask(text, add) },
+    this.server = source instanceof Server ? source : null;
+    this.#painter = new Painter(stage.mesh, geometry.count);
+    this.#bounds = geometry.bounds();
+    const { examples } = source;
+    this.search = new SearchBar(
+      { complete: (text) => source.complete(text), ask: (text, add) => this.run(() => this.ask(text, add)) },
       examples[0] ?? "",
     );
-    this.#views = viewsPanel(manifest.views, (view) => this.jump(view));
+    this.views = viewsPanel(manifest.views, (view) => this.jump(view), this.server !== null);
     this.#overlay = new Overlay(stage);
+    this.measure = new Measure(stage, geometry, this.#overlay, manifest);
+    const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
+    this.objects = objectsPanel(list, ({ size }) => this.measure.sides(size), (object) => this.#goTo(object));
     const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }));
     const tries = h("p", { class: "examples" }, examples.length > 0 && "Try: ");
     for (const phrase of examples) {
-      tries.append(h("button", { type: "button", text: phrase, onclick: () => void this.ask(phrase, false) }));
+      tries.append(h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, false)) }));
     }
     this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, tries, this.#list, this.#status);
     root.append(
-      h("div", { class: "bar" }, this.#search.element, this.#sheet),
+      h("div", { class: "bar" }, this.search.element, this.#sheet),
       head,
-      this.#tools(),
-      this.#views.element,
+      toolbar(this, this.#life.signal),
+      this.views.element,
+      this.objects.element,
+      ...(this.server ? [this.views.figure] : []),
       this.#overlay.element,
     );
     stage.onMove = () => this.#moved();
@@ -87,7 +81,21 @@ export class App {
     new ResizeObserver(() => this.#cover()).observe(this.#sheet);
   }
 
-  /** Take up the state of the link; true if it says where to stand. */
+  /** End before another version of the scene is shown; the link keeps what was asked and the view. */
+  dispose(): void {
+    this.#life.abort();
+    this.#writeNow();
+  }
+
+  /** Do something; what fails is told in one line. */
+  run(work: () => Promise<void>): void {
+    work().catch((error: unknown) => {
+      this.note(error instanceof PageError ? error.message : `That failed: ${String(error)}`);
+      if (!(error instanceof PageError)) console.error(error);
+    });
+  }
+
+  /** Take up the state of the link. */
   async restore(): Promise<void> {
     const state = readState(location.hash);
     const view = this.manifest.views.find(({ name }) => name === state.view) ?? null;
@@ -95,7 +103,7 @@ export class App {
       const [x, y, z, a, b, c, fov] = state.camera;
       const placed = new THREE.Vector3(x, y, z);
       await this.stage.fly(placed, new THREE.Vector3(a, b, c), false, THREE.MathUtils.clamp(fov, 5, 120));
-    } else this.#start(view);
+    } else this.start(view);
     this.#mode = state.mode;
     const given = state.prompts.map((prompt) => prompt.toLowerCase());
     if (given.join("\n") === this.answers.map((answer) => answer.prompt.toLowerCase()).join("\n")) return;
@@ -107,21 +115,18 @@ export class App {
   async ask(text: string, add = false, fly = true): Promise<void> {
     const prompts = text.split(",").map((part) => part.trim()).filter(Boolean);
     if (!add) this.answers.length = 0;
-    this.#note("");
+    this.#preview = null;
+    this.note("");
     for (const prompt of prompts) {
-      if (this.answers.length === MOST_PROMPTS) this.answers.shift();
-      const answer = await this.answerer.answer(prompt, freeColor(this.answers));
-      if (!answer) {
-        this.#unknown(prompt);
-        continue;
-      }
-      this.answers.push(answer);
+      const answer = await this.source.answer(prompt, freeColor(this.answers));
+      if (answer) this.#add(answer);
+      else this.#unknown(prompt);
     }
     if (this.geometry.count > MOST_AT_ONCE) {
       this.#paint(); // colors first, then places
       await new Promise((resolve) => setTimeout(resolve));
     }
-    for (const answer of this.answers) placesOf(answer, this.geometry);
+    for (const answer of this.answers) await this.source.refine(answer);
     this.#paint();
     this.#refresh();
     const latest = this.answers.at(-1);
@@ -129,11 +134,16 @@ export class App {
     if (fly && latest?.places?.length) this.#flyTo(latest);
   }
 
+  #add(answer: Answer): void {
+    if (this.answers.length === MOST_PROMPTS) this.answers.shift();
+    this.answers.push(answer);
+  }
+
   clear(): void {
     this.answers.length = 0;
-    this.#note("");
-    this.#points = [];
-    this.#overlay.show([]);
+    this.#preview = null;
+    this.note("");
+    this.measure.clear();
     this.#paint();
     this.#refresh();
   }
@@ -145,11 +155,11 @@ export class App {
     this.#view = "";
     this.stage.jump(view, depth, fly);
     this.#view = view.name;
-    this.#views.mark(view.name);
+    this.views.mark(view.name);
     this.#write();
   }
 
-  #start(view: ViewEntry | null): void {
+  start(view: ViewEntry | null): void {
     const { views, scene } = this.manifest;
     const chosen = view ?? views.find(({ name }) => name === scene.start_view) ?? views[0];
     const { center, radius } = this.#bounds;
@@ -188,7 +198,11 @@ export class App {
 
   #paint(): void {
     const shown = this.answers.filter(painted);
-    this.#painter.paint(shown.map((answer) => ({ ...answer, splats: answer.places?.flatMap((place) => place.splats) ?? null })), this.#mode);
+    this.#painter.paint(
+      shown.map((answer) => ({ ...answer, splats: answer.places?.flatMap((place) => place.splats) ?? null })),
+      this.#mode,
+      this.#preview,
+    );
     this.stage.draw();
     this.#write();
   }
@@ -205,50 +219,79 @@ export class App {
           },
           remove: (one) => {
             this.answers.splice(this.answers.indexOf(one), 1);
+            this.#preview = null;
             this.#paint();
             this.#refresh();
-            this.#search.input.focus();
+            this.search.input.focus();
           },
           changed: (one) => {
             one.place = 0;
+            one.places = null;
             this.#paint();
             clearTimeout(this.#later);
-            this.#later = setTimeout(() => {
-              placesOf(one, this.geometry);
-              this.#paint();
-              const focused = document.activeElement?.getAttribute("aria-label");
-              this.#refresh();
-              if (focused) this.#list.querySelector<HTMLElement>(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
-            }, 250);
+            this.#later = setTimeout(() => this.run(() => this.#refine(one)), 250);
           },
+          repaint: () => {
+            this.#paint();
+            this.#refreshKeepingFocus();
+          },
+          further: (one) => this.server && workbench(one, this.server, this.geometry, this.stage.camera.up, this.#bench()),
         }),
       ),
     );
     this.#sheet.classList.toggle("asked", this.answers.length > 0);
   }
+
+  async #refine(answer: Answer): Promise<void> {
+    await this.source.refine(answer);
+    this.#paint();
+    this.#refreshKeepingFocus();
+  }
+
+  #refreshKeepingFocus(): void {
+    const focused = document.activeElement?.getAttribute("aria-label");
+    this.#refresh();
+    if (focused) this.#list.querySelector<HTMLElement>(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
+  }
+
+  #bench() {
+    return {
+      preview: (preview: Preview | null) => {
+        this.#preview = preview;
+        this.#paint();
+      },
+      jump: (name: string) => {
+        const view = this.manifest.views.find((one) => one.name === name);
+        if (view) this.jump(view);
+      },
+      run: (work: () => Promise<void>) => this.run(work),
+    };
+  }
   #later: ReturnType<typeof setTimeout> | undefined;
 
   /** Nothing in the page can tell what a prompt means: offer the nearest phrases. */
   #unknown(prompt: string): void {
-    const near = this.answerer.dictionary.similar(prompt);
-    const count = this.answerer.dictionary.phrases.length.toLocaleString("en");
-    this.#note(`“${prompt}” is not among the ${count} phrases of this page.`, near);
-    if (this.loader?.waiting) {
-      const size = (this.loader.bytes / 1e6).toFixed(0);
+    if (!(this.source instanceof Tables)) return;
+    const { dictionary, loader } = this.source;
+    const near = dictionary.similar(prompt);
+    const count = dictionary.phrases.length.toLocaleString("en");
+    this.note(`“${prompt}” is not among the ${count} phrases of this page.`, near);
+    if (loader?.waiting) {
+      const size = (loader.bytes / 1e6).toFixed(0);
       this.#status.append(
         h("button", {
           type: "button",
           text: `Load the text model (${size} MB) to ask anything`,
-          onclick: () => void this.loader?.agree().then(() => this.ask(prompt, true)),
+          onclick: () => this.run(() => loader.agree().then(() => this.ask(prompt, true))),
         }),
       );
     }
   }
 
-  #note(text: string, near: string[] = []): void {
+  note(text: string, near: string[] = []): void {
     this.#status.replaceChildren(text ? h("p", { text }) : "");
     if (near.length) {
-      this.#status.append(h("p", { class: "examples" }, "Nearest: ", ...near.map((phrase) => h("button", { type: "button", text: phrase, onclick: () => void this.ask(phrase, true) }))));
+      this.#status.append(h("p", { class: "examples" }, "Nearest: ", ...near.map((phrase) => h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, true)) }))));
     }
     this.#sheet.classList.toggle("noted", Boolean(text));
   }
@@ -259,105 +302,77 @@ export class App {
     }
   }
 
-  /** What is under a point of the page: names from the dictionary, the likeliest first. */
-  whatIs(x: number, y: number): { phrase: string; score: number }[] | null {
-    const hit = this.geometry.hit(this.stage.ray(x, y));
-    if (!hit) return null;
-    const names = this.answerer.dictionary.name(this.language.distribution(hit.splats, hit.shares), 4);
-    this.#points = [];
-    this.#overlay.show([hit.point]);
-    const sure = names.filter(({ score }) => score >= 0.5);
-    const shown = sure.length ? sure : names.slice(0, 2);
-    const position = hit.point.toArray().map((value) => value.toFixed(2)).join(", ");
-    this.#note(sure.length ? "This may be:" : "No phrase of this page fits well. Nearest:");
+  /** What is under a point of the page, told as buttons that ask for it. */
+  async whatIs(x: number, y: number): Promise<Clicked | null> {
+    const clicked = await this.source.whatIs(x, y);
+    if (!clicked) {
+      this.note("Nothing is there.");
+      return null;
+    }
+    const sure = clicked.names.filter(({ score }) => score >= 0.5);
+    const shown = sure.length ? sure.slice(0, 4) : clicked.names.slice(0, 2);
+    const { found } = clicked;
+    if (found) {
+      const before = this.answers.findIndex((answer) => answer.from === "click");
+      if (before >= 0) this.answers.splice(before, 1);
+      const name = sure.length ? `clicked: ${shown[0].phrase}` : "what was clicked";
+      this.#add(answered(name, freeColor(this.answers), { ...found, phrase: name }));
+      this.#preview = null;
+      this.#paint();
+      this.#refresh();
+    }
+    this.measure.clear();
+    this.#overlay.show([new THREE.Vector3(...clicked.point)]);
+    this.note(sure.length ? "This may be:" : "No phrase of this page fits well. Nearest:");
     this.#status.append(
       h("p", { class: "examples" }, ...shown.map(({ phrase, score }) =>
-        h("button", { type: "button", text: phrase, title: `relevancy ${score.toFixed(2)}`, onclick: () => void this.ask(phrase, false) }))),
-      h("p", { class: "fine", text: `at ${position}` }),
+        h("button", { type: "button", text: phrase, title: `relevancy ${score.toFixed(2)}`, onclick: () => this.run(() => this.ask(phrase, false)) }))),
+      h("p", { class: "fine", text: `at ${clicked.point.map((value) => value.toFixed(2)).join(", ")}` }),
     );
-    return names;
-  }
-
-  #measure(x: number, y: number): void {
-    const hit = this.geometry.hit(this.stage.ray(x, y));
-    if (!hit) return this.#note("Nothing to measure there: click on a surface.");
-    this.#points = this.#points.length === 2 ? [hit.point] : [...this.#points, hit.point];
-    const [a, b] = this.#points;
-    const text = b ? this.#length(a.distanceTo(b)) : "";
-    this.#overlay.show(this.#points, text);
-    this.#note(text ? `Distance: ${text}` : "Click on the second point.");
     this.stage.draw();
+    return clicked;
   }
 
-  /** A length in meters where the scale is known, else in units of the scene. */
-  #length(units: number): string {
-    const scale = this.manifest.scene.meters_per_unit;
-    if (scale === null) return `${units.toPrecision(3)} units (the scale is not known)`;
-    const meters = units * scale;
-    return meters < 1 ? `${(meters * 100).toPrecision(3)} cm` : `${meters.toPrecision(3)} m`;
+  /** Stand before an object of the list. */
+  #goTo({ name, center, size }: ObjectEntry): void {
+    const place: Place = { center: new THREE.Vector3(...center), radius: Math.hypot(...size) / 2, splats: [] };
+    this.#overlay.show([place.center]);
+    this.note(`${name}: ${this.measure.sides(size)}`);
+    this.stage.flyTo(place, this.#vantage(place));
   }
 
-  #tools(): HTMLElement {
-    const toggle = (button: HTMLButtonElement, on: boolean): void => button.setAttribute("aria-pressed", String(on));
-    const views = iconButton("views", "Where the photos were taken", () => toggle(views, this.#views.toggle()), "v");
-    const measure = iconButton("measure", "Measure between two points", () => {
-      this.#measuring = !this.#measuring;
-      toggle(measure, this.#measuring);
-      this.#points = [];
-      this.#overlay.show([]);
-      this.stage.canvas.classList.toggle("measuring", this.#measuring);
-      this.#note(this.#measuring ? "Click on two points." : "");
-    }, "m");
-    const heat = iconButton("heat", "Show heat instead of marks", () => {
-      this.#mode = this.#mode === "heat" ? "marks" : "heat";
-      toggle(heat, this.#mode === "heat");
-      this.#paint();
-    }, "h");
-    const dialog = helpDialog(this.manifest);
-    const help = iconButton("help", "Help and about", () => dialog.showModal(), "?");
-    const buttons = {
-      v: views,
-      m: measure,
-      h: heat,
-      0: iconButton("whole", "Back to the start", () => this.#start(null), "0"),
-      p: iconButton("picture", "Save the picture", () => void this.#save(), "p"),
-      l: iconButton("link", "Copy the link", () => void this.#copy(), "l"),
-      t: iconButton("theme", "Light or dark", () => this.theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"), "t"),
-      "?": help,
-    };
-    for (const button of [views, measure, heat]) toggle(button, false);
-    addEventListener("keydown", (event) => this.#key(event, buttons));
-    return h("nav", { class: "tools", "aria-label": "Tools" }, ...Object.values(buttons), dialog);
+  toggleHeat(): boolean {
+    this.#mode = this.#mode === "heat" ? "marks" : "heat";
+    this.#paint();
+    return this.#mode === "heat";
   }
 
-  #key(event: KeyboardEvent, buttons: Record<string, HTMLButtonElement>): void {
-    const typing = event.target instanceof HTMLInputElement && event.target.type === "text";
-    if (typing || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
-    if (event.key === "/") {
-      event.preventDefault();
-      this.#search.input.focus();
-    } else if (event.key === "Escape") this.clear();
-    else if (buttons[event.key]) buttons[event.key].click();
-    else if (event.key === "[" || event.key === "]") this.#views.step(event.key === "]" ? 1 : -1);
-    else if (event.target === this.stage.canvas || event.target === document.body) {
-      if (this.stage.key(event.key, event.shiftKey)) event.preventDefault();
-    }
+  /** Show language, codes, uncertainty and the photo's colors in turn; true if they are not the photo's. */
+  async nextColors(): Promise<boolean> {
+    const modes = this.server?.entry.modes ?? [];
+    const next = (this.#colors + 1) % (modes.length + 1);
+    this.#painter.recolor(next ? await this.server!.colors(modes[next - 1]) : null);
+    this.#colors = next;
+    this.note(next ? `Colors: ${modes[next - 1]}` : "");
+    this.stage.draw();
+    return next > 0;
   }
 
   #listen(): void {
     const { canvas } = this.stage;
+    const { signal } = this.#life;
     let down: { x: number; y: number; time: number } | null = null;
     canvas.addEventListener("pointerdown", (event) => {
       down = event.isPrimary && event.button === 0 ? { x: event.clientX, y: event.clientY, time: event.timeStamp } : null;
-    });
+    }, { signal });
     canvas.addEventListener("pointerup", (event) => {
       if (!down || Math.hypot(event.clientX - down.x, event.clientY - down.y) > 6 || event.timeStamp - down.time > 600) return;
       down = null;
-      if (this.#measuring) this.#measure(event.clientX, event.clientY);
-      else if (!this.whatIs(event.clientX, event.clientY)) this.#note("Nothing is there.");
-      this.stage.draw();
-    });
-    addEventListener("hashchange", () => location.hash !== this.#written && void this.restore());
+      const { clientX: x, clientY: y } = event;
+      if (this.measure.active) this.note(this.measure.click(x, y));
+      else this.run(async () => void (await this.whatIs(x, y)));
+    }, { signal });
+    addEventListener("hashchange", () => location.hash !== this.#written && this.run(() => this.restore()), { signal });
   }
 
   theme(name: string): void {
@@ -370,17 +385,25 @@ export class App {
     }
   }
 
-  async #save(): Promise<void> {
+  async savePicture(): Promise<void> {
     save(await this.stage.picture(), "picture.png");
   }
 
-  async #copy(): Promise<void> {
-    this.#write();
+  async saveVideo(): Promise<void> {
+    this.note("Recording for six seconds …");
+    const made = await this.stage.record();
+    if (!made) throw new PageError("This browser records no videos.");
+    save(made.video, `video${made.suffix}`);
+    this.note("");
+  }
+
+  async copyLink(): Promise<void> {
+    this.#writeNow();
     try {
       await navigator.clipboard.writeText(location.href);
-      this.#note("The link is copied. It carries the prompts and the view.");
+      this.note("The link is copied. It carries the prompts and the view.");
     } catch {
-      this.#note(`Copy the address of this page: ${location.href}`);
+      this.note(`Copy the address of this page: ${location.href}`);
     }
   }
 
@@ -389,7 +412,7 @@ export class App {
       const view = this.manifest.views.find(({ name }) => name === this.#view);
       if (view && pose(view).position.distanceTo(this.stage.camera.position) > this.#bounds.radius * 1e-3) {
         this.#view = "";
-        this.#views.mark("");
+        this.views.mark("");
       }
     }
     this.#write();
@@ -398,22 +421,25 @@ export class App {
   /** Write the state into the link, at most four times a second. */
   #write(): void {
     clearTimeout(this.#writing);
-    this.#writing = setTimeout(() => {
-      const { camera, target } = this.stage;
-      this.#written = writeState({
-        prompts: this.answers.map((answer) => answer.prompt),
-        view: this.#view,
-        camera: [...camera.position.toArray(), ...target.toArray(), camera.fov],
-        mode: this.#mode,
-      });
-      try {
-        history.replaceState(null, "", this.#written);
-      } catch {
-        // a page without an address of its own
-      }
-    }, 250);
+    this.#writing = setTimeout(() => this.#writeNow(), 250);
   }
   #writing: ReturnType<typeof setTimeout> | undefined;
+
+  #writeNow(): void {
+    clearTimeout(this.#writing);
+    const { camera, target } = this.stage;
+    this.#written = writeState({
+      prompts: this.answers.filter((answer) => answer.from !== "click").map((answer) => answer.prompt),
+      view: this.#view,
+      camera: [...camera.position.toArray(), ...target.toArray(), camera.fov],
+      mode: this.#mode,
+    });
+    try {
+      history.replaceState(null, "", this.#written);
+    } catch {
+      // a page without an address of its own
+    }
+  }
 
   /** On phones the sheet lies over the picture: move the middle of the picture above it. */
   #cover(): void {

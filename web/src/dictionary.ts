@@ -17,8 +17,8 @@ export function normalize(text: string): string {
 export class Dictionary {
   readonly phrases: string[];
   /** What each phrase is: asked of this scene before (a), a name (n), a name with a color or part (c), a use (u). */
-  readonly #kinds: string;
-  readonly #presences: string;
+  #kinds: string;
+  #presences: string;
   readonly #places = new Map<string, number>();
   readonly #words = new Map<string, number>();
   readonly #tables: Uint8Array;
@@ -27,7 +27,10 @@ export class Dictionary {
   #strengths = new Float32Array(0);
   #means = new Float32Array(0);
 
-  /** `list` has a phrase a line, its kind and presence in front; `tables` a relevancy for each phrase and code in 255ths. */
+  /**
+   * `list` has a phrase a line, its kind and presence in front; `tables` a relevancy for each phrase and code in
+   * 255ths, empty where a server answers.
+   */
   constructor(list: string, tables: Uint8Array, numCodes: number) {
     const lines = list.split("\n").filter(Boolean);
     this.#kinds = lines.map((line) => line[0]).join("");
@@ -51,6 +54,14 @@ export class Dictionary {
       return best / 255;
     });
     this.#means = Float32Array.from(this.phrases, (_, place) => dot(this.#row(place), shares) / 255);
+  }
+
+  /** Offer a phrase first from now on. */
+  remember(phrase: string): void {
+    if (this.phrases[0]?.toLowerCase() === phrase.toLowerCase()) return;
+    this.phrases.unshift(phrase);
+    this.#kinds = `a${this.#kinds}`;
+    this.#presences = `y${this.#presences}`;
   }
 
   #row(place: number): Uint8Array {
@@ -89,7 +100,7 @@ export class Dictionary {
       if (!begins && !lower.includes(` ${typed}`)) return;
       const asked = this.#kinds[place] === "a" ? 0.3 : 0;
       const here = { y: 0.5, u: 0.2 }[this.#presences[place]] ?? 0;
-      scored.push([place, (begins ? 1 : 0) + asked + here + this.#strengths[place] * 0.3 - lower.length / 200]);
+      scored.push([place, (begins ? 1 : 0) + asked + here + (this.#strengths[place] ?? 0) * 0.3 - lower.length / 200]);
     });
     const found = scored.sort((a, b) => b[1] - a[1]).slice(0, count).map(([place]) => this.phrases[place]);
     return found.length ? found : this.similar(text, count);

@@ -28,22 +28,26 @@ const SAME_SURFACE = 0.05;
 export class Geometry {
   readonly centers: Float32Array;
   readonly opacities: Float32Array;
+  /** Brightness of each splat, 0..1. */
+  readonly lights: Float32Array;
   readonly #scales: Float32Array;
   readonly #quats: Float32Array;
 
   constructor(mesh: SplatMesh, count: number) {
     this.centers = new Float32Array(3 * count);
     this.opacities = new Float32Array(count);
+    this.lights = new Float32Array(count);
     this.#scales = new Float32Array(3 * count);
     this.#quats = new Float32Array(4 * count);
     const turn = mesh.quaternion.clone();
     const point = new THREE.Vector3();
     const quat = new THREE.Quaternion();
-    mesh.forEachSplat((i, center, scales, quaternion, opacity) => {
+    mesh.forEachSplat((i, center, scales, quaternion, opacity, color) => {
       point.copy(center).applyQuaternion(turn).toArray(this.centers, 3 * i);
       scales.toArray(this.#scales, 3 * i);
       quat.copy(turn).multiply(quaternion).toArray(this.#quats, 4 * i);
       this.opacities[i] = opacity;
+      this.lights[i] = 0.2126 * color.r + 0.7152 * color.g + 0.0722 * color.b;
     });
   }
 
@@ -138,7 +142,7 @@ export class Geometry {
     return firm
       .filter((cluster) => cluster.peak >= limit)
       .sort((a, b) => b.peak * Math.sqrt(b.mass) - a.peak * Math.sqrt(a.mass))
-      .map(({ splats }) => this.#place(splats));
+      .map(({ splats }) => this.place(splats));
   }
 
   /**
@@ -195,7 +199,18 @@ export class Geometry {
     return found[Math.floor(found.length / 2)] || Math.max(...this.#scales.subarray(3 * splats[0], 3 * splats[0] + 3));
   }
 
-  #place(splats: number[]): Place {
+  /** Mean brightness of some splats. */
+  light(splats: number[]): number {
+    let [sum, weight] = [0, 0];
+    for (const i of splats) {
+      sum += this.lights[i] * this.opacities[i];
+      weight += this.opacities[i];
+    }
+    return sum / (weight || 1);
+  }
+
+  /** Where some splats are: their middle and the radius that holds most of them. */
+  place(splats: number[]): Place {
     const center = new THREE.Vector3();
     const point = new THREE.Vector3();
     let sum = 0;

@@ -1,15 +1,21 @@
 // Starts the page: reads the manifest and its files, and says in one line why it cannot.
 
 import { App, failure } from "./app";
+import { Dictionary } from "./dictionary";
 import { h } from "./dom";
+import { Geometry } from "./geometry";
+import { Language } from "./language";
 import { Files, type Manifest, PageError } from "./manifest";
+import { Segments } from "./segments";
+import { Server } from "./server";
 import { Stage } from "./stage";
+import { Tables } from "./tables";
 import { TowerLoader } from "./tower-loader";
 
 declare global {
   interface Window {
     /** For pages around this one and for tests: `await lexsplat.ready`, then `lexsplat.ask("red apple")`. */
-    lexsplat: { ready: Promise<App>; app: App | null; loader: TowerLoader | null };
+    lexsplat: { ready: Promise<App>; app: App | null };
   }
 }
 
@@ -37,18 +43,39 @@ async function start(root: HTMLElement): Promise<App> {
 async function load(
   files: Files, manifest: Manifest, stage: Stage, root: HTMLElement, tell: (text: string) => void,
 ): Promise<App> {
-  const { scene, language, words } = manifest;
+  const { scene, words } = manifest;
   const bytes = manifest.files[scene.file].bytes;
   tell(`Loading ${scene.gaussians.toLocaleString("en")} Gaussians (${(bytes / 1e6).toFixed(1)} MB)`);
-  const names = [scene.file, language.codes, words.phrases, words.table];
-  const [splats, codes, phrases, table] = await Promise.all(names.map((name) => files.read(name)));
+  stage.manifest = manifest;
+  const [splats, phrases] = await Promise.all([files.read(scene.file), files.read(words.phrases)]);
+  const list = new TextDecoder().decode(phrases);
+  if (manifest.server) {
+    await stage.load(splats);
+    const geometry = new Geometry(stage.mesh, scene.gaussians);
+    const server = new Server(stage, geometry, new Dictionary(list, new Uint8Array(0), 0), manifest, async (next) => {
+      app.dispose();
+      const shown = next ? files.take(next) : await files.manifest();
+      root.replaceChildren(stage.canvas);
+      window.lexsplat.app = await load(files, shown, stage, root, () => undefined);
+      await window.lexsplat.app.restore();
+    });
+    const app = new App(stage, geometry, manifest, server, root);
+    return app;
+  }
+  const { language } = manifest;
+  const [codes, table, segments] = await Promise.all([
+    files.read(language!.codes), files.read(words.table!), language!.segments ? files.read(language!.segments) : null,
+  ]);
   if (codes.length !== 8 * scene.gaussians) {
-    throw new PageError(`${language.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
+    throw new PageError(`${language!.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
   }
   await stage.load(splats);
+  const geometry = new Geometry(stage.mesh, scene.gaussians);
+  const codesOf = new Language(codes, language!.num_codes);
   const loader = manifest.text ? new TowerLoader(files, manifest) : null;
-  window.lexsplat.loader = loader;
-  return new App(stage, manifest, { codes, phrases: new TextDecoder().decode(phrases), table }, loader, root);
+  const whole = segments && new Segments(segments, scene.gaussians);
+  const tables = new Tables(stage, geometry, codesOf, whole, new Dictionary(list, table, language!.num_codes), loader);
+  return new App(stage, geometry, manifest, tables, root);
 }
 
 /** Light or dark as chosen before, else as the system has it. */
@@ -65,7 +92,7 @@ function theme(): void {
 
 const root = document.getElementById("page")!;
 const ready = start(root);
-window.lexsplat = { ready, app: null, loader: null };
+window.lexsplat = { ready, app: null };
 ready.then(
   (app) => (window.lexsplat.app = app),
   (error: unknown) => {

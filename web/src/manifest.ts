@@ -26,6 +26,30 @@ export interface EverydayRule {
   peak: number;
   yes: number;
   no: number;
+  /** Borders of "yes" for names of whole objects and for phrases with a color; words that tell which is which. */
+  yes_object: number;
+  yes_colored: number;
+  names: string[];
+  qualities: string[];
+  colors: string[];
+}
+
+/** What lexsplat view says of itself: the page asks its server instead of its tables. */
+export interface ServerEntry {
+  /** Counts the edits; a page that shows an earlier version is told so. */
+  version: number;
+  steps: string[];
+  undone: number;
+  examples: string[];
+  vocabulary: string[];
+  formats: string[];
+  modes: string[];
+}
+
+export interface ObjectEntry {
+  name: string;
+  center: [number, number, number];
+  size: [number, number, number];
 }
 
 export interface Manifest {
@@ -45,8 +69,11 @@ export interface Manifest {
     meters_per_unit: number | null;
     start_view: string;
   };
-  language: { codes: string; num_codes: number; method: string };
-  words: { phrases: string; table: string; count: number };
+  /** Null where a server answers, as are the table of words and the list of objects. */
+  server: ServerEntry | null;
+  language: { codes: string; segments: string | null; num_codes: number; method: string } | null;
+  words: { phrases: string; table: string | null; count: number };
+  objects: ObjectEntry[] | null;
   text: {
     weights: string;
     tokenizer: string;
@@ -61,7 +88,7 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 1;
+const FORMAT_VERSION = 2;
 
 /** Where the files are: beside the page, or inside it (`--single-file`). */
 export class Files {
@@ -92,6 +119,11 @@ export class Files {
           `found ${manifest.format_version}; publish the scene again.`,
       );
     }
+    return this.take(manifest);
+  }
+
+  /** Read the files of this manifest from now on. */
+  take(manifest: Manifest): Manifest {
     this.#manifest = manifest;
     return manifest;
   }

@@ -45,17 +45,34 @@ export function relevancyOf(heights: Heights, best: Float32Array, rule: Everyday
   });
 }
 
-/** Whether the scene holds a phrase: how well it describes the splats that score best. */
-export function presenceOf(
-  scores: Float32Array, heights: Heights, best: Float32Array, rule: EverydayRule, language: Language, shown: Uint32Array,
-): Presence {
-  if (shown.length === 0) return "no";
+/** Whether a phrase names a part of a thing: the everyday name of the thing, and then another word. */
+export function isPart(phrase: string, rule: EverydayRule): boolean {
+  const words = phrase.toLowerCase().split(/\s+/).map((word) => word.replace(/s$/, ""));
+  const last = words.pop()!;
+  return !rule.names.includes(last) && !rule.qualities.includes(last) && words.some((word) => rule.names.includes(word));
+}
+
+export function hasColor(phrase: string, rule: EverydayRule): boolean {
+  return phrase.toLowerCase().split(/\s+/).some((word) => rule.colors.includes(word));
+}
+
+/** The mean distribution of the splats that score best. */
+export function peakOf(scores: Float32Array, language: Language, shown: Uint32Array): Float32Array {
   const count = Math.min(shown.length, Math.max(PEAK_COUNT, Math.floor(PEAK_SHARE * shown.length)));
-  const place = language.distribution(largest(scores, shown, count));
-  const reached = dot(place, heights);
-  const ratio = Math.max(0, reached / Math.max(dot(place, best), LEAST));
-  const strength = Math.sqrt(ratio * Math.max(0, reached / rule.peak));
-  return strength >= rule.yes ? "yes" : strength < rule.no ? "no" : "unsure";
+  return language.distribution(largest(scores, shown, count));
+}
+
+/** Whether the scene holds a phrase: how well it describes the best of some places, distributions [V, K]. */
+export function presenceOf(heights: Heights, places: Float32Array, best: Float32Array, rule: EverydayRule, yes: number): Presence {
+  const count = heights.length;
+  let strength = 0;
+  for (let start = 0; start < places.length; start += count) {
+    const place = places.subarray(start, start + count);
+    const reached = dot(place, heights);
+    const ratio = Math.max(0, reached / Math.max(dot(place, best), LEAST));
+    strength = Math.max(strength, Math.sqrt(ratio * Math.max(0, Math.min(ratio, reached / rule.peak))));
+  }
+  return strength >= yes ? "yes" : strength < rule.no ? "no" : "unsure";
 }
 
 /** The `count` indices among `of` with the largest values, without sorting them all. */

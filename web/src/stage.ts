@@ -21,13 +21,15 @@ export class Stage {
   onMove: () => void = () => undefined;
   /** Called after every picture. */
   onDraw: () => void = () => undefined;
+  manifest: Manifest;
   readonly #controls: OrbitControls;
   readonly #spark: SparkRenderer;
   #wanted = false;
   #flight = 0;
   #bottom = 0;
 
-  constructor(readonly canvas: HTMLCanvasElement, readonly manifest: Manifest) {
+  constructor(readonly canvas: HTMLCanvasElement, manifest: Manifest) {
+    this.manifest = manifest;
     try {
       this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     } catch {
@@ -41,6 +43,10 @@ export class Stage {
       sortRadial: false, // scenes are trained with splats in the order of depth
       preBlurAmount: antialiased ? 0 : 0.3,
       blurAmount: antialiased ? 0.3 : 0,
+      // Spark drops splats whose centers lie outside the picture and cuts large ones. Walls are made of such splats:
+      // with its defaults a view of the demo differs from our renderer by 32 dB, with these by 37 dB.
+      clipXY: 4,
+      maxPixelRadius: 4096,
       onDirty: () => this.draw(),
     });
     this.scene.add(this.#spark);
@@ -59,6 +65,10 @@ export class Stage {
 
   async load(content: Uint8Array<ArrayBuffer>): Promise<void> {
     const { file, rotation, gaussians } = this.manifest.scene;
+    if (this.mesh) {
+      this.scene.remove(this.mesh);
+      this.mesh.dispose();
+    }
     this.mesh = new SplatMesh({
       fileBytes: content,
       fileType: TYPES[file.split(".").at(-1)!],
@@ -127,6 +137,44 @@ export class Stage {
     if (seen.z > 1) return null;
     const box = this.canvas.getBoundingClientRect();
     return { x: box.left + ((seen.x + 1) / 2) * box.width, y: box.top + ((1 - seen.y) / 2) * box.height };
+  }
+
+  /** The camera for the server: world to camera with OpenCV axes, row by row; width, height, focal length, center. */
+  lens(): { viewmat: number[]; lens: number[] } {
+    this.camera.updateMatrixWorld();
+    const m = this.camera.matrixWorldInverse.elements; // column by column, OpenGL axes
+    const row = (r: number, sign: number): number[] => [0, 1, 2, 3].map((column) => sign * m[4 * column + r]);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const focal = height / 2 / Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
+    return {
+      viewmat: [...row(0, 1), ...row(1, -1), ...row(2, -1), 0, 0, 0, 1],
+      lens: [width, height, focal, width / 2, height / 2 - this.#bottom / 2],
+    };
+  }
+
+  /** Swing around the target and back, as a video; null where the browser records none. */
+  async record(seconds = 6, degrees = 30): Promise<{ video: Blob; suffix: string } | null> {
+    const kinds = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
+    const kind = globalThis.MediaRecorder && kinds.find((one) => MediaRecorder.isTypeSupported(one));
+    if (!kind) return null;
+    const recorder = new MediaRecorder(this.canvas.captureStream(30), { mimeType: kind, videoBitsPerSecond: 8e6 });
+    const parts: Blob[] = [];
+    recorder.ondataavailable = ({ data }) => parts.push(data);
+    const stopped = new Promise((resolve) => (recorder.onstop = resolve));
+    const offset = this.camera.position.clone().sub(this.target);
+    const flight = ++this.#flight;
+    recorder.start();
+    const start = performance.now();
+    for (let share = 0; share < 1 && flight === this.#flight; ) {
+      share = Math.min(1, (performance.now() - start) / (1000 * seconds));
+      const angle = THREE.MathUtils.degToRad(degrees) * Math.sin(2 * Math.PI * share);
+      this.camera.position.copy(this.target).add(offset.clone().applyAxisAngle(this.camera.up, angle));
+      this.draw();
+      await new Promise(requestAnimationFrame);
+    }
+    recorder.stop();
+    await stopped;
+    return { video: new Blob(parts, { type: kind }), suffix: kind.startsWith("video/mp4") ? ".mp4" : ".webm" };
   }
 
   /** Stand where a photo was taken. `depth` is how far away the scene is there. */

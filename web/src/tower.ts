@@ -11,6 +11,9 @@ export interface Description {
   heights: Heights;
   best: Float32Array;
   rule: EverydayRule;
+  /** Distributions of the scene's objects, and the best heights for phrases with a color; null without segments. */
+  places: Float32Array | null;
+  colored: Float32Array | null;
 }
 
 interface Matrix {
@@ -85,7 +88,8 @@ export class TextTower {
     const embedding = unit(templates.map((template) => this.embed(template.replace("{}", phrase))));
     const [codewords, mean, best] = ["codewords", "mean", "best"].map((name) => this.#get(name).data as Float32Array);
     const heights = heightsOf(codewords, embedding, mean, everyday);
-    return { table: relevancyOf(heights, best, everyday), heights, best, rule: everyday };
+    const [places, colored] = ["places", "best_colored"].map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
+    return { table: relevancyOf(heights, best, everyday), heights, best, rule: everyday, places, colored };
   }
 
   /** The embedding of a phrase, of unit length. */

@@ -14,17 +14,26 @@ To add a reader of camera files: write ``readers/FORMAT.py`` with ``find_FORMAT(
 To add a layout of ground truth, see ``ground_truth/layouts.py``.
 """
 
-from lexsplat.captures.capture import Capture, View, stem_of
-from lexsplat.captures.ground_truth.layouts import Annotations, check_ground_truth_options, load_annotations
-from lexsplat.captures.images.undistortion import Lens
-from lexsplat.captures.loading import is_photo_folder, load_capture
-from lexsplat.captures.sfm.photos import PhotoPoses, PoseConfig, poses_from_photos
-from lexsplat.captures.sfm.triangulation import (
-    InitialPoints,
-    initial_points,
-    random_points_in_frusta,
-    triangulate,
-)
+from typing import TYPE_CHECKING
+
+from lexsplat.runtime.lazy import at_first_use
+
+if TYPE_CHECKING:
+    from lexsplat.captures.capture import Capture, View, stem_of
+    from lexsplat.captures.ground_truth.layouts import (
+        Annotations,
+        check_ground_truth_options,
+        load_annotations,
+    )
+    from lexsplat.captures.images.undistortion import Lens
+    from lexsplat.captures.loading import is_photo_folder, load_capture
+    from lexsplat.captures.sfm.photos import PhotoPoses, PoseConfig, poses_from_photos
+    from lexsplat.captures.sfm.triangulation import (
+        InitialPoints,
+        initial_points,
+        random_points_in_frusta,
+        triangulate,
+    )
 
 __all__ = [
     "Annotations",
@@ -44,3 +53,15 @@ __all__ = [
     "stem_of",
     "triangulate",
 ]
+
+__getattr__ = at_first_use(
+    "lexsplat.captures",
+    {
+        "capture": ("Capture", "View", "stem_of"),
+        "ground_truth.layouts": ("Annotations", "check_ground_truth_options", "load_annotations"),
+        "images.undistortion": ("Lens",),
+        "loading": ("is_photo_folder", "load_capture"),
+        "sfm.photos": ("PhotoPoses", "PoseConfig", "poses_from_photos"),
+        "sfm.triangulation": ("InitialPoints", "initial_points", "random_points_in_frusta", "triangulate"),
+    },
+)

@@ -16,6 +16,7 @@ from typing import NamedTuple, NoReturn
 
 from lexsplat import __version__
 from lexsplat.runtime.errors import STOPPED, LexsplatError
+from lexsplat.runtime.lazy import without_collection
 from lexsplat.runtime.progress import NOTE
 
 
@@ -35,6 +36,7 @@ COMMANDS = {
     "language": CommandEntry("build", "Language", "the later stages of build: language on the Gaussians"),
     "query": CommandEntry("query", "Query", "heatmaps, masks and scores for free text"),
     "find": CommandEntry("find", "Find", "where things are in 3D, how many and how large"),
+    "list": CommandEntry("listing", "List", "everything in a scene: names, colors, places and sizes"),
     "ask": CommandEntry("ask", "Ask", "questions in your own words, many a second with --stdin"),
     "scale": CommandEntry("scale", "Scale", "set the length of a meter and the up direction of a scene"),
     "evaluate": CommandEntry("evaluate", "Evaluate", "measure a scene on its held-out views"),
@@ -43,6 +45,7 @@ COMMANDS = {
     "edit": CommandEntry("edit", "Edit", "delete, recolor, move or duplicate things by words"),
     "export": CommandEntry("export", "Export", "write a scene or a selection for other programs"),
     "publish": CommandEntry("publish", "Publish", "write a page that searches a scene with no server"),
+    "library": CommandEntry("library", "LibraryCommand", "search many scenes at once"),
     "view": CommandEntry("view", "View", "show and search a scene in the browser"),
     "encoders": CommandEntry(
         "encoders", "EncodersCommand", "fetch, check and time encoders before a long build"
@@ -111,11 +114,13 @@ def _run(words: list[str]) -> int:
     name = ALIASES.get(name, name)
     if name not in COMMANDS:
         _refuse(name)
-    from lexsplat.cli.arguments import parse
-
     entry = COMMANDS[name]
-    command = getattr(importlib.import_module(f"lexsplat.cli.{entry.module}"), entry.name)
-    parse(command, name, rest).run()
+    with without_collection():
+        from lexsplat.cli.arguments import parse
+
+        kind = getattr(importlib.import_module(f"lexsplat.cli.{entry.module}"), entry.name)
+        command = parse(kind, name, rest)
+    command.run()
     return 0
 
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.experiments import open_bench, print_table
-from lexsplat.cli.options import CaptureArgument, PromptListName, Settings, check_seeds
+from lexsplat.cli.options import CaptureArgument, PromptListName, check_seeds
+from lexsplat.cli.settings import Settings
 from lexsplat.language.methods import VARIANTS, MethodName
 from lexsplat.pipeline.config import BuildConfig
 
@@ -39,7 +40,6 @@ class Ablate:
         masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         forms: How codes and text are compared, measured side by side. The paper's form is "feature".
-        as_in_paper: Fit and train as long as the paper (30,000 steps).
         json: Print ablation.json on standard output (docs/schemas/ablation.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
@@ -53,7 +53,6 @@ class Ablate:
     masks: Path | None = None
     prompt_list: PromptListName | None = None
     forms: tuple[Literal["segment", "code", "feature"], ...] = ("feature",)
-    as_in_paper: bool = False
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
 
@@ -79,8 +78,6 @@ class Ablate:
         from lexsplat.evaluation import ablate as ablation
 
         capture, settings = capture_and_settings(self.capture, self.settings)
-        if self.as_in_paper:
-            settings = ablation.as_in_paper(settings)
         evaluation = ablation.paper_evaluation()
         with open_bench(capture, settings, evaluation, self) as bench:
             rows = ablation.ablate(bench, self._plan())

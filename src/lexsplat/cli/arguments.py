@@ -29,6 +29,7 @@ HELP = ("-h", "--help")
 HELP_ALL = "--help-all"
 ESSENTIAL_SETTINGS = (
     "clip", "dino", "device", "method", "as_in_paper", "iterations", "downscale", "test_every", "seed", "memory",
+    "workers",
 )  # fmt: skip
 """Settings of a build that people use."""
 
@@ -38,6 +39,7 @@ _PLACEHOLDERS = {
     "start_view": "VIEW",
     "clip": "NAME", "dino": "NAME", "view": "NAME", "test_views": "NAME", "name": "NAME", "host": "ADDRESS",
     "select": "PHRASE", "height_of": "PHRASE", "between": "PHRASE PHRASE", "negatives": "PHRASE",
+    "workers": "none|ray|ray://HOST:PORT", "blocks": "auto|N|none",
     "template": "SENTENCE", "points": "X,Y,Z X,Y,Z", "up": "X,Y,Z", "memory": "SIZE",
 }  # fmt: skip
 """Placeholders by name of option; that of an option with any number of values is followed by an ellipsis."""
@@ -134,13 +136,19 @@ def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
             example = factory()
             page = _help_page(type(example), hidden, {})
             values = {part.name: getattr(example, part.name) for part in dataclasses.fields(example)}
-            hint = Annotated[page, tyro.conf.arg(name="")]  # as `options.Settings`
+            hint = Annotated[page, tyro.conf.arg(name="")]  # as `settings.Settings`
             factory = _maker(page, values)
         elif get_origin(hint) is not Annotated:
             hint = Annotated[hint, _in_words(field.name, hint, default, defaults)]
         if field.name in hidden:
             hint = Annotated[hint, tyro.conf.Suppress]
-        fields.append((field.name, hint, dataclasses.field(default=default, default_factory=factory)))
+        fields.append(
+            (
+                field.name,
+                hint,
+                dataclasses.field(default=default, default_factory=factory, kw_only=field.kw_only),
+            )
+        )
     frozen = kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
     page = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=frozen)
     page.__doc__ = _arguments_section(kind)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.cli.options import CaptureArgument, Settings
+from lexsplat.cli.options import CaptureArgument, MoreCapturesArgument, OptionalCaptureArgument, ProgressName
+from lexsplat.cli.settings import Settings
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.errors import CaptureError
 
 
 @dataclasses.dataclass
@@ -24,13 +27,17 @@ class Build:
             nerfstudio, instant-ngp or NeRF-synthetic. Photos without cameras, and videos (.mp4, .mov), receive
             cameras by structure from motion. Black pixels of ``masks/NAME.png`` are ignored. The words "demo" and
             "second" are the bundled captures.
-        output: The scene folder to make.
+        output: The scene folder to make; of several captures, the folder of their scenes.
+        more: Further captures, as in: build captures/* --output scenes
+        progress: "json" prints every event of progress as a line of JSON (docs/scaling.md).
         test_views: Names of the views to hold out for evaluation.
         settings: Settings of all stages.
     """
 
     capture: CaptureArgument
     output: Path
+    more: MoreCapturesArgument = ()
+    progress: ProgressName = "bars"
     test_views: tuple[str, ...] = ()
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
@@ -39,11 +46,16 @@ class Build:
 
     def run(self) -> None:
         """Build up to the last stage of this command."""
-        from lexsplat.cli.progress import ProgressBars
+        from lexsplat.cli.progress import shown_progress
         from lexsplat.pipeline.build import build
 
-        capture, settings = capture_and_settings(self.capture, self.settings)
-        with ProgressBars() as bars:
+        if self.more:
+            self._build_scenes()
+            return
+        capture, settings = None, self.settings
+        if self.capture:
+            capture, settings = capture_and_settings(self.capture, settings)
+        with shown_progress(self.progress) as bars:
             folder = build(
                 capture,
                 self.output,
@@ -53,9 +65,40 @@ class Build:
                 splats=getattr(self, "splats", None),
                 listener=bars,
             )
+        if self.progress == "json":
+            return
         print(f"{folder.root}: finished {', '.join(folder.record['stages'])}")
         if self.until == "language":
             print(f'next: lexsplat query {folder.root} "something you see"')
+
+    def _build_scenes(self) -> None:
+        """Build one scene per capture; failures are reported and the other scenes are kept."""
+        from lexsplat.cli.progress import shown_progress
+        from lexsplat.pipeline.distribution import build_scenes, scene_tasks
+        from lexsplat.runtime.workers import open_workers
+
+        if self.test_views or getattr(self, "splats", None) is not None:
+            raise ValueError("--test-views and --splats belong to one CAPTURE: build the scenes one by one")
+        sources = dict(capture_and_settings(name, self.settings) for name in (self.capture, *self.more))
+        tasks = scene_tasks(sources, self.output, self.until)
+        failed = 0
+        with (
+            shown_progress(self.progress) as bars,
+            open_workers(self.settings.workers, tuple(sources)) as workers,
+        ):
+            for outcome in build_scenes(tasks, self.output, workers, bars):
+                if outcome.error is not None:
+                    failed += 1
+                    print(f"{outcome.name}: {outcome.error}", file=sys.stderr)
+                elif self.progress != "json":
+                    print(f"{tasks[outcome.name].output}: finished {', '.join(outcome.result)}")
+        if failed:
+            raise CaptureError(
+                self.output,
+                expected=f"{len(tasks)} scenes",
+                found=f"{failed} failed, told above",
+                remedy="mend their captures and run the same command again; finished scenes are kept",
+            )
 
 
 @dataclasses.dataclass
@@ -78,16 +121,23 @@ class Reconstruct(Build):
 class Language(Build):
     """Put language on the Gaussians of a scene: the stages after reconstruct, which runs first if it is missing.
 
-    With --splats, Gaussians made by another program are used unchanged. Photos and poses must be those that they
-    were made from, in the same axes and units.
+    With --splats, Gaussians made by another program are used unchanged. A CAPTURE must be the photos and poses that
+    they were made from, in the same axes and units. Without CAPTURE, views of the splats are chosen and rendered;
+    they are kept in OUTPUT/poses, with a contact sheet.
 
     Args:
-        splats: Gaussians to use instead of reconstructing: .ply, .splat, .spz, .compressed.ply or .ksplat.
+        capture: Folder with photos and cameras, as in build; not needed with --splats.
+        splats: Gaussians to use instead of reconstructing: .ply, .spz, .sog, .glb and others (docs/formats.md).
     """
 
+    capture: OptionalCaptureArgument = dataclasses.field(default="", kw_only=True)
     splats: Path | None = None
 
     def check(self) -> None:
         """Refuse invalid options."""
-        if self.splats is not None and self.settings.joint:
+        if self.splats is not None and self.settings.spelled_out().joint:
             raise ValueError("joint training makes its own Gaussians: give --splats or --joint, not both")
+        if self.splats is None and not self.capture:
+            raise ValueError("a CAPTURE is needed, or --splats FILE")
+        if self.test_views and not self.capture:
+            raise ValueError("--test-views needs a CAPTURE: views chosen from splats are no ground truth")

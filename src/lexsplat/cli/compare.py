@@ -14,9 +14,9 @@ from lexsplat.cli.options import (
     CaptureArgument,
     PromptListName,
     ProtocolName,
-    Settings,
     check_seeds,
 )
+from lexsplat.cli.settings import Settings
 from lexsplat.evaluation.compare import COMPARED, ComparisonPlan
 from lexsplat.pipeline.config import BuildConfig
 

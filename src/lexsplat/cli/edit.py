@@ -16,7 +16,6 @@ from lexsplat.runtime.errors import QueryError
 
 if TYPE_CHECKING:
     from lexsplat.scenes.editing import Editor
-    from lexsplat.scenes.scene import Scene
 
 CHANGES = ("delete", "keep", "recolor", "move", "duplicate")
 ACTIONS = (*CHANGES, "undo", "redo", "list", "discard", "save")
@@ -113,13 +112,13 @@ class Edit:
 
     def run(self) -> None:
         """Do one action and print the steps and the size of the edited scene."""
-        from lexsplat.scenes.editing import Editor
+        from lexsplat.scenes.editing import Editor, journal_of
         from lexsplat.scenes.previous import require_current
 
         scene = open_scene(self.scene, self.device, self.clip)
         if scene.folder is not None:
             require_current(scene.folder)
-        journal = _journal_of(scene)
+        journal = journal_of(scene)
         if self.action == "discard":
             self._discard(journal)
         editor = Editor(scene, journal)
@@ -163,10 +162,3 @@ class Edit:
             raise QueryError(
                 self.action, expected="Gaussians that can be drawn afterwards", found=str(error)
             ) from error
-
-
-def _journal_of(scene: Scene) -> Path:
-    """File of the steps; the bundled scene is never written to."""
-    if scene.folder is None or scene.folder.is_bundled:
-        return Path("demo_edits.jsonl")
-    return scene.folder.root / "edits.jsonl"

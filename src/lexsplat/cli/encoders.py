@@ -47,6 +47,7 @@ class EncodersCommand:
         """
         from lexsplat.features.checks import check_dense, check_words
         from lexsplat.features.estimate import estimate
+        from lexsplat.features.hub import model_folder
         from lexsplat.pipeline.config import BuildConfig
         from lexsplat.pipeline.encoding import Encoders
         from lexsplat.pipeline.inputs import count_photos
@@ -59,6 +60,7 @@ class EncodersCommand:
         if self.capture is not None:
             survey = count_photos(_place(self.capture), config)
             photos, size = survey.count, survey.size
+        model_folder(config.clip, "clip")  # downloads it: its architecture decides the settings
         config = config.resolved(choose_device(self.device), size)
         encoders = Encoders(config.clip, config.dino, config.encoder_device)
         facts: dict[str, Any] = {"clip": _facts(encoders.clip) | {"words_ranked": check_words(encoders.clip)}}

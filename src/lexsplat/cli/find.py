@@ -50,9 +50,9 @@ class Find:
 
     def run(self) -> None:
         """Find and print."""
+        scene = open_scene(self.scene, self.device, self.clip)
         from lexsplat.scenes.answers import find_phrases
 
-        scene = open_scene(self.scene, self.device, self.clip)
         answers = find_phrases(scene, self.phrases, self.view, self.threshold)
         if self.json:
             print_json(answers)

@@ -21,7 +21,7 @@ class Info:
 
     def run(self) -> None:
         """Print the facts."""
-        from lexsplat.scenes.answers import scene_facts
+        from lexsplat.scenes.facts import scene_facts
 
         facts = scene_facts(open_folder(self.scene))
         if self.json:

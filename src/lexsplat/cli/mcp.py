@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from lexsplat.cli.options import Device
-from lexsplat.runtime.errors import BackendError
+from lexsplat.runtime.errors import BackendError, LibraryError
 
 Scenes = tyro.conf.Positional[
     Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...", help_behavior_hint="(required)")]
@@ -25,7 +25,7 @@ class Mcp:
     it listens at http://127.0.0.1:8765/mcp.
 
     Args:
-        scenes: Scene folders, or the word "demo" for the bundled scene.
+        scenes: Scene folders, a library of scenes, or the word "demo" for the bundled scene.
         http: Serve over HTTP instead of standard input and output.
         host: Address to listen on. Other addresses than this machine's need --token.
         port: Port to listen on.
@@ -66,10 +66,16 @@ class Mcp:
                 "lexsplat mcp", expected="the package mcp", found="none", remedy='pip install "lexsplat[mcp]"'
             )
         from lexsplat.mcp.server import make_server, serve_http
+        from lexsplat.scenes.library import open_library
         from lexsplat.scenes.serving import open_scenes
 
-        scenes = open_scenes(self.scenes, self.device, self.clip)
-        server = make_server(scenes, self.output.resolve() if self.allow_write else None)
+        libraries = [path for path in self.scenes if (Path(path) / "library.json").is_file()]
+        if len(libraries) > 1:
+            raise LibraryError(libraries[1], expected="one library", found=str(len(libraries)))
+        library = open_library(libraries[0], device=self.device) if libraries else None
+        alone = [path for path in self.scenes if path not in libraries]
+        scenes = open_scenes(alone, self.device, self.clip)
+        server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
         if self.http:
             serve_http(server, self.host, self.port, self.token)
         else:

@@ -1,4 +1,7 @@
-"""What several commands share: placeholders, checks, opening a scene, asking on a terminal, printing."""
+"""What several commands share: placeholders, checks, opening a scene, asking on a terminal, printing.
+
+Nothing here loads torch, so that help pages and wrong usage are answered at once.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.pipeline.config import BuildConfig
-from lexsplat.reconstruction.settings import ReconstructionConfig
-from lexsplat.runtime.device import check_seed
+from lexsplat.cli.waiting import LateProgress
+from lexsplat.runtime.lazy import without_collection
 
 if TYPE_CHECKING:
     from lexsplat.scenes.folder import SceneFolder
     from lexsplat.scenes.scene import Scene
 
-# tyro offers --iterations for this one; the settings of the reconstruction do not depend on tyro.
-ReconstructionConfig.__annotations__["iterations"] = tyro.conf.Suppress[int]
-Settings = Annotated[BuildConfig, tyro.conf.arg(name="")]
 Device = Literal["auto", "cpu", "cuda"]
+ProgressName = Literal["bars", "json"]
 PromptListName = Literal["paper", "released"]
 ProtocolName = Literal["strict", "official", "lerf-2d", "lerf-3d"]
 ALL_PROTOCOLS: tuple[ProtocolName, ...] = ("strict", "official", "lerf-2d", "lerf-3d")
@@ -31,6 +31,12 @@ SceneArgument = tyro.conf.Positional[
 ]
 CaptureArgument = tyro.conf.Positional[
     Annotated[str, tyro.conf.arg(metavar="CAPTURE", help_behavior_hint=_REQUIRED)]
+]
+OptionalCaptureArgument = tyro.conf.Positional[
+    Annotated[str, tyro.conf.arg(metavar="[CAPTURE]", help_behavior_hint="(default: none)")]
+]
+MoreCapturesArgument = tyro.conf.Positional[
+    Annotated[tuple[str, ...], tyro.conf.arg(metavar="[CAPTURE ...]", help_behavior_hint="(default: none)")]
 ]
 PhrasesArgument = tyro.conf.Positional[
     Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...", help_behavior_hint=_REQUIRED)]
@@ -45,17 +51,21 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 
 def open_scene(path: str, device: str, clip: str | None) -> Scene:
     """Open the scene of a command with its encoders."""
-    from lexsplat.scenes import scene as search
-
     note_hidden("demo", path)
-    return search.open_scene(path, device=device, clip=clip)
+    with without_collection():
+        from lexsplat.scenes import scene as search
+
+        scene = search.open_scene(path, device=device, clip=clip)
+    scene.listener = LateProgress()
+    return scene
 
 
 def open_folder(path: str) -> SceneFolder:
     """Open the scene folder of a command that needs no encoder."""
-    from lexsplat.scenes.folder import SceneFolder
-
     note_hidden("demo", path)
+    with without_collection():
+        from lexsplat.scenes.folder import SceneFolder
+
     return SceneFolder.open(Path(path))
 
 
@@ -112,6 +122,8 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
     Raises:
         ValueError: There is none, or one is negative or too large.
     """
+    from lexsplat.runtime.device import check_seed
+
     if not seeds:
         raise ValueError("at least one seed is needed")
     for seed in seeds:

@@ -1,8 +1,11 @@
-"""Progress as bars in a terminal, as plain lines elsewhere; both state rate and time left."""
+"""Progress as bars in a terminal, as plain lines elsewhere, as lines of JSON; all state rate and time left."""
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 from rich.console import Console
@@ -19,7 +22,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from lexsplat.runtime.progress import Event
+from lexsplat.runtime.progress import Event, Listener, Pace
 
 _SECONDS_BETWEEN_LINES = 15.0
 
@@ -54,7 +57,7 @@ class ProgressBars:
     def __init__(self) -> None:
         self.console = Console(stderr=True)
         self._tasks: dict[str, TaskID] = {}
-        self._starts: dict[str, tuple[float, int]] = {}  # time and units done at the first event of a stage
+        self._pace = Pace()
         self._last_line: dict[str, float] = {}
         self._progress = Progress(
             TextColumn("{task.description:<13}"),
@@ -93,16 +96,29 @@ class ProgressBars:
         self._progress.update(self._tasks[event.stage], completed=event.done, total=event.total, metrics=text)
 
     def _print_line(self, event: Event, text: str) -> None:
-        now = time.monotonic()
-        started, done_before = self._starts.setdefault(event.stage, (now, event.done))
+        now, rate = time.monotonic(), self._pace.rate(event)
         is_first = event.stage not in self._last_line
         is_due = now - self._last_line.get(event.stage, 0.0) >= _SECONDS_BETWEEN_LINES
         if not (is_first or is_due or event.done >= event.total):
             return
         self._last_line[event.stage] = now
-        rate = (event.done - done_before) / (now - started) if now > started else 0.0
         speed = format_rate(rate)
         if rate and event.done < event.total:
             speed += f", {format_seconds((event.total - event.done) / rate)} left"
         parts = (f"{event.stage}: {event.done}/{event.total}", speed, text)
         self.console.print(" ".join(part for part in parts if part), highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def shown_progress(form: str) -> Iterator[Listener]:
+    """A listener that shows progress as "bars" on standard error, or as "json" lines on standard output."""
+    if form == "bars":
+        with ProgressBars() as bars:
+            yield bars
+        return
+    pace = Pace()
+
+    def tell(event: Event) -> None:
+        print(json.dumps(pace.record(event)), flush=True)
+
+    yield tell

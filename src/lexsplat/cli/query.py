@@ -16,9 +16,9 @@ from lexsplat.cli.options import (
     open_scene,
     print_json,
 )
-from lexsplat.queries.relevancy import QueryConfig
 
 if TYPE_CHECKING:
+    from lexsplat.queries.relevancy import QueryConfig
     from lexsplat.scenes.scene import Scene
 
 
@@ -32,6 +32,8 @@ class Query:
         view: Names of the views to answer in.
         output: Folder for the images.
         pictures: Write a heatmap and a mask for each prompt and view; --no-pictures writes none.
+        features: Also write the language features of each view: features/VIEW.safetensors and their principal
+            components as colors, features/VIEW.png.
         threshold: Relevancy from which a pixel belongs to the mask. The paper's is 0.5.
         form: How codes and text are compared: "feature" blends features, then compares (the paper); "code"
             compares each code, then blends; "segment" takes whole segments by the scores of "code".
@@ -48,6 +50,7 @@ class Query:
     view: tuple[str, ...] = ()
     output: Path | None = None
     pictures: bool = True
+    features: bool = False
     threshold: float | None = None
     form: Literal["segment", "code", "feature"] | None = None
     negatives: tuple[str, ...] = ()
@@ -71,7 +74,12 @@ class Query:
         """Refuse invalid options."""
         check_phrases(self.prompts)
         check_threshold(self.threshold)
-        self._changed(QueryConfig())
+        if self.features and not self.pictures:
+            raise ValueError("--features writes files: leave --no-pictures out")
+        if any((self.form, self.negatives, self.temperature is not None, self.template)):
+            from lexsplat.queries.relevancy import QueryConfig
+
+            self._changed(QueryConfig())
 
     def _changed(self, config: QueryConfig) -> QueryConfig:
         """The scene's settings of relevancy, with those given on the command line."""
@@ -85,12 +93,16 @@ class Query:
 
     def run(self) -> None:
         """Answer and write images."""
-        from lexsplat.scenes.answers import answer_queries
-
         scene = open_scene(self.scene, self.device, self.clip)
+        from lexsplat.scenes.answers import answer_queries, default_views
+        from lexsplat.scenes.feature_maps import write_features
+
         scene.query = self._changed(scene.query)
         folder = (self.output or _images_folder(scene)) if self.pictures else None
         answers = answer_queries(scene, self.prompts, self.view, self.threshold, folder)
+        if self.features and folder is not None:
+            names = [scene.view(name).name for name in self.view] or default_views(scene)
+            answers["features"] = write_features(scene, names, folder)
         if self.json:
             print_json(answers)
             return

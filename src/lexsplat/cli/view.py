@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass
 class View:
-    """Show and search a scene in the browser.
+    """Show, search and edit a scene in the browser.
 
-    Only this machine can connect unless --host allows others. Ctrl-C stops the server.
+    Only this machine can connect unless --host allows others. Edits are steps of lexsplat edit. Ctrl-C stops the
+    server.
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
-        host: Address to listen on. There is no password: 0.0.0.0 admits everyone who can reach this machine.
+        host: Address to listen on. On others than 127.0.0.1, visitors need the token of the printed address.
         port: Port to listen on. The next free port is used if it is taken.
         name: Host names under which the page may be opened, beside localhost and addresses.
         splats: Maximum number of Gaussians that the browser draws.

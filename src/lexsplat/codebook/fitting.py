@@ -72,6 +72,7 @@ def fit_codebook(
             lambda_dino,
             iterations=config.kmeans_iterations,
             generator=generator,
+            listener=listener,
         )
     else:
         code_clip = _uniform_codes(clip, config.num_codes, generator)
@@ -189,6 +190,7 @@ def spherical_kmeans(
     *,
     iterations: int,
     generator: torch.Generator,
+    listener: Listener = silent,
 ) -> tuple[Tensor, Tensor | None]:
     """k-means for the similarity of Eq. 4, with k-means++ seeds.
 
@@ -201,7 +203,8 @@ def spherical_kmeans(
     joint = clip if dino is None else torch.cat([clip, lambda_dino**0.5 * dino], dim=-1)
     split = clip.shape[1]
     centers = joint[_kmeans_seeds(joint, num_codes, generator)]
-    for _ in range(iterations):
+    for done in range(iterations):
+        listener(Event("clusters", done, iterations))
         best, chosen = _nearest(joint, centers)
         sums = torch.zeros_like(centers).index_add_(0, chosen, joint)
         counts = torch.bincount(chosen, minlength=num_codes)
@@ -216,6 +219,7 @@ def spherical_kmeans(
         if torch.equal(updated, centers):
             break
         centers = updated
+    listener(Event("clusters", iterations, iterations))
     code_dino = None if dino is None else functional.normalize(centers[:, split:], dim=-1)
     return functional.normalize(centers[:, :split], dim=-1), code_dino
 

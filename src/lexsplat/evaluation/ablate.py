@@ -69,11 +69,6 @@ def changed(config: BuildConfig, variant: str) -> BuildConfig:
     return replace(config, **parts)
 
 
-def as_in_paper(config: BuildConfig) -> BuildConfig:
-    """The settings with the codebook fit and the training of the paper in place of our short ones."""
-    return replace(config, codebook=config.codebook.as_in_paper(), trained=config.trained.as_in_paper())
-
-
 @dataclass(frozen=True)
 class AblationPlan:
     """The rows of an ablation, and how often each is measured.

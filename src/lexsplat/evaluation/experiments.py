@@ -133,12 +133,14 @@ class Bench:
         self.origin = ground_truth or GroundTruthSource()
         check_ground_truth_options(source, self.origin.masks, self.origin.prompt_list)
         self.output, self.listener, self.evaluation = output, listener, evaluation
+        self.as_in_paper = config.as_in_paper  # all rows share one geometry, so none is trained jointly
+        config = replace(config.spelled_out(), joint=False, as_in_paper=False)
         preview = preview_capture(source, output, config)
         if preview is not None:  # before the build, which takes long
             self._read_ground_truth(preview, source)
         # Features are shared by methods that use DINO and others that do not, so they are made with both encoders.
-        with_dino: Any = next(name for name, method in METHODS.items() if method.uses_dino)
-        every = config if METHODS[config.method].uses_dino else replace(config, method=with_dino)
+        with_dino: Any = next(name for name, method in METHODS.items() if method.uses_dino(config))
+        every = config if METHODS[config.method].uses_dino(config) else replace(config, method=with_dino)
         self.folder = build(source, output / "scene", every, until="features", listener=listener)
         self.device = choose_device(config.device)
         self.capture = reload_capture(self.folder)
@@ -271,7 +273,7 @@ class Bench:
             seed: Seed of the language.
             keep_images: Whether to keep images of every prompt in every view.
         """
-        query, settings = QueryConfig(form=row.form), list(row.settings)
+        query, settings = QueryConfig(form=row.form, fixed=self.as_in_paper), list(row.settings)
         measured = (asdict(self.evaluation), asdict(query), self._ground_truth_identity, code_identity())
         inputs = fingerprint(self._stages(), settings, seed, *measured)
         path = self.output / "runs" / _folder_name(row.name) / f"seed-{seed}.json"

@@ -152,8 +152,8 @@ class _Evaluation:
         for prompt, value in zip(self.prompts, answers.thresholds.tolist()):
             self.thresholds[prompt] = {"auto": value, "fixed": scene.query.threshold}
         if "lerf-3d" in config.protocols and answers.scores is not None:
-            for prompt, row in zip(self.prompts, answers.scores):
-                self.selected[prompt] = scene.gaussians.select(row >= self.thresholds[prompt]["auto"])
+            for number, prompt in enumerate(self.prompts):
+                self.selected[prompt] = scene.gaussians.select(answers.chosen(number))
 
     def run(self, observer: Callable[[ViewImages], None] | None, listener: Listener) -> dict[str, Any]:
         """Render and score every held-out view; returns the quality section."""

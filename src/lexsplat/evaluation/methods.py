@@ -45,6 +45,12 @@ class MethodAnswers:
     scores: Tensor | None
     thresholds: Tensor
 
+    def chosen(self, index: int) -> Tensor:
+        """The Gaussians ``[N]`` bool that reach the threshold of a prompt."""
+        if self.scores is None:
+            raise ValueError("a method without scores of Gaussians selects none")
+        return self.scores[index] >= self.thresholds[index]
+
 
 @dataclass(frozen=True)
 class MethodScene:

@@ -20,6 +20,7 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, read_json, write_json
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import file_name
+from lexsplat.scenes.feature_maps import feature_picture
 from lexsplat.scenes.previous import require_current
 from lexsplat.scenes.scene import Scene
 
@@ -81,6 +82,8 @@ def evaluate_scene(
         },
         machine=machine_facts(),
     )
+    for view in gallery.views:
+        gallery.add_features(view, feature_picture(scene, view).cpu().numpy())
     result = metrics.to_json()
     write_json(folder.root / "metrics.json", result)
     write_rows(folder.root, "metrics", table_rows({title: result}))

@@ -6,11 +6,16 @@ To add an encoder: implement `ImageTextEncoder` or `DenseEncoder` of ``encoders.
 `load_dino` there. Its ``content_hash`` is part of the cache keys.
 """
 
-from lexsplat.features.cache import FeatureMap, FeatureMaps
-from lexsplat.features.external import external_identity, load_external_features
-from lexsplat.features.extraction import extract_features, load_level_maps
-from lexsplat.features.settings import FeatureConfig
-from lexsplat.features.text import TextCache
+from typing import TYPE_CHECKING
+
+from lexsplat.runtime.lazy import at_first_use
+
+if TYPE_CHECKING:
+    from lexsplat.features.cache import FeatureMap, FeatureMaps
+    from lexsplat.features.external import external_identity, load_external_features
+    from lexsplat.features.extraction import extract_features, load_level_maps
+    from lexsplat.features.settings import FeatureConfig
+    from lexsplat.features.text import TextCache
 
 __all__ = [
     "FeatureConfig",
@@ -22,3 +27,14 @@ __all__ = [
     "load_external_features",
     "load_level_maps",
 ]
+
+__getattr__ = at_first_use(
+    "lexsplat.features",
+    {
+        "cache": ("FeatureMap", "FeatureMaps"),
+        "external": ("external_identity", "load_external_features"),
+        "extraction": ("extract_features", "load_level_maps"),
+        "settings": ("FeatureConfig",),
+        "text": ("TextCache",),
+    },
+)

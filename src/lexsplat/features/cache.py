@@ -97,6 +97,14 @@ class FeatureMaps(Mapping[str, FeatureMap]):
         if self._source is not None:
             self._source.forget()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the kept maps and their lock, for workers."""
+        return {**vars(self), "_kept": OrderedDict(), "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._lock = Lock()
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
 

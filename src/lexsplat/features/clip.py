@@ -18,6 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS
+from lexsplat.features.hub import local_folder
 from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
@@ -35,11 +37,7 @@ _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.2613
 _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
 _FEW_PATCHES = 64
-_SAME = 1e-5  # distance of two unit vectors that are equal but for rounding
 _PADDING = 128  # vocabularies are padded to a multiple of at most this
-
-UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
-"""Words that every encoder tells apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,7 @@ class ClipEncoder(PretrainedModel):
         self._tokenizer = _load_tokenizer(folder, name, config)
         words = self.encode_text(UNLIKE_WORDS)
         self.dim = int(words.shape[-1])
-        if F.pdist(words).min() < _SAME:
+        if F.pdist(words).min() < UNLIKE:
             raise self._refusal(
                 "unlike words with unlike embeddings",
                 "fetch the whole model again, or choose another model",
@@ -264,6 +262,22 @@ def check_patches(folder: Path, name: str) -> None:
             found=str(kind),
             remedy="use image-level embeddings only: `--features.crop-tokens class`",
         )
+
+
+def patch_grid(name: str) -> int:
+    """Patches along a side of a model's input, from its configuration.
+
+    0 for architectures without patch-level embeddings, and for a model that is not on this machine.
+    """
+    folder = local_folder(name, "clip")
+    try:
+        config = json.loads((folder / "config.json").read_text()) if folder else {}
+        vision = config.get("vision_config") or {}
+        # transformers leaves out what equals its defaults
+        grid = int(vision.get("image_size", 224)) // int(vision.get("patch_size", 32))
+    except (OSError, ValueError, TypeError, AttributeError, ZeroDivisionError):
+        return 0  # loading the model reports the error
+    return max(0, grid) if config.get("model_type") == "clip" else 0
 
 
 class _PatchReader:

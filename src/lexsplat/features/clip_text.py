@@ -1,50 +1,150 @@
-"""The text tower of a CLIP model without transformers, whose import alone takes seconds.
+"""The text tower of a CLIP without transformers, whose import alone takes seconds.
 
-The bundled encoder answers the first question through it. `lexsplat.features.clip` has whole models; tests compare
-the two.
+It answers questions for every model of CLIP's original architecture, in the files of transformers or of OpenCLIP.
+`lexsplat.features.clip` has whole models; tests compare the two.
 """
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash
-from lexsplat.runtime.files import read_tensors
+from lexsplat.features.hub import content_hash, read_config
+from lexsplat.features.weights import load_weights
 
 log = logging.getLogger("lexsplat")
 
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "quick_gelu": lambda hidden: hidden * torch.sigmoid(1.702 * hidden),
+    "gelu": F.gelu,
+}
+_DEFAULTS = {  # of transformers' CLIPTextConfig, which files may leave out
+    "vocab_size": 49408, "hidden_size": 512, "intermediate_size": 2048, "num_hidden_layers": 12,
+    "num_attention_heads": 8, "max_position_embeddings": 77, "hidden_act": "quick_gelu", "layer_norm_eps": 1e-5,
+    "eos_token_id": 49407,
+}  # fmt: skip
+_LEGACY_END = 2
+"""An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
+_MOST_LAYERS = 1000
+_PADDING = 128  # vocabularies are padded to a multiple of at most this
+UNLIKE = 1e-5
+"""Distance of two unit vectors that are equal but for rounding."""
+UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
+"""Words that every encoder tells apart."""
+
+
+def open_clip_text(folder: Path, name: str, device: torch.device | str = "cpu") -> ClipText | None:
+    """The text tower of a model folder; None for a model that it does not know or that is not whole.
+
+    Whatever is refused here, the loader of whole models refuses in words, or loads.
+    """
+    if not (folder / "tokenizer.json").is_file():
+        return None
+    config = read_config(folder / "config.json")
+    given = config.get("text_config") or config.get("text_config_dict") or {}
+    if config.get("model_type") != "clip" or not isinstance(given, dict):
+        return None
+    settings = {**_DEFAULTS, **{key: given[key] for key in _DEFAULTS if given.get(key) is not None}}
+    weights = {
+        key: value
+        for key, value in load_weights(folder, name).items()
+        if key.startswith(("text_model.", "text_projection.")) and not key.endswith("position_ids")
+    }
+    if not _is_usable(settings) or _shapes(settings, config.get("projection_dim", 512)) != {
+        key: tuple(value.shape) for key, value in weights.items()
+    }:
+        return None
+    tokenizer = _tokenizer(folder / "tokenizer.json", settings["vocab_size"])
+    if tokenizer is None:
+        return None
+    tower = ClipText(settings, weights, tokenizer, device)
+    tower.content_hash = content_hash(folder, "clip")
+    words = tower.encode_text(UNLIKE_WORDS)
+    return tower if bool(words.isfinite().all()) and F.pdist(words).min() >= UNLIKE else None
+
+
+def _is_usable(settings: Mapping[str, Any]) -> bool:
+    sizes = [value for key, value in settings.items() if key not in ("hidden_act", "layer_norm_eps")]
+    return (
+        all(isinstance(size, int) and 0 < size < 1 << 20 for size in sizes)
+        and isinstance(settings["layer_norm_eps"], float)
+        and settings["num_hidden_layers"] <= _MOST_LAYERS
+        and settings["hidden_size"] % settings["num_attention_heads"] == 0
+        and settings["hidden_act"] in _ACTIVATIONS
+    )
+
+
+def _tokenizer(path: Path, size: int) -> Any:
+    """The tokenizer of a file; None if it cannot be read, or its vocabulary is not the model's."""
+    from tokenizers import Tokenizer
+
+    try:
+        tokenizer = Tokenizer.from_file(str(path))
+    except Exception:  # its errors have no type of their own
+        return None
+    tokenizer.no_truncation()
+    tokenizer.no_padding()
+    return tokenizer if size - _PADDING < tokenizer.get_vocab_size() <= size else None
+
+
+def _shapes(settings: Mapping[str, Any], projection: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of all tensors of the text tower."""
+    width, hidden = settings["hidden_size"], settings["intermediate_size"]
+    found: dict[str, tuple[int, ...]] = {
+        "text_model.embeddings.token_embedding.weight": (settings["vocab_size"], width),
+        "text_model.embeddings.position_embedding.weight": (settings["max_position_embeddings"], width),
+        "text_projection.weight": (projection, width),
+    }
+    norms = ["text_model.final_layer_norm"]
+    for number in range(settings["num_hidden_layers"]):
+        layer = f"text_model.encoder.layers.{number}"
+        norms += [f"{layer}.layer_norm1", f"{layer}.layer_norm2"]
+        linear = {f"self_attn.{part}_proj": (width, width) for part in ("q", "k", "v", "out")}
+        linear |= {"mlp.fc1": (hidden, width), "mlp.fc2": (width, hidden)}
+        for part, shape in linear.items():
+            found |= {f"{layer}.{part}.weight": shape, f"{layer}.{part}.bias": shape[:1]}
+    return found | {f"{norm}.{part}": (width,) for norm in norms for part in ("weight", "bias")}
+
 
 class ClipText:
-    """Text embeddings of a folder with a CLIP of transformers' layout (quick GELU, causal attention).
+    """Text embeddings by a CLIP's text tower: causal attention, pre-norm, the embedding of the end token.
 
     Args:
-        folder: ``config.json``, ``model.safetensors`` and ``tokenizer.json``.
+        settings: The text part of its ``config.json``.
+        weights: Its tensors by their names in transformers.
+        tokenizer: Its tokenizer, without truncation and padding.
         device: Where it computes.
     """
 
-    def __init__(self, folder: Path, device: torch.device | str = "cpu") -> None:
-        from tokenizers import Tokenizer
+    content_hash: str
 
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))["text_config"]
-        self.content_hash = content_hash(folder, "clip")
+    def __init__(
+        self,
+        settings: Mapping[str, Any],
+        weights: Mapping[str, Tensor],
+        tokenizer: Any,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.device = torch.device(device)
-        self._heads, self._layers = config["num_attention_heads"], config["num_hidden_layers"]
-        self._epsilon, self._end = config["layer_norm_eps"], config["eos_token_id"]
-        tensors, _ = read_tensors(folder / "model.safetensors")
+        self._heads, self._layers = settings["num_attention_heads"], settings["num_hidden_layers"]
+        self._epsilon, self._end = settings["layer_norm_eps"], settings["eos_token_id"]
+        self._limit, self._activation = (
+            settings["max_position_embeddings"],
+            _ACTIVATIONS[settings["hidden_act"]],
+        )
+        # Copies, because tensors in a file are not aligned, and alignment affects the rounding of sums.
         self._weights = {
-            name: value.float().to(self.device) for name, value in tensors.items() if name.startswith("text_")
+            re.sub(r"^text_model\.", "", name): value.to(self.device, torch.float32, copy=True)
+            for name, value in weights.items()
         }
-        self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
-        self._limit = config["max_position_embeddings"]
-        self._tokenizer.no_truncation()
-        self._tokenizer.no_padding()
+        self._tokenizer = tokenizer
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
         """Prompts to ``[B, D]``, float32 on the CPU, unit length, one by one; long prompts are truncated."""
@@ -52,25 +152,29 @@ class ClipText:
 
     @torch.inference_mode()
     def _encode(self, prompt: str) -> Tensor:
+        ids = self._tokens(prompt)
+        weights = self._weights
+        x = weights["embeddings.token_embedding.weight"][ids]
+        x = (x + weights["embeddings.position_embedding.weight"][: len(ids)])[None]
+        for number in range(self._layers):
+            layer = f"encoder.layers.{number}"
+            x = x + self._attention(self._norm(x, f"{layer}.layer_norm1"), f"{layer}.self_attn")
+            hidden = self._linear(self._norm(x, f"{layer}.layer_norm2"), f"{layer}.mlp.fc1")
+            x = x + self._linear(self._activation(hidden), f"{layer}.mlp.fc2")
+        x = self._norm(x, "final_layer_norm")
+        end = ids if self._end == _LEGACY_END else (ids == self._end).int()
+        return F.normalize(x[0, int(end.argmax())] @ weights["text_projection.weight"].T, dim=-1).cpu()
+
+    def _tokens(self, prompt: str) -> Tensor:
+        """Numbers of the tokens ``[T]``, with start and end, at most as many as the model has positions."""
         tokens = self._tokenizer.encode(prompt).ids
         if len(tokens) > self._limit:
             subject, limit = prompt[:30] + "...", self._limit
             log.warning(
                 "%r: prompt truncated: %d tokens, the model's limit is %d", subject, len(tokens), limit
             )
-            tokens = [*tokens[: limit - 1], self._end]
-        ids = torch.tensor(tokens, device=self.device)
-        weights = self._weights
-        rows = weights["text_model.embeddings.token_embedding.weight"][ids]
-        x = (rows + weights["text_model.embeddings.position_embedding.weight"][: len(ids)])[None]
-        for number in range(self._layers):
-            layer = f"text_model.encoder.layers.{number}"
-            x = x + self._attention(self._norm(x, f"{layer}.layer_norm1"), f"{layer}.self_attn")
-            hidden = self._linear(self._norm(x, f"{layer}.layer_norm2"), f"{layer}.mlp.fc1")
-            x = x + self._linear(hidden * torch.sigmoid(1.702 * hidden), f"{layer}.mlp.fc2")
-        x = self._norm(x, "text_model.final_layer_norm")
-        end = int((ids == self._end).int().argmax())
-        return F.normalize(x[0, end] @ weights["text_projection.weight"].T, dim=-1).cpu()
+            tokens = [*tokens[: limit - 1], tokens[-1]]
+        return torch.tensor(tokens, device=self.device)
 
     def _attention(self, x: Tensor, name: str) -> Tensor:
         q, k, v = (

@@ -115,6 +115,22 @@ def extract_features(
     return FeatureMaps(list(entries), load, memory // 4)
 
 
+def missing_views(
+    capture: Capture,
+    clip: ImageTextEncoder,
+    dino: DenseEncoder | None,
+    config: FeatureConfig,
+    cache_dir: Path,
+) -> dict[str, tuple[str, ...]]:
+    """Views whose features are not cached, by the name of the first view of the same photo."""
+    same_files: dict[tuple[Path, Path | None], tuple[str, ...]] = {}
+    for name, view in capture.views.items():
+        entry = _Entry.of(view, clip, dino, config, Path(cache_dir))
+        if not entry.is_complete():
+            same_files[entry.clip, entry.dino] = (*same_files.get((entry.clip, entry.dino), ()), name)
+    return {names[0]: names for names in same_files.values()}
+
+
 def _view_bytes(view: View, entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig, memory: int) -> int:
     """Bytes that one view takes while it is processed: its photo, and the embeddings of its patches with a copy.
 

@@ -65,6 +65,14 @@ def model_folder(name: str, tower: str) -> Path:
     return cached if cached is not None else _download(name, tower, lacking)
 
 
+def local_folder(name: str, tower: str) -> Path | None:
+    """The folder of a model if it is on this machine, complete or not; does not use the network."""
+    if name in ("bundled", "embedded"):
+        return BUNDLED_ENCODERS / tower
+    folder = Path(name).expanduser()
+    return folder if folder.is_dir() else _cached_folder(name, tower)[0]
+
+
 def missing_part(folder: Path, tower: str) -> str:
     """What a folder lacks to be a model, in words; "" if nothing."""
     if not (folder / "config.json").is_file():

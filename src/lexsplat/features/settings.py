@@ -15,6 +15,9 @@ GRID_SETTINGS = ("crop_sizes", "crop_strides", "crop_tokens")
 RANDOM_SETTINGS = ("random_crops", "random_levels", "random_sizes", "seed")
 """Settings of mode "random"."""
 
+PATCH_SIDE = 0.36 / 14
+"""Side of a patch as a fraction of the photo's short side, where a CPU reads large encoders at their patches."""
+
 
 @dataclass(frozen=True)
 class FeatureConfig:
@@ -91,9 +94,21 @@ class FeatureConfig:
         return self.crop_tokens or "class"
 
     @classmethod
-    def sparse(cls) -> FeatureConfig:
-        """Settings for large encoders on a CPU: a sixth of the crops and a quarter of DINO's work."""
-        return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=4)
+    def sparse(cls, patches: int = 0) -> FeatureConfig:
+        """Settings for large encoders on a CPU: fewer crops, and a quarter of DINO's work.
+
+        An encoder with patch-level embeddings reads few large crops at their patches, too: 24 of a 4:3 photo for
+        14x14 patches. A patch covers `PATCH_SIDE` of the photo, so finer grids of patches take larger crops, up to
+        half of it.
+
+        Args:
+            patches: Patches along a side of the encoder's input (`lexsplat.features.clip.patch_grid`); 0 if it has no
+                patch-level embeddings.
+        """
+        if not patches:
+            return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=4)
+        size = min(0.5, max(patches, 6) * PATCH_SIDE)
+        return cls(crop_sizes=(size,), crop_strides=(0.6,), crop_tokens="both", dino_stride=4)
 
     @classmethod
     def bundled(cls) -> FeatureConfig:

@@ -1,8 +1,10 @@
-"""Cache of text embeddings on disk: known prompts need no encoder."""
+"""Texts to embeddings: the lightest tower that gives them, and a cache on disk: known words need no encoder."""
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -11,14 +13,17 @@ import torch
 from torch import Tensor
 
 from lexsplat.features.hub import model_folder
+from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
-from lexsplat.runtime.fingerprints import digest
+from lexsplat.runtime.progress import Event, Listener, silent
 
 log = logging.getLogger("lexsplat")
 
 _MAX_STORED = 10_000
-"""Texts in one file, at most; further ones are encoded each time."""
+"""Texts in one file, at most; the ones that came first are forgotten."""
+_MAX_LENGTH = 1_000
+"""Characters of a stored text, at most; longer ones are encoded each time."""
 
 
 class TextTower(Protocol):
@@ -34,88 +39,162 @@ class TextTower(Protocol):
 def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
     """The text tower of a CLIP-like encoder by name, folder, or "bundled".
 
+    A CLIP of the original architecture is computed by `ClipText`. Whatever that does not know is loaded, or refused,
+    by transformers, whose import alone takes seconds.
+
     Raises:
         ModelError: If it is not available and cannot be downloaded, or is not a CLIP-like model.
     """
-    if name in ("bundled", "embedded"):
-        from lexsplat.features.clip_text import ClipText
+    from lexsplat.features.clip_text import open_clip_text
 
-        return ClipText(model_folder(name, "clip"), device)
+    tower = open_clip_text(model_folder(name, "clip"), name, device)
+    if tower is not None:
+        return tower
     from lexsplat.features.encoders import load_clip
 
     return load_clip(name, device)
 
 
-def encode_each(encoder: TextTower, texts: Sequence[str]) -> Tensor:
-    """Embeddings ``[T, D]`` of texts, encoded one by one: in a batch, the last bits depend on the other texts."""
-    return torch.cat([encoder.encode_text([text]) for text in texts])
+def encode_each(encoder: TextTower, texts: Sequence[str], listener: Listener = silent) -> Tensor:
+    """Embeddings ``[T, D]`` of texts, encoded one by one: in a batch, the last bits depend on the other texts.
+
+    Args:
+        encoder: The model.
+        texts: The texts.
+        listener: Receives events of stage "words".
+    """
+    found = []
+    for done, text in enumerate(texts, start=1):
+        found.append(encoder.encode_text([text]))
+        listener(Event("words", done, len(texts)))
+    return torch.cat(found)
 
 
 class TextCache:
-    """Embeddings of prompts by model and prompt.
+    """Embeddings of prompts by model and prompt, in one or more folders.
 
-    One file per model, ``text-HASH.safetensors``, read once. A damaged file is replaced.
+    A folder has one file per model, ``text-HASH.safetensors``, which is read once. A damaged file counts as empty.
 
     Args:
-        folder: Folder of the files; created on the first write.
-        writable: Whether new embeddings are stored.
+        *folders: Folders of the files; created on the first write. What is asked is kept in each that can be written.
+        read_only: A folder that is read, too, and never written.
     """
 
-    def __init__(self, folder: Path, *, writable: bool = True) -> None:
-        self._folder, self._writable = Path(folder), writable
-        self._known: dict[str, dict[str, Tensor]] = {}
+    def __init__(self, *folders: Path, read_only: Path | None = None) -> None:
+        self._written = [_Store(Path(folder)) for folder in folders]
+        self._read = [*self._written, *([] if read_only is None else [_Store(read_only)])]
 
-    def encode(self, content_hash: str, prompts: Sequence[str], encoder: Callable[[], TextTower]) -> Tensor:
+    def encode(
+        self,
+        content_hash: str,
+        prompts: Sequence[str],
+        encoder: Callable[[], TextTower],
+        listener: Listener = silent,
+    ) -> Tensor:
         """Embeddings ``[P, D]`` of prompts, float32, unit length.
 
         Args:
             content_hash: The model's hash, as recorded with the features.
             prompts: Texts; repeated ones are encoded once.
             encoder: Returns the model; called only for new prompts.
+            listener: See `encode_each`.
 
         Raises:
             ValueError: If there is no prompt, one is empty, or the model has another hash.
         """
         if not prompts or any(not prompt.strip() for prompt in prompts):
             raise ValueError("prompts must be one or more texts that are not empty")
-        known = self._read(content_hash)
-        new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in known]
+        wanted = list(dict.fromkeys(prompts))
+        found: dict[str, Tensor] = {}
+        for store in reversed(self._read):
+            known = store.read(content_hash)
+            found.update((prompt, known[prompt]) for prompt in wanted if prompt in known)
+        if len({len(vector) for vector in found.values()}) > 1:
+            found = {}  # one of the files was made by something else
+        new = [prompt for prompt in wanted if prompt not in found]
         if new:
             model = encoder()
             if model.content_hash != content_hash:
                 raise ValueError(f"{model.content_hash} is not the model of the features ({content_hash})")
-            known.update(zip(new, encode_each(model, new)))
-            if len(known) > _MAX_STORED:
-                found = torch.stack([known[prompt] for prompt in prompts])
-                for prompt in new:
-                    del known[prompt]
-                return found
+            vectors = encode_each(model, new, listener)
+            if any(len(vector) != vectors.shape[1] for vector in found.values()):
+                new, vectors = wanted, encode_each(model, wanted, listener)
+            found.update(zip(new, vectors))
+        for store in self._written:
+            store.add(content_hash, found)
+        return torch.stack([found[prompt] for prompt in prompts])
+
+
+class _Store:
+    """The files of one folder. A folder that cannot be written is only read."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[str, dict[str, Tensor]] = {}
+
+    def read(self, content_hash: str) -> dict[str, Tensor]:
+        """The stored embeddings by text."""
+        if content_hash not in self._known:
             try:
-                if self._writable:
-                    self._write(content_hash, known)
-            except OSError as error:  # the cache is optional
-                log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
-        return torch.stack([known[prompt] for prompt in prompts])
+                self._known[content_hash] = _read(self._path(content_hash))
+            except (FileFormatError, KeyError, ValueError, RecursionError):
+                self._known[content_hash] = {}  # a damaged cache counts as empty
+        return self._known[content_hash]
+
+    def add(self, content_hash: str, found: dict[str, Tensor]) -> None:
+        """Store what is new, and forget what came first if there is too much."""
+        known, width = self.read(content_hash), len(next(iter(found.values())))
+        if any(len(vector) != width for vector in known.values()):
+            known.clear()
+        new = {text: v for text, v in found.items() if text not in known and len(text) <= _MAX_LENGTH}
+        place = next(folder for folder in (self._folder, *self._folder.parents) if folder.exists())
+        if not new or not os.access(place, os.W_OK):
+            return
+        known.update(new)
+        for text in list(known)[:-_MAX_STORED]:
+            del known[text]
+        try:
+            stored = torch.stack(list(known.values()))
+            facts = {"texts": json.dumps(list(known)), "width": str(width)}
+            write_tensors(self._path(content_hash), {"embeddings": stored}, facts)
+        except OSError as error:  # the cache is optional
+            log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
 
     def _path(self, content_hash: str) -> Path:
         return self._folder / f"text-{content_hash}.safetensors"
 
-    def _read(self, content_hash: str) -> dict[str, Tensor]:
-        if content_hash not in self._known:
-            found: dict[str, Tensor] = {}
-            try:
-                tensors, prompts = read_tensors(self._path(content_hash))
-                found = {prompts[key]: vector for key, vector in tensors.items()}
-            except (FileFormatError, KeyError):
-                pass  # a damaged cache counts as empty
-            sound = all(
-                v.ndim == 1 and v.dtype == torch.float32 and v.isfinite().all() for v in found.values()
-            )
-            uniform = len({len(vector) for vector in found.values()}) <= 1 if sound else False
-            self._known[content_hash] = found if uniform else {}
-        return self._known[content_hash]
 
-    def _write(self, content_hash: str, known: dict[str, Tensor]) -> None:
-        # Tensors are named by hashes: prompts may contain any character, and "__metadata__" is reserved.
-        keys = {digest([prompt.encode()], 16): prompt for prompt in known}
-        write_tensors(self._path(content_hash), {key: known[prompt] for key, prompt in keys.items()}, keys)
+def _read(path: Path) -> dict[str, Tensor]:
+    """The texts of a file and their embeddings.
+
+    Raises:
+        FileFormatError: If it is missing or damaged.
+        KeyError, ValueError, RecursionError: If it has other contents.
+    """
+    tensors, facts = read_tensors(path)
+    vectors, texts = tensors["embeddings"], json.loads(facts["texts"])
+    if vectors.ndim != 2 or vectors.dtype != torch.float32 or not bool(vectors.isfinite().all()):
+        raise ValueError("embeddings must be [T, D], float32 and finite")
+    if str(vectors.shape[-1]) != facts.get("width", str(vectors.shape[-1])):
+        raise ValueError("embeddings of another width than was written")
+    if (
+        not isinstance(texts, list)
+        or len(texts) != len(vectors)
+        or not all(isinstance(t, str) for t in texts)
+    ):
+        raise ValueError("as many texts as embeddings expected")
+    return dict(zip(texts, vectors))
+
+
+def texts_of_scene(folder: Path, *, shipped: bool) -> TextCache:
+    """The cache of a scene: its own folder, so that a scene carries its words, and that of the user for all scenes.
+
+    Args:
+        folder: The scene's own folder of texts.
+        shipped: Whether it belongs to the package and is never written.
+    """
+    try:
+        users = [user_cache() / "texts"]
+    except RuntimeError:
+        users = []
+    return TextCache(*users, read_only=folder) if shipped else TextCache(folder, *users)

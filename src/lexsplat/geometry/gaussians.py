@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814
@@ -162,6 +161,8 @@ def gaussians_from_points(
     count = len(points)
     spacing = np.ones(1)
     if count > 1:
+        from scipy.spatial import cKDTree
+
         distances, _ = cKDTree(points).query(points, k=min(4, count), workers=-1)
         spacing = distances[:, 1:].mean(1)
         typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0

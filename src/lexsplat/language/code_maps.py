@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lexsplat.captures.capture import View
 from lexsplat.codebook import MAX_CODES
+from lexsplat.rendering.back_projection import cell_of
 
 MASKED_CODE = MAX_CODES
 """Index of a pixel that no loss uses; it is above the codes of every codebook."""
@@ -33,9 +34,7 @@ def codes_at_pixels(code_map: Tensor, height: int, width: int, pixels: Tensor) -
         Codes ``[M]`` int64.
     """
     rows, columns = code_map.shape
-    # (p + 1/2) h / H in integers: rounding cannot move a pixel to the neighboring cell.
-    row = (2 * (pixels // width) + 1) * rows // (2 * height)
-    column = (2 * (pixels % width) + 1) * columns // (2 * width)
+    row, column = cell_of(pixels // width, height, rows), cell_of(pixels % width, width, columns)
     return code_map[row, column].long()
 
 

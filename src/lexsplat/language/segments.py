@@ -19,12 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
-from lexsplat.rendering.kernels.jit import kernel
 
 _NEIGHBORS = 10
 _COLOR = 0.2
@@ -112,6 +109,8 @@ def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segme
         features: Their mean language features, 0 where no view shows them.
         masses: Their visible weights over the training views ``[N]``.
     """
+    from lexsplat.language.segment_kernels import join_linked
+
     count = len(gaussians)
     weights = masses.detach().cpu().double().numpy()
     if count < 2:
@@ -141,6 +140,8 @@ def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segme
 
 def _links(means: FloatArray, neighbors: int) -> tuple[IntArray, IntArray]:
     """Pairs of neighboring Gaussians ``[E]``, each once, the smaller index first."""
+    from scipy.spatial import cKDTree
+
     count = len(means)
     _, found = cKDTree(means).query(means, k=neighbors + 1)
     pairs = np.stack([np.repeat(np.arange(count), neighbors + 1), found.ravel().astype(np.int64)])
@@ -157,57 +158,12 @@ def _language_distances(features: Rows, first: IntArray, second: IntArray) -> Fl
     return np.maximum(1 - cosines, 0.0)
 
 
-@kernel
-def find_root(parents: IntArray, place: int) -> int:
-    """The root of an element, with path halving."""
-    while parents[place] != place:
-        parents[place] = parents[parents[place]]
-        place = parents[place]
-    return place
-
-
-@kernel
-def join_linked(
-    first: IntArray,
-    second: IntArray,
-    lengths: FloatArray,
-    order: IntArray,
-    tolerance: float,
-    smallest: int,
-    count: int,
-) -> IntArray:
-    """Felzenszwalb and Huttenlocher's segments of a graph: the root of each element ``[N]``.
-
-    Args:
-        first: One end of each link ``[E]``.
-        second: The other end ``[E]``.
-        lengths: Lengths of the links ``[E]``.
-        order: Links by length ``[E]``.
-        tolerance: k: a set of n elements accepts links that are longer than its longest by k / n.
-        smallest: Smaller segments are joined with the nearest one afterwards.
-        count: Number of elements N.
-    """
-    parents, sizes, longest = np.arange(count), np.ones(count, np.int64), np.zeros(count)
-    for late in (False, True):
-        for link in order:
-            a, b = find_root(parents, first[link]), find_root(parents, second[link])
-            if a == b:
-                continue
-            accepted = min(longest[a] + tolerance / sizes[a], longest[b] + tolerance / sizes[b])
-            small = sizes[a] < smallest or sizes[b] < smallest
-            if small if late else lengths[link] <= accepted:
-                if sizes[a] < sizes[b]:
-                    a, b = b, a
-                parents[b] = a
-                sizes[a] += sizes[b]
-                longest[a] = lengths[link]
-    return np.array([find_root(parents, place) for place in range(count)])
-
-
 def _describe(
     labels: IntArray, features: Rows, colors: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean language and color ``[S, D + 3]`` of segments, each scaled by its spread, and their masses ``[S]``."""
+    from scipy.sparse import csr_array
+
     segments, total = int(labels.max()) + 1, max(float(weights.sum()), 1e-12)
     masses = np.bincount(labels, weights, segments).astype(np.float64)
     described = []

@@ -9,7 +9,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args
 
 from mcp.server import MCPServer
 from mcp.server.mcpserver.exceptions import ResourceError
@@ -17,9 +17,11 @@ from mcp.server.transport_security import TransportSecuritySettings
 from mcp_types import CallToolResult, ImageContent, TextContent, ToolAnnotations
 
 from lexsplat import __version__
+from lexsplat.mcp.library import LibraryTools
 from lexsplat.mcp.tools import Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError
+from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, error_document
 
 MAX_BODY = 1 << 20
@@ -33,23 +35,26 @@ INSTRUCTIONS = (
 )
 
 
-def make_server(scenes: Mapping[str, OpenScene], output: Path | None = None) -> MCPServer:
+def make_server(
+    scenes: Mapping[str, OpenScene], output: Path | None = None, library: Library | None = None
+) -> MCPServer:
     """A server for scenes.
 
     Args:
         scenes: The scenes by name.
         output: Where the tools that write put their files; None offers none of these tools.
+        library: A library that is searched, and whose scenes are served as well.
     """
     server: MCPServer = MCPServer(
         "lexsplat", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING"
     )
     logging.getLogger("mcp").setLevel(logging.ERROR)
-    tools = Tools(scenes)
+    tools = Tools(scenes) if library is None else LibraryTools(scenes, library)
     reading = ToolAnnotations(read_only_hint=True, open_world_hint=False)
-    for name in _public(Tools):
+    for name in _public(type(tools)):
         server.add_tool(_tool(getattr(tools, name)), name=name, annotations=reading)
     if output is not None:
-        writing = WritingTools(scenes, output)
+        writing = WritingTools(scenes, output, library)
         for name in set(_public(WritingTools)) - set(_public(Tools)):
             server.add_tool(
                 _tool(getattr(writing, name)), name=name, annotations=ToolAnnotations(read_only_hint=False)
@@ -106,7 +111,10 @@ def _public(kind: type) -> list[str]:
 
 
 def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
-    """A tool of the protocol: structured content and one sentence; errors that have a remedy are answers."""
+    """A tool of the protocol: structured content and one sentence; errors that have a remedy are answers.
+
+    Its output schema is that of the document type in the function's return annotation.
+    """
     # The package reads names and types from the signature; its annotations are strings of the other module.
     hints = inspect.signature(function, eval_str=True)
 
@@ -127,9 +135,11 @@ def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
             content.append(ImageContent(data=base64.b64encode(reply.image).decode(), mime_type="image/png"))
         return CallToolResult(content=content, structured_content=reply.document)
 
-    call.__signature__ = hints.replace(return_annotation=CallToolResult)  # type: ignore[attr-defined]
+    document = get_args(hints.return_annotation)[1]  # Annotated[Reply, type of the document]
+    answer = Annotated[CallToolResult, document]
+    call.__signature__ = hints.replace(return_annotation=answer)  # type: ignore[attr-defined]
     call.__annotations__ = {name: each.annotation for name, each in hints.parameters.items()} | {
-        "return": CallToolResult
+        "return": answer
     }
     del call.__wrapped__  # type: ignore[attr-defined]
     return call

@@ -11,6 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from lexsplat.mcp import answers
 from lexsplat.mcp.pictures import picture
 from lexsplat.queries.phrases import Related, RelationName, Understood
 from lexsplat.queries.relations import distance, same
@@ -18,6 +19,8 @@ from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import find_phrases
 from lexsplat.scenes.finding import find_in
+from lexsplat.scenes.library import Library
+from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.serving import OpenScene, sentence
 
@@ -29,6 +32,8 @@ PhraseText = Annotated[
 ViewName = Annotated[
     str, Field(description="Name of a view (a photo): what left, right and me refer to; may be empty.")
 ]
+_LISTED = 100
+"""Scenes of a library that are listed, at most."""
 
 
 class Reply(NamedTuple):
@@ -44,17 +49,24 @@ class Tools:
 
     Args:
         scenes: The served scenes by name.
+        library: A library whose scenes are served as well.
     """
 
-    def __init__(self, scenes: Mapping[str, OpenScene]) -> None:
-        self.scenes = scenes
+    def __init__(self, scenes: Mapping[str, OpenScene], library: Library | None = None) -> None:
+        self.scenes, self.library = scenes, library
 
-    def list_scenes(self) -> Reply:
+    def list_scenes(self) -> Annotated[Reply, answers.ScenesAnswer]:
         """List the places that can be searched."""
         listed = [{"name": name, **_facts(served.scene)} for name, served in self.scenes.items()]
-        return Reply(f"{len(listed)} scenes: {', '.join(self.scenes)}.", {"scenes": listed})
+        document: dict[str, Any] = {"scenes": listed}
+        said = f"{len(listed)} scenes: {', '.join(self.scenes)}." if listed or not self.library else ""
+        if self.library is not None:
+            names = self.library.names()
+            document["library"] = {"scenes": len(names), "names": names[:_LISTED]}
+            said = f"{said} A library of {len(names)} scenes: {', '.join(names[:_LISTED])}.".strip()
+        return Reply(said, document)
 
-    def describe_scene(self, scene: SceneName = "") -> Reply:
+    def describe_scene(self, scene: SceneName = "") -> Annotated[Reply, answers.SceneAnswer]:
         """Describe a place: its size, its up direction, its unit of length, its views and the things it holds."""
         place = self._scene(scene)
         low, high = np.quantile(place.gaussians.means.detach().cpu().numpy(), (0.01, 0.99), axis=0)
@@ -71,9 +83,11 @@ class Tools:
         scale = f"one unit is {unit:.3g} m" if unit else "the length of a unit in meters is unknown"
         return Reply(f"{len(names)} known things: {', '.join(names)}; {scale}.", document)
 
-    def list_objects(self, scene: SceneName = "") -> Reply:
-        """List the things of an everyday vocabulary that a place holds, with their places and sizes."""
-        return self.find("everything", scene)
+    def list_objects(self, scene: SceneName = "") -> Annotated[Reply, answers.ListAnswer]:
+        """List everything that a place holds, with names, colors, places and sizes."""
+        document = list_document(self._scene(scene))
+        named = (f"{' '.join(thing['colors'])} {thing['name']}" for thing in document["objects"])
+        return Reply(f"{len(document['objects'])} objects: {', '.join(named)}.", document)
 
     def find(
         self,
@@ -83,13 +97,13 @@ class Tools:
         threshold: Annotated[
             float | None, Field(description="Relevancy in 0..1; chosen by itself if left out.")
         ] = None,
-    ) -> Reply:
+    ) -> Annotated[Reply, answers.FindAnswer]:
         """Find things by words: where they are, how large, how many, best view; "present": "no" means not here."""
         place = self._scene(scene)
         document = find_phrases(place, phrase, view or None, threshold)
         return Reply(sentence(document["phrases"][0], place.world.meters_per_unit), document)
 
-    def count(self, phrase: PhraseText, scene: SceneName = "") -> Reply:
+    def count(self, phrase: PhraseText, scene: SceneName = "") -> Annotated[Reply, answers.Counted]:
         """Count things by words, such as "apples" or "toys on the table"."""
         answer = self.find(phrase, scene).document["phrases"][0]
         document = {key: answer[key] for key in ("phrase", "understood", "note", "present", "count")}
@@ -102,7 +116,7 @@ class Tools:
         second: PhraseText,
         scene: SceneName = "",
         view: ViewName = "",
-    ) -> Reply:
+    ) -> Annotated[Reply, answers.RelateAnswer]:
         """Tell whether things stand in a relation to others, and which do. Left and right are those of the view."""
         place = self._scene(scene)
         both = (place.understand(first).phrase, place.understand(second).phrase)
@@ -122,7 +136,7 @@ class Tools:
         ] = "",
         point: Annotated[list[float], Field(description="Or a point x, y, z in scene units.")] = [],  # noqa: B006
         scene: SceneName = "",
-    ) -> Reply:
+    ) -> Annotated[Reply, answers.NearestAnswer]:
         """Find which of several things is nearest to another thing or to a point, and how far away it is."""
         place = self._scene(scene)
         if point:
@@ -143,7 +157,9 @@ class Tools:
         document = {"distance": _lengths(place, gap), "nearest": best.geometry(), "among": len(gaps)}
         return Reply(f"{best.phrase} is nearest: {_length(place, gap)} away.", document)
 
-    def measure(self, first: PhraseText, second: PhraseText, scene: SceneName = "") -> Reply:
+    def measure(
+        self, first: PhraseText, second: PhraseText, scene: SceneName = ""
+    ) -> Annotated[Reply, answers.MeasureAnswer]:
         """Measure between two things: center to center, the gap between their surfaces, the difference in height."""
         place = self._scene(scene)
         one, other = (_instances(place, phrase)[0] for phrase in (first, second))
@@ -173,7 +189,7 @@ class Tools:
         x: Annotated[float, Field(description="Pixels from the left.")],
         y: Annotated[float, Field(description="Pixels from the top.")],
         scene: SceneName = "",
-    ) -> Reply:
+    ) -> Annotated[Reply, answers.PixelAnswer]:
         """Tell what a pixel of a view shows: the name of the thing, its place and its size."""
         place = self._scene(scene)
         hit = place.click(view, x, y)
@@ -201,7 +217,7 @@ class Tools:
             list[str], Field(description="Up to 4 phrases whose relevancy is drawn as heat.", max_length=4)
         ] = [],  # noqa: B006
         scene: SceneName = "",
-    ) -> Reply:
+    ) -> Annotated[Reply, answers.RenderAnswer]:
         """Show a picture of a place: a view, or the view that shows a thing best; with a heatmap for each phrase."""
         place = self._scene(scene)
         name = place.view(view).name if view else ""
@@ -218,8 +234,10 @@ class Tools:
     def _scene(self, name: str) -> Scene:
         if not name and len(self.scenes) == 1:
             return next(iter(self.scenes.values())).scene
+        if name not in self.scenes and self.library is not None and name in self.library.names():
+            return self.library.scene(name)
         if name not in self.scenes:
-            known = ", ".join(self.scenes)[:200]
+            known = ", ".join([*self.scenes, *(self.library.names() if self.library else [])])[:200]
             raise QueryError(f"scene {name[:60]!r}", expected=f"one of {known}", found="no such name")
         return self.scenes[name].scene
 

@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from lexsplat.mcp import answers
 from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene
+from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
@@ -24,13 +26,16 @@ class WritingTools(Tools):
     Args:
         scenes: The served scenes by name.
         output: The folder of all files; nothing is written elsewhere.
+        library: A library whose scenes are served as well.
     """
 
-    def __init__(self, scenes: Mapping[str, OpenScene], output: Path) -> None:
-        super().__init__(scenes)
+    def __init__(self, scenes: Mapping[str, OpenScene], output: Path, library: Library | None = None) -> None:
+        super().__init__(scenes, library)
         self.output = output
 
-    def export(self, phrase: PhraseText, file: FileName, scene: SceneName = "") -> Reply:
+    def export(
+        self, phrase: PhraseText, file: FileName, scene: SceneName = ""
+    ) -> Annotated[Reply, answers.ExportAnswer]:
         """Write the Gaussians of a thing to a new file for other programs; the ending selects the format."""
         place, path = self._scene(scene), self._new(file)
         ending_of(path)
@@ -51,7 +56,7 @@ class WritingTools(Tools):
         folder: Annotated[str, Field(description="Name of a new scene folder for the result.")],
         color: Annotated[list[float], Field(description="Red, green, blue in 0..1, for recolor.")] = [],  # noqa: B006
         scene: SceneName = "",
-    ) -> Reply:
+    ) -> Annotated[Reply, answers.EditAnswer]:
         """Make a new scene without a thing, with a thing alone, or with a thing in another color; the scene stays."""
         place, path = self._scene(scene), self._new(folder)
         found = place.find(phrase)

@@ -6,6 +6,7 @@ the photos, the cameras, its settings and the stages before it.
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -15,19 +16,24 @@ from typing import Any
 from torch import Tensor
 
 from lexsplat.captures import Capture, View, load_annotations
-from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.features import FeatureMaps, external_identity, load_external_features
+from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.fields import CodeField
 from lexsplat.language.methods import METHODS, FitRun, TrainingViews
 from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps
-from lexsplat.pipeline.inputs import prepare_capture, refuse_without_cameras, survey_photos
-from lexsplat.pipeline.provenance import model_identity, write_provenance
+from lexsplat.pipeline.distribution import extract_on_workers
+from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
+from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
+from lexsplat.pipeline.provenance import model_identity, model_place, write_provenance
 from lexsplat.pipeline.splats import check_agreement, existing_splats
+from lexsplat.pipeline.viewpoints import capture_of_splats
+from lexsplat.pipeline.viewpoints.choosing import SIZE
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
+from lexsplat.reconstruction.blocks import BlockRun, number_of_blocks, reconstruct_blocks
 from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
@@ -37,6 +43,7 @@ from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
+from lexsplat.runtime.workers import IN_PROCESS, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.previous import drop_previous
@@ -46,7 +53,7 @@ STAGES = ("reconstruct", "features", "codebook", "language")
 
 
 def build(
-    source: str | Path,
+    source: str | Path | None,
     output: str | Path,
     config: BuildConfig | None = None,
     *,
@@ -58,7 +65,8 @@ def build(
     """Make a scene from a capture, or resume an earlier build.
 
     Args:
-        source: Folder with photos and cameras (COLMAP or ``transforms.json``) or with photos alone, or a video.
+        source: Folder with photos and cameras (COLMAP or ``transforms.json``) or with photos alone, or a video. None
+            chooses views of ``splats`` and renders them.
         output: Scene folder to make or to resume.
         config: Settings; open ones are chosen to suit the device. None takes the defaults.
         until: Last stage to run, one of `STAGES`.
@@ -69,31 +77,36 @@ def build(
     Raises:
         LexsplatError: If anything in the capture, the models or the output folder is wrong, or the device cannot be
             used.
-        ValueError: If ``until`` is not a stage, or ``splats`` are given for joint training.
+        ValueError: If ``until`` is not a stage, ``splats`` are given for joint training, or there is neither a source
+            nor ``splats``.
     """
-    if until not in STAGES:
-        raise ValueError(f"until must be one of {', '.join(STAGES)}, got {until!r}")
-    source, config = Path(source), config or BuildConfig()
-    if config.joint and splats is not None:
-        raise ValueError("joint training makes its own Gaussians: leave --splats out")
+    source, config = None if source is None else Path(source), (config or BuildConfig()).spelled_out()
+    _check_request(source, splats, until, config)
     device = choose_device(config.device)
     config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
     if device == "cuda":
         require_gsplat()  # before anything that takes time
-    if splats is not None:
-        existing_splats(splats)
-        refuse_without_cameras(source)
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
     with folder.locked():
         try:
             # Errors in ground truth and encoders are reported before structure from motion, not after it.
-            photos = survey_photos(source, folder.root, config, test_names)
+            photos: PhotoSurvey | None = PhotoSurvey(0, SIZE)
+            if source is not None:
+                photos = survey_photos(source, folder.root, config, test_names)
             encodes = until != "reconstruct" and "features" not in folder.record["stages"]
+            another = folder.record.get("config", {}).get("clip") != model_place(config.clip)
+            if encodes or (another and until != "reconstruct"):  # its architecture decides settings
+                fetch_clip(config)
             if photos is not None and encodes:
-                check_encoders(config.resolved(device, photos.size), source, photos.count, photos.size)
-            capture = prepare_capture(source, folder, config, test_names, listener)
+                check_encoders(
+                    config.resolved(device, photos.size), source or splats, photos.count, photos.size
+                )
+            if source is None:
+                capture = capture_of_splats(splats, folder, config, device, listener)
+            else:
+                capture = prepare_capture(source, folder, config, test_names, listener)
             load_annotations(capture)
             sizes = [view.capture_size for view in capture.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
@@ -102,11 +115,26 @@ def build(
             if config.features_from is not None:
                 load_external_features(config.features_from, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
-            return builder.run(until, encoders_checked=photos is not None and encodes)
+            with open_workers(config.workers, (capture.root,)) as builder.workers:
+                return builder.run(until, encoders_checked=photos is not None and encodes)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw()
             raise
+
+
+def _check_request(source: Path | None, splats: Path | None, until: str, config: BuildConfig) -> None:
+    """Refuse what cannot be built, before anything is written; the errors are those of `build`."""
+    if until not in STAGES:
+        raise ValueError(f"until must be one of {', '.join(STAGES)}, got {until!r}")
+    if source is None and splats is None:
+        raise ValueError("a build needs a capture or splats")
+    if config.joint and splats is not None:
+        raise ValueError("joint training makes its own Gaussians: leave --splats out")
+    if splats is not None:
+        existing_splats(splats)
+        if source is not None:
+            refuse_without_cameras(source)
 
 
 @dataclass(frozen=True)
@@ -138,8 +166,10 @@ class _Builder:
     ) -> None:
         self.capture, self.folder, self.config = capture, folder, config
         self.device, self.listener, self.splats = device, listener, splats
+        self.workers: Workers = IN_PROCESS
         self.method = METHODS[config.method]
         self.memory = parse_bytes(config.memory)
+        self.blocks = number_of_blocks(config.blocks, config.reconstruction, device, self.memory)
         self.fingerprints: dict[str, str] = {}
         self.checkpoint: Checkpoint | None = None
         self._maps: FeatureMaps | None = None
@@ -197,6 +227,8 @@ class _Builder:
             content = file_hash(existing_splats(self.splats))
             return _Stage([capture_hash, content], self._take_splats, outputs)
         inputs = [capture_hash, config.reconstruction, config.seed, self.device]
+        if self.blocks > 1:
+            inputs += [f"{self.blocks} blocks", self.config.up]
         return _Stage(inputs, self._reconstruct, outputs)
 
     def _feature_inputs(self, capture_hash: str, config: BuildConfig) -> list[Any]:
@@ -235,6 +267,8 @@ class _Builder:
     # -- the work of each stage
 
     def _reconstruct(self) -> dict[str, Any]:
+        if self.blocks > 1:
+            return self._reconstruct_blocks()
         gaussians = reconstruct(
             self.capture,
             self.config.reconstruction,
@@ -248,6 +282,23 @@ class _Builder:
         self.folder.write_gaussians(gaussians)
         return {"gaussians": len(gaussians)}
 
+    def _reconstruct_blocks(self) -> dict[str, Any]:
+        config, folder = self.config, self._checkpoints / "blocks"
+        points = self._initial_points()
+        key, seconds = self.fingerprints["reconstruct"], config.checkpoint_seconds
+        run = BlockRun(
+            self.device, config.seed, self.memory, folder, key, seconds, self.workers, self.listener
+        )
+        world = World.of_cameras(view.camera for view in self.capture.train_views)
+        if config.up is not None:
+            world = world.with_up(parse_vector(config.up))
+        gaussians = reconstruct_blocks(
+            self.capture, config.reconstruction, points, world.up, self.blocks, run
+        )
+        self.folder.write_gaussians(gaussians)
+        shutil.rmtree(folder, ignore_errors=True)
+        return {"gaussians": len(gaussians), "blocks": self.blocks}
+
     def _take_splats(self) -> dict[str, Any]:
         splats = existing_splats(self.splats)
         gaussians = read_splats(splats)
@@ -257,10 +308,7 @@ class _Builder:
 
     def _train_jointly(self) -> dict[str, Any]:
         config, seed, memory = self.config, self.config.seed, self.memory
-        cache = self._checkpoints / "points"
-        points = initial_points(
-            self.capture, seed=seed, cache_dir=cache, memory=memory, listener=self.listener
-        )
+        points = self._initial_points()
         check_gaussians(config.reconstruction, self.device, memory)
         reconstructor = Reconstructor(
             self.capture, config.reconstruction, points, device=self.device, seed=seed, memory=memory
@@ -282,7 +330,7 @@ class _Builder:
             ):  # reading checks them, before anything is made of them
                 _ = maps[name]
                 self.listener(Event("features", done, len(maps)))
-        return {"views": len(maps), "clip_hash": self._clip_hash}
+        return {"views": len(maps), "clip_hash": self._clip_hash, "dino": self.config.uses_dino}
 
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
@@ -311,6 +359,7 @@ class _Builder:
             seed=self.config.seed,
             memory=self.memory,
             scratch=self._checkpoints,
+            workers=self.workers,
             checkpoint=self.checkpoint,
             listener=self.listener,
         )
@@ -340,9 +389,17 @@ class _Builder:
             encoders = Encoders.of(config)
             cache = self.folder.features_path
             training = replace(self.capture, views=self._training_views, test_names=())
+            if self.workers.distributed and config.features_from is None:
+                extract_on_workers(training, config, encoders, cache, self.workers, self.listener)
             self._maps = feature_maps(training, config, encoders, cache, self.listener)
             self._clip_hash = encoders.clip.content_hash
         return self._maps
+
+    def _initial_points(self) -> InitialPoints:
+        cache, seed = self._checkpoints / "points", self.config.seed
+        return initial_points(
+            self.capture, seed=seed, cache_dir=cache, memory=self.memory, listener=self.listener
+        )
 
     @property
     def _training_views(self) -> dict[str, View]:

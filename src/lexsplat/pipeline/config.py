@@ -11,14 +11,17 @@ from lexsplat.captures.readers.video import DEFAULT_FRAMES
 from lexsplat.captures.sfm.photos import PoseConfig
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureConfig
+from lexsplat.features.clip import patch_grid
 from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction import ReconstructionConfig
+from lexsplat.reconstruction.blocks import number_of_blocks
 from lexsplat.runtime.device import check_seed, choose_encoder_device
 from lexsplat.runtime.memory import parse_bytes
+from lexsplat.runtime.workers import check_spec
 
 CPU_PIXELS = 80_000
 """Pixels of the working images on a CPU if no downscale is given: about 320x240."""
@@ -26,7 +29,9 @@ CUDA_PIXELS = 2_000_000
 """Pixels of the working images on CUDA if no downscale is given: 1600 wide at 4:3, as in 3DGS."""
 CPU_ITERATIONS = 3_000
 """Reconstruction steps on a CPU if none are given."""
-CUDA_ITERATIONS = 30_000
+PAPER_ITERATIONS = 30_000
+"""Reconstruction steps of the paper."""
+CUDA_ITERATIONS = PAPER_ITERATIONS
 """Reconstruction steps on CUDA if none are given, as in the paper."""
 
 
@@ -46,6 +51,10 @@ class BuildConfig:
             used for prompts only.
         memory: Host memory for photos, features and projections, such as "4GB". Libraries, encoders and Gaussians
             come on top (docs/conventions.md).
+        workers: Where views and scenes are worked on: "none" is this process, "ray" the cluster of RAY_ADDRESS or the
+            cores of this machine, "ray://HOST:PORT" a cluster (docs/scaling.md).
+        blocks: Number of blocks of the ground plane that are reconstructed apart, "auto" for as few as fit into the
+            memory, or "none".
         checkpoint_seconds: Seconds between two checkpoints of a training.
         downscale: Factor by which photos are reduced for reconstruction and language; by default what suits the
             device.
@@ -56,6 +65,9 @@ class BuildConfig:
         method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in
             docs/results.md); "trained" is the optimization of the paper.
         joint: Train language together with geometry, as the authors' code does; needs method "trained".
+        as_in_paper: Build and ask as the paper describes it (docs/paper.md): method "trained", jointly, 30,000 steps
+            over full maps, random crops, rasterization without the mip filter, prompts relative to canonical phrases
+            with a fixed threshold. Settings that are given otherwise are kept.
         poses: Structure from motion, for photos without cameras and for videos.
         reconstruction: Geometry and appearance.
         features: Dense CLIP and DINO features. Settings left at their default take the value that suits the encoder
@@ -75,6 +87,8 @@ class BuildConfig:
     seed: int = 0
     features_from: Path | None = None
     memory: str = "4GB"
+    workers: str = "none"
+    blocks: str = "none"
     checkpoint_seconds: float = 20.0
     downscale: float | None = None
     iterations: int | None = None
@@ -83,6 +97,7 @@ class BuildConfig:
     up: str | None = None
     method: MethodName = "averaged"
     joint: bool = False
+    as_in_paper: bool = False
     poses: PoseConfig = field(default_factory=PoseConfig)
     reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
@@ -99,6 +114,10 @@ class BuildConfig:
         if self.encoder_device not in ("auto", "cpu", "cuda", "mps"):
             raise ValueError(f"encoder_device must be auto, cpu, cuda or mps, got {self.encoder_device!r}")
         parse_bytes(self.memory)
+        check_spec(self.workers)
+        number_of_blocks(self.blocks, self.reconstruction, "cpu", parse_bytes(self.memory))
+        if self.joint and self.blocks != "none":
+            raise ValueError("joint training takes the capture in one piece: leave --blocks out")
         check_seed(self.seed)
         if self.downscale is not None and not 0 < self.downscale < 1e6:
             raise ValueError(f"downscale must be positive, got {self.downscale:g}")
@@ -121,24 +140,46 @@ class BuildConfig:
     def result_settings(self) -> BuildConfig:
         """These settings with everything that does not affect the result at its default, for fingerprints.
 
-        Memory, checkpoints, the device of the encoders, settings of methods that are not used, and features that
-        take no part.
+        Memory, workers, checkpoints, the device of the encoders, settings of methods that are not used, and features
+        that take no part.
         """
         used = METHODS[self.method].settings
         unused = {part for method in METHODS.values() for part in method.settings} - set(used)
         usual = BuildConfig()
         idle: dict[str, Any] = {
-            name: getattr(usual, name) for name in unused | {"memory", "checkpoint_seconds", "encoder_device"}
+            name: getattr(usual, name)
+            for name in unused | {"memory", "workers", "blocks", "checkpoint_seconds", "encoder_device"}
         }
         return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **idle)
 
     @property
     def uses_dino(self) -> bool:
         """Whether DINO features take part."""
-        return self.dino != "none" and METHODS[self.method].uses_dino
+        return self.dino != "none" and METHODS[self.method].uses_dino(self)
+
+    def spelled_out(self) -> BuildConfig:
+        """With `as_in_paper`, the settings that it stands for; otherwise the same."""
+        if not self.as_in_paper:
+            return self
+        trained = self.trained.as_in_paper()
+        if self.trained.iterations != TrainedConfig.iterations:
+            trained = replace(trained, iterations=self.trained.iterations)
+        return replace(
+            self,
+            method="trained",
+            joint=True,
+            iterations=self.iterations or PAPER_ITERATIONS,
+            reconstruction=replace(self.reconstruction, antialiased=False),
+            features=replace(self.features, mode="random", crop_tokens=None),
+            codebook=self.codebook.as_in_paper(),
+            trained=trained,
+        )
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
         """The same settings with every open one chosen.
+
+        What depends on the architecture of CLIP is chosen by its configuration, so the model has to be on this
+        machine (`lexsplat.features.hub.model_folder`).
 
         Args:
             device: "cpu" or "cuda".
@@ -155,9 +196,12 @@ class BuildConfig:
             # Halves keep the numbers readable; never enlarge.
             downscale = max(1.0, round(factor * 2) / 2)
         features = self.features
-        if self.clip == "bundled" or encoder_device != "cuda":
-            suited = FeatureConfig.bundled() if self.clip == "bundled" else FeatureConfig.sparse()
-            features = features.on_top_of(suited)
+        if self.clip == "bundled":
+            features = features.on_top_of(FeatureConfig.bundled())
+        elif encoder_device != "cuda":
+            reads_patches = features.mode == "grid" and features.crop_tokens != "class"
+            patches = patch_grid(self.clip) if reads_patches else 0
+            features = features.on_top_of(FeatureConfig.sparse(patches))
         iterations = self.iterations
         if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:
             iterations = self.reconstruction.iterations  # set from Python

@@ -11,7 +11,8 @@ from lexsplat.captures import Capture
 from lexsplat.codebook import MAX_CODES
 from lexsplat.features import FeatureMaps, extract_features, load_external_features
 from lexsplat.features.checks import ENOUGH, check_dense, rank_words
-from lexsplat.features.clip import UNLIKE_WORDS, check_patches
+from lexsplat.features.clip import check_patches
+from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import estimate
 from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
@@ -61,6 +62,15 @@ class Encoders:
         return None if self._dino_name == "none" else load_dino(self._dino_name, self.device)
 
 
+def fetch_clip(config: BuildConfig) -> None:
+    """Download CLIP if it is not on this machine, because its architecture decides settings (`BuildConfig.resolved`).
+
+    Raises:
+        ModelError: If it can be had nowhere.
+    """
+    model_folder(config.clip, "clip")
+
+
 def check_encoders(
     config: BuildConfig, source: Path | None = None, photos: int = 0, size: tuple[int, int] = (1440, 1080)
 ) -> None:
@@ -96,6 +106,7 @@ def check_encoders(
     encoders = Encoders.of(config)
     if config.clip == "bundled" and config.dino in ("bundled", "none"):
         return
+    log.log(NOTE, "the encoders are loaded, checked and timed")
     right = rank_words(encoders.clip)
     if (
         right < ENOUGH

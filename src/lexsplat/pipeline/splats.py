@@ -14,6 +14,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.formats.sog import META
 
 CHECKED_VIEWS = 8
 """Number of views in which the Gaussians are looked for."""
@@ -26,11 +27,13 @@ MIN_AGREEMENT = 0.25
 
 
 def existing_splats(path: Path | None) -> Path:
-    """The path, if it is a file.
+    """The path, if it is a file, or the ``meta.json`` of a folder with an unbundled SOG.
 
     Raises:
         FileFormatError: If there is no such file.
     """
+    if path is not None and (path / META).is_file():
+        path = path / META
     if path is None or not path.is_file():
         raise FileFormatError(path, expected="a file of Gaussians", found="no such file")
     return path

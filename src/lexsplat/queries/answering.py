@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.phrases import (
     Anything,
     AtLeast,
@@ -68,12 +69,21 @@ def answer(phrase: Phrase, searched: Searched) -> Selection:
         QueryError: If the phrase relates something to the viewer in a way that has no meaning, such as "on me".
     """
     if isinstance(phrase, Thing):
-        return apart(searched.select(phrase.text), searched)
+        members = () if phrase.exact else _members(phrase.text, searched)
+        selected = searched.select(phrase.text)
+        return _joined(selected, members, present="yes") if members else apart(selected, searched)
     found = _ANSWERS[type(phrase)](phrase, searched)
     # An empty result is a "no", whatever the presence of the parts; a "no" has no instances.
     if not found or found.present == "no":
         found = replace(found, mask=torch.zeros_like(found.mask), parts=(), present="no")
     return replace(found, phrase=str(phrase))
+
+
+def _members(text: str, searched: Searched) -> tuple[Selection, ...]:
+    """The objects of the kind that a text names (`lexsplat.queries.kinds`)."""
+    if not is_kind(text):
+        return ()
+    return tuple(each for each in searched.objects() if is_of_kind(each.phrase, text))
 
 
 def apart(selection: Selection, searched: Searched) -> Selection:

@@ -7,30 +7,45 @@ describes that place, on the scale of everyday words (`lexsplat.queries.everyday
   bear "giraffe" may score high, but "stuffed animal" scores higher;
 - *height*: the height of the phrase there, over those that the scene's best described words reach at their places.
 
-The answer depends on their geometric mean. ``benchmarks/selection.py`` measures it.
+Places are the objects of the scene (`lexsplat.queries.objects`), found with everyday words: a stripe of a ball may
+resemble a book, the ball does not. What names a part of a thing, such as "mug handle", is judged at segments of all
+levels. A phrase with a color, such as "red apple", is compared with the colors and names of the scene's objects: at a
+red mug, "red mug" describes more than "red apple". A scene without segments is judged at the Gaussians that score
+best. ``benchmarks/selection.py`` measures the decisions.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
-from lexsplat.queries.everyday import EverydayScale
+from lexsplat.language.segment_codes import SegmentCodes, segment_codes
+from lexsplat.queries.everyday import EverydayScale, everyday_words
+from lexsplat.queries.objects import FITS, whole_segments
 from lexsplat.queries.selection import Presence
+from lexsplat.queries.vocabulary import COLORS, has_color, is_part
 
-YES, NO = 0.74, 0.6
+YES, NO = 0.74, FITS
 """Strengths from which the answer is "yes", and below which it is "no"."""
+YES_OBJECT, YES_COLORED = 0.62, 0.82
+"""The former for names of whole objects, whose means are lower than peaks, and for phrases with a color, which share
+the color or the name with most of what they are confused with. Chosen on the second scene."""
 
 _PEAK_SHARE = 5e-4
 _PEAK_COUNT = 20
 """A peak is the mean of the best 0.05 percent of the Gaussians, and of at least this many."""
 _FAINT = 0.1
 """Gaussians of lower opacity do not count."""
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -40,20 +55,22 @@ class Evidence:
     Args:
         ratio: Height at the best place over that of the best everyday word there.
         height: Height at the best place over those of the scene's best described words.
+        yes: Strength from which the answer is "yes".
     """
 
     ratio: float
     height: float
+    yes: float = YES
 
     @property
     def strength(self) -> float:
-        """Geometric mean of the two, at least 0."""
-        return math.sqrt(max(0.0, self.ratio) * max(0.0, self.height))
+        """Geometric mean of the ratio and the lesser of the two, at least 0."""
+        return math.sqrt(max(0.0, self.ratio) * max(0.0, min(self.ratio, self.height)))
 
     @property
     def presence(self) -> Presence:
         """Whether the scene holds the phrase: "yes", "no" or "unsure"."""
-        return "yes" if self.strength >= YES else "no" if self.strength < NO else "unsure"
+        return "yes" if self.strength >= self.yes else "no" if self.strength < NO else "unsure"
 
 
 class PresenceClassifier:
@@ -63,34 +80,108 @@ class PresenceClassifier:
         gaussians: The geometry of the scene.
         language: Its language.
         scale: What everyday words reach in it.
+        embed: Texts to embeddings ``[T, D]``.
     """
 
-    def __init__(self, gaussians: Gaussians, language: LanguageField, scale: EverydayScale) -> None:
-        self.language, self.scale = language, scale
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        language: LanguageField,
+        scale: EverydayScale,
+        embed: Callable[[Sequence[str]], Tensor],
+    ) -> None:
+        self.language, self.scale, self._embed = language, scale, embed
         self._shown = (gaussians.opacities >= _FAINT).detach().nonzero()[:, 0]
 
+    @cached_property
+    def segment_codes(self) -> SegmentCodes | None:
+        """The language of the segments; None if the field has none or nothing is shown."""
+        segments = self.language.segments
+        if segments is None or len(self._shown) == 0:
+            return None
+        return segment_codes(segments, lambda index: self.language.select(index).code_probabilities())
+
     @torch.no_grad()
-    def evidence(self, texts: Tensor, scores: Tensor) -> list[Evidence]:
+    def evidence(self, phrases: Sequence[str], texts: Tensor, scores: Tensor) -> list[Evidence]:
         """Evidence for phrases.
 
         Args:
+            phrases: The phrases.
             texts: Their embeddings ``[P, D]``, of any length.
-            scores: Their scores ``[P, N]``; each phrase is judged at the Gaussians that score best.
+            scores: Their relevancies ``[P, N]``; read where the field has no segments.
         """
         if len(self._shown) == 0:
             return [Evidence(0.0, 0.0)] * len(texts)
-        codewords = self.language.codebook.clip.to(self._shown.device)
-        heights = self.scale.heights(codewords, texts)
-        count = min(len(self._shown), max(_PEAK_COUNT, int(_PEAK_SHARE * len(self._shown))))
+        heights = self.scale.heights(self.language.codebook.clip, texts)
+        codes = self.segment_codes
         found = []
-        for row, height in zip(scores.to(self._shown.device), heights.T):
-            region = self._shown[row[self._shown].topk(count).indices]
-            place = self.language.select(region).code_probabilities().mean(0)
-            reached = float(place @ height)
-            best = max(float(place @ self.scale.best), 1e-6)
-            found.append(Evidence(reached / best, reached / self.scale.peak))
+        for number, phrase in enumerate(phrases):
+            best, yes = self.scale.best, YES
+            if codes is None:
+                places = self._peak(scores[number])[None]
+            elif is_part(phrase):
+                places = codes.distributions
+            else:
+                places, yes = self._objects[0], YES_OBJECT
+                if has_color(phrase):
+                    best, yes = self._best_colored, YES_COLORED
+            ratios, reached = self._compared(heights[:, number : number + 1], places, best)
+            place = _strength(ratios, reached)[:, 0].argmax()
+            found.append(Evidence(float(ratios[place]), float(reached[place]), yes))
         return found
 
-    def classify(self, texts: Tensor, scores: Tensor) -> tuple[Presence, ...]:
+    @property
+    def tables(self) -> dict[str, Tensor]:
+        """What published pages need: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
+        return {"places": self._objects[0], "best_colored": self._best_colored}
+
+    def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:
+        """`Evidence.strength` of phrases ``[P, D]`` at places with distributions ``[V, K]``: ``[V, P]``."""
+        heights = self.scale.heights(self.language.codebook.clip, texts)
+        return np.asarray(_strength(*self._compared(heights, places, self.scale.best)).cpu().double().numpy())
+
+    def classify(self, phrases: Sequence[str], texts: Tensor, scores: Tensor) -> tuple[Presence, ...]:
         """Whether the scene holds each phrase; the arguments are those of `evidence`."""
-        return tuple(evidence.presence for evidence in self.evidence(texts, scores))
+        return tuple(evidence.presence for evidence in self.evidence(phrases, texts, scores))
+
+    @cached_property
+    def _objects(self) -> tuple[Tensor, tuple[str, ...]]:
+        """The segments that everyday words describe as wholes, as distributions ``[V, K]``, and those words."""
+        codes, words = self.segment_codes, everyday_words()
+        if codes is None:
+            return torch.zeros(0, self.language.codebook.num_codes), ()
+        texts = self._embed(words)
+        whole = whole_segments(
+            codes, lambda part: self.strengths(texts[part], codes.distributions), len(words)
+        )
+        # What no word describes is judged by its lowest segments.
+        places = np.unique(np.where(whole.places < 0, codes.numbers[0], whole.places))
+        named = whole.words[np.unique(whole.places[whole.places >= 0])]
+        return codes.distributions[torch.from_numpy(places)], tuple(
+            dict.fromkeys(words[word] for word in named)
+        )
+
+    @cached_property
+    def _best_colored(self) -> Tensor:
+        """The best height at each code ``[K]`` of everyday words and of the scene's objects in any color."""
+        phrases = [f"{color} {name}" for color in sorted(COLORS) for name in self._objects[1]]
+        if not phrases:
+            return self.scale.best
+        heights = self.scale.heights(self.language.codebook.clip, self._embed(phrases))
+        return torch.maximum(self.scale.best, heights.amax(1))
+
+    def _compared(self, heights: Tensor, places: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
+        """Ratios and heights of phrases at places ``[V, P]`` each, from their heights at the codes ``[K, P]``."""
+        places = places.to(heights)
+        reached = places @ heights
+        return reached / (places @ best).clamp_min(_LEAST)[:, None], reached / self.scale.peak
+
+    def _peak(self, scores: Tensor) -> Tensor:
+        """Mean distribution ``[K]`` over the codes of the Gaussians that score best."""
+        count = min(len(self._shown), max(_PEAK_COUNT, int(_PEAK_SHARE * len(self._shown))))
+        best = self._shown[scores.to(self._shown.device)[self._shown].topk(count).indices]
+        return self.language.select(best).code_probabilities().mean(0)
+
+
+def _strength(ratios: Tensor, heights: Tensor) -> Tensor:
+    return (ratios.clamp_min(0) * torch.minimum(ratios, heights).clamp_min(0)).sqrt()

@@ -59,6 +59,7 @@ class QueryConfig:
             words (`lexsplat.queries.everyday`), "feature" with `CANONICAL_PHRASES` (LERF and the paper).
         templates: Sentences with ``{}`` for the prompt; the embeddings of several are averaged.
         threshold: Fixed relevancy threshold of masks, in 0..1 (paper: 0.5).
+        fixed: Take it for every prompt (the paper) instead of deriving one from the scene.
     """
 
     temperature: float = 10.0
@@ -66,6 +67,7 @@ class QueryConfig:
     negatives: tuple[str, ...] = ()
     templates: tuple[str, ...] = NO_TEMPLATE
     threshold: float = 0.5
+    fixed: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.temperature < float("inf"):
@@ -156,6 +158,22 @@ def check_prompts(prompts: str | Sequence[str]) -> list[str]:
                 remedy='name something, such as "red apple"',
             )
     return cleaned
+
+
+def check_phrase(phrase: str) -> str:
+    """A phrase without surrounding space.
+
+    Raises:
+        QueryError: If it is empty or not a single text.
+    """
+    if not isinstance(phrase, str):
+        raise QueryError(
+            "phrase",
+            expected="one phrase as text",
+            found=repr(phrase)[:60],
+            remedy="ask several at once with scene.ask",
+        )
+    return check_prompts(phrase)[0]
 
 
 def embed_prompts(

@@ -26,7 +26,7 @@ from lexsplat.language.segments import Segments
 SEGMENT_THRESHOLD = 0.5
 """Smallest score of a Gaussian in a taken segment."""
 
-_LOWEST = 0.3
+_LOWEST = 0.6
 """A cut is above this share of the best segment's score."""
 _BORDER = 0.5
 _OWN_SHARE = 0.7

@@ -62,6 +62,7 @@ class Selection:
         phrase: What was asked for.
         world: Up and scale of the scene; None takes up from the cameras.
         parts: Its instances where they are known, such as objects that touch each other; () takes clusters.
+        names: Its likeliest names and their probabilities, if it is an object of `Scene.objects`.
     """
 
     gaussians: Gaussians
@@ -73,6 +74,7 @@ class Selection:
     phrase: str = ""
     world: World | None = None
     parts: tuple[Selection, ...] = ()
+    names: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.gaussians),)
@@ -241,17 +243,20 @@ class Selection:
             mask |= instance.mask
         return replace(self, mask=mask)
 
-    def convincing(self) -> Selection:
+    def convincing(self, scores: Tensor | None = None) -> Selection:
         """The instances whose peak is close to that of the best instance.
+
+        Args:
+            scores: What is compared ``[N]``; None takes the scores of the selection.
 
         For the prompt "apple", part of a duck may exceed the threshold that keeps the rim of the apple, but the duck
         peaks far below the apple. Two apples have similar peaks.
         """
         if len(self.instances) < 2:
             return self
+        compared = self.scores if scores is None else scores
         peaks = [
-            float(one.scores[one.mask].topk(min(_PEAK_COUNT, len(one))).values.mean())
-            for one in self.instances
+            float(compared[one.mask].topk(min(_PEAK_COUNT, len(one))).values.mean()) for one in self.instances
         ]
         limit = self.convincing_limit(max(peaks))
         mask = torch.zeros_like(self.mask)

@@ -17,11 +17,14 @@ _BUNDLED = """
     apple, rubber duck, mug, stack of books, vase, ring, traffic cone, potted plant, table lamp, banana, teddy bear,
     striped ball, bowl, candle, bottle, pumpkin, toy car, wooden crate, table, tablecloth, wall, floor
 """
+_COLORS = """
+    red, green, blue, yellow, orange, white, black, purple, pink, brown, gray, gold, silver
+"""
 _QUALITIES = """
-    red, green, blue, yellow, orange, white, black, purple, pink, brown, gray, grey, gold, golden, silver, copper,
-    wooden, metal, metallic, ceramic, glass, rubber, plastic, wax, paper, stone, brick, striped, checkered, plain,
-    painted, shiny, soft, fluffy, leafy, tiled, potted, burning, round, square, flat, big, small, large, little, tall,
-    open, closed, empty, full, broken, wet, dry, old, new, dark, bright, transparent, colorful, dirty, clean
+    grey, golden, copper, wooden, metal, metallic, ceramic, glass, rubber, plastic, wax, paper, stone, brick,
+    striped, checkered, plain, painted, shiny, soft, fluffy, leafy, tiled, potted, burning, round, square, flat,
+    big, small, large, little, tall, open, closed, empty, full, broken, wet, dry, old, new, dark, bright,
+    transparent, colorful, dirty, clean
 """
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
@@ -36,13 +39,28 @@ def words(text: str) -> list[str]:
 
 SURFACES = frozenset(words(_SURFACES))
 """Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
+STUFF = frozenset({"wall", "floor", "ceiling", "ground", "road", "sky", "water", "grass", "sand", "carpet"})
+"""Names of surfaces that are one, however the things in front of them divide what can be seen of them."""
 NAMES = frozenset(entry.split(" of ")[0].split()[-1] for entry in words(_EVERYDAY) + words(_BUNDLED)) - {
     "wood",
     "metal",
 }
 """The nouns of all everyday names."""
-QUALITIES = frozenset(words(_QUALITIES))
+COLORS = frozenset(words(_COLORS))
+"""Words of colors."""
+QUALITIES = frozenset(words(_QUALITIES)) | COLORS
 """Adjectives that may follow their noun: "is the mug red", "vase, white"."""
+
+
+def has_color(phrase: str) -> bool:
+    """Whether a phrase names a color."""
+    return not COLORS.isdisjoint(phrase.lower().split())
+
+
+def is_part(phrase: str) -> bool:
+    """Whether a phrase names a part of a thing: the everyday name of the thing, and then another word."""
+    *before, last = (word.removesuffix("s") for word in phrase.lower().split() or [""])
+    return last not in NAMES | QUALITIES and not NAMES.isdisjoint(before)
 
 
 def default_vocabulary(clip: str = "") -> list[str]:

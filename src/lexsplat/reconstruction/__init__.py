@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.reconstruction.forecasting import forecast
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
 from lexsplat.reconstruction.trainer import EVENT_EVERY, STAGE, Reconstructor
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.progress import NOTE, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
@@ -26,6 +28,12 @@ __all__ = [
     "check_gaussians",
     "reconstruct",
 ]
+
+
+log = logging.getLogger("lexsplat")
+
+_FORECAST_FROM = 500
+"""Iterations from which the time is forecast; the calibration takes as long as about thirty of them."""
 
 
 # Eight parameters: two inputs, and the options that every stage takes.
@@ -62,6 +70,10 @@ def reconstruct(
 
     check_gaussians(config, device, memory)
     points = initial_points(capture, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
+    if config.iterations >= _FORECAST_FROM:
+        seconds = round(forecast(capture, config, points, device=device, memory=memory))
+        length = f"{seconds // 60}:{seconds % 60:02} min"
+        log.log(NOTE, "reconstruct: about %s for %s iterations", length, f"{config.iterations:,}")
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)
     return trainer.gaussians()

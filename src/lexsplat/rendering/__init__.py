@@ -10,6 +10,7 @@ from lexsplat.rendering.back_projection import (
     BACK_PROJECTED_CHANNELS,
     accumulate_weights,
     back_project,
+    weigh_cells,
 )
 from lexsplat.rendering.compositing import prepare, render
 from lexsplat.rendering.results import PreparedView, Projection, Rendering
@@ -23,4 +24,5 @@ __all__ = [
     "back_project",
     "prepare",
     "render",
+    "weigh_cells",
 ]

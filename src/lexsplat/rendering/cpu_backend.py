@@ -12,13 +12,13 @@ from torch.autograd.function import once_differentiable
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering.cell_weights import weigh_cells
 from lexsplat.rendering.kernels import blending, gradients, projection, spherical_harmonics
 from lexsplat.rendering.kernels.jit import parallel
-from lexsplat.rendering.pairs import GRAIN, TilePairs, find_pairs
+from lexsplat.rendering.pairs import GRAIN, TILE_GRAIN, TilePairs, find_pairs
 from lexsplat.rendering.results import Projection
 
-TILE_GRAIN = 8
-"""Tiles per work item of a thread."""
+__all__ = ["blend", "find_tiles", "project", "shade", "weigh_cells"]
 
 
 def camera_vector(camera: Camera, near: float) -> NDArray[np.float64]:
@@ -113,34 +113,37 @@ class _Blend(torch.autograd.Function):
         colors, features, background = tensors[3:]
         image = torch.empty(pairs.height, pairs.width, _channels(colors) + _channels(features))
         alpha = torch.empty(pairs.height, pairs.width)
-        behind = np.zeros(0, np.float32) if background is None else _array(background)
         values = _gather(pairs, colors, features)
+        kept = pairs.tiles * blending.PIXELS if any(ctx.needs_input_grad) else 0
+        ctx.passed, ctx.last_pairs = np.empty(kept, np.float32), np.empty(kept, np.float32)
         parallel(
             blending.blend, pairs.tiles, TILE_GRAIN,
-            pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members, values, behind, pairs.tiles_x,
-            _array(image), _array(alpha),
+            pairs.ellipses, pairs.tile_offsets, pairs.members, pairs.rows, values, _behind(background),
+            pairs.tiles_x, _array(image), _array(alpha), ctx.passed, ctx.last_pairs,
         )  # fmt: skip
-        ctx.pairs, ctx.has_colors, ctx.has_features = pairs, colors is not None, features is not None
+        ctx.pairs = pairs
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(image, alpha, colors, features)
+        ctx.save_for_backward(alpha, colors, features, background)
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Any) -> tuple[Any, ...]:
         grad_image, grad_alpha = grads
-        image, alpha, colors, features = ctx.saved_tensors
+        alpha, colors, features, background = ctx.saved_tensors
         pairs: TilePairs = ctx.pairs
         visible, color_channels = len(pairs.order), _channels(colors)
+        channels = color_channels + _channels(features)
         geometry = any(ctx.needs_input_grad[:3])
-        grad_image = _zeros(*image.shape) if grad_image is None else grad_image
+        grad_image = _zeros(*alpha.shape, channels) if grad_image is None else grad_image
         grad_alpha = _zeros(*alpha.shape) if grad_alpha is None else grad_alpha
         values = _gather(pairs, colors, features)
-        rows = np.empty(len(pairs.members) * gradients.row_width(image.shape[2]), np.float32)
+        rows = np.empty(len(pairs.members) * gradients.row_width(channels), np.float32)
         parallel(
             gradients.blend_backward, pairs.tiles, TILE_GRAIN,
-            pairs.ellipses, pairs.boxes, pairs.tile_offsets, pairs.members, pairs.pairs, values, pairs.tiles_x,
-            color_channels, geometry, *[_array(t) for t in (image, alpha, grad_image, grad_alpha)], rows,
+            pairs.ellipses, pairs.tile_offsets, pairs.members, pairs.pairs, pairs.rows, values,
+            _behind(background), pairs.tiles_x, color_channels, geometry, ctx.passed, ctx.last_pairs,
+            _array(grad_image), _array(grad_alpha), rows,
         )  # fmt: skip
         count = pairs.count if geometry else 0
         shapes = (
@@ -156,14 +159,18 @@ class _Blend(torch.autograd.Function):
             pairs.order, pairs.ellipses, pairs.pair_offsets, rows, geometry, color_channels,
             *[_array(t) for t in outputs],
         )  # fmt: skip
-        background = None
+        grad_background = None
         if ctx.needs_input_grad[5]:
             # NumPy sums on one thread: torch's order of addition depends on the number of threads.
             factors = _array(grad_image[..., :color_channels]), _array(1 - alpha)
             total = np.einsum("hwc,hw->c", *factors, dtype=np.float64)
-            background = torch.from_numpy(total.astype(np.float32))
+            grad_background = torch.from_numpy(total.astype(np.float32))
         wanted = [g if ctx.needs_input_grad[i] else None for i, g in enumerate(outputs)]
-        return (*wanted, background, None)
+        return (*wanted, grad_background, None)
+
+
+def _behind(background: Tensor | None) -> NDArray[np.float32]:
+    return np.zeros(0, np.float32) if background is None else _array(background)
 
 
 def _channels(values: Tensor | None) -> int:

@@ -15,6 +15,8 @@ STRIPS = 16
 """Number of parts in which Gaussians are counted and listed."""
 GRAIN = 2048
 """Gaussians per work item of a thread."""
+TILE_GRAIN = 8
+"""Tiles per work item of a thread."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +29,11 @@ class TilePairs:
         count: Number of all Gaussians N.
         order: Index of each visible Gaussian, nearest first ``[V]``.
         ellipses: Center, half conic and opacity in that order ``[V, 8]``.
-        boxes: Tile columns and pixel rows ``[V, 4]``, half open.
         pair_offsets: First pair of each Gaussian in the list by Gaussian ``[V + 1]``.
         tile_offsets: First pair of each tile in the list by tile ``[T + 1]``.
         members: Position in ``order`` of each pair, by tile and depth ``[M]``.
         pairs: Place of each pair in the list by Gaussian ``[M]``.
+        rows: First row of the tile that the Gaussian reaches, and one past the last ``[M, 2]``.
     """
 
     width: int
@@ -39,11 +41,11 @@ class TilePairs:
     count: int
     order: NDArray[np.int32]
     ellipses: NDArray[np.float32]
-    boxes: NDArray[np.int32]
     pair_offsets: NDArray[np.int64]
     tile_offsets: NDArray[np.int64]
     members: NDArray[np.int32]
     pairs: NDArray[np.int32]
+    rows: NDArray[np.uint8]
 
     @property
     def tiles_x(self) -> int:
@@ -85,15 +87,26 @@ def find_pairs(projection: Projection, width: int, height: int) -> TilePairs:
         binning.find_boxes, visible, GRAIN,
         order, means2d, conics, opacities, extents, width, height, ellipses, boxes, counts,
     )  # fmt: skip
-    pair_offsets = np.zeros(visible + 1, np.int64)
-    np.cumsum(counts, out=pair_offsets[1:])
+    column_offsets = _offsets(counts)
+    spans = np.empty((int(column_offsets[-1]), 2), np.int32)
+    parallel(binning.find_spans, visible, GRAIN, ellipses, boxes, column_offsets, spans, counts)
+    pair_offsets = _offsets(counts)
     total = int(pair_offsets[-1])
-    members, pairs = np.empty(total, np.int32), np.empty(total, np.int32)
+    members, pairs, rows = (
+        np.empty(total, np.int32),
+        np.empty(total, np.int32),
+        np.empty((total, 2), np.uint8),
+    )
     tiles_x, tiles_y = -(-width // binning.TILE), -(-height // binning.TILE)
     histogram = np.zeros((STRIPS, tiles_x * tiles_y), np.int64)
     tile_offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
-    lists = boxes, tiles_x, histogram, pair_offsets, members, pairs
+    lists = boxes, column_offsets, spans, tiles_x, histogram, pair_offsets, members, pairs, rows
     parallel(binning.list_pairs, STRIPS, 1, True, *lists)
     binning.offsets_of(histogram, tile_offsets)
     parallel(binning.list_pairs, STRIPS, 1, False, *lists)
-    return TilePairs(width, height, count, order, ellipses, boxes, pair_offsets, tile_offsets, members, pairs)
+    return TilePairs(width, height, count, order, ellipses, pair_offsets, tile_offsets, members, pairs, rows)
+
+
+def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sums of all counts before each one, and of all."""
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])

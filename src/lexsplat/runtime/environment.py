@@ -22,8 +22,13 @@ def machine_facts() -> dict[str, Any]:
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
         "gpu": gpu,
-        "versions": {"lexsplat": version("lexsplat"), **versions()},
+        "versions": {"lexsplat": version_of_lexsplat(), **versions()},
     }
+
+
+def version_of_lexsplat() -> str:
+    """Version of the installed package."""
+    return version("lexsplat")
 
 
 def versions() -> dict[str, str]:
@@ -35,6 +40,16 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def user_cache() -> Path:
+    """The user's folder for what can be made again: ``$XDG_CACHE_HOME/lexsplat``, by default ``~/.cache/lexsplat``.
+
+    Raises:
+        RuntimeError: If the user has no home directory.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
+    return Path(home).expanduser() / "lexsplat"
 
 
 @functools.cache

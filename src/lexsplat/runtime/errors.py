@@ -59,6 +59,10 @@ class SceneFolderError(LexsplatError):
     """A scene folder is missing, unfinished or of another version."""
 
 
+class LibraryError(LexsplatError):
+    """A library of scenes is missing, damaged or in use, or its index server cannot answer."""
+
+
 class ModelError(LexsplatError):
     """An encoder cannot be found or loaded."""
 
@@ -77,3 +81,7 @@ class QueryError(LexsplatError):
 
 class TrainingError(LexsplatError):
     """A training diverged or has nothing to optimize."""
+
+
+class WorkersError(LexsplatError):
+    """A cluster cannot be used, has disappeared, or lost a task for good."""

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from threading import get_ident
 from typing import Any
@@ -52,6 +52,33 @@ def remove_left_overs(root: Path) -> None:
         match = _TEMPORARY.fullmatch(path.name)
         if match and not _is_running(int(match[1])):
             path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(root: Path, refusal: Callable[[str], Exception]) -> Iterator[None]:
+    """Lock a folder for one writer, and remove what killed ones left; the lock ends with the process.
+
+    Args:
+        root: The folder; created if missing.
+        refusal: The error where another process holds the lock, from the number of that process.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows has no flock: two writers there are not detected
+        yield
+        return
+    root.mkdir(parents=True, exist_ok=True)
+    with open(root / ".lock", "a+", encoding="ascii") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.seek(0)
+            raise refusal(file.read(20).strip() or "another process") from error
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        remove_left_overs(root)
+        yield
 
 
 def _is_running(process: int) -> bool:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 NOTE = 25
 """Level of log records that every user of the command line sees and that are no warnings: licenses, estimates."""
@@ -31,6 +34,33 @@ class Event:
 
 Listener = Callable[[Event], None]
 """Receives events. It must return quickly and never raise."""
+
+
+class Pace:
+    """Rates and times left of stages, from their events."""
+
+    def __init__(self) -> None:
+        self._starts: dict[str, tuple[float, int]] = {}  # time and units done at the first event of a stage
+
+    def rate(self, event: Event) -> float:
+        """Units a second since the first event of the stage; 0 at that event."""
+        now = time.monotonic()
+        started, done_before = self._starts.setdefault(event.stage, (now, event.done))
+        return (event.done - done_before) / (now - started) if now > started else 0.0
+
+    def record(self, event: Event) -> dict[str, Any]:
+        """The event as JSON data, with the rate and the seconds left; null where they are unknown."""
+        rate = self.rate(event)
+        left = (event.total - event.done) / rate if rate else None
+        numbers = {name: value if math.isfinite(value) else None for name, value in event.metrics.items()}
+        return {
+            "stage": event.stage,
+            "done": event.done,
+            "total": event.total,
+            "per_second": round(rate, 6) if rate else None,
+            "seconds_left": None if left is None else round(left, 3),
+            "metrics": numbers,
+        }
 
 
 def silent(event: Event) -> None:

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
-from lexsplat.geometry.world import world_of
-from lexsplat.language.methods import METHODS
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.visibility import without_hidden
+from lexsplat.queries.vocabulary import STUFF
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.progress import Event
 from lexsplat.runtime.sampling import evenly
-from lexsplat.scenes.folder import SceneFolder
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -37,13 +36,15 @@ class Word:
     """What a scene keeps of a prompt.
 
     Args:
-        scores: Relevancy of every Gaussian ``[N]`` in 0..1.
+        scores: Relevancy of every Gaussian ``[N]`` in 0..1, in the form of the query.
+        own: The same for each Gaussian by itself ``[N]``.
         presence: Whether the scene holds it.
         threshold: The automatic threshold; None until it is asked for.
         selection: The selection of that threshold; None until it is asked for.
     """
 
     scores: Tensor
+    own: Tensor
     presence: Presence
     threshold: float | None = None
     selection: Selection | None = None
@@ -95,6 +96,10 @@ class Answers:
         word.selection = word.selection or self._selection(index)
         return word.selection
 
+    def chosen(self, index: int) -> Tensor:
+        """The Gaussians ``[N]`` bool that reach the threshold of a prompt and can be seen."""
+        return (self.scores[index] >= self.thresholds[index]) & ~self.scene.hidden
+
     def _selection(self, index: int) -> Selection:
         scores = self.words[index].scores if self.words else self.scores[index]
         threshold = float(self.thresholds[index])
@@ -107,8 +112,14 @@ class Answers:
             self.presences[index],
             self.prompts[index],
             self.scene.world,
-        ).without_specks()
-        return selection.convincing() if self.automatic else selection
+        )
+        if self.prompts[index].lower().split()[-1] in STUFF:
+            seen = replace(selection, mask=self.chosen(index))
+            return replace(seen, parts=(seen,)) if seen else seen
+        selection = selection.without_specks()
+        if self.automatic:
+            selection = selection.convincing(self.words[index].own if self.words else None)
+        return without_hidden(selection, self.scene.hidden)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""
@@ -139,7 +150,7 @@ def answer_queries(
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
     """
-    names = [scene.view(name).name for name in views] or _default_views(scene)
+    names = [scene.view(name).name for name in views] or default_views(scene)
     found = scene.ask(prompts, threshold)
     thresholds = found.thresholds.tolist()
     answers: list[dict[str, Any]] = [
@@ -154,13 +165,15 @@ def answer_queries(
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
     ]
-    for name in names:
+    for done, name in enumerate(names):
+        scene.listener(Event("views", done, len(names)))
         image = _to_uint8(scene.render(name).image)
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(folder, answer["prompt"], name, image, values, limit)
             if values.max() > answer["peak"]:
                 answer["peak"], answer["peak_view"] = float(values.max()), name
+    scene.listener(Event("views", len(names), len(names)))
     return {
         "scene": str(scene.folder.root) if scene.folder else None,
         "form": form_used(scene.field, scene.query),
@@ -218,7 +231,8 @@ def find_phrase(
     return {**found, "phrase": phrase, "understood": str(understood.phrase), "note": understood.note}
 
 
-def _default_views(scene: Scene) -> list[str]:
+def default_views(scene: Scene) -> list[str]:
+    """The held-out views that a query without views answers in, at most `MAX_DEFAULT_VIEWS`."""
     held_out = [name for name, view in scene.views.items() if view.split == "test"]
     return evenly(held_out or list(scene.views), MAX_DEFAULT_VIEWS)
 
@@ -235,6 +249,8 @@ def _write_images(
     }
     if folder is None:
         return answer
+    from PIL import Image
+
     stem = folder / file_name(prompt) / Path(name).with_suffix("")
     heatmap_path = stem.with_name(stem.name + ".png")
     mask_path = stem.with_name(stem.name + ".mask.png")
@@ -254,38 +270,3 @@ def file_name(prompt: str) -> str:
 
 def _to_uint8(image: torch.Tensor) -> np.ndarray:
     return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-
-
-def scene_facts(folder: SceneFolder) -> dict[str, Any]:
-    """The document of ``lexsplat info --json``: facts about a scene folder."""
-    record = folder.record
-    views = folder.read_cameras()
-    splits = [view.split for view in views.values()]
-    sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
-    config = record.get("config", {})
-    stages = record["stages"]
-    language = stages.get("language", {})
-    codes = language if "codes" in language else stages.get("codebook", {})  # the stage that found them
-    method = METHODS.get(language.get("method"))  # None for methods of earlier versions
-    facts: dict[str, Any] = {
-        "scene": str(folder.root),
-        "capture": record.get("capture"),
-        "views": {"training": splits.count("train"), "held out": splits.count("test")},
-        "size": ", ".join(sizes),
-        **world_of(record, {name: view.camera for name, view in views.items()}).to_json(),
-        "finished": ", ".join(stages) or "nothing yet",
-        "seconds": folder.stage_seconds(),
-        "gaussians": stages.get("reconstruct", {}).get("gaussians"),
-        "codes": codes.get("codes"),
-        "codes_used": codes.get("codes_used"),
-        "segments": language.get("segments"),
-        "method": language.get("method"),
-        "clip": config.get("clip"),
-        "dino": config.get("dino") if method is None or method.uses_dino else "not used",
-        "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
-        "language_bytes": folder.bytes_on_disk(folder.language_path),
-        "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
-        "warnings": len(record.get("warnings", [])),
-        "lexsplat": record.get("provenance", {}).get("lexsplat"),
-    }
-    return facts

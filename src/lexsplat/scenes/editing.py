@@ -26,6 +26,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.visibility import whole_things
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.folder import SceneFolder
@@ -306,7 +307,8 @@ class Editor:
                 found="nothing",
                 remedy="try other words or a lower threshold",
             )
-        step = Step(kind, chosen.mask.clone().cpu(), values, chosen.phrase)
+        whole = whole_things(chosen, self.scene.hidden, self.scene.field.segments)
+        step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
         self._advance(step)
         self.undone.clear()
         self._write(step.to_json())
@@ -380,3 +382,10 @@ class Editor:
                 found="edits of another one",
                 remedy="the scene was built again: discard the edits",
             )
+
+
+def journal_of(scene: Scene) -> Path:
+    """File of the steps of an edit; the bundled scene is never written to."""
+    if scene.folder is None or scene.folder.is_bundled:
+        return Path("demo_edits.jsonl")
+    return scene.folder.root / "edits.jsonl"

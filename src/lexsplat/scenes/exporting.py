@@ -11,6 +11,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.visibility import whole_things
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, write_json
 from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
@@ -23,12 +24,14 @@ from lexsplat.scenes.formats.language import (
     write_codebook,
 )
 from lexsplat.scenes.formats.ply import write_ply
+from lexsplat.scenes.formats.sog_writing import write_sog
 from lexsplat.scenes.formats.splat import write_splat
+from lexsplat.scenes.formats.spz import write_spz
 from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
 from lexsplat.scenes.scene import Scene
 
-SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".glb")
-"""Formats of Gaussians or their points."""
+SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".v3.spz", ".spz", ".sog", ".glb")
+"""Formats of Gaussians or their points; the first that fits is taken."""
 LABEL_ENDINGS = (".csv", ".json")
 """Formats of labels."""
 
@@ -62,7 +65,7 @@ def export_gaussians(
 
     Args:
         gaussians: The Gaussians.
-        path: ``.ply``, ``.points.ply``, ``.compressed.ply``, ``.splat``, ``.spz``, ``.ksplat`` or ``.glb``.
+        path: A name with one of `SPLAT_ENDINGS`; ``.spz`` is version 4.
         language: Codes to include, in ``.ply`` (the codebook goes into a file beside it) and ``.glb``.
         world: Up and scale of the scene, for ``.glb``: it has y up, and meters if the scale is known. The other
             formats keep the scene's axes and units, so that they match its cameras.
@@ -88,6 +91,9 @@ def export_gaussians(
         ".ply": lambda file: write_ply(gaussians, file, further=ply_columns(language) if language else None),
         ".points.ply": lambda file: write_points_ply(gaussians, file),
         ".splat": lambda file: write_splat(gaussians, file),
+        ".spz": lambda file: write_spz(gaussians, file),
+        ".v3.spz": lambda file: write_spz(gaussians, file, version=3),
+        ".sog": lambda file: write_sog(gaussians, file),
         ".glb": lambda file: write_glb(gaussians, file, language=language, world=world),
     }
     writers |= {
@@ -150,7 +156,9 @@ def export_scene(
     stored = stored_language(scene.field, scene.encoder_identity()) if language else None
     gaussians = scene.gaussians
     if found:
-        mask = torch.stack([selection.mask for selection in found]).any(0)
+        segments = scene.field.segments
+        things = [whole_things(selection, scene.hidden, segments) for selection in found]
+        mask = torch.stack([thing.mask for thing in things]).any(0)
         if not mask.any():
             raise QueryError(
                 ", ".join(selection.phrase for selection in found),

@@ -12,10 +12,9 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
-from lexsplat.queries.relations import same
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import corrected
-from lexsplat.queries.vocabulary import QUALITIES, SURFACES, default_vocabulary
+from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -76,32 +75,6 @@ def find_in(
     if found.present == "no" and threshold is None:
         return replace(found, mask=torch.zeros_like(found.mask), parts=())
     return found
-
-
-def named_objects(scene: Scene) -> tuple[Selection, ...]:
-    """The instances of all everyday words in a scene, each with its name in ``phrase``.
-
-    Of several names for one place, the one that scores highest there is kept. The vocabulary is that of
-    `lexsplat.queries.vocabulary`: what it has no word for is not found.
-    """
-    answers = scene.ask(default_vocabulary(scene.clip))
-    found = [
-        instance
-        for number, presence in enumerate(answers.presences)
-        if presence != "no"
-        for instance in answers.selection(number).instances
-    ]
-    kept: list[Selection] = []
-    for instance in sorted(found, key=lambda each: -each.score):
-        if not any(same(instance, other) or _is_part(instance, other) for other in kept):
-            kept.append(instance)
-    return tuple(kept)
-
-
-def _is_part(instance: Selection, other: Selection) -> bool:
-    """Whether another name has most of it: a part of a thing is no object; a coin on a table is one."""
-    shared = int((instance.mask & other.mask).sum())
-    return other.phrase not in SURFACES and shared > 0.5 * len(instance)
 
 
 def middle_camera(scene: Scene) -> Camera | None:

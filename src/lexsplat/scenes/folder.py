@@ -18,21 +18,19 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
-import os
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from lexsplat.captures.images.undistortion import MAX_SIDE
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE, checked_name
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
-from lexsplat.runtime.files import atomic_path, read_json, remove_left_overs, to_json, write_json
+from lexsplat.runtime.files import atomic_path, locked, read_json, to_json, write_json
 from lexsplat.scenes.records import FORMAT_VERSION, read_record
 
 SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
@@ -221,28 +219,16 @@ class SceneFolder:
         Raises:
             SceneFolderError: If another process holds the lock.
         """
-        try:
-            import fcntl
-        except ImportError:  # Windows has no flock: two builds there are not detected
-            yield
-            return
-        self.root.mkdir(parents=True, exist_ok=True)
-        with open(self.root / ".lock", "a+", encoding="ascii") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                file.seek(0)
-                holder = file.read(20).strip() or "another process"
-                raise SceneFolderError(
-                    self.root,
-                    expected="a folder that no other process builds in",
-                    found=f"process {holder} at work",
-                    remedy="wait for it or give another --output",
-                ) from error
-            file.truncate(0)
-            file.write(str(os.getpid()))
-            file.flush()
-            remove_left_overs(self.root)
+
+        def refusal(holder: str) -> SceneFolderError:
+            return SceneFolderError(
+                self.root,
+                expected="a folder that no other process builds in",
+                found=f"process {holder} at work",
+                remedy="wait for it or give another --output",
+            )
+
+        with locked(self.root, refusal):
             yield
 
     def withdraw(self) -> None:
@@ -311,6 +297,8 @@ class SceneFolder:
 
     def write_code_map(self, name: str, codes: np.ndarray) -> None:
         """Write one code index map, uint8 ``[h, w]``, as PNG."""
+        from PIL import Image
+
         with atomic_path(self.code_map_path(name)) as temporary:
             Image.fromarray(np.ascontiguousarray(codes, dtype=np.uint8)).save(temporary, format="PNG")
 
@@ -320,6 +308,8 @@ class SceneFolder:
         Raises:
             FileFormatError: If it is missing, damaged or not an 8-bit gray PNG.
         """
+        from PIL import Image
+
         path = self.code_map_path(name)
         try:
             content = path.read_bytes()

@@ -8,6 +8,7 @@ from typing import Any
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField, field_from_tensors
+from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import read_tensors
 from lexsplat.scenes.folder import SceneFolder, StoredView
@@ -25,6 +26,13 @@ class SceneContent:
     views: dict[str, StoredView]
     gaussians: Gaussians
     field: LanguageField
+
+    @property
+    def query(self) -> QueryConfig:
+        """How it is asked unless the user says otherwise: as in the paper if it was built so."""
+        if self.folder.record.get("config", {}).get("as_in_paper"):
+            return QueryConfig(form="feature", fixed=True)
+        return QueryConfig()
 
 
 def read_scene(path: Path, device: str) -> SceneContent:

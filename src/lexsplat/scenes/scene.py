@@ -10,12 +10,13 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from lexsplat.features.text import TextCache, TextTower, encode_each, load_text
+from lexsplat.features.text import TextCache, TextTower, encode_each, load_text, texts_of_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
@@ -28,6 +29,7 @@ from lexsplat.queries.relevancy import (
     QueryConfig,
     Question,
     TextEncoder,
+    check_phrase,
     check_prompts,
     embed_prompts,
     gaussian_relevancy,
@@ -36,13 +38,16 @@ from lexsplat.queries.relevancy import (
 from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
+from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
+from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, Word
-from lexsplat.scenes.finding import find_in, named_objects, understood_in
+from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 
 _KEPT_BYTES = 128 << 20
@@ -81,12 +86,15 @@ class Scene:
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.folder = clip, folder
+        self.listener: Listener = silent  # hears of long work: stages "words" and "views"
         self._working = threading.RLock()
         """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
         self._given_encode_text = encode_text
         self._encoder: TextTower | None = None
         self._cache: TextCache | None = None
+        if folder is not None:
+            self._cache = texts_of_scene(folder.root / "checkpoints" / "texts", shipped=folder.is_bundled)
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
 
@@ -105,7 +113,7 @@ class Scene:
         self._classifier: PresenceClassifier | None = None
         self._scale: EverydayScale | None = None
         self._objects: tuple[Selection, ...] | None = None
-        kept = max(32, min(1024, _KEPT_BYTES // (5 * max(1, len(self.gaussians)))))
+        kept = max(32, min(1024, _KEPT_BYTES // (9 * max(1, len(self.gaussians)))))
         self._words: Bounded[str, Word] = Bounded(kept)
         self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
         self._understood: Bounded[str, Understood] = Bounded(_KEPT_TEXTS)
@@ -116,6 +124,7 @@ class Scene:
             gaussians, field, self.views, self.clip, self.query, self.folder, self._given_encode_text
         )
         other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
+        other.listener = self.listener
         return other
 
     # -- text
@@ -139,7 +148,7 @@ class Scene:
     def encode_text(self, texts: list[str]) -> Tensor:
         """Embeddings ``[T, D]`` of whole sentences, from the encoder that belongs to the language.
 
-        The scene folder caches them, so that a known prompt needs no model.
+        The scene folder and the user's cache keep them, so that a known prompt needs no model.
 
         Raises:
             ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
@@ -147,12 +156,9 @@ class Scene:
         if self._given_encode_text is not None:
             return self._given_encode_text(texts)
         known = self._encoder_hash
-        if self.folder is None or known is None:
-            return encode_each(self.preload(), texts)
-        if self._cache is None:
-            writable = not self.folder.is_bundled and os.access(self.folder.root, os.W_OK)
-            self._cache = TextCache(self.folder.root / "checkpoints" / "texts", writable=writable)
-        return self._cache.encode(known, texts, self.preload)
+        if self._cache is None or known is None:
+            return encode_each(self.preload(), texts, self.listener)
+        return self._cache.encode(known, texts, self.preload, self.listener)
 
     def encoder_identity(self) -> dict[str, str]:
         """Name and content hash (if known) of the text encoder, for files of other programs."""
@@ -258,7 +264,7 @@ class Scene:
         Raises:
             QueryError: If the phrase is empty or not a single text, or the threshold is not in 0..1.
         """
-        return self.ask(_one_phrase(phrase), threshold).selection(0)
+        return self.ask(check_phrase(phrase), threshold).selection(0)
 
     def find(
         self,
@@ -293,15 +299,15 @@ class Scene:
         Raises:
             QueryError: If a part of the phrase is empty.
         """
-        text = _one_phrase(phrase)
+        text = check_phrase(phrase)
         return self._understood.get_or_make(text, lambda: understood_in(self, text))
 
     @property
     def objects(self) -> tuple[Selection, ...]:
-        """The things of the everyday vocabulary that the scene holds, each with its name in ``phrase``."""
+        """Its objects with everyday names (`lexsplat.scenes.objects.objects_of`), the largest first."""
         if self._objects is None:
             with self._working:
-                self._objects = self._objects or named_objects(self)
+                self._objects = self._objects or objects_of(self)
         return self._objects
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
@@ -322,17 +328,27 @@ class Scene:
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale, self.embed)
         return self._classifier
+
+    @cached_property
+    def hidden(self) -> Tensor:
+        """Gaussians ``[N]`` bool that the views hardly show, as far as a scene with segments knows."""
+        if (segments := self.field.segments) is None:
+            return torch.zeros_like(self.gaussians.opacities, dtype=torch.bool)
+        seen_by = [view.camera for view in self.views.values() if view.split == "train"]
+        return hidden_gaussians(self.gaussians, seen_by, segments.masses)
 
     def _new_words(self, prompts: list[str]) -> list[Word]:
         """Scores and presence of prompts that were not asked before."""
         question = self.question(prompts)
         scores = gaussian_relevancy(self.field, question)
-        presences = self.presence_classifier.classify(question.positives, scores)
-        scores = scores_in_form(self.field, self.query, scores, presences)
+        presences = self.presence_classifier.classify(prompts, question.positives, scores)
+        formed = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
-        return [Word(row.clone(), presence) for row, presence in zip(scores, presences)]
+        return [
+            Word(row.clone(), own.clone(), presence) for row, own, presence in zip(formed, scores, presences)
+        ]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
         """The automatic thresholds of words, from one rendering of the training views.
@@ -340,8 +356,8 @@ class Scene:
         Relative to everyday words and by segments, a score of 0.5 is the border itself.
         """
         question = self.question(list(words))
-        if question.scale is not None or form_used(self.field, self.query) == "segment":
-            found = [BORDER] * len(words)
+        if self.query.fixed or question.scale is not None or form_used(self.field, self.query) == "segment":
+            found = [self.query.threshold if self.query.fixed else BORDER] * len(words)
         else:
             views = list(self.views.values())
             training = [view.camera for view in views if view.split == "train"]
@@ -410,22 +426,6 @@ class Scene:
         return matches[0]
 
 
-def _one_phrase(phrase: str) -> str:
-    """A phrase without surrounding space.
-
-    Raises:
-        QueryError: If it is empty or not a single text.
-    """
-    if not isinstance(phrase, str):
-        raise QueryError(
-            "phrase",
-            expected="one phrase as text",
-            found=repr(phrase)[:60],
-            remedy="ask several at once with scene.ask",
-        )
-    return check_prompts(phrase)[0]
-
-
 def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> Scene:
     """Open a scene folder for queries.
 
@@ -447,4 +447,4 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         )
     found = read_scene(Path(path), place)
     clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
-    return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder)
+    return Scene(found.gaussians, found.field, found.views, clip, found.query, found.folder)

@@ -1,151 +1,119 @@
-"""Access control in front of viser's server: only the viewer's own page may talk to it.
+"""Access control in front of the viewer: only the viewer's own page may talk to it.
 
-viser serves its page and its websocket on one port and does not authenticate anyone. Browsers do not apply the
-same-origin policy to websockets, so any web page open in the same browser could connect, or reach the server under a
-name of its own that resolves to 127.0.0.1 (DNS rebinding). Therefore:
+A foreign web page in the same browser can send requests to 127.0.0.1, and can reach the server under its own name if
+that resolves to 127.0.0.1 (DNS rebinding). Therefore:
 
 - ``Host`` must be an IP address (an address cannot be rebound), ``localhost``, or an allowed name;
-- a websocket needs an ``Origin`` header equal to ``Host``;
-- only viser's page is served, with headers that forbid framing and foreign content;
-- messages are limited in size;
-- viser's handlers for public tunnels and file uploads are removed, and updates of a control may only set its value.
+- a request that is not GET or HEAD needs an ``Origin`` equal to ``Host``; a foreign one is refused in any request;
+- on other addresses than loopback, a token of the printed address is required, and kept in a cookie;
+- bodies are limited in size, and responses forbid framing and foreign content.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
-import threading
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+import secrets
+from collections.abc import Iterable, Sequence
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
 
-if TYPE_CHECKING:
-    import viser
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse, RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-MAX_MESSAGE_BYTES = 24 << 20
-"""Size limit of a message. The largest are images that the page renders for us."""
-
-_PATHS = ("/", "/index.html")
-"""viser's page is a single file."""
+MAX_BODY_BYTES = 64 << 10
+"""Size limit of what a page sends: a prompt and a camera."""
+COOKIE = "lexsplat"
 
 _HEADERS = {
     "X-Frame-Options": "DENY",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": (
-        "default-src 'self' blob: data:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; "
-        "style-src 'self' 'unsafe-inline'; connect-src 'self' ws: wss: blob: data:; frame-ancestors 'none'"
-    ),
+    "Content-Security-Policy": "frame-ancestors 'none'",  # the page itself has the rest
+    "Cache-Control": "no-store",
 }
 
-_PATCHING = threading.Lock()
 
-
-class RequestGuard:
-    """Decides which requests reach viser.
+class Guard:
+    """Refuses requests before the application sees them (ASGI).
 
     Args:
+        app: The application.
         names: Allowed host names besides addresses and ``localhost``.
-        max_message_bytes: Size limit of a websocket message.
+        token: What a visitor has to know; "" admits everyone.
     """
 
-    def __init__(self, names: Iterable[str] = (), max_message_bytes: int = MAX_MESSAGE_BYTES) -> None:
+    def __init__(self, app: ASGIApp, names: Iterable[str] = (), token: str = "") -> None:
+        self.app, self.token = app, token
         self.names = {name.lower().rstrip(".") for name in names} | {"localhost"}
-        self.max_message_bytes = max_message_bytes
-        self.in_place = False
-        """Whether a websocket server has started inside `wrap_server`."""
 
-    def refusal(self, hosts: Sequence[str], origins: Sequence[str], websocket: bool) -> str | None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it."""
+        if scope["type"] != "http":  # no websockets; uvicorn closes what is not accepted
+            return
+
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+            await send(message)
+
+        headers = Headers(scope=scope)
+        reason = self.refusal(headers.getlist("host"), headers.getlist("origin"), scope["method"])
+        if reason is not None:
+            await PlainTextResponse(f"{reason}\n", 403)(scope, receive, guarded)
+        elif self.token and self._is_token(
+            parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
+        ):
+            response = RedirectResponse("/", 303)
+            response.set_cookie(COOKIE, self.token, httponly=True, samesite="lax")
+            await response(scope, receive, guarded)
+        elif self.token and not self._is_token(_cookies(headers)):
+            text = "open the address that lexsplat view has printed, with its token\n"
+            await PlainTextResponse(text, 403)(scope, receive, guarded)
+        elif (size := body_size(headers)) is None or size > MAX_BODY_BYTES:
+            await PlainTextResponse(f"at most {MAX_BODY_BYTES} bytes\n", 413)(scope, receive, guarded)
+        else:
+            await self.app(scope, receive, guarded)
+
+    def refusal(self, hosts: Sequence[str], origins: Sequence[str], method: str) -> str | None:
         """The reason to refuse a request, or None to let it pass.
 
         Args:
             hosts: All ``Host`` headers.
             origins: All ``Origin`` headers.
-            websocket: Whether the request opens a websocket.
+            method: Such as "GET".
         """
         if len(hosts) != 1:
             return "exactly one Host header is required"
         host = host_name(hosts[0])
         if host is None or not (host in self.names or is_address(host)):
             return "this host name is not served here"
-        if websocket and len(origins) != 1:
+        if len(origins) > 1 or (method not in ("GET", "HEAD") and not origins):
             return "only the viewer's own page may connect"
         if origins and origin_host(origins[0]) != hosts[0].lower():
             return "only the viewer's own page may connect"
         return None
 
-    @contextlib.contextmanager
-    def wrap_server(self) -> Iterator[None]:
-        """Guard every websocket server that starts inside this context.
-
-        viser has no hook for requests, so `websockets.asyncio.server.serve` is replaced while viser starts.
-        """
-        import websockets.asyncio.server as module
-
-        original = module.serve
-
-        def serve(*arguments: Any, **options: Any) -> Any:
-            self.in_place = True
-            return original(*arguments, **self._guarded(options))
-
-        with _PATCHING:
-            module.serve = serve  # type: ignore[assignment,misc]
-            try:
-                yield
-            finally:
-                module.serve = original  # type: ignore[misc]
-
-    def _guarded(self, options: dict[str, Any]) -> dict[str, Any]:
-        inner = options.get("process_request")
-
-        def process_request(connection: Any, request: Any) -> Any:
-            headers = request.headers
-            websocket = "upgrade" in headers
-            reason = self.refusal(headers.get_all("Host"), headers.get_all("Origin"), websocket)
-            if reason is not None:
-                return connection.respond(403, reason + "\n")
-            if not websocket and request.path.partition("?")[0] not in _PATHS:
-                return connection.respond(404, "not found\n")
-            response = inner(connection, request) if inner else None
-            if response is not None:
-                for name, value in _HEADERS.items():
-                    response.headers[name] = value
-            return response
-
-        limits = {"max_size": self.max_message_bytes, "max_queue": 32, "close_timeout": 3}
-        return {**options, **limits, "process_request": process_request}
+    def _is_token(self, given: Sequence[str]) -> bool:
+        return any(secrets.compare_digest(value.encode(), self.token.encode()) for value in given)
 
 
-def restrict_messages(server: viser.ViserServer) -> None:
-    """Remove what viser would do for any connected client but our page never asks for.
+def _cookies(headers: Headers) -> list[str]:
+    found = []
+    for line in headers.getlist("cookie"):
+        try:
+            found += [morsel.value for name, morsel in SimpleCookie(line).items() if name == COOKIE]
+        except CookieError:
+            continue
+    return found
 
-    That is opening a public tunnel ("share"), receiving files, and setting attributes of a control other than its
-    value.
 
-    Raises:
-        ImportError, AttributeError, AssertionError, KeyError: If this version of viser handles messages in
-            another way.
-    """
-    from viser import _messages as messages
-
-    connections: Any = server._websock_server
-    for kind in (
-        messages.ShareUrlRequest,
-        messages.ShareUrlDisconnect,
-        messages.FileTransferStartUpload,
-        messages.FileTransferPart,
-        messages.GuiUpdateMessage,
-    ):
-        connections.unregister_handler(kind)
-    update = server.gui._handle_gui_updates
-
-    async def set_value(client_id: Any, message: Any) -> None:
-        if isinstance(message.updates, dict) and set(message.updates) == {"value"}:
-            await update(client_id, message)
-
-    connections.register_handler(messages.GuiUpdateMessage, set_value)
+def body_size(headers: Headers) -> int | None:
+    """The length of a request's body; None if it is not told."""
+    length = headers.get("content-length", "0")
+    chunked = "transfer-encoding" in headers
+    return int(length) if length.isascii() and length.isdigit() and len(length) < 12 and not chunked else None
 
 
 def host_name(host: str) -> str | None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import LexsplatError
 from lexsplat.runtime.files import read_json, write_json
-from lexsplat.viewer.vocabulary import clean_phrases
 
-MAX_PROMPTS = 50
+MAX_PROMPTS, MAX_PHRASES = 50, 500
+MAX_LENGTH = 120
+"""Characters in one phrase."""
 
 logger = logging.getLogger("lexsplat")
 
@@ -86,3 +88,15 @@ class History:
         except OSError as error:  # a full disk must not stop the viewer
             logger.warning("%s: not saved: %s", self.path, error.strerror or error)
             self.path = None
+
+
+def clean_phrases(phrases: Iterable[str]) -> list[str]:
+    """Normalize white space; drop empty phrases and duplicates (ignoring case); keep at most `MAX_PHRASES`."""
+    cleaned: dict[str, str] = {}
+    for phrase in phrases:
+        short = " ".join(phrase.split())[:MAX_LENGTH].strip()
+        if short:
+            cleaned.setdefault(short.lower(), short)
+        if len(cleaned) == MAX_PHRASES:
+            break
+    return list(cleaned.values())

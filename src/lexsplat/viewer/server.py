@@ -1,17 +1,28 @@
-"""Starts the viewer: viser behind the request guard, with the scene and the panels on its page."""
+"""Starts the viewer: the application behind its guard, on a socket of this machine."""
 
 from __future__ import annotations
 
-import contextlib
-import io
+import errno
+import secrets
 import socket
+import threading
+import time
 from dataclasses import dataclass
+
+import uvicorn
 
 from lexsplat.runtime.errors import BackendError
 from lexsplat.scenes.scene import Scene
-from lexsplat.viewer.guard import RequestGuard, restrict_messages
+from lexsplat.viewer.app import make_app
+from lexsplat.viewer.guard import Guard
 from lexsplat.viewer.history import History
 from lexsplat.viewer.session import Session
+
+MOST_CONNECTIONS = 64
+"""Open connections, at most; a browser opens up to six for a page."""
+_PORTS = 50
+"""Number of ports that are tried."""
+_ANYWHERE = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 @dataclass(frozen=True)
@@ -33,8 +44,8 @@ class ViewerConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
             raise ValueError(f"port must be in 0..65535, got {self.port}")
-        if self.splats < 1:
-            raise ValueError(f"splats must be positive, got {self.splats}")
+        if self.splats < 2:
+            raise ValueError(f"splats must be at least 2, got {self.splats}")
 
 
 class ViewerServer:
@@ -45,75 +56,84 @@ class ViewerServer:
         config: Where and how it is served; None takes the defaults.
 
     Raises:
-        BackendError: If viser is missing or cannot be guarded, or if the address cannot be used.
+        BackendError: If the address cannot be used.
+        QueryError: If the scene has fewer than two Gaussians, or invalid ones.
     """
 
     def __init__(self, scene: Scene, config: ViewerConfig | None = None) -> None:
         self.config = config or ViewerConfig()
-        _check_address(self.config.host)
+        self.socket = _listen(self.config.host, self.config.port)
         try:
-            import viser
-        except ImportError as error:
-            raise BackendError(
-                "viewer", expected="the package viser", found="none", remedy="pip install viser"
-            ) from error
-        from lexsplat.viewer.display import Display
-        from lexsplat.viewer.panels import Panels
-
-        guard = RequestGuard(self.config.names)
-        # viser prints a banner; the command line prints its own line.
-        with guard.wrap_server(), contextlib.redirect_stdout(io.StringIO()):
-            self.viser = viser.ViserServer(self.config.host, self.config.port, verbose=False)
-        try:
-            if not guard.in_place:
-                raise _unguarded(viser.__version__)
-            try:
-                restrict_messages(self.viser)
-            except (ImportError, AttributeError, AssertionError, KeyError) as error:
-                raise _unguarded(viser.__version__) from error
             folder = scene.folder.root if scene.folder and not scene.folder.is_bundled else None
-            self.session = Session(scene, History.load(folder, scene.clip))
-            self.display = Display(self.viser, scene, self.config.splats)
-            self.panels = Panels(self.viser, self.session, self.display)
+            self.session = Session(scene, self.config.splats, History.load(folder, scene.clip))
         except BaseException:
-            self.viser.stop()
+            self.socket.close()
             raise
+        self.token = "" if _is_loopback(self.socket) else secrets.token_urlsafe(18)
+        guard = Guard(make_app(self.session), self.config.names, self.token)
+        settings = uvicorn.Config(
+            guard, log_config=None, access_log=False, server_header=False, lifespan="off", ws="none",
+            limit_concurrency=MOST_CONNECTIONS, timeout_keep_alive=20, timeout_graceful_shutdown=2,
+        )  # fmt: skip
+        self._server = uvicorn.Server(settings)
+        self._thread = threading.Thread(target=self._server.run, args=([self.socket],), daemon=True)
+        self._thread.start()
+        while not self._server.started and self._thread.is_alive():
+            time.sleep(0.005)
+        self._warming = threading.Thread(target=self.session.warm_up, daemon=True)
+        self._warming.start()
 
     @property
     def port(self) -> int:
         """The port it listens on."""
-        return int(self.viser.get_port())
+        return int(self.socket.getsockname()[1])
 
     @property
     def url(self) -> str:
         """The address to open in a browser on this machine."""
-        host = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.config.host, self.config.host)
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+        host = _ANYWHERE.get(self.config.host, self.config.host)
+        token = f"/?token={self.token}" if self.token else ""
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}{token}"
 
     def stop(self) -> None:
-        """Close all pages and free the port."""
-        self.panels.stop()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints here, too
-            self.viser.stop()
+        """Close all connections and free the port."""
+        self._server.should_exit = self.session.closed = True
+        self._thread.join(timeout=10)
+        self._warming.join(timeout=10)
+        self.socket.close()
 
 
-def _check_address(host: str) -> None:
-    """Fail at once for a foreign address, for which viser would wait forever."""
+def _listen(host: str, port: int) -> socket.socket:
+    """A socket that listens on the port, or on one of the next ones if it is taken."""
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.bind(address)
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        for number in range(port, min(port + _PORTS, 65536)) if port else [0]:
+            listening = socket.socket(family, kind, protocol)
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listening.bind((address[0], number, *address[2:]))
+                listening.listen()
+                return listening
+            except OSError as error:
+                listening.close()
+                if error.errno != errno.EADDRINUSE:
+                    raise
     except (OSError, UnicodeError) as error:
         raise BackendError(
             f"--host {host}", expected="an address of this machine", found=str(error),
             remedy="use 127.0.0.1, or 0.0.0.0 for all networks of this machine",
         ) from error  # fmt: skip
-
-
-def _unguarded(version: str) -> BackendError:
-    return BackendError(
-        f"viser {version}",
-        expected="a server that can be guarded, as in version 1.1",
-        found="a different way to start or to handle messages",
-        remedy="install the version of viser that constraints.txt names",
+    raise BackendError(
+        f"--port {port}",
+        expected="a free port",
+        found=f"{port} and the next ones are taken",
+        remedy="--port 0 takes any",
     )
+
+
+def _is_loopback(listening: socket.socket) -> bool:
+    import ipaddress
+
+    return ipaddress.ip_address(listening.getsockname()[0].partition("%")[0]).is_loopback

@@ -1,312 +1,306 @@
-"""State of the viewer without a browser: prompts, clicks, selections.
-
-`Session.ask` and `Session.colors` take milliseconds. `Session.refine` renders views to find the automatic threshold
-and takes longer, so the page shows provisional colors first.
-"""
+"""The state behind all pages of one viewer: a scene, its edits, and what was asked of it."""
 
 from __future__ import annotations
 
+import json
+import logging
+import os
+import struct
 import tempfile
 import threading
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
-from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.rotations import rotation_about
 from lexsplat.queries.everyday import everyday_words
-from lexsplat.queries.grammar import parse
-from lexsplat.queries.heatmaps import overlay_mask
 from lexsplat.queries.phrases import Thing
-from lexsplat.queries.picking import select_hit, surface_at
-from lexsplat.queries.presence import PresenceClassifier
-from lexsplat.queries.relevancy import check_prompts, probability_relevancy
+from lexsplat.queries.picking import Hit, select_hit, surface_at
+from lexsplat.queries.relevancy import probability_relevancy
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.thresholds import BORDER
-from lexsplat.rendering import render
-from lexsplat.runtime.errors import QueryError
+from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import file_name
+from lexsplat.scenes.editing import Editor, Motion, journal_of
 from lexsplat.scenes.exporting import export_gaussians
+from lexsplat.scenes.publishing.manifest import checksums, object_entries, scene_manifest
+from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
+from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
 from lexsplat.scenes.scene import Scene
-from lexsplat.viewer.coloring import PROMPT_COLORS, Coloring, Layer, Mode, quick_threshold
+from lexsplat.viewer.coloring import MODES, colors_in
 from lexsplat.viewer.history import History
-from lexsplat.viewer.vocabulary import MAX_LENGTH
+from lexsplat.viewer.requests import Asked, number, vector
 
-MAX_QUESTIONS = len(PROMPT_COLORS)
-CLICKED_COLOR = (0, 168, 150)
-EXPORT_ENDINGS = (".ply", ".glb", ".splat", ".spz", ".points.ply")
-
-
-@dataclass(eq=False)  # compared by identity: the same prompt can be removed and asked again
-class Question:
-    """A prompt on the page, and its answer.
-
-    Args:
-        layer: How it is drawn.
-        automatic: The automatic threshold; None until `Session.refine`.
-        manual: The threshold set by the user, if any.
-        selection: The Gaussians that answer it; None until `Session.refine`.
-        understood: How it was parsed, for phrases that are more than a thing; "" until `Session.refine`.
-    """
-
-    layer: Layer
-    automatic: float | None = None
-    manual: float | None = None
-    selection: Selection | None = None
-    understood: str = ""
-
-    @property
-    def text(self) -> str:
-        """The prompt."""
-        return self.layer.text
+EXPORT_ENDINGS = (".ply", ".glb", ".splat", ".spz", ".sog", ".points.ply")
+CHANGES = ("delete", "keep", "recolor", "move", "duplicate")
+_MOST_INSTANCES = 254
+_NAMES = 6
+"""Number of names that a click gets, at most."""
 
 
 @dataclass(frozen=True)
-class ClickAnswer:
-    """The answer to a click.
+class Content:
+    """What pages load.
 
     Args:
-        phrases: The most relevant phrases of the vocabulary with their relevancy in 0..1, best first.
-        selection: The clicked surface and the Gaussians that belong to it.
-        point: Where the click hit ``[3]``, world units.
+        manifest: The content of ``manifest.json``.
+        files: The other files by name.
+        drawn: Indices ``[M]`` of the Gaussians that are drawn, in the order of the file.
     """
 
-    phrases: list[tuple[str, float]]
-    selection: Selection
-    point: NDArray[np.float64]
+    manifest: dict[str, Any]
+    files: dict[str, bytes]
+    drawn: Tensor
 
 
 class Session:
-    """State of one viewer, shared by all open pages.
+    """Answers all pages of a viewer; calls wait for each other.
 
     Args:
-        scene: The scene.
-        history: Earlier prompts and the vocabulary; None starts empty and stores nothing.
+        scene: The scene as it was built. Steps of ``lexsplat edit`` are replayed.
+        splats: Maximum number of Gaussians that a browser draws.
+        history: Earlier prompts and the vocabulary.
+
+    Raises:
+        QueryError: If the scene has fewer than two Gaussians, or invalid ones.
+        FileFormatError: If the journal of its edits is damaged.
     """
 
-    def __init__(self, scene: Scene, history: History | None = None) -> None:
-        self.scene, self.history = scene, history or History()
-        self.coloring = Coloring(scene.gaussians, scene.field)
-        self.mode: Mode = "photo"
-        self.opacity, self.fade = 0.9, 0.0
-        self.questions: list[Question] = []
-        self.clicked: Question | None = None
-        self.current: Question | None = None
-        self._encoding = threading.Lock()
-        self._presence: PresenceClassifier | None = None
-        self._opacities = scene.gaussians.opacities.detach().cpu().numpy()
-
-    def warm_up(self) -> None:
-        """Load the text encoder and embed the vocabulary, so that the first answers are fast.
-
-        Raises:
-            ModelError: If the encoder cannot be loaded.
-        """
-        with self._encoding:
-            self.scene.preload()
-        for phrase in [*self.scene.query.compared, *self.history.vocabulary, *everyday_words()]:
-            with self._encoding:  # one phrase at a time, so that a prompt waits for one phrase at most
-                self.scene.embed([phrase])
-        self._presence = self.scene.presence_classifier
-
-    # -- prompts
-
-    def ask(self, text: str) -> Question:
-        """Show a prompt with a provisional threshold; it becomes the current one.
-
-        The oldest prompt is dropped when `MAX_QUESTIONS` are shown.
-
-        Raises:
-            QueryError: If the prompt is empty or longer than `MAX_LENGTH`.
-            ModelError: If the text encoder cannot be loaded.
-        """
-        (text,) = check_prompts([text])
-        if len(text) > MAX_LENGTH:
-            raise QueryError("prompt", expected=f"at most {MAX_LENGTH} characters", found=f"{len(text)}")
-        question = self.find(text)
-        if question is None:
-            with self._encoding:
-                self.scene.embed([text])
-            scores = self.scene.scores([text])[0].cpu().numpy()
-            layer = Layer(text, scores, self._provisional_threshold(text, scores), self._free_color())
-            question = Question(layer)
-            self.questions = [*self.questions[-(MAX_QUESTIONS - 1) :], question]
-        self.current, self.mode = question, "relevancy"
-        return question
-
-    def find(self, text: str) -> Question | None:
-        """The question with this text, if it is shown."""
-        return next((question for question in self.all_questions() if question.text == text), None)
-
-    def all_questions(self) -> list[Question]:
-        """Everything that is drawn: the prompts, then the clicked object."""
-        return [*self.questions, *([self.clicked] if self.clicked else [])]
-
-    def refine(self, question: Question, viewpoint: Camera | None = None) -> None:
-        """Compute the final answer to a prompt: its automatic threshold and the Gaussians it selects.
-
-        Args:
-            question: The prompt.
-            viewpoint: The camera that defines left and right in phrases with relations; None takes the view that
-                shows the reference object best.
-        """
-        # The selection of a plain prompt stays valid until `set_threshold` clears it.
-        if question is self.clicked or (question.selection is not None and is_plain(question.text)):
-            return
-        manual = question.manual
-        selection = answer_prompt(self.scene, question.text, manual, viewpoint)
-        if manual is None:
-            question.automatic = float(selection.threshold)
-        if manual == question.manual:  # otherwise the user has moved the slider in the meantime
-            question.selection = selection
-            question.understood = understood_as(self.scene, question.text)
-            question.layer.set_scores(selection.scores.float().cpu().numpy())
-            question.layer.threshold = float(selection.threshold)
-            question.layer.mask = selection.mask.cpu().numpy()
-
-    def set_threshold(self, question: Question, value: float | None) -> None:
-        """Set a threshold by hand, or None for the automatic one. Colors follow at once, the selection on `refine`.
-
-        Raises:
-            ValueError: If the threshold is not in 0..1.
-        """
-        if value is not None and not 0 <= value <= 1:
-            raise ValueError(f"threshold must be in 0..1, got {value}")
-        question.manual, question.selection, question.layer.mask = value, None, None
-        if value is not None:
-            question.layer.threshold = value
-        elif question.automatic is not None:
-            question.layer.threshold = question.automatic
-        else:
-            question.layer.threshold = self._provisional_threshold(question.layer.text, question.layer.scores)
-
-    def remove(self, question: Question) -> None:
-        """Remove a prompt; the latest remaining one becomes the current one."""
-        self.questions = [other for other in self.questions if other is not question]
-        if question is self.clicked:
-            self.clicked = None
-        if question is self.current:
-            shown = self.all_questions()
-            self.current = shown[-1] if shown else None
-
-    def _provisional_threshold(self, text: str, scores: NDArray[np.float32]) -> float:
-        """A threshold in milliseconds. It is 0.5 for an absent object, as the automatic one will be."""
-        if self._presence is not None:  # None until `warm_up` has encoded the everyday words
-            (present,) = self._presence.classify(self.scene.embed([text]), torch.from_numpy(scores)[None])
-            if present == "no":
-                return BORDER
-        return quick_threshold(scores, self._opacities)
-
-    def _free_color(self) -> tuple[int, int, int]:
-        used = {question.layer.color for question in self.questions[-(MAX_QUESTIONS - 1) :]}
-        return next(color for color in PROMPT_COLORS if color not in used)
-
-    # -- clicks
-
-    def what_is(self, camera: Camera, x: float, y: float, count: int = 6) -> ClickAnswer:
-        """Name and select the surface at a pixel; the selection becomes the current one.
-
-        Args:
-            camera: The camera of the page.
-            x: Column in pixels.
-            y: Row in pixels.
-            count: Maximum number of phrases.
-
-        Raises:
-            QueryError: If there is no surface at the pixel.
-        """
-        scene = self.scene
-        hit = surface_at(scene.gaussians, camera, x, y)
-        selection = select_hit(hit, scene.gaussians, scene.field, scene.cameras, world=scene.world)
-        shares = hit.weights.float() / hit.weights.sum().clamp_min(1e-12)
-        probabilities = shares @ scene.field.select(hit.indices).code_probabilities()
-        vocabulary = self.history.vocabulary
-        with self._encoding:
-            asked = scene.question(vocabulary)
-        relevancy = probability_relevancy(probabilities[None], scene.field.codebook.clip, asked)[0]
-        order = relevancy.argsort(descending=True)[:count].tolist()
-        phrases = [(vocabulary[i], float(relevancy[i])) for i in order]
-        threshold = float(selection.threshold)
-        layer = Layer(
-            "clicked object",
-            selection.scores.float().cpu().numpy(),
-            threshold,
-            CLICKED_COLOR,
-            selection.mask.cpu().numpy(),
-        )
-        self.clicked = Question(layer, automatic=threshold, selection=selection)
-        self.current, self.mode = self.clicked, "relevancy"
-        return ClickAnswer(phrases, selection, hit.point)
-
-    # -- images
-
-    def colors(self, eye: NDArray | None = None) -> NDArray[np.uint8]:
-        """The color of every Gaussian ``[N, 3]`` in the current state; ``eye`` is the camera position, for depth."""
-        layers = [question.layer for question in self.all_questions()]
-        return self.coloring.colors(self.mode, layers, opacity=self.opacity, fade=self.fade, eye=eye)
+    def __init__(self, scene: Scene, splats: int, history: History) -> None:
+        self.lock = threading.RLock()
+        self.history, self._splats = history, splats
+        writable = scene.folder is not None and os.access(journal_of(scene).absolute().parent, os.W_OK)
+        self.editor = Editor(scene, journal_of(scene) if writable else None)
+        self.version = 1
+        self.closed = False
+        """Ends `warm_up`."""
+        self._journal_size = self._journal_bytes()
+        self.content = self._make_content()
 
     @property
-    def selection(self) -> Selection | None:
-        """The selection of the current question; None until `refine`."""
-        return self.current.selection if self.current else None
+    def scene(self) -> Scene:
+        """The scene after its edits."""
+        return self.editor.scene
 
-    def thumbnail(self, name: str, selection: Selection) -> NDArray[np.uint8]:
-        """A view ``[h, w, 3]`` with the selection tinted and the rest dimmed."""
-        camera = self.scene.view(name).camera
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 280))
-        with torch.no_grad():
-            drawn = render(self.scene.gaussians, small, features=selection.mask.float()[:, None])
-        image = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        return overlay_mask(image, drawn.features[..., 0].cpu().numpy() > 0.5)
+    def warm_up(self) -> None:
+        """Load the text encoder and embed what every answer needs, so that the first one is fast."""
+        try:
+            for phrase in [*self.scene.query.compared, *self.history.vocabulary, *everyday_words()]:
+                if self.closed:
+                    return
+                with self.lock:  # one phrase at a time, so that a prompt waits for one phrase at most
+                    self.scene.preload()
+                    self.scene.embed([phrase])
+        except LexsplatError as error:  # the first question says it to the page
+            logging.getLogger("lexsplat").warning("%s", error)
 
-    # -- files
+    # -- answers
 
-    def export(self, selection: Selection, ending: str = ".ply") -> tuple[str, bytes]:
+    def ask(self, asked: Asked) -> bytes:
+        """The answer to a prompt: a header, a score in 255ths and an instance for each drawn Gaussian.
+
+        The header is JSON, after its length as four bytes, little-endian. Instances count from 1; 0 is none.
+
+        Raises:
+            QueryError: If the prompt is empty.
+            ModelError: If the text encoder cannot be loaded.
+        """
+        selection = self._select(asked)
+        understood = self.scene.understand(asked.prompt)
+        plain = understood.phrase == Thing(asked.prompt)
+        if asked.threshold is None:
+            self.history.add(asked.prompt)
+        notes = {"understood": "" if plain else str(understood.phrase), "note": understood.note}
+        return self._reply(selection, notes)
+
+    def what_is(self, asked: Asked) -> bytes:
+        """What lies at a pixel, as `ask` answers, with "names" of the vocabulary and the "point" in the header.
+
+        Raises:
+            QueryError: If nothing is there.
+        """
+        hit = self._hit(asked)
+        field, vocabulary = self.scene.field, self.history.vocabulary
+        shares = hit.weights.float() / hit.weights.sum().clamp_min(1e-12)
+        probabilities = shares @ field.select(hit.indices).code_probabilities()
+        question = self.scene.question(vocabulary)
+        relevancy = probability_relevancy(probabilities[None], field.codebook.clip, question)[0]
+        best = relevancy.argsort(descending=True)[:_NAMES].tolist()
+        names = [{"phrase": vocabulary[place], "score": round(float(relevancy[place]), 4)} for place in best]
+        return self._reply(self._select(asked), {"names": names, "point": hit.point.round(5).tolist()})
+
+    def details(self, asked: Asked) -> dict[str, Any]:
+        """Where a selection is, how large, and which photos show most of it."""
+        chosen = self._chosen(asked)
+        views = [{"name": name, "share": round(share, 4)} for name, share in chosen.view_shares[:3] if share]
+        return {**chosen.geometry(), "pieces": chosen.count, "views": views}
+
+    def objects(self) -> list[dict[str, Any]]:
+        """The objects of the scene for its list."""
+        return object_entries(self.scene)
+
+    def colors(self, mode: str) -> bytes:
+        """RGB of each drawn Gaussian; see `lexsplat.viewer.coloring`."""
+        return colors_in(mode, self.scene.field)[self.content.drawn.numpy()].tobytes()
+
+    def export(self, asked: Asked, ending: str) -> tuple[str, bytes]:
         """File name and content of an export of the selected Gaussians.
 
         Raises:
-            ValueError: If the ending is not one of them.
-            QueryError: If the selection is empty.
+            QueryError: If the selection is empty or the ending is none of `EXPORT_ENDINGS`.
             BackendError: If the format needs a library that is not installed.
         """
         if ending not in EXPORT_ENDINGS:
-            raise ValueError(f"ending must be one of {', '.join(EXPORT_ENDINGS)}, got {ending!r}")
-        if not selection:
-            raise QueryError("selection", expected="at least one Gaussian", found="none")
+            raise QueryError("format", expected=", ".join(EXPORT_ENDINGS), found=repr(ending)[:40])
+        chosen = self._chosen(asked)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"selection{ending}"
-            export_gaussians(selection.selected, path, world=self.scene.world)
-            return f"{file_name(selection.phrase)}{ending}", path.read_bytes()
+            export_gaussians(chosen.selected, path, world=self.scene.world)
+            return f"{file_name(chosen.phrase)}{ending}", path.read_bytes()
 
+    def _select(self, asked: Asked) -> Selection:
+        scene = self.scene
+        if asked.click is not None:
+            return select_hit(self._hit(asked), scene.gaussians, scene.field, scene.cameras, scene.world)
+        plain = isinstance(scene.understand(asked.prompt).phrase, Thing)  # the scene keeps those answers
+        return scene.find(asked.prompt, None if plain else asked.camera, threshold=asked.threshold)
 
-def answer_prompt(
-    scene: Scene, prompt: str, threshold: float | None = None, viewpoint: Camera | None = None
-) -> Selection:
-    """The scene's answer to a prompt: scores, threshold, presence and selection.
+    def _chosen(self, asked: Asked) -> Selection:
+        """The selection, or the instance that was meant; never an empty one."""
+        selection = self._select(asked)
+        if not selection:
+            raise QueryError(
+                asked.prompt or "selection",
+                expected="at least one Gaussian",
+                found="none",
+                remedy="lower the threshold",
+            )
+        if asked.instance is None:
+            return selection
+        if asked.instance >= selection.count:
+            raise QueryError("instance", expected=f"one of {selection.count}", found=str(asked.instance))
+        return selection.instances[asked.instance]
 
-    All final answers of the viewer come from here. Phrases with relations are answered by `Scene.find`.
-    """
-    if is_plain(prompt) and scene.understand(prompt).phrase == Thing(prompt):
-        return scene.select(prompt, threshold)
-    return replace(scene.find(prompt, viewpoint, threshold=threshold), phrase=prompt)
+    def _hit(self, asked: Asked) -> Hit:
+        if asked.click is None or asked.camera is None:
+            raise QueryError("click", expected="a pixel and a camera", found="none")
+        return surface_at(self.scene.gaussians, asked.camera, *asked.click)
 
+    def _reply(self, selection: Selection, further: Mapping[str, Any]) -> bytes:
+        instances = selection.instances[:_MOST_INSTANCES] if selection else []
+        labels = torch.zeros(len(selection.mask), dtype=torch.uint8)
+        for place, instance in enumerate(instances, start=1):
+            labels[instance.mask.cpu()] = place
+        header = {
+            "presence": selection.present,
+            "threshold": round(float(selection.threshold), 4),
+            "gaussians": selection.num_gaussians,
+            "instances": [
+                {"center": one.center.round(5).tolist(), "size": one.size.round(5).tolist()}
+                for one in instances
+            ],
+            **further,
+        }
+        text = json.dumps(header).encode()
+        scores = (selection.scores.detach().cpu().float().clamp(0, 1) * 255).round().to(torch.uint8)
+        drawn = self.content.drawn
+        values = (scores[drawn].numpy().tobytes(), labels[drawn].numpy().tobytes())
+        return b"".join([struct.pack("<I", len(text)), text, *values])
 
-def understood_as(scene: Scene, prompt: str) -> str:
-    """How a prompt was parsed, and what was not understood; "" for one thing in its own words."""
-    understood = scene.understand(prompt)
-    if is_plain(prompt) and not understood.note:
-        return ""
-    return "; ".join(filter(None, [f"understood as {understood.phrase}", understood.note]))
+    # -- editing
 
+    def edit(self, action: str, asked: Asked, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Do a step, undo or redo one, as ``lexsplat edit`` does; returns the new manifest.
 
-def is_plain(phrase: str) -> bool:
-    """Whether a phrase names one thing, such as "mug" or "something to sit on".
+        Raises:
+            QueryError: If nothing is selected, or the result could not be drawn.
+            SceneFolderError: If another program has changed the steps.
+        """
+        if action not in (*CHANGES, "undo", "redo"):
+            raise QueryError("action", expected=", ".join((*CHANGES, "undo", "redo")), found=action[:40])
+        if self._journal_bytes() != self._journal_size:
+            raise SceneFolderError(
+                self.editor.journal or "edits",
+                expected="the steps of this viewer",
+                found="steps of another program",
+                remedy="start lexsplat view again",
+            )
+        try:
+            if action in ("undo", "redo"):
+                getattr(self.editor, action)()
+            else:
+                self._change(action, self._chosen(asked), values)
+        except ValueError as error:  # numbers that have no meaning for these Gaussians
+            raise QueryError(
+                action, expected="Gaussians that can be drawn afterwards", found=str(error)
+            ) from error
+        finally:
+            self._journal_size = self._journal_bytes()
+        self.version += 1
+        self.content = self._make_content()
+        return self.content.manifest
 
-    Phrases with relations, articles or counts ("how many mugs") are parsed by `lexsplat.queries.phrases`.
-    """
-    try:
-        return parse(phrase) == Thing(phrase)
-    except QueryError:
-        return True
+    def _change(self, action: str, chosen: Selection, values: Mapping[str, Any]) -> None:
+        left = {"delete": len(chosen.mask) - len(chosen), "keep": len(chosen)}.get(action, len(chosen.mask))
+        if left < 2:
+            raise QueryError(action, expected="at least 2 Gaussians afterwards", found=str(left))
+        if action == "recolor":
+            self.editor.recolor(chosen, vector(values, "color"), number(values, "strength", 1.0))
+        elif action in ("move", "duplicate"):
+            turn = rotation_about(chosen.up.direction, number(values, "turn", 0.0))
+            motion = Motion(vector(values, "by"), turn, number(values, "scale", 1.0))
+            getattr(self.editor, action)(chosen, motion)
+        else:
+            getattr(self.editor, action)(chosen)
+
+    def _journal_bytes(self) -> int:
+        journal = self.editor.journal
+        return journal.stat().st_size if journal is not None and journal.exists() else 0
+
+    # -- content
+
+    def _make_content(self) -> Content:
+        scene = self.scene
+        if len(scene.gaussians) < 2 or (damage := scene.gaussians.find_invalid()):
+            found = str(len(scene.gaussians)) if len(scene.gaussians) < 2 else damage
+            raise QueryError("scene", expected="at least 2 finite Gaussians", found=found)
+        drawn = most_visible(scene.gaussians, self._splats)
+        gaussians = scene.gaussians.select(drawn.to(scene.gaussians.device)).to("cpu")
+        with tempfile.TemporaryDirectory() as folder:
+            path, rotation = write_splats(gaussians, Path(folder))
+            files = {path.name: path.read_bytes(), "words.txt": self._words()}
+        manifest = scene_manifest(scene, gaussians, path.name, rotation)
+        manifest["words"]["count"] = files["words.txt"].count(b"\n")
+        manifest["server"] = {
+            "version": self.version,
+            "steps": [str(step) for step in self.editor.steps],
+            "undone": len(self.editor.undone),
+            "examples": list(dict.fromkeys([*self.history.prompts[:4], *self.history.vocabulary]))[:4],
+            "vocabulary": self.history.vocabulary,
+            "formats": EXPORT_ENDINGS,
+            "modes": MODES,
+        }
+        manifest["files"] = {name: checksums(content) for name, content in files.items()}
+        return Content(manifest, files, drawn)
+
+    def _words(self) -> bytes:
+        """Completions: what was asked, the vocabulary, everyday phrases."""
+        phrases = page_phrases(self.history.prompts, bundled=self.scene.clip in ("bundled", "embedded"))
+        phrases |= {name.lower(): NAME for name in self.history.vocabulary if name.lower() not in phrases}
+        known = {*self.history.prompts, *self.history.vocabulary}
+        return words_file(phrases, ["y" if phrase in known else "u" for phrase in phrases])
+
+    def set_vocabulary(self, phrases: Any) -> list[str]:
+        """Replace the names that clicks choose from; an empty list restores the default.
+
+        Raises:
+            QueryError: If they are no texts.
+        """
+        if not isinstance(phrases, list) or not all(isinstance(phrase, str) for phrase in phrases):
+            raise QueryError("vocabulary", expected="a list of phrases", found=type(phrases).__name__)
+        self.history.set_vocabulary(phrases)
+        self.content.manifest["server"]["vocabulary"] = self.history.vocabulary
+        return self.history.vocabulary

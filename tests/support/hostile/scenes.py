@@ -56,7 +56,7 @@ def make_folder(folder: Path, *, trained: bool = False) -> None:
 
 
 def open_folder(folder: Path) -> Any:
-    from lexsplat.scenes.answers import scene_facts
+    from lexsplat.scenes.facts import scene_facts
     from lexsplat.scenes.scene import open_scene
 
     scene = open_scene(folder, device="cpu")

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
+import json
+import struct
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,6 +84,108 @@ def splat() -> Reader:
     )  # fmt: skip
 
 
+@reader
+def splat_text_ply() -> Reader:
+    from lexsplat.scenes.formats.ply import write_ply
+    from lexsplat.scenes.formats.reading import read_splats
+
+    def make(folder: Path) -> None:
+        write_ply(small_gaussians(), folder / "a.ply")
+        head, rows = (folder / "a.ply").read_bytes().split(b"end_header\n", 1)
+        numbers = np.frombuffer(rows, "<f4").reshape(4, -1).tolist()
+        lines = "".join(" ".join(f"{number:.6g}" for number in row) + "\n" for row in numbers)
+        head = head.replace(b"binary_little_endian", b"ascii")
+        (folder / "a.ply").write_bytes(head + b"end_header\n" + lines.encode())
+
+    def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+        yield from mutate.text(content, rng, 600, 500)
+        for count in (5, 10**6, 10**9, 2**63, 10**30):
+            yield "counts", content.replace(b"element vertex 4", b"element vertex %d" % count)
+
+    return Reader(make, lambda folder: read_splats(folder / "a.ply"), check_gaussians, {"a.ply": mutations})
+
+
+def spz(version: int) -> Callable[[], Reader]:
+    """SPZ, damaged as it is and, of version 3, before it is compressed."""
+
+    def make_reader() -> Reader:
+        from lexsplat.scenes.formats.reading import read_splats
+        from lexsplat.scenes.formats.spz import write_spz
+
+        def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+            yield from mutate.binary(content, rng, 400, 500)
+            if version == 3:
+                for kind, changed in mutate.binary(gzip.decompress(content), rng, 400, 500):
+                    # Cut before it is compressed, the file is complete and too short.
+                    yield "moved" if kind == "truncated" else kind, gzip.compress(changed, 1)
+
+        return Reader(
+            lambda folder: write_spz(small_gaussians(), folder / "a.spz", version=version),
+            lambda folder: read_splats(folder / "a.spz"), check_gaussians, {"a.spz": mutations},
+            exact=("a.spz",),
+        )  # fmt: skip
+
+    return make_reader
+
+
+READERS["spz"] = spz(3)
+READERS["spz_4"] = spz(4)
+
+
+@reader
+def sog() -> Reader:
+    from lexsplat.scenes.formats.reading import read_splats
+    from lexsplat.scenes.formats.sog_writing import write_sog
+
+    return Reader(
+        lambda folder: write_sog(small_gaussians(), folder / "a.sog"),
+        lambda folder: read_splats(folder / "a.sog"), check_gaussians,
+        {"a.sog": lambda content, rng: mutate.binary(content, rng, 500, 500)},
+    )  # fmt: skip
+
+
+@reader
+def sog_folder() -> Reader:
+    """Unbundled: the pictures have no checksums."""
+    from lexsplat.scenes.formats.reading import read_splats
+    from lexsplat.scenes.formats.sog_writing import write_sog
+
+    def make(folder: Path) -> None:
+        write_sog(small_gaussians(), folder / "a.sog")
+        with zipfile.ZipFile(folder / "a.sog") as archive:
+            archive.extractall(folder)
+
+    def picture(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+        yield from mutate.binary(content, rng, 100, 60)
+
+    names = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
+    parts = {f"{name}.webp": picture for name in names}
+    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 150, 1200)
+    return Reader(make, read_splats, check_gaussians, parts)
+
+
+@reader
+def glb() -> Reader:
+    from lexsplat.scenes.formats.gltf import write_glb
+    from lexsplat.scenes.formats.reading import read_splats
+
+    def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+        yield from mutate.binary(content, rng, 300, 300)
+        (length,) = struct.unpack_from("<I", content, 12)
+        document, binary = json.loads(content[20 : 20 + length]), content[20 + length :]
+        document["asset"]["generator"] = "another"  # so that its nodes count
+        for kind, text in mutate.structure(document, rng, 2500):
+            text += b" " * (-len(text) % 4)
+            head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON")
+            yield kind, head + text + binary
+
+    return Reader(
+        lambda folder: write_glb(small_gaussians(), folder / "a.glb"),
+        lambda folder: read_splats(folder / "a.glb"), check_gaussians, {"a.glb": mutations},
+        exact=("a.glb",),
+    )  # fmt: skip
+
+
 def compressed(ending: str, count: int) -> Callable[[], Reader]:
     def make() -> Reader:
         from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
@@ -87,16 +194,14 @@ def compressed(ending: str, count: int) -> Callable[[], Reader]:
         return Reader(
             lambda folder: write_compressed(small_gaussians(), folder / f"a{ending}", COMPRESSED[ending]),
             lambda folder: read_splats(folder / f"a{ending}"), check_gaussians,
-            {f"a{ending}": lambda content, rng: mutate.binary(content, rng, count, 150)},
+            {f"a{ending}": lambda content, rng: mutate.binary(content, rng, count, 40)},
         )  # fmt: skip
 
     return make
 
 
-READERS["spz"] = compressed(".spz", 90)
+# Each input starts a process, so there are few.
+READERS["compressed_ply"] = compressed(".compressed.ply", 20)
 
 
-READERS["compressed_ply"] = compressed(".compressed.ply", 90)
-
-
-READERS["ksplat"] = compressed(".ksplat", 90)
+READERS["ksplat"] = compressed(".ksplat", 20)

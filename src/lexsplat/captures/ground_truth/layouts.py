@@ -5,7 +5,7 @@
 - **3d-ovs**: ``segmentations/NN/CLASS.png`` and ``segmentations/classes.txt``; NN is the index of the image.
 - **lerf-ovs**: LangSplat's ``label/SCENE/frame_*.json`` beside the capture ``SCENE``: polygons and boxes.
 
-To add a layout: add its name to `LAYOUTS`, recognize it in `layout_of` and `annotated_names`, and read it in
+To add a layout: list it here, recognize it in `layout_of` and `annotated_names`, and read it in
 `_read_ground_truth`. Views with ground truth are held out by default.
 """
 
@@ -32,9 +32,6 @@ from lexsplat.runtime.files import read_json
 
 log = logging.getLogger("lexsplat")
 
-LAYOUTS = ("segmentations", "3d-ovs", "lerf-ovs")
-"""Names of the layouts."""
-
 CLASSES_FILE = "classes.txt"
 """3D-OVS: class names, one per line."""
 
@@ -44,7 +41,7 @@ class Annotations:
     """Ground truth by view and prompt.
 
     Args:
-        layout: One of `LAYOUTS`.
+        layout: Name of its layout, from the list above.
         origin: The folder it was read from.
         masks: ``{view: {prompt: mask}}``: a file for `View.load_mask`, or an array ``[H, W]`` bool on the
             undistorted image.
@@ -97,7 +94,7 @@ def find_annotations(root: Path) -> tuple[str, Path] | None:
 
 
 def layout_of(folder: Path) -> str:
-    """The layout of a folder with ground truth: one of `LAYOUTS`."""
+    """The layout of a folder with ground truth: a name of the list above."""
     if any(folder.glob("frame_*.json")):
         return "lerf-ovs"
     return "3d-ovs" if (folder / CLASSES_FILE).is_file() else "segmentations"

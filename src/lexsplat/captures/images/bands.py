@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import binary_dilation
 
 LARGE_PIXELS = 2_000_000
 """Images with more pixels are processed in bands."""
@@ -73,6 +72,8 @@ class MaskRows:
         top = max(0, first - self._reach)
         part = self._mask[top : last + self._reach]
         if self._reach:
+            from scipy.ndimage import binary_dilation
+
             side = 2 * self._reach + 1
             part = binary_dilation(part, np.ones((side, side), bool))
         return part[first - top : last - top, :, None].astype(np.float32)

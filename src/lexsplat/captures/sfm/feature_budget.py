@@ -10,9 +10,12 @@ import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lexsplat.captures.sfm.pycolmap_import import pycolmap
 from lexsplat.runtime import memory as budget
+
+if TYPE_CHECKING:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
 
 HELD_AT_MOST = 1225
 """Most photos whose features are held at once: pycolmap's own limit."""
@@ -62,6 +65,8 @@ def matching_plan(
         memory, {count: budget.matching_bytes(most, least, count) for count in range(1, _cores() + 1)}
     )
     held = (memory - budget.matching_bytes(most, 0, threads)) // max(1, most * budget.FEATURE_BYTES)
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
     return pycolmap.FeatureMatchingOptions(num_threads=threads), max(2, least, min(HELD_AT_MOST, held))
 
 

@@ -22,7 +22,7 @@ class Gallery:
 
     Args:
         width: Width of an image in pixels.
-        views: ``{view: {"photo" | "render": JPEG}}``.
+        views: ``{view: {"photo" | "render" | "features": JPEG}}``.
         cases: ``{(view, prompt): {"heatmap" | "mask" | "ground_truth": JPEG}}``.
     """
 
@@ -45,6 +45,10 @@ class Gallery:
                     overlay_mask(photo, view.ground_truth[prompt], color=(64, 200, 140))
                 ),
             }
+
+    def add_features(self, view: str, picture: NDArray[np.float32]) -> None:
+        """Store a thumbnail of the language features of a view ``[H, W, 3]`` in 0..1."""
+        self.views[view]["features"] = self._jpeg(_to_bytes(picture))
 
     def tensors(self) -> dict[str, Tensor]:
         """All JPEGs by name as uint8 tensors, for safetensors."""

@@ -19,6 +19,9 @@ from lexsplat.language.fields.rendering import (
 )
 from lexsplat.language.segments import Segments
 
+_STEPS = 255
+"""Steps between 0 and 1 of what is stored in 8 bits."""
+
 
 class CodeField:
     """A sparse distribution over codes on every Gaussian. Rendering it is linear and needs no decoder.
@@ -120,8 +123,12 @@ class CodeField:
         )
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name, for safetensors; those of the codebook under ``codebook.``."""
-        own = {"codes": self.codes, "weights": self.weights, "uncertainties": self.uncertainties}
+        """All tensors by name, for safetensors; those of the codebook under ``codebook.``.
+
+        Weights and uncertainties have 8 bits: 9 bytes a Gaussian with four codes.
+        """
+        uncertainties = (self.uncertainties.clamp(0, 1) * _STEPS).round().to(torch.uint8)
+        own = {"codes": self.codes, "weights": _in_steps(self.weights), "uncertainties": uncertainties}
         own |= self.segments.tensors() if self.segments else {}
         return {name: value.contiguous() for name, value in own.items()} | codebook_tensors(self.codebook)
 
@@ -135,7 +142,7 @@ class CodeField:
     ) -> CodeField:
         """The inverse of `tensors` and `metadata`.
 
-        Files of earlier versions have the kind "lifted" and may name the method "lifted"; they open as well.
+        Files of earlier versions hold floats; they may have the kind "lifted" and name the method "lifted".
 
         Raises:
             ValueError: If a tensor is missing or has the wrong shape.
@@ -144,8 +151,21 @@ class CodeField:
         return cls(
             stored_codebook(tensors),
             tensors["codes"],
-            tensors["weights"],
-            tensors["uncertainties"],
+            _as_floats(tensors["weights"]),
+            _as_floats(tensors["uncertainties"]),
             method=(metadata or {}).get("method", "averaged"),
             segments=Segments.from_tensors(tensors),
         )
+
+
+def _in_steps(weights: Tensor) -> Tensor:
+    """Weights ``[N, T]`` in 0..1 as uint8, each row with its sum: the largest remainders are rounded up."""
+    scaled = weights.double().clamp(0, 1) * _STEPS
+    whole = scaled.floor()
+    missing = scaled.sum(1, keepdim=True).round() - whole.sum(1, keepdim=True)
+    rank = (whole - scaled).argsort(dim=1, stable=True).argsort(dim=1)
+    return (whole + (rank < missing)).clamp(max=_STEPS).to(torch.uint8)
+
+
+def _as_floats(stored: Tensor) -> Tensor:
+    return stored.float() / _STEPS if stored.dtype == torch.uint8 else stored

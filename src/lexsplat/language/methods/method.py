@@ -18,6 +18,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.workers import IN_PROCESS, Workers
 
 if TYPE_CHECKING:
     from lexsplat.runtime.training import Checkpoint
@@ -76,6 +77,7 @@ class FitRun:
         seed: Seed of all randomness.
         memory: Host memory that the fit may take, in bytes.
         scratch: Folder for temporary files; None takes the system's.
+        workers: Where work that is a sum over views runs.
         checkpoint: Where a training is saved and resumed from; None saves nothing.
         listener: Receives progress events.
     """
@@ -83,6 +85,7 @@ class FitRun:
     seed: int = 0
     memory: int = DEFAULT_MEMORY
     scratch: Path | None = None
+    workers: Workers = IN_PROCESS
     checkpoint: Checkpoint | None = None
     listener: Listener = silent
 
@@ -102,9 +105,8 @@ class LanguageMethod(Protocol):
     def needs(self) -> tuple[str, ...]:
         """Stages before "language" that it needs beside the Gaussians, in order."""
 
-    @property
-    def uses_dino(self) -> bool:
-        """Whether DINO features take part."""
+    def uses_dino(self, config: Any) -> bool:
+        """Whether DINO features take part in a build of these settings."""
 
     @property
     def trains_jointly(self) -> bool:

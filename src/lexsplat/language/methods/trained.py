@@ -37,7 +37,6 @@ class Trained:
     name = "trained"
     settings = ("codebook", "trained")
     needs = ("features", "codebook")
-    uses_dino = True
     trains_jointly = True
     variants: Mapping[str, Variant] = {  # the rows of the paper's Table 2, in its order
         "w/o DINO": {"codebook": {"use_dino": False}},
@@ -47,6 +46,10 @@ class Trained:
         "w/o u_G & MLP": {"trained": {"use_uncertainty": False, "use_smoothing": False}},
         "full": {},
     }
+
+    def uses_dino(self, config: Any) -> bool:
+        """Always: index maps are made with both halves."""
+        return True
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> TrainedField:
         """Train the paper's field on the index maps of the training views."""

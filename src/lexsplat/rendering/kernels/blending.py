@@ -1,4 +1,4 @@
-"""Front-to-back blending by tiles: the forward pass, and the functions shared with its gradient.
+"""Front-to-back blending by tiles: the forward pass, and functions that its gradient shares.
 
 The outer loop is over Gaussians, and the inner loop processes rows of sixteen pixels (see `lanes`). Per-tile arrays
 are flat: row j of the tile starts at 16 j, and row j of channel c of C at 16 (j C + c).
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lexsplat.rendering.kernels.arrays import F32, I32, I64
+from lexsplat.rendering.kernels.arrays import F32, I32, I64, U8
 from lexsplat.rendering.kernels.binning import (
     CENTER_X,
     CENTER_Y,
@@ -18,8 +18,6 @@ from lexsplat.rendering.kernels.binning import (
     HALF_A,
     HALF_C,
     OPACITY,
-    ROW_FIRST,
-    ROW_LAST,
     TILE,
 )
 from lexsplat.rendering.kernels.jit import kernel
@@ -130,31 +128,32 @@ def seen_from_tile(ellipses: F32, k: int, left: int, top: int, columns: Any) -> 
 
 
 @kernel
-def rows_in_tile(boxes: I32, k: int, top: int) -> tuple[int, int]:
-    """First row of the tile that box ``k`` covers, and one past the last."""
-    return max(boxes[k, ROW_FIRST] - top, 0), min(boxes[k, ROW_LAST] - top, TILE)
-
-
-@kernel
 def blend(
     start: int,
     stop: int,
     ellipses: F32,
-    boxes: I32,
     tile_offsets: I64,
     members: I32,
+    rows: U8,
     values: F32,
     background: F32,
     tiles_x: int,
     image: F32,
     alpha: F32,
+    passed: F32,
+    last_pairs: F32,
 ) -> None:
     """Render tiles ``start`` to ``stop``: ``image [H, W, C]`` and ``alpha [H, W]``.
 
     Args:
+        rows: Rows of the tile that each pair reaches ``[M, 2]``.
         values: Channels of each Gaussian in depth order ``[V, C]``.
         background: Added behind the first channels ``[B]``, B <= C; the others composite over zero.
+        passed: Receives the transmittance of each pixel, tile by tile ``[tiles * PIXELS]``; empty keeps nothing.
+        last_pairs: Receives the number of the tile's pairs up to the last one that a pixel shows, in the same
+            layout; exact up to 2^24 pairs in a tile.
     """
+    keep = passed.shape[0] > 0
     height, width, channels = image.shape
     live = np.empty(PIXELS, np.float32)
     sums = np.empty(PIXELS * channels, np.float32)
@@ -163,16 +162,22 @@ def blend(
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         start_tile(tile, tiles_x, width, height, live)
         sums[:] = ZERO
+        if keep:
+            last_pairs[tile * PIXELS : (tile + 1) * PIXELS] = ZERO
         countdown = CHECK_EVERY
         for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
             k = members[slot]
+            number = np.float32(slot - tile_offsets[tile] + 1)
             _, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
-            first, last = rows_in_tile(boxes, k, top)
-            for j in range(first, last):
+            for j in range(np.int64(rows[slot, 0]), np.int64(rows[slot, 1])):
                 dy = np.float32(j) + dy0
                 row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
                 weight = pass_row(live, j, row_alpha)
                 if any_positive(weight):
+                    if keep:
+                        here = (tile * TILE + j) * TILE
+                        kept = select_greater(weight, ZERO, number, load(last_pairs, here))
+                        store(last_pairs, here, kept)
                     place = j * channels * TILE
                     for channel in range(channels):
                         store(sums, place, load(sums, place) + weight * values[k, channel])
@@ -182,6 +187,9 @@ def blend(
                 countdown = CHECK_EVERY
                 if tile_finished(live):
                     break
+        if keep:
+            for i in range(PIXELS):
+                passed[tile * PIXELS + i] = abs(live[i])
         for j in range(min(TILE, height - top)):
             for i in range(min(TILE, width - left)):
                 transmittance = abs(live[j * TILE + i])

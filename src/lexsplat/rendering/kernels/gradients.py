@@ -1,32 +1,28 @@
 """The gradient of blending: one row of values per pair, then a sum over the pairs of each Gaussian.
 
-Blending is recomputed from front to back. The contribution of everything behind a Gaussian to the loss is the total,
-which follows from the image, minus the contributions already passed. The forward pass therefore stores nothing per
-pixel.
+Blending is undone from back to front, starting from the transmittance and the last pair of each pixel that the
+forward pass keeps. The contribution of everything behind a Gaussian is then a sum, not a difference of two large
+numbers: gradients behind a nearly opaque Gaussian are as exact as those in front of it.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lexsplat.rendering.kernels.arrays import F32, I32, I64
+from lexsplat.rendering.kernels.arrays import F32, I32, I64, U8
 from lexsplat.rendering.kernels.binning import CONIC_B, HALF_A, HALF_C, OPACITY, TILE
 from lexsplat.rendering.kernels.blending import (
     ALPHA_MAX,
-    CHECK_EVERY,
     HALF,
     ONE,
     PIXELS,
     ZERO,
     alpha_of,
     column_numbers,
-    pass_row,
-    rows_in_tile,
     seen_from_tile,
-    start_tile,
-    tile_finished,
 )
 from lexsplat.rendering.kernels.jit import kernel
 from lexsplat.rendering.kernels.lanes import (
@@ -54,43 +50,40 @@ def _load_tile(
     tile: int,
     tiles_x: int,
     colors: int,
-    image: F32,
-    alpha: F32,
+    background: F32,
+    passed: F32,
     grad_image: F32,
     grad_alpha: F32,
     upstream: F32,
+    live: F32,
     behind: F32,
 ) -> None:
-    """Load the gradients of the tile's pixels, and the contribution of all Gaussians of each pixel to the loss."""
-    height, width, channels = image.shape
+    """Load the transmittance and the gradients of the tile's pixels, and what the background adds to the loss."""
+    height, width, channels = grad_image.shape
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     if left + TILE > width or top + TILE > height:
         upstream[:] = ZERO
         behind[:] = ZERO
+    for j in range(TILE):
+        store(live, j * TILE, load(passed, (tile * TILE + j) * TILE))
     for j in range(min(TILE, height - top)):
         for i in range(min(TILE, width - left)):
-            loss = (alpha[top + j, left + i] - ONE) * grad_alpha[top + j, left + i]
+            loss = -grad_alpha[top + j, left + i]
             for channel in range(channels):
                 gradient = grad_image[top + j, left + i, channel]
                 upstream[(j * channels + channel) * TILE + i] = gradient
-                if channel < colors:
-                    loss += gradient * image[top + j, left + i, channel]
-            behind[j * TILE + i] = loss
+                if channel < colors and channel < background.shape[0]:
+                    loss += gradient * background[channel]
+            behind[j * TILE + i] = loss * live[j * TILE + i]
 
 
 @kernel
-def _exponent_gradient(behind: F32, j: int, weight: Any, row_alpha: Any, dots: Any) -> Any:
-    """Gradient w.r.t. the exponent along row ``j``; subtracts the Gaussian's contribution from ``behind``.
-
-    ``dots`` is the dot product of the Gaussian's color and the upstream gradient of each pixel.
-    """
-    # d loss / d alpha = T dots - rest / (1 - alpha), and d alpha / d exponent = -alpha.
-    share = weight * dots
-    rest = load(behind, j * TILE) - share
-    store(behind, j * TILE, rest)
-    gradient = rest * row_alpha / (ONE - row_alpha) - share
-    gradient = select_greater(weight, ZERO, gradient, ZERO)
-    return select_greater(ALPHA_MAX, row_alpha, gradient, ZERO)
+def _last_of_tile(last: F32, tile: int) -> int:
+    """Number of pairs of the tile up to the last one that a pixel shows."""
+    most = ZERO
+    for i in range(tile * PIXELS, (tile + 1) * PIXELS):
+        most = max(most, last[i])
+    return int(most)
 
 
 @kernel
@@ -123,18 +116,22 @@ def _feature_gradients(
             channel += 1
 
 
-@kernel
+@partial(kernel, inlined=True)
 def _pair_gradients(
     k: int,
+    tile: int,
+    number: np.float32,
     left: int,
     top: int,
     ellipses: F32,
-    boxes: I32,
+    first: int,
+    last: int,
     values: F32,
     columns: Any,
     colors: int,
     channels: int,
     geometry: bool,
+    last_pairs: F32,
     live: F32,
     behind: F32,
     upstream: F32,
@@ -144,7 +141,8 @@ def _pair_gradients(
 ) -> None:
     """Gradients of ellipse ``k`` in the tile at pixel (left, top), written from ``rows[row]``, which is zero, on.
 
-    Updates ``live`` and ``behind``; ``weights`` is scratch.
+    ``number`` of the tile's pairs lie in front of it. Takes it off ``live`` and adds it to ``behind``; ``weights`` is
+    scratch.
     """
     dx, across, slope, down, dy0, opacity = seen_from_tile(ellipses, k, left, top, columns)
     red, green, blue = ZERO, ZERO, ZERO
@@ -152,16 +150,20 @@ def _pair_gradients(
         red, green, blue = values[k, 0], values[k, 1], values[k, 2]
     zeros = splat(ZERO)
     g0, g1, g2, r0, r1, r2 = zeros, zeros, zeros, zeros, zeros, zeros
-    first, last = rows_in_tile(boxes, k, top)
     touched = False
     for j in range(first, last):
         dy = np.float32(j) + dy0
         row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
-        weight = pass_row(live, j, row_alpha)
-        store(weights, j * TILE, weight)
-        if not any_positive(weight):
+        row_alpha = select_greater(load(last_pairs, (tile * TILE + j) * TILE), number, row_alpha, ZERO)
+        if not any_positive(row_alpha):
+            store(weights, j * TILE, zeros)
             continue
         touched = True
+        inverse = ONE / (ONE - row_alpha)
+        before = load(live, j * TILE) * inverse
+        store(live, j * TILE, before)
+        weight = row_alpha * before
+        store(weights, j * TILE, weight)
         dots = zeros
         if colors == 3:
             place = j * channels * TILE
@@ -173,7 +175,12 @@ def _pair_gradients(
             dots = u0 * red + u1 * green + u2 * blue
         if not geometry:
             continue
-        gradient = _exponent_gradient(behind, j, weight, row_alpha, dots)
+        # d loss / d alpha = T dots - behind / (1 - alpha), and d alpha / d exponent = -alpha.
+        share = weight * dots
+        rest = load(behind, j * TILE)
+        store(behind, j * TILE, rest + share)
+        gradient = rest * row_alpha * inverse - share
+        gradient = select_greater(ALPHA_MAX, row_alpha, gradient, ZERO)
         g0 += gradient
         g1 += gradient * dy
         g2 += gradient * (dy * dy)
@@ -191,16 +198,17 @@ def blend_backward(
     start: int,
     stop: int,
     ellipses: F32,
-    boxes: I32,
     tile_offsets: I64,
     members: I32,
     pairs: I32,
+    reached: U8,
     values: F32,
+    background: F32,
     tiles_x: int,
     colors: int,
     geometry: bool,
-    image: F32,
-    alpha: F32,
+    passed: F32,
+    last_pairs: F32,
     grad_image: F32,
     grad_alpha: F32,
     rows: F32,
@@ -208,37 +216,36 @@ def blend_backward(
     """Gradients of every pair in tiles ``start`` to ``stop``, written to ``rows [M * row_width(C)]``.
 
     Args:
+        reached: Rows of the tile that each pair reaches ``[M, 2]``.
+        background: As in `blend`.
         colors: 3 or 0. Only these first channels and alpha contribute to the gradients of the geometry; the other
             channels contribute to the gradients of their own values only.
         geometry: Whether gradients of the geometry are required.
+        passed: From `blend`.
+        last_pairs: From `blend`.
     """
-    height, width, channels = image.shape
+    channels = grad_image.shape[2]
     live, weights = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
     behind, upstream = np.empty(PIXELS, np.float32), np.empty(PIXELS * channels, np.float32)
     fields = row_width(channels)
     columns = column_numbers()
     for tile in range(start, stop):
-        if tile_offsets[tile] == tile_offsets[tile + 1]:
+        first, end = tile_offsets[tile], tile_offsets[tile + 1]
+        if first == end:
             continue
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        start_tile(tile, tiles_x, width, height, live)
-        _load_tile(tile, tiles_x, colors, image, alpha, grad_image, grad_alpha, upstream, behind)
-        countdown = CHECK_EVERY
-        finished = False
-        for slot in range(tile_offsets[tile], tile_offsets[tile + 1]):
+        for slot in range(first, end):
             row = np.int64(pairs[slot]) * fields
             for field in range(row, row + fields):
                 rows[field] = ZERO
-            if finished:
-                continue
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        _load_tile(tile, tiles_x, colors, background, passed, grad_image, grad_alpha, upstream, live, behind)
+        for number in range(min(_last_of_tile(last_pairs, tile), end - first) - 1, -1, -1):
+            slot = first + number
             _pair_gradients(
-                members[slot], left, top, ellipses, boxes, values, columns, colors, channels, geometry,
-                live, behind, upstream, weights, row, rows,
+                members[slot], tile, np.float32(number), left, top, ellipses, np.int64(reached[slot, 0]),
+                np.int64(reached[slot, 1]), values, columns, colors, channels, geometry, last_pairs, live, behind,
+                upstream, weights, np.int64(pairs[slot]) * fields, rows,
             )  # fmt: skip
-            countdown -= 1
-            if countdown == 0:
-                countdown = CHECK_EVERY
-                finished = tile_finished(live)
 
 
 @kernel

@@ -21,7 +21,9 @@ import numba
 import torch
 from numba.core import event
 
+from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.fingerprints import digest
+from lexsplat.runtime.progress import NOTE
 
 logger = logging.getLogger("lexsplat")
 
@@ -29,16 +31,20 @@ _dispatchers: set[Any] = set()
 _announced = False
 
 
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+def kernel(function: Callable[..., Any], *, inlined: bool = False) -> Callable[..., Any]:
     """Compile a function that releases the GIL, with a cache on disk.
 
     Fast-math stays off: it leaves comparisons with NaN undefined, and comparisons decide where memory is written.
+
+    Args:
+        function: The function to compile.
+        inlined: Whether it becomes part of its callers. A call passes seven values for each array.
     """
     # Numba reads the folder from its global settings when it creates the cache; the settings are restored afterwards.
     before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     numba.config.CACHE_DIR = _cache_folder()  # type: ignore[attr-defined]
     try:
-        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=inlined)(function)
     finally:
         numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
     _dispatchers.add(dispatcher)
@@ -59,12 +65,10 @@ def _cache_folder() -> str:
         [numba.__version__.encode(), *(source.read_bytes() for source in sorted(here.glob("*.py")))], 6
     )
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
-    places = [Path(chosen)] if chosen else [here / "__pycache__", Path(home) / "lexsplat"]
+    places = [lambda: Path(chosen)] if chosen else [lambda: here / "__pycache__", user_cache]
     for place in places:
         try:
-            # expanduser() raises RuntimeError if the user has no home directory.
-            folder = place.expanduser() / f"kernels-{key}"
+            folder = place().expanduser() / f"kernels-{key}"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return str(folder)
@@ -81,7 +85,7 @@ class _Announcer(event.Listener):
         global _announced
         if not _announced and event.data["dispatcher"] in _dispatchers:
             _announced = True
-            logger.info("compiling CPU kernels, once (about 15 seconds)")
+            logger.log(NOTE, "compiling CPU kernels, once (about 15 seconds)")
 
     def on_end(self, event: Any) -> None:
         pass

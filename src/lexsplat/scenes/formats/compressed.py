@@ -1,30 +1,43 @@
-"""Compressed splat files: SPZ, the compressed PLY of SuperSplat, and ``.ksplat``, through the library GaussForge.
+"""The compressed PLY of SuperSplat and ``.ksplat``, through the library GaussForge (Apache-2.0).
 
-GaussForge (Apache-2.0) includes Niantic's own SPZ code. It is an optional dependency:
-``pip install "lexsplat[formats]"``.
-
-SPZ uses y up and z backward; PLY uses y down and z forward. The two differ by a rotation of 180 degrees about x.
-GaussForge 0.6 omits this rotation, so it is applied here. splat-transform agrees with the result
-(tools/check_exports.py).
+It is an optional dependency: ``pip install "lexsplat[formats]"``. Damaged ``.ksplat`` files corrupt its memory, so it
+works in a process of its own. Three faults of GaussForge 0.6 are corrected here: it drops the comment of the mip
+filter, writes the spherical harmonics of a compressed PLY coefficient by coefficient instead of channel by channel,
+and takes all degrees of a ``.ksplat`` for one. splat-transform agrees with the result
+(tests/scenes/test_splat_transform.py).
 """
 
 from __future__ import annotations
 
+import importlib.util
+import subprocess
+import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import torch
+from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
-from lexsplat.scenes.formats.ply import read_ply, write_ply
-from lexsplat.scenes.transforms import transformed
+from lexsplat.scenes.formats.foreign import read_content
+from lexsplat.scenes.formats.ply import MIP, header_lines, is_antialiased, parse_ply, write_ply
 
-_HALF_TURN = np.diag([1.0, -1.0, -1.0])
-
-COMPRESSED = {".spz": "spz", ".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
+COMPRESSED = {".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
 """GaussForge's name of each format, by file suffix."""
+
+_FORMAT_LINE = b"format binary_little_endian 1.0\n"
+_CONVERT = """
+import sys
+from pathlib import Path
+from gaussforge import GaussForge
+source, kind, target, wanted = sys.argv[1:]
+answer = GaussForge().convert(Path(source).read_bytes(), kind, wanted)
+if "data" not in answer:
+    sys.exit(str(answer.get("error")))
+Path(target).write_bytes(answer["data"])
+"""
 
 
 def write_compressed(gaussians: Gaussians, path: Path, kind: str) -> None:
@@ -34,14 +47,14 @@ def write_compressed(gaussians: Gaussians, path: Path, kind: str) -> None:
         BackendError: If GaussForge is not installed.
         FileFormatError: If GaussForge cannot convert the Gaussians.
     """
-    library = _library(path)
     with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "plain.ply"
-        write_ply(transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians, plain)
-        answer = library.convert(plain.read_bytes(), "ply", kind)
-    if "data" not in answer:
-        raise FileFormatError(path, expected=f"a {kind} file", found=str(answer.get("error")))
-    path.write_bytes(answer["data"])
+        plain, converted = Path(folder) / "plain.ply", Path(folder) / "converted"
+        write_ply(replace(gaussians, shN=_as_the_library_writes(gaussians.shN, kind)), plain)
+        _convert(plain, "ply", converted, kind, subject=path)
+        content = converted.read_bytes()
+    if kind == "compressed.ply" and gaussians.antialiased:
+        content = content.replace(_FORMAT_LINE, _FORMAT_LINE + MIP.encode() + b"\n", 1)
+    path.write_bytes(content)
 
 
 def read_compressed(path: Path, kind: str) -> Gaussians:
@@ -51,35 +64,60 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
         BackendError: If GaussForge is not installed.
         FileFormatError: If the file is damaged or has another format.
     """
-    library = _library(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise FileFormatError(path, expected=f"a readable {kind} file", found=str(error.strerror)) from error
-    try:
-        answer = library.convert(content, kind, "ply")
-    except Exception as error:  # GaussForge documents no exception types; the cause is always the file
-        raise FileFormatError(path, expected=f"a {kind} file", found=str(error)) from error
-    if "data" not in answer:
-        raise FileFormatError(path, expected=f"a {kind} file", found=str(answer.get("error")))
+    read_content(path, kind)  # a missing file is a clearer error here
+    antialiased = False
+    if kind == "compressed.ply":
+        with open(path, "rb") as file:
+            antialiased = is_antialiased(header_lines(file, path))
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "plain.ply"
-        plain.write_bytes(answer["data"])
+        _convert(path, kind, plain, "ply", subject=path)
         try:
-            gaussians = read_ply(plain, certain_opacities=True)
+            found = parse_ply(plain)
         except FileFormatError as error:  # its text concerns the temporary file, not the user's
             raise FileFormatError(path, expected=f"a {kind} file", found="damaged content") from error
-    return transformed(gaussians, rotation=_HALF_TURN) if kind == "spz" else gaussians
+    if kind == "ksplat":
+        values = found.shN.transpose(1, 2).flatten(1)
+        found = replace(found, shN=values[:, _places_in_ksplat(found.sh_degree)].reshape_as(found.shN))
+    return replace(found, antialiased=antialiased)
 
 
-def _library(path: Path) -> Any:
-    try:
-        import gaussforge
-    except ImportError as error:
+def _as_the_library_writes(shN: Tensor, kind: str) -> Tensor:
+    """Coefficients ``[N, K, 3]`` in the order in which GaussForge writes them rightly."""
+    if kind == "compressed.ply":
+        return shN.transpose(1, 2).reshape(shN.shape)
+    degree = round((shN.shape[1] + 1) ** 0.5) - 1
+    values = torch.zeros_like(shN.flatten(1))
+    values[:, _places_in_ksplat(degree)] = shN.flatten(1)
+    return values.reshape(len(shN), 3, shN.shape[1]).transpose(1, 2)
+
+
+def _places_in_ksplat(degree: int) -> Tensor:
+    """Where a ``.ksplat`` has coefficient k of channel c ``[3 K]``, k slowest: degrees, then channels, then k."""
+    places = torch.zeros((degree + 1) ** 2 - 1, 3, dtype=torch.long)
+    for order in range(1, degree + 1):
+        first, count = order * order - 1, 2 * order + 1
+        rows = torch.arange(count)[:, None] + count * torch.arange(3)
+        places[first : first + count] = 3 * first + rows
+    return places.flatten()
+
+
+def _convert(source: Path, kind: str, target: Path, wanted: str, subject: Path) -> None:
+    """Convert a file with GaussForge in another process.
+
+    Raises:
+        BackendError: If GaussForge is not installed.
+        FileFormatError: If it refuses the file or ends by a signal.
+    """
+    if importlib.util.find_spec("gaussforge") is None:
         raise BackendError(
-            path,
+            subject,
             expected="the library gaussforge",
             found="not installed",
             remedy='pip install "lexsplat[formats]"',
-        ) from error
-    return gaussforge.GaussForge()
+        )
+    command = [sys.executable, "-c", _CONVERT, str(source), kind, str(target), wanted]
+    run = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if run.returncode:
+        last = (run.stderr.strip().splitlines() or ["damaged content"])[-1][:200]
+        raise FileFormatError(subject, expected=f"a {kind if wanted == 'ply' else wanted} file", found=last)

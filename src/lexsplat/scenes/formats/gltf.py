@@ -24,6 +24,8 @@ from lexsplat.geometry.world import World
 from lexsplat.scenes.formats.language import StoredLanguage, check_language
 
 EXTENSION = "KHR_gaussian_splatting"
+GENERATOR = "lexsplat"
+"""The program named in the files."""
 _FLOAT, _BYTE = 5126, 5121
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
@@ -75,7 +77,7 @@ def write_glb(
     if own:
         primitive["extras"] = {"lexsplat": own}
     document = {
-        "asset": {"version": "2.0", "generator": "lexsplat"},
+        "asset": {"version": "2.0", "generator": GENERATOR},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

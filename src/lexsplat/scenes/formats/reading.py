@@ -2,39 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import refuse_pickle
 from lexsplat.scenes.formats.compressed import COMPRESSED, read_compressed
-from lexsplat.scenes.formats.ply import read_ply
+from lexsplat.scenes.formats.foreign import renderable
+from lexsplat.scenes.formats.gltf_reading import read_gltf
+from lexsplat.scenes.formats.ply import parse_ply
+from lexsplat.scenes.formats.sog import META, read_sog
 from lexsplat.scenes.formats.splat import read_splat
+from lexsplat.scenes.formats.spz import read_spz
+
+READERS: dict[str, Callable[[Path], Gaussians]] = {
+    ".ply": lambda path: read_compressed(path, "compressed.ply") if _is_compressed(path) else parse_ply(path),
+    ".splat": read_splat,
+    ".spz": read_spz,
+    ".sog": read_sog,
+    META: read_sog,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".ksplat": lambda path: read_compressed(path, COMPRESSED[".ksplat"]),
+}
+"""How files are read, by the end of their name."""
 
 
 def read_splats(path: Path) -> Gaussians:
-    """Read ``.ply``, ``.splat``, ``.spz``, ``.compressed.ply`` or ``.ksplat``, chosen by suffix.
+    """Read Gaussians of any program; the name's ending chooses the format, one of `READERS`.
+
+    Axes are those of the 3DGS PLY, y down and z forward, where a format defines others. Gaussians that cannot be
+    rendered are dropped with a warning.
+
+    Args:
+        path: The file; of an unbundled SOG, its ``meta.json`` or its folder.
 
     Raises:
-        FileFormatError: If the suffix is unknown or the content does not match it.
+        FileFormatError: If the ending is unknown, the content does not match it, or more than a tenth of the
+            Gaussians cannot be rendered.
         BackendError: If the format requires a library that is not installed.
     """
     refuse_pickle(path)
-    name = path.name.lower()
-    for ending, kind in COMPRESSED.items():
-        if name.endswith(ending):
-            return read_compressed(path, kind)
-    if name.endswith(".ply"):
-        if _is_compressed(path):
-            return read_compressed(path, "compressed.ply")
-        return read_ply(path, certain_opacities=True)
-    if name.endswith(".splat"):
-        return read_splat(path)
-    raise FileFormatError(
-        path,
-        expected="a name that ends in .ply, .splat, .spz, .compressed.ply or .ksplat",
-        found=repr(path.suffix),
-    )
+    if (path / META).is_file():
+        path = path / META
+    for ending, read in READERS.items():
+        if path.name.lower().endswith(ending):
+            return renderable(read(path), path)
+    raise FileFormatError(path, expected="a name that ends in " + ", ".join(READERS), found=repr(path.suffix))
 
 
 def _is_compressed(path: Path) -> bool:

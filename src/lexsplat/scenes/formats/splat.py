@@ -14,6 +14,7 @@ import torch
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.foreign import as_tensor, logits_of_bytes, read_content
 
 _LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -39,38 +40,25 @@ def write_splat(gaussians: Gaussians, path: Path) -> None:
 def read_splat(path: Path) -> Gaussians:
     """Read a ``.splat`` file.
 
-    Opacity bytes 0 and 255 are read as 0.25 and 254.75, because the logits of opacities 0 and 1 are infinite.
-
     Raises:
-        FileFormatError: If the file size is not a multiple of 32 bytes, a position or size is NaN or infinite, or a
-            size is negative.
+        FileFormatError: If the file size is not a multiple of 32 bytes or a size is negative.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise FileFormatError(path, expected="a readable .splat file", found=str(error.strerror)) from error
+    content = read_content(path, ".splat")
     if not content or len(content) % _LAYOUT.itemsize:
         raise FileFormatError(
             path, expected=f"a multiple of {_LAYOUT.itemsize} bytes", found=f"{len(content)} bytes"
         )
     table = np.frombuffer(content, dtype=_LAYOUT)
-    means, scales = (torch.from_numpy(table[name].astype(np.float32)) for name in ("mean", "scale"))
-    if not (torch.isfinite(means).all() and torch.isfinite(scales).all() and (scales >= 0).all()):
-        raise FileFormatError(
-            path, expected="finite positions and sizes", found="other values: not a .splat file"
-        )
-    rgba = torch.from_numpy(table["rgba"].astype(np.float32)) / 255
-    quats = (torch.from_numpy(table["quat"].astype(np.float32)) - 128) / 128
-    quats[quats.norm(dim=1) < 1e-3] = torch.tensor([1.0, 0, 0, 0])
-    gaussians = Gaussians(
-        means=means,
-        quats=quats,
-        log_scales=scales.clamp_min(1e-12).log(),
-        opacity_logits=rgba[:, 3].clamp(0.25 / 255, 1 - 0.25 / 255).logit(),
-        sh0=((rgba[:, :3] - 0.5) / SH_C0)[:, None, :],
+    if (table["scale"] < 0).any():
+        raise FileFormatError(path, expected="sizes of 0 or more", found="negative ones: not a .splat file")
+    with np.errstate(divide="ignore"):  # the logarithm of 0 is minus infinity
+        log_scales = np.log(table["scale"])
+    rgba = as_tensor(table["rgba"][:, :3]) / 255
+    return Gaussians(
+        means=as_tensor(table["mean"]),
+        quats=(as_tensor(table["quat"]) - 128) / 128,
+        log_scales=as_tensor(log_scales),
+        opacity_logits=logits_of_bytes(table["rgba"][:, 3]),
+        sh0=((rgba - 0.5) / SH_C0)[:, None, :],
         shN=torch.zeros(len(table), 0, 3),
     )
-    damage = gaussians.find_invalid()
-    if damage:
-        raise FileFormatError(path, expected="valid Gaussians", found=damage)
-    return gaussians

@@ -1,14 +1,12 @@
-"""What a page needs beside the splats: the codes of each, and the cameras."""
+"""The language of the splats of a page: four codes of each, their weights, and the segments."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import torch
 
+from lexsplat.language.segments import Segments
 from lexsplat.scenes.formats.language import StoredLanguage
-from lexsplat.scenes.scene import Scene
 
 
 def splat_codes(language: StoredLanguage) -> bytes:
@@ -25,15 +23,16 @@ def splat_codes(language: StoredLanguage) -> bytes:
     return language.codes.numpy().tobytes() + quantized.numpy().tobytes()
 
 
-def view_entries(scene: Scene) -> list[dict[str, Any]]:
-    """The cameras of the views for the page, in the order of their names."""
-    return [
-        {
-            "name": name,
-            "width": view.camera.width,
-            "height": view.camera.height,
-            "focal": [round(float(view.camera.K[axis, axis]), 4) for axis in (0, 1)],
-            "viewmat": [round(float(value), 6) for value in np.asarray(view.camera.viewmat).ravel()],
-        }
-        for name, view in sorted(scene.views.items())
-    ]
+def segments_file(segments: Segments, hidden: torch.Tensor) -> bytes:
+    """The segments of N splats, little-endian: the numbers of levels L and of segments S, then four arrays.
+
+    They are the segment at each level of each lowest segment ``[L, S]`` uint32; the lowest segment of each splat
+    ``[N]`` uint16, or uint32 for more than 65,536 segments; the masses ``[N]`` float16, as the scene stores them; and
+    1 for each splat that no view shows, which selections leave out, ``[N]`` uint8.
+    """
+    levels = segments.levels.cpu().numpy().astype("<u4")
+    labels = segments.labels.cpu().numpy().astype("<u2" if levels.shape[1] <= 1 << 16 else "<u4")
+    masses = segments.masses.clamp(max=6e4).cpu().numpy().astype("<f2")
+    unseen = hidden.cpu().numpy().astype(np.uint8)
+    head = np.array(levels.shape, "<u4")
+    return b"".join(array.tobytes() for array in (head, levels, labels, masses, unseen))

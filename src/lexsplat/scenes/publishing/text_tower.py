@@ -12,6 +12,7 @@ from torch import Tensor
 from lexsplat.features.clip import ClipEncoder
 from lexsplat.features.encoders import load_clip
 from lexsplat.queries import everyday, presence
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 from lexsplat.runtime.files import save_tensors
 from lexsplat.scenes.scene import Scene
 
@@ -35,6 +36,8 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
     tensors = _eight_bits(tower.tensors)
     codewords = torch.nn.functional.normalize(scene.field.codebook.clip.detach().cpu().float(), dim=-1)
     tensors |= {"codewords": codewords, "mean": scene.everyday_scale.mean, "best": scene.everyday_scale.best}
+    if scene.field.segments is not None:
+        tensors |= {name: table.float() for name, table in scene.presence_classifier.tables.items()}
     save_tensors(
         {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
         weights,
@@ -55,6 +58,11 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
             "peak": scene.everyday_scale.peak,
             "yes": presence.YES,
             "no": presence.NO,
+            "yes_object": presence.YES_OBJECT,
+            "yes_colored": presence.YES_COLORED,
+            "names": sorted(NAMES),
+            "qualities": sorted(QUALITIES),
+            "colors": sorted(COLORS),
         },
     }
 

@@ -90,13 +90,12 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
     codewords = field.codebook.clip
     tables, presences = [], []
     for start in range(0, len(phrases), _BATCH):
-        texts = embed_prompts(
-            phrases[start : start + _BATCH], scene.preload().encode_text, scene.query.templates
-        )
+        batch = phrases[start : start + _BATCH]
+        texts = embed_prompts(batch, scene.preload().encode_text, scene.query.templates)
         relevancy = scale.relevancy(codewords, texts.to(codewords.device))
         tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
         scores = field.scores(relevancy).T.contiguous()
-        presences += [presence[0] for presence in scene.presence_classifier.classify(texts, scores)]
+        presences += [presence[0] for presence in scene.presence_classifier.classify(batch, texts, scores)]
     return torch.cat(tables), presences
 
 

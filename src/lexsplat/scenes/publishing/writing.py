@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import base64
-import hashlib
-import html
-import shutil
+import re
 import tempfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from lexsplat import __version__
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.scoring import form_used
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.formats.language import stored_language
-from lexsplat.scenes.publishing.sidecar import splat_codes, view_entries
+from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file, single_index
+from lexsplat.scenes.publishing.manifest import FORMAT, checksums, object_entries, one_line, scene_manifest
+from lexsplat.scenes.publishing.sidecar import segments_file, splat_codes
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
 from lexsplat.scenes.publishing.vocabulary import (
@@ -34,13 +32,7 @@ MOST_SPLATS = 4_000_000
 """Gaussians that a browser draws, at most."""
 SINGLE_FILE_BYTES = 50_000_000
 """Largest size of the files that go into one HTML file."""
-
-_FORMAT, _FORMAT_VERSION = "lexsplat-page", 1
-_PAGE_FILES = ("page.js", "page.css", "LICENSES.txt")
-_POLICY = (
-    "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; style-src {style}; img-src data: blob:; "
-    "connect-src {connect}; worker-src blob:; base-uri 'none'; form-action 'none'"
-)
+_PLAIN_NAME = re.compile(r"\w+(\.\w+)*")
 
 
 @dataclass(frozen=True)
@@ -141,7 +133,7 @@ def check_target(target: Path, single_file: bool) -> None:
     if single_file:
         if target.suffix.lower() != ".html":
             raise SceneFolderError(target, expected="a name that ends in .html", found=repr(target.suffix))
-        if target.exists() and (not target.is_file() or _FORMAT not in _head(target)):
+        if target.exists() and (not target.is_file() or FORMAT not in _head(target)):
             raise SceneFolderError(
                 target,
                 expected="a new file or an earlier page",
@@ -153,11 +145,9 @@ def check_target(target: Path, single_file: bool) -> None:
         return
     if not target.is_dir():
         raise SceneFolderError(target, expected="a folder", found="a file", remedy="give another name")
-    foreign = sorted(
-        path.name for path in target.iterdir() if path.name not in (_own_files(target) | {"manifest.json"})
-    )
-    if not _own_files(target) and (target / "manifest.json").exists():
-        foreign.append("manifest.json")
+    own = _own_files(target)
+    own |= {"manifest.json"} if own else set()
+    foreign = sorted(path.name for path in target.iterdir() if path.name not in own or not path.is_file())
     if foreign:
         raise SceneFolderError(
             target,
@@ -173,14 +163,20 @@ def _head(path: Path) -> str:
 
 
 def _own_files(folder: Path) -> set[str]:
-    """Names of the files of an earlier page in a folder; none if there is no page."""
+    """Names of the files of an earlier page in a folder; none if there is no page.
+
+    Publishing deletes these files, and the manifest may be somebody else's: one with a path in it is not a page.
+    """
     try:
         manifest = read_json(folder / "manifest.json")
     except LexsplatError:
         return set()
-    if not isinstance(manifest, Mapping) or manifest.get("format") != _FORMAT:
+    if not isinstance(manifest, Mapping) or manifest.get("format") != FORMAT:
         return set()
-    return set(manifest.get("files", ()))
+    names = manifest.get("files")
+    if not isinstance(names, Mapping) or not all(_PLAIN_NAME.fullmatch(name) for name in names):
+        return set()
+    return set(names)
 
 
 def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[str, Any]:
@@ -192,6 +188,9 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     identity = scene.encoder_identity()
     language = stored_language(scene.field, identity).select(kept)
     (folder / "codes.bin").write_bytes(splat_codes(language))
+    segments = scene.field.segments if form_used(scene.field, scene.query) == "segment" else None
+    if segments is not None:
+        (folder / "segments.bin").write_bytes(segments_file(segments.select(kept), scene.hidden.cpu()[kept]))
     phrases = page_phrases(asked_phrases(scene), bundled=scene.clip in ("bundled", "embedded"))
     tables, presences = phrase_answers(scene, list(phrases))
     (folder / "words.txt").write_bytes(words_file(phrases, presences))
@@ -199,54 +198,32 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     text = None
     if not options.words_only:
         text = write_text_tower(scene, folder / "text.safetensors", folder / "tokenizer.json")
-    for name in _PAGE_FILES:
-        shutil.copyfile(str(files(__package__).joinpath("page", name)), folder / name)
-    record = scene.folder.record if scene.folder else {}
-    manifest: dict[str, Any] = {
-        "format": _FORMAT,
-        "format_version": _FORMAT_VERSION,
-        "lexsplat": __version__,
-        "title": _one_line(options.title) or (scene.folder.root.resolve().name if scene.folder else "scene"),
-        "description": _one_line(options.description),
-        "scene": {
-            "file": splats.name,
-            "gaussians": len(gaussians),
-            "of": len(scene.gaussians),
-            "rotation": rotation,
-            "antialiased": gaussians.antialiased,
-            "up": [round(float(value), 6) + 0.0 for value in scene.world.up.direction],
-            "meters_per_unit": scene.world.meters_per_unit,
-            "start_view": start,
-        },
+    for name in PAGE_FILES:
+        (folder / name).write_bytes(page_file(name))
+    manifest = scene_manifest(scene, gaussians, splats.name, rotation, options.title)
+    manifest["description"] = one_line(options.description)
+    manifest["scene"]["start_view"] = start
+    manifest |= {
         "language": {
             "codes": "codes.bin",
+            "segments": None if segments is None else "segments.bin",
             "num_codes": scene.field.codebook.num_codes,
             "method": scene.field.method,
         },
         "words": {"phrases": "words.txt", "table": "words.bin", "count": len(phrases)},
         "text": text,
-        "views": view_entries(scene),
+        "objects": object_entries(scene),
         "licenses": {
             "page.js": "Apache-2.0 and those of LICENSES.txt",
             "words.txt": "Apache-2.0",
             "text.safetensors": "Apache-2.0" if scene.clip == "bundled" else f"that of {scene.clip}",
             "scene": "not stated",
         },
-        "provenance": {
-            **identity,
-            "built_with": {
-                key: record.get("provenance", {}).get(key) for key in ("lexsplat", "versions", "seed")
-            },
-        },
     }
-    manifest["files"] = {path.name: _checksums(path.read_bytes()) for path in sorted(folder.iterdir())}
+    manifest["files"] = {path.name: checksums(path.read_bytes()) for path in sorted(folder.iterdir())}
     manifest["files"]["index.html"] = {}  # it belongs to the page; nothing reads it by its checksum
     write_json(folder / "manifest.json", manifest)
     return manifest
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())[:500]
 
 
 def _start_view(scene: Scene, name: str | None) -> str:
@@ -255,35 +232,9 @@ def _start_view(scene: Scene, name: str | None) -> str:
     return min(scene.views, default="")
 
 
-def _checksums(content: bytes) -> dict[str, Any]:
-    return {
-        "bytes": len(content),
-        "crc32": zlib.crc32(content),
-        "sha256": hashlib.sha256(content).hexdigest(),
-    }
-
-
-def _page(manifest: dict[str, Any], policy: str, style: str, script: str) -> str:
-    """``index.html``; all that others wrote in it is escaped."""
-    template = files(__package__).joinpath("page/index.html").read_text(encoding="utf-8")
-    values = {
-        "POLICY": html.escape(policy),
-        "TITLE": html.escape(manifest["title"]),
-        "DESCRIPTION": html.escape(manifest["description"] or f"Search {manifest['title']} with words."),
-        "STYLE": style,
-        "SCRIPT": script,
-    }
-    head, *parts = template.split("{{")
-    return head + "".join(values[name] + rest for name, rest in (part.split("}}", 1) for part in parts))
-
-
 def _write_folder(folder: Path, manifest: dict[str, Any], target: Path) -> int:
     """Move a finished page to its place; returns its size. The manifest of an earlier page is the last to go."""
-    policy = _POLICY.format(script="'self'", style="'self'", connect="'self'")
-    page = _page(
-        manifest, policy, '<link rel="stylesheet" href="page.css">', '<script src="page.js" defer></script>'
-    )
-    (folder / "index.html").write_text(page, encoding="utf-8")
+    (folder / "index.html").write_text(folder_index(manifest), encoding="utf-8")
     size = sum(path.stat().st_size for path in folder.iterdir())
     earlier = _own_files(target) if target.exists() else set()
     target.mkdir(exist_ok=True)
@@ -318,16 +269,8 @@ def _write_single(folder: Path, manifest: dict[str, Any], target: Path) -> int:
         f"{base64.b64encode(path.read_bytes()).decode()}</script>"
         for path in data
     ]
-    policy = _POLICY.format(script=_source(script), style=_source(style), connect="'none'")
-    page = _page(
-        manifest, policy, f"<style>{style}</style>", "\n".join([*blocks, f"<script>{script}</script>"])
-    )
+    page = single_index(manifest, style, script, "\n".join(blocks))
     temporary = folder / "single.html"
     temporary.write_text(page, encoding="utf-8")
     temporary.replace(target)
     return target.stat().st_size
-
-
-def _source(content: str) -> str:
-    """The source expression of a content security policy that admits one inline element."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"

@@ -1,0 +1,161 @@
+"""Time of method "averaged", against back-projecting every channel at every pixel, alternated in one process.
+
+    python benchmarks/averaging.py                         # a synthetic room of 200,000 Gaussians
+    python benchmarks/averaging.py --gaussians 1000000 --views 2
+    python benchmarks/averaging.py --demo output/demo      # the language stage of a scene of `lexsplat demo`
+
+The room has no mip filter, like splats of other programs: its views are rendered at full size. Its features are
+random; times do not depend on their values. `sparse` is the program, `dense` the same loop with `DenseCellWeights`,
+the path of CUDA. Seconds are of the whole stage without features. Sparse runs first; `peak` is the peak memory of
+the process after its first run.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from records import argument_parser, write_record
+from torch import Tensor
+
+from lexsplat.captures import load_capture
+from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
+from lexsplat.features import FeatureMap
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
+from lexsplat.language.methods import averaged
+from lexsplat.language.methods.averaged import Averaged, AveragedConfig, average_features
+from lexsplat.language.methods.method import FitRun, TrainingViews
+from lexsplat.pipeline.encoding import Encoders, feature_maps
+from lexsplat.rendering import PreparedView
+from lexsplat.rendering.back_projection import DenseCellWeights, cell_of
+from lexsplat.scenes.folder import SceneFolder
+
+
+def main() -> None:
+    parser = argument_parser(__doc__)
+    parser.add_argument("--demo", type=Path, metavar="SCENE", help="measure the language stage of this scene")
+    parser.add_argument("--gaussians", type=int, default=200_000)
+    parser.add_argument("--views", type=int, default=2)
+    parser.add_argument("--size", default="1600x1067")
+    parser.add_argument("--dimensions", type=int, default=512)
+    parser.add_argument("--cells", type=int, default=112, help="cells along the short side")
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--only-sparse", action="store_true")
+    options = parser.parse_args()
+    run, views = demo_stage(options.demo) if options.demo else synthetic_average(options)
+    if not options.demo:
+        warm_up()
+    paths = ["sparse"] if options.only_sparse else ["sparse", "dense"]
+    rows = []
+    for repeat in range(options.repeats):
+        for path in paths:
+            row = measured(run, path)
+            rows.append({"path": path, "repeat": repeat, "views": views, **row})
+            print(
+                "{path:7} {seconds:8.2f} s  {cpu:8.2f} CPU s  peak {peak:.2f} GiB".format(**rows[-1]),
+                flush=True,
+            )
+    if not options.only_sparse:
+        best = {path: min(row["cpu"] for row in rows if row["path"] == path) for path in paths}
+        print(f"ratio of CPU seconds: {best['dense'] / best['sparse']:.2f}")
+        found = [row.pop("means") for row in rows[:2]]
+        print(f"largest difference of the means: {np.abs(found[0] - found[1]).max():.2g}")
+    write_record(options.json, [{k: v for k, v in row.items() if k != "means"} for row in rows])
+
+
+def measured(run: Callable[[], Any], path: str) -> dict[str, Any]:
+    """Wall and CPU seconds of one run, and its first means."""
+    start, cpu = time.perf_counter(), time.process_time()
+    with patch.object(averaged, "weigh_cells", dense_cells if path == "dense" else averaged.weigh_cells):
+        means = run()
+    seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+    return {"seconds": seconds, "cpu": cpu, "peak": peak, "means": np.asarray(means[:4096], np.float32)}
+
+
+def dense_cells(
+    gaussians: Gaussians, camera: Camera, cells: tuple[int, int], counts: Tensor, prepared: PreparedView
+) -> DenseCellWeights:
+    """What `weigh_cells` makes for CUDA."""
+    rows = cell_of(np.arange(camera.height), camera.height, cells[0])
+    columns = cell_of(np.arange(camera.width), camera.width, cells[1])
+    at = torch.from_numpy(rows[:, None] * cells[1] + columns)
+    return DenseCellWeights(gaussians, camera, at, counts, prepared)
+
+
+def demo_stage(scene: Path) -> tuple[Callable[[], Any], int]:
+    """The language stage of a scene of the demo: averaging, codebook and segments."""
+    folder = SceneFolder.open(scene)
+    capture = load_capture(demo_capture("tabletop"))
+    config = DEMO_CONFIG.resolved("cpu", next(iter(capture.views.values())).capture_size)
+    capture = capture.downscaled(config.downscale or 1.0)
+    capture = replace(
+        capture, views={name: capture.views[name] for name in capture.train_names}, test_names=()
+    )
+    maps = feature_maps(capture, config, Encoders.of(config), folder.features_path)
+    gaussians = folder.read_gaussians()
+    views = TrainingViews(capture.views, features={name: maps[name] for name in maps})
+
+    def run() -> Any:
+        return Averaged().fit(gaussians, views, config, FitRun()).weights
+
+    return run, len(capture.views)
+
+
+def synthetic_average(options: Any) -> tuple[Callable[[], Any], int]:
+    """The averaging of random features over views from inside a room."""
+    width, height = map(int, options.size.split("x"))
+    gaussians = room(options.gaussians)
+    angles = np.linspace(0, 2 * np.pi, options.views, endpoint=False)
+    cameras = {
+        f"{number:03}": look_at(
+            np.array([0.5 * np.cos(a), 0.5 * np.sin(a), 0.1]),
+            np.array([-2 * np.cos(a), -2 * np.sin(a), -0.3]),
+            np.array([0, 0, 1.0]), width, height, 1.0,
+        )
+        for number, a in enumerate(angles)
+    }  # fmt: skip
+    shape = (options.cells, round(options.cells * width / height), options.dimensions)
+    features = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    maps = dict.fromkeys(cameras, FeatureMap(torch.nn.functional.normalize(features, dim=-1).half()))
+
+    def run() -> Any:
+        return average_features(gaussians, cameras, maps, AveragedConfig()).means
+
+    return run, options.views
+
+
+def room(count: int) -> Gaussians:
+    """Translucent disks on the walls of a room of 4 x 4 x 2.5 and on a table, of sizes that vary sixfold."""
+    rng = np.random.default_rng(0)
+    half = np.array([2, 2, 1.25])
+    points = rng.uniform(-1, 1, (count, 3))
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = np.sign(points[np.arange(count), axis])
+    points *= half
+    points[: count // 3] = points[: count // 3] * 0.4 - np.array([0, 0, 0.5])
+    made = gaussians_from_points(points, rng.uniform(0, 1, (count, 3)), sh_degree=0)
+    log_scales = made.log_scales + torch.from_numpy(rng.normal(0, 0.6, (count, 3)).astype(np.float32))
+    opacities = torch.from_numpy(rng.normal(0, 2, count).astype(np.float32))
+    return replace(made, log_scales=log_scales, opacity_logits=opacities)
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    gaussians = room(1000)
+    camera = look_at(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), 64, 48, 1.0)
+    maps = {"a": FeatureMap(torch.ones(6, 8, 130))}
+    for path in ("sparse", "dense"):
+        measured(lambda: average_features(gaussians, {"a": camera}, maps, AveragedConfig()).means, path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""``lexsplat library``: many scenes, searched at once."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import tyro
+
+from lexsplat.cli.options import Device, check_phrases, print_json
+from lexsplat.runtime.errors import LibraryError
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.library import Found, Library
+
+_REQUIRED = "(required)"
+Action = tyro.conf.Positional[
+    Annotated[
+        Literal["add", "search", "list", "remove", "verify"], tyro.conf.arg(help_behavior_hint=_REQUIRED)
+    ]
+]
+LibraryArgument = tyro.conf.Positional[
+    Annotated[Path, tyro.conf.arg(metavar="LIB", help_behavior_hint=_REQUIRED)]
+]
+Words = tyro.conf.Positional[
+    Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE|PHRASE ...", help_behavior_hint="")]
+]
+
+
+@dataclasses.dataclass
+class LibraryCommand:
+    """Search many scenes at once: which of them holds a thing, where, how many and how large.
+
+        lexsplat library add rooms kitchen/ office/
+        lexsplat library search rooms "fire extinguisher"
+        lexsplat library list rooms
+        lexsplat library remove rooms office
+        lexsplat library verify rooms --repair
+
+    The library is a folder of its own. It keeps the codes and a picture of each scene; the scenes stay where they
+    are. Add a scene again after it was rebuilt or moved (docs/library.md).
+
+    Args:
+        action: What to do.
+        library: The folder of the library; the first "add" makes it.
+        words: Scene folders or the word "demo" for add, names or folders for remove, phrases for search.
+        limit: Scenes of an answer, at most.
+        thumbnails: Folder of the pictures that search writes; "none" writes none.
+        repair: Mend what verify finds.
+        index: Address of a Chroma server that proposes scenes, such as http://localhost:8000.
+        device: "auto" takes CUDA where there is a GPU.
+        json: Print one JSON document on standard output (docs/schemas/library.json).
+    """
+
+    action: Action
+    library: LibraryArgument
+    words: Words = ()
+    limit: int = 10
+    thumbnails: Path | None = None
+    repair: bool = False
+    index: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
+    device: Device = "auto"
+    json: bool = False
+
+    defaults: ClassVar[dict[str, str]] = {"thumbnails": "LIB/thumbnails", "index": "compare with all scenes"}
+
+    def check(self) -> None:
+        """Refuse invalid options."""
+        if self.action == "search":
+            check_phrases(self.words)
+        if self.action in ("add", "remove") and not self.words:
+            raise ValueError("at least one SCENE is needed")
+        if self.action in ("list", "verify") and self.words:
+            raise ValueError(f"{self.action} takes no SCENE, got {self.words[0]}")
+        if self.limit < 1:
+            raise ValueError(f"limit must be at least 1, got {self.limit}")
+
+    def run(self) -> None:
+        """Do it and print."""
+        from lexsplat.scenes.library import Library
+
+        make = Library.create if self.action == "add" else Library
+        library = make(self.library, self.device, self.index)
+        document = getattr(self, f"_{self.action}")(library)
+        if self.json:
+            print_json({"library": str(self.library), **document})
+        if document.get("problems"):
+            count = len(document["problems"])
+            raise LibraryError(
+                self.library,
+                expected="sound entries",
+                found=f"{count} of {len(library.names())} with a problem",
+                remedy="see above" if self.repair else "mend them with --repair",
+            )
+
+    def _say(self, text: str) -> None:
+        if not self.json:
+            print(text)
+
+    def _add(self, library: Library) -> dict[str, Any]:
+        records = []
+        for path in self.words:
+            record = library.add(path)
+            records.append(dataclasses.asdict(record))
+            self._say(f"{record.name}: added from {record.path}, {record.codes} codes of {record.clip}")
+        return {"scenes": records}
+
+    def _remove(self, library: Library) -> dict[str, Any]:
+        removed = [library.remove(name) for name in self.words]
+        self._say(f"removed: {', '.join(removed)}")
+        return {"removed": removed}
+
+    def _list(self, library: Library) -> dict[str, Any]:
+        records = library.records()
+        for record in records:
+            self._say(f"{record.name}: {record.path}, {record.gaussians:,} Gaussians, encoder {record.clip}")
+        for error in library.damaged.values():
+            self._say(f"damaged: {error}")
+        self._say(f"{len(records)} scenes, {len({record.group for record in records})} encoders")
+        damaged = [{"scene": name, "problem": str(error)} for name, error in library.damaged.items()]
+        return {"scenes": [dataclasses.asdict(record) for record in records], "skipped": damaged}
+
+    def _verify(self, library: Library) -> dict[str, Any]:
+        problems = library.verify(self.repair)
+        for name, problem in problems.items():
+            self._say(f"{name}: {problem}")
+        if not problems:
+            self._say(f"{len(library.names())} scenes are sound")
+        return {"problems": [{"scene": name, "problem": problem} for name, problem in problems.items()]}
+
+    def _search(self, library: Library) -> dict[str, Any]:
+        folder = self.thumbnails or self.library / "thumbnails"
+        answers = []
+        for phrase in self.words:
+            found = library.search(phrase, self.limit)
+            answer = found.to_dict()
+            if str(self.thumbnails) != "none":
+                for hit, entry in zip(found.hits, answer["hits"]):
+                    entry["thumbnail"] = str(hit.write_picture(folder))
+            self._print(found, answer)
+            answers.append(answer)
+        return {"phrases": answers}
+
+    def _print(self, found: Found, answer: dict[str, Any]) -> None:
+        from lexsplat.scenes.serving import sentence
+
+        more = f"; {found.unopened} more may hold it" if found.unopened else ""
+        self._say(f"{found.phrase}: in {len(found.hits)} of {found.scenes} scenes{more}")
+        for number, (hit, entry) in enumerate(zip(found.hits, answer["hits"]), start=1):
+            said = sentence(hit.answer, hit.opened.world.meters_per_unit)
+            self._say(f"  {number}. {hit.scene}: present: {hit.present}. {said} {entry.get('thumbnail', '')}")
+        for problem in found.skipped.values():
+            self._say(f"  skipped: {problem}")

@@ -1,0 +1,105 @@
+"""``lexsplat list``: everything in a scene."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from lexsplat.cli.options import Device, SceneArgument, open_scene, print_json
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
+
+
+@dataclasses.dataclass
+class List:
+    """List everything in a scene: names, colors, places and sizes of its objects.
+
+    Objects come from the segments that a build stores with the language. Names come from a vocabulary: a text file
+    with one name a line, such as "teapot". Sizes are in meters once the scale is known (see lexsplat scale).
+
+    Args:
+        scene: A scene folder, or the word "demo" for the bundled scene.
+        vocabulary: Text file of the names that objects may have, one a line, at most 2,000.
+        pictures: Write a sheet of thumbnails.
+        output: PNG file of the sheet.
+        clip: Text encoder: a name on the Hugging Face Hub or a folder.
+        device: "auto" takes CUDA where there is a GPU.
+        csv: Print a table with one object a line.
+        json: Print one JSON document on standard output (docs/schemas/list.json).
+    """
+
+    scene: SceneArgument
+    vocabulary: Path | None = None
+    pictures: bool = False
+    output: Path | None = None
+    clip: str | None = None
+    device: Device = "auto"
+    csv: bool = False
+    json: bool = False
+
+    defaults: ClassVar[dict[str, str]] = {
+        "vocabulary": "everyday names",
+        "output": 'SCENE/objects.png; demo_objects.png for "demo"',
+    }
+
+    def check(self) -> None:
+        """Refuse options that exclude each other."""
+        if self.csv and self.json:
+            raise ValueError("give --csv or --json, not both")
+        if self.output is not None and not self.pictures:
+            raise ValueError("--output needs --pictures")
+
+    def run(self) -> None:
+        """List and print."""
+        from lexsplat.scenes.objects import list_document, read_vocabulary
+
+        names = read_vocabulary(self.vocabulary) if self.vocabulary else []
+        scene = open_scene(self.scene, self.device, self.clip)
+        picture = (self.output or _sheet_of(scene)) if self.pictures else None
+        document = list_document(scene, names, picture)
+        if self.json:
+            print_json(document)
+        elif self.csv:
+            _print_table(document["objects"])
+        else:
+            _print_objects(document)
+
+
+def _sheet_of(scene: Scene) -> Path:
+    """File of the thumbnails if none is given; the bundled scene is never written to."""
+    if scene.folder is None or scene.folder.is_bundled:
+        return Path("demo_objects.png")
+    return scene.folder.root / "objects.png"
+
+
+def _print_objects(document: dict[str, Any]) -> None:
+    for number, thing in enumerate(document["objects"], start=1):
+        center = ", ".join(f"{value:.2f}" for value in thing["center"])
+        size = " x ".join(f"{value:.2f}" for value in thing["size"])
+        if "size_meters" in thing:
+            size = " x ".join(f"{value:.3f}" for value in thing["size_meters"]) + " m"
+        names = ", ".join(f"{each['name']} {each['probability']:.2f}" for each in thing["names"])
+        print(
+            f"{number}. {names}; {' and '.join(thing['colors'])}; at ({center}), size {size}, "
+            f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
+        )
+    print(f"{len(document['objects'])} objects, named with {document['words']} words")
+    for line in filter(None, (document["note"], document["picture"])):
+        print(line)
+
+
+def _print_table(things: list[dict[str, Any]]) -> None:
+    columns = ("center", "size", "size_meters")
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    places = [f"{column}_{axis}" for column in columns for axis in "xyz"]
+    writer.writerow(["name", "probability", "colors", *places, "gaussians", "best_view"])
+    for thing in things:
+        probability, colors = thing["names"][0]["probability"], " ".join(thing["colors"])
+        numbers = [value for column in columns for value in thing.get(column, [""] * 3)]
+        writer.writerow(
+            [thing["name"], probability, colors, *numbers, thing["gaussians"], thing["best_view"]]
+        )

@@ -1,0 +1,236 @@
+"""What the tools answer, as types: `lexsplat.mcp.server` makes the output schemas of them.
+
+The documents are those of the commands (docs/schemas); the tests compare both.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from typing_extensions import NotRequired, TypedDict
+
+Present = Annotated[
+    Literal["yes", "unsure", "no"],
+    Field(description='"no": the scene does not hold it, and nothing is listed.'),
+]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3, description="x, y, z in scene units.")]
+View = Annotated[str | None, Field(description="Name of the view that shows it best.")]
+Count = Annotated[int, Field(ge=0)]
+
+Up = TypedDict(
+    "Up",
+    {"direction": Vector, "reliable": bool, "from": Annotated[str, Field(description="cameras or user")]},
+)
+
+
+class World(TypedDict):
+    """Axes and unit of a scene."""
+
+    up: Up
+    meters_per_unit: Annotated[float | None, Field(description="null while the scale is not known.")]
+
+
+class Instance(TypedDict):
+    """One thing, in an upright box."""
+
+    name: str
+    gaussians: Count
+    score: Annotated[float, Field(ge=0, le=1, description="Mean relevancy.")]
+    center: Vector
+    size: Vector
+    size_meters: NotRequired[list[float]]
+    axes: list[Vector]
+    best_view: View
+
+
+class Counted(TypedDict):
+    """How many, and how the phrase was understood."""
+
+    phrase: str
+    understood: str
+    note: Annotated[str, Field(description="What was not understood or mended; empty if nothing.")]
+    present: Present
+    count: Count
+
+
+class Answer(Counted):
+    """The things of one phrase."""
+
+    gaussians: Count
+    threshold: Annotated[float, Field(description="Relevancy from which a Gaussian matches.")]
+    best_view: View
+    instances: list[Instance]
+
+
+class FindAnswer(World):
+    """The document of ``lexsplat find --json``."""
+
+    scene: str | None
+    rests_on: Annotated[str, Field(description="What relevancy and presence are relative to.")]
+    phrases: list[Answer]
+
+
+class RelateAnswer(Answer):
+    """The things that stand in the relation."""
+
+    holds: Literal["yes", "perhaps", "no"]
+
+
+class Name(TypedDict):
+    """What an object may be called."""
+
+    name: str
+    probability: float
+
+
+class Object(Instance):
+    """An object with its likeliest names."""
+
+    names: list[Name]
+    colors: list[str]
+    surface: Annotated[bool, Field(description="A table, a wall, ...: no thing.")]
+
+
+class ListAnswer(World):
+    """The document of ``lexsplat list --json``."""
+
+    scene: str | None
+    rests_on: str
+    words: Count
+    note: str
+    picture: str | None
+    objects: list[Object]
+
+
+class Facts(TypedDict):
+    """Facts of a scene."""
+
+    gaussians: Count
+    views: Count
+    meters_per_unit: float | None
+    method: str
+
+
+class SceneFacts(Facts):
+    """Facts of a named scene."""
+
+    name: str
+
+
+class LibraryFacts(TypedDict):
+    """The first names of a library."""
+
+    scenes: Count
+    names: list[str]
+
+
+class ScenesAnswer(TypedDict):
+    """The places that can be searched."""
+
+    scenes: list[SceneFacts]
+    library: NotRequired[LibraryFacts]
+
+
+class SceneAnswer(Facts):
+    """A place."""
+
+    up: Up
+    extent: Annotated[list[Vector], Field(description="Lowest and highest corner, without the outer 1 %.")]
+    view_names: list[str]
+    things: list[str]
+    encoder: dict[str, str]
+
+
+class Length(TypedDict):
+    """A length."""
+
+    units: float
+    meters: float | None
+
+
+class NearestAnswer(TypedDict):
+    """The nearest thing."""
+
+    distance: Length
+    nearest: Instance
+    among: Annotated[int, Field(description="Number of things compared.")]
+
+
+class MeasureAnswer(World):
+    """Lengths between two things."""
+
+    first: Instance
+    second: Instance
+    centers: Length
+    gap: Length
+    height: Annotated[Length, Field(description="How much higher the second is.")]
+
+
+class PixelAnswer(TypedDict):
+    """The thing at a pixel."""
+
+    name: Annotated[str, Field(description="Empty if no known thing is there.")]
+    view: str
+    x: float
+    y: float
+    surface: Instance
+    thing: Instance | None
+
+
+class Heat(TypedDict):
+    """A phrase that is drawn as heat."""
+
+    phrase: str
+    present: Present
+    peak: float
+    threshold: float
+
+
+class RenderAnswer(TypedDict):
+    """What the picture shows."""
+
+    view: str
+    legend: list[Heat]
+
+
+class Hit(World):
+    """A scene that holds it."""
+
+    scene: str
+    path: str
+    encoder: str
+    bound: Annotated[float, Field(description="Upper bound of the strength of presence.")]
+    present: Literal["yes", "unsure"]
+    count: Count
+    gaussians: Count
+    threshold: float
+    best_view: View
+    instances: list[Instance]
+
+
+class LibraryAnswer(TypedDict):
+    """One phrase of ``lexsplat library search --json``."""
+
+    phrase: str
+    understood: str
+    scenes: Count
+    opened: Count
+    unopened: Annotated[int, Field(description="Scenes that may hold it and were not opened.")]
+    hits: list[Hit]
+    skipped: list[dict[str, str]]
+
+
+class ExportAnswer(TypedDict):
+    """The files that were written."""
+
+    files: list[str]
+    gaussians: Count
+
+
+class EditAnswer(TypedDict):
+    """The scene that was written."""
+
+    scene: str
+    action: str
+    gaussians: Count

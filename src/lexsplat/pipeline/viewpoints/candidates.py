@@ -1,0 +1,93 @@
+"""Cameras among which views are chosen: around the scene and its parts, and around oneself in a room."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.geometry.boxes import upright_frame
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target
+
+FOV_Y = math.radians(40)
+"""Vertical field of view, that of a phone held upright or of a 45 mm lens."""
+_AZIMUTHS = 16
+"""Cameras on a circle around a part; twice as many around the whole scene, of which photos are taken mostly."""
+_ELEVATIONS = (10, 25, 45)
+_DISTANCES = (0.75, 1.1)
+"""In distances from which the target fills the height of the image."""
+_CLEARANCE = 0.15
+"""Free radius around a camera, relative to its distance from the target."""
+_CLOSEST = 0.5
+"""Least distance, relative to that from which the whole scene fills the image."""
+_EYE = 0.6
+"""Eye height in a room, relative to its height: 1.5 m of 2.5 m."""
+_GRID = 4
+
+Points = NDArray[np.float64]
+
+
+def around(surroundings: Surroundings, size: tuple[int, int]) -> list[tuple[Camera, Target]]:
+    """Cameras on circles around the scene and its parts that see their targets from free, sensible places.
+
+    A camera is above the ground, on the inner side of a wall it looks at, and not close to anything.
+    """
+    found = []
+    least = _CLOSEST * surroundings.whole.radius / math.sin(FOV_Y / 2)
+    for target in (surroundings.whole, *surroundings.targets):
+        reach = max(target.radius / math.sin(FOV_Y / 2), least)
+        for position in _circle_positions(target, reach, surroundings):
+            away = position - target.center
+            distance = float(np.linalg.norm(away))
+            behind = target.normal is not None and away @ target.normal < 0.1 * distance
+            under = position @ surroundings.up.direction < surroundings.ground + 0.05 * surroundings.height
+            close = surroundings.tree.query(position)[0] < _CLEARANCE * distance
+            if not (behind or under or close):
+                found.append(
+                    (look_at(position, target.center, surroundings.up.direction, *size, FOV_Y), target)
+                )
+    return found
+
+
+def above(surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
+    """Cameras on a circle above the whole scene, wherever that is."""
+    whole = surroundings.whole
+    reach = whole.radius / math.sin(FOV_Y / 2)
+    positions = _circle_positions(whole, reach, surroundings)[2 * _AZIMUTHS : 4 * _AZIMUTHS : 2]
+    return [
+        look_at(position, whole.center, surroundings.up.direction, *size, FOV_Y) for position in positions
+    ]
+
+
+def _circle_positions(target: Target, reach: float, surroundings: Surroundings) -> list[Points]:
+    first, second, up = upright_frame(surroundings.up.direction)
+    positions = []
+    azimuths = 2 * _AZIMUTHS if target is surroundings.whole else _AZIMUTHS
+    for ring, (distance, elevation) in enumerate((d, e) for d in _DISTANCES for e in _ELEVATIONS):
+        for number in range(azimuths):
+            angle = 2 * math.pi * (number + 0.5 * (ring % 2)) / azimuths
+            level, rise = math.cos(math.radians(elevation)), math.sin(math.radians(elevation))
+            direction = level * (math.cos(angle) * first + math.sin(angle) * second) + rise * up
+            positions.append(target.center + distance * reach * direction)
+    return positions
+
+
+def inside(surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
+    """Cameras at eye height on a grid of free places within the scene that look all around, slightly down."""
+    first, second, up = upright_frame(surroundings.up.direction)
+    points = surroundings.tree.data
+    sides = [np.quantile(points @ axis, [0.1, 0.9]) for axis in (first, second)]
+    eye = surroundings.ground + _EYE * surroundings.height
+    clearance = 0.2 * surroundings.height
+    found = []
+    for a in np.linspace(sides[0][0], sides[0][1], _GRID):
+        for b in np.linspace(sides[1][0], sides[1][1], _GRID):
+            position = a * first + b * second + eye * up
+            if surroundings.tree.query(position)[0] < clearance:
+                continue
+            for angle in np.arange(8) * (math.pi / 4):
+                ahead = math.cos(angle) * first + math.sin(angle) * second - 0.2 * up
+                found.append(look_at(position, position + ahead, up, *size, FOV_Y))
+    return found

@@ -1,0 +1,256 @@
+"""The choice of views: those in which the splat looks like something, until nearly all visible Gaussians are seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.pipeline.viewpoints.candidates import FOV_Y, above, around, inside
+from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target, find_surroundings
+from lexsplat.rendering import accumulate_weights, prepare, render
+from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.progress import Event, Listener, silent
+
+SIZE = (960, 720)
+"""Width and height of the chosen views in pixels."""
+_SMALL = (96, 72)
+_MOST_CANDIDATES = 600
+_MOST_VIEWS = 96
+_FEWEST_VIEWS = 8
+_SAMPLE = 40_000
+"""Gaussians whose coverage is followed, at most."""
+_TIMES = 6
+"""Number of views that shall see each Gaussian: the mean over views cancels what is wrong in one."""
+_SEEN = 0.1
+"""Weight in pixels of a small view at which a Gaussian counts as seen: a quarter of a cell of a feature map."""
+_LEAST_GAIN = 0.001
+"""The choice ends when no view adds this share of all coverage."""
+_SPREAD = 0.1
+"""Standard deviation of depth along a ray, relative to depth, beyond which a pixel shows no surface."""
+_LEAST_CLEAR = 0.2
+"""Least share of the drawn pixels of a view that show a surface,"""
+_LEAST_OF_BEST = 0.65
+"""and least share relative to good views: where a splat is sharp, a view of fog is no use."""
+_LEAST_DRAWN = 0.15
+"""Least share of the pixels of a view that show anything."""
+_ENCLOSED = 0.7
+"""Share of good views all around from inside that makes a scene a room."""
+
+
+@dataclass(frozen=True)
+class ChosenViews:
+    """Views of a splat without a capture.
+
+    Args:
+        cameras: The cameras, best first.
+        up: The up direction.
+        candidates: Number of cameras that were tried.
+        left_out: Number of those that showed floaters, holes, or something in front of their target.
+        visible: Number of Gaussians that any good candidate shows.
+        unseen: Number of those that no chosen view shows.
+    """
+
+    cameras: tuple[Camera, ...]
+    up: Up
+    candidates: int
+    left_out: int
+    visible: int
+    unseen: int
+
+    @property
+    def note(self) -> str:
+        """One line for the user."""
+        return (
+            f"{len(self.cameras)} views chosen of {self.candidates} ({self.left_out} showed no surfaces); "
+            f"{self.unseen:,} of {self.visible:,} visible Gaussians are in none of them"
+        )
+
+
+@torch.no_grad()
+def choose_views(
+    gaussians: Gaussians,
+    *,
+    up: NDArray[np.float64] | None = None,
+    subject: Path = Path("splats"),
+    seed: int = 0,
+    listener: Listener = silent,
+) -> ChosenViews:
+    """Choose cameras that see the surfaces of a splat well.
+
+    Args:
+        gaussians: The scene.
+        up: The up direction; None estimates it.
+        subject: The file, for errors and warnings.
+        seed: Seed of samples.
+        listener: Receives events of stage "views".
+
+    Raises:
+        CaptureError: If the Gaussians form no surfaces, or no place shows any.
+    """
+
+    def look(surroundings: Surroundings) -> float:
+        shares = [_look(gaussians, camera)[1] for camera in above(surroundings, _SMALL)]
+        return float(np.mean(sorted(shares)[len(shares) // 2 :]))  # photos are often taken from one side only
+
+    found = find_surroundings(gaussians, up, look, subject, seed)
+    tried = _good_candidates(gaussians, found, seed, listener)
+    if not tried.cameras:
+        raise CaptureError(
+            subject,
+            expected="a place from which the Gaussians look like surfaces",
+            found=f"none of {tried.count} tried (fog, holes, or no free space)",
+            remedy="give the capture it was made from, or the up direction with --up x,y,z",
+        )
+    chosen, visible, unseen = _cover(tried)
+    cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
+    share = len(gaussians) / max(tried.weights.shape[1], 1)
+    return ChosenViews(
+        cameras,
+        found.up,
+        tried.count,
+        tried.count - len(tried.cameras),
+        round(visible * share),
+        round(unseen * share),
+    )
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """Good candidates.
+
+    Args:
+        count: Number of all candidates.
+        cameras: The good ones, small.
+        qualities: Share of their pixels that show a surface ``[C]``.
+        weights: Weight of a sample of the Gaussians in each ``[C, n]``, pixels.
+    """
+
+    count: int
+    cameras: list[Camera]
+    qualities: NDArray[np.float32]
+    weights: NDArray[np.float32]
+
+
+def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, listener: Listener) -> _Tried:
+    generator = np.random.default_rng(seed)
+    outer: list[tuple[Camera, Target | None]] = list(around(found, _SMALL))
+    if len(outer) > _MOST_CANDIDATES:
+        kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
+        outer = [outer[index] for index in kept]
+    inner = inside(found, _SMALL)
+    candidates = [*outer, *((camera, None) for camera in inner)]
+    qualities = np.zeros(len(candidates), np.float32)
+    for done, (camera, target) in enumerate(candidates, start=1):
+        depth, clear = _look(gaussians, camera)
+        hidden = target is not None and is_hidden(depth, camera, target)
+        qualities[done - 1] = 0 if hidden or clear < _LEAST_CLEAR else clear
+        listener(Event("views", done, len(candidates)))
+    best = float(np.quantile(qualities[qualities > 0], 0.9)) if qualities.any() else 0.0
+    good = qualities > _LEAST_OF_BEST * best
+    for index in np.flatnonzero(good):
+        good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
+    if inner and good[len(outer) :].mean() >= _ENCLOSED:  # a room: from outside, walls are seen from behind
+        good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
+    else:  # no room: what is inside is between things, or beside them
+        good[len(outer) :] = False
+    looked_at = np.arange(len(gaussians))
+    if len(looked_at) > _SAMPLE:
+        looked_at = np.sort(generator.choice(looked_at, _SAMPLE, replace=False))
+    cameras = [candidates[index][0] for index in np.flatnonzero(good)]
+    weights = np.zeros((len(cameras), len(looked_at)), np.float32)
+    for row, camera in enumerate(cameras):
+        weights[row] = accumulate_weights(gaussians, camera).cpu().numpy()[looked_at]
+    return _Tried(len(candidates), cameras, qualities[good], weights)
+
+
+def _look(gaussians: Gaussians, camera: Camera) -> tuple[NDArray[np.float32], float]:
+    """Depth of a small view ``[H, W]``, infinite where nothing is drawn, and its share of surfaces."""
+    prepared = prepare(gaussians, camera)
+    depths = prepared.projection.depths[:, None]
+    moments = torch.cat([depths, depths**2], 1)
+    drawn = render(gaussians, camera, features=moments, color=False, prepared=prepared)
+    alpha = drawn.alpha.cpu().numpy()
+    depth, square = (drawn.features[..., i].cpu().numpy() / np.maximum(alpha, 1e-6) for i in (0, 1))
+    return np.where(alpha > 0.1, depth, np.inf), surface_share(depth, square, alpha)
+
+
+def surface_share(
+    depth: NDArray[np.float32], square: NDArray[np.float32], alpha: NDArray[np.float32]
+) -> float:
+    """Share of the drawn pixels of a view that show a surface; 0 if hardly anything is drawn.
+
+    A pixel shows a surface if it is opaque and what is blended in it lies at one depth. Floaters, fog, holes and the
+    backs of things blend what is far apart.
+
+    Args:
+        depth: Mean depth ``[H, W]``, world units.
+        square: Mean squared depth ``[H, W]``.
+        alpha: ``[H, W]`` in 0..1.
+    """
+    drawn = alpha > 0.1
+    if drawn.mean() < _LEAST_DRAWN:
+        return 0.0
+    spread = np.sqrt(np.maximum(square - depth**2, 0)) / np.maximum(depth, 1e-6)
+    return float(((alpha > 0.9) & (spread < _SPREAD)).sum() / drawn.sum())
+
+
+def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> bool:
+    """Whether something stands between a camera and its target, or close in front of the camera.
+
+    Args:
+        depth: Depth ``[H, W]``, infinite where nothing is drawn.
+        camera: The camera.
+        target: What is in the middle of its image.
+    """
+    rows, columns = (slice(size * 2 // 5, size * 3 // 5) for size in depth.shape)
+    distance = float(np.linalg.norm(camera.position - target.center))
+    before = float(np.median(depth[rows, columns])) < distance - 1.5 * target.radius
+    return before or float((depth < 0.3 * distance).mean()) > 0.05
+
+
+def _is_behind_a_wall(gaussians: Gaussians, camera: Camera, found: Surroundings) -> bool:
+    """Whether a camera outside of the scene does not see into it: it would show the back of a wall."""
+    if found.box.contains(camera.position[None])[0]:
+        return False
+    whole = found.whole
+    steep = abs(float((whole.center - camera.position) @ found.up.direction)) > 0.9 * float(
+        np.linalg.norm(whole.center - camera.position)
+    )
+    upwards = camera.viewmat[0, :3] if steep else found.up.direction
+    inwards = look_at(camera.position, whole.center, upwards, *_SMALL, FOV_Y)
+    depth, _ = _look(gaussians, inwards)
+    return is_hidden(depth, inwards, Target(whole.center, whole.radius * 2 / 3))
+
+
+def _cover(tried: _Tried) -> tuple[list[int], int, int]:
+    """Greedy choice: the view that adds most coverage, again and again.
+
+    Returns:
+        Indices of the chosen candidates; how many Gaussians of the sample any candidate shows; how many of these no
+        chosen one shows.
+    """
+    shown = np.minimum(tried.weights / _SEEN, 1)
+    covered = np.zeros(shown.shape[1], np.float32)
+    possible = np.minimum(shown.sum(0), _TIMES)
+    left = set(range(len(shown)))
+    chosen: list[int] = []
+    while left and len(chosen) < _MOST_VIEWS:
+        indices = sorted(left)
+        gains = [
+            float(np.minimum(shown[i], _TIMES - covered).sum() * tried.qualities[i] ** 2) for i in indices
+        ]
+        best = int(np.argmax(gains))
+        if len(chosen) >= _FEWEST_VIEWS and gains[best] < _LEAST_GAIN * possible.sum():
+            break
+        chosen.append(indices[best])
+        left.remove(indices[best])
+        covered = np.minimum(covered + shown[indices[best]], _TIMES)
+    visible = possible > 0.5
+    return chosen, int(visible.sum()), int((visible & (covered < 0.5)).sum())

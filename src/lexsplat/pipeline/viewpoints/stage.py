@@ -1,0 +1,67 @@
+"""The capture of a build that was given splats only: its views are chosen, rendered and kept in the scene folder."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+
+from lexsplat.captures import Capture, load_capture
+from lexsplat.geometry.world import parse_vector
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.splats import existing_splats
+from lexsplat.pipeline.viewpoints.choosing import choose_views
+from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
+from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.runtime.progress import NOTE, Listener
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.reading import read_splats
+
+log = logging.getLogger("lexsplat")
+
+_MANY_UNSEEN = 0.1
+"""Share of the visible Gaussians above which those in no view are a warning."""
+
+
+def capture_of_splats(
+    splats: Path | None, folder: SceneFolder, config: BuildConfig, device: str, listener: Listener
+) -> Capture:
+    """The capture of chosen views in ``poses/`` of a scene folder, chosen unless it is up to date.
+
+    All views are training views: renders are no ground truth.
+
+    Args:
+        splats: File of Gaussians.
+        folder: The scene folder.
+        config: Settings of the build, of which the up direction and the seed are read.
+        device: Device to render on.
+        listener: Receives events of stage "views".
+
+    Raises:
+        FileFormatError: If the file is missing or damaged.
+        CaptureError: If no views can be chosen.
+    """
+    splats, poses = existing_splats(splats), folder.root / "poses"
+    key = fingerprint(file_hash(splats), config.up, config.seed)
+    if not (folder.is_finished("views", key) and (poses / "transforms.json").is_file()):
+        start = time.perf_counter()
+        folder.reopen("views")
+        gaussians = read_splats(splats).to(device)
+        up = None if config.up is None else np.array(parse_vector(config.up))
+        chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
+        write_chosen_capture(gaussians, chosen, poses)
+        few = chosen.unseen <= _MANY_UNSEEN * chosen.visible
+        log.log(NOTE if few else logging.WARNING, "%s: %s", splats, chosen.note)
+        facts = {
+            "views": len(chosen.cameras),
+            "candidates": chosen.candidates,
+            "showed_no_surfaces": chosen.left_out,
+            "visible": chosen.visible,
+            "unseen": chosen.unseen,
+        }
+        folder.finish("views", key, time.perf_counter() - start, **facts)
+    folder.record["images"] = "poses/images"
+    folder.record["capture"] = None
+    return load_capture(poses, test_every=0)

@@ -1,0 +1,39 @@
+"""Kinds of things: words such as "toy", which are answered by the names of objects.
+
+An encoder describes a teddy bear better with "teddy bear" than with "toy": on the scale of everyday words the name of
+a kind loses to the names of its members (`lexsplat.queries.presence`). So a kind holds the objects of a scene whose
+names are among its members. Only everyday kinds with everyday members are here; any other word is a plain phrase.
+"""
+
+from __future__ import annotations
+
+from lexsplat.queries.vocabulary import words
+
+_MEMBERS = {
+    "toy": "teddy bear, rubber duck, stuffed animal, doll, ball",
+    "animal": "bear, duck, cat, dog, bird",
+    "fruit": "apple, banana, orange, lemon, pear",
+    "food": "apple, banana, orange, lemon, pear, bread, cake, cookie, cheese, egg, pumpkin",
+    "clothes": "shoe, hat, shirt, glove",
+    "instrument": "drum, guitar, piano",
+}
+_SAME = {
+    "something to eat": "food", "thing to eat": "food", "edible thing": "food", "pet": "animal",
+    "clothing": "clothes", "musical instrument": "instrument", "plaything": "toy",
+}  # fmt: skip
+KINDS = {kind: frozenset(words(members)) for kind, members in _MEMBERS.items()}
+
+
+def is_kind(text: str) -> bool:
+    """Whether a text names a kind."""
+    return _kind(text) in KINDS
+
+
+def is_of_kind(name: str, text: str) -> bool:
+    """Whether an object's name is a member of the kind that a text names: "toy car" and "striped ball" are toys."""
+    kind, parts = _kind(text), name.lower().split()
+    return kind in KINDS and (kind in parts or not KINDS[kind].isdisjoint({" ".join(parts), *parts[-1:]}))
+
+
+def _kind(text: str) -> str:
+    return _SAME.get(text.lower(), text.lower())

@@ -1,0 +1,74 @@
+"""The objects of a scene: the segments that one name describes as a whole.
+
+Each segment of the hierarchy (`lexsplat.language.segments`) has a best name in a vocabulary. From the coarsest level
+down, a segment is an object if its best name describes it well, and nearly all of its parts too; else its parts are
+tried. Segments of one name that touch are one object: a stack of books has parts of many colors.
+
+Dimension letters: W words of the vocabulary, V segments of all levels, S lowest segments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.language.segment_codes import SegmentCodes
+
+FITS = 0.6
+"""Smallest strength of the name of an object, and of what a scene holds (`lexsplat.queries.presence`)."""
+_PART = 0.5
+"""Smallest strength of that name at its parts."""
+_WHOLE = 0.75
+"""A name describes a segment as a whole if it describes this share of what the views show of it."""
+_SLOPE = 12.0
+"""Slope of the log-odds of a name over its strength."""
+_WORDS = 256
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Strengths = Callable[[slice], FloatArray]
+"""How well some words of the vocabulary describe each segment ``[V, w]`` (`lexsplat.queries.presence`)."""
+
+
+class WholeSegments(NamedTuple):
+    """The segments that are objects, or parts of one object that has several.
+
+    Args:
+        places: The one that holds each lowest segment ``[S]``, in 0..V-1; -1 where no word describes any.
+        words: The word that describes each segment best ``[V]``.
+    """
+
+    places: IntArray
+    words: IntArray
+
+
+def whole_segments(codes: SegmentCodes, strengths: Strengths, words: int) -> WholeSegments:
+    """The segments that one word describes as a whole, from the coarsest level down.
+
+    Args:
+        codes: The segments of all levels.
+        strengths: How well words describe them.
+        words: Number of words W.
+    """
+    best, most = np.zeros(len(codes.masses), np.int64), np.full(len(codes.masses), -np.inf)
+    for start in range(0, words, _WORDS):
+        found = strengths(slice(start, min(start + _WORDS, words)))
+        better = found.max(1) > most
+        best[better], most[better] = start + found.argmax(1)[better], found.max(1)[better]
+    places, lowest = np.full(codes.numbers.shape[1], -1), codes.numbers[0]
+    fitting = {int(word): strengths(slice(int(word), int(word) + 1))[:, 0] for word in np.unique(best)}
+    for level in codes.numbers[::-1]:
+        at_parts = np.array([fitting[word][part] for word, part in zip(best[level].tolist(), lowest)])
+        described = np.bincount(level, codes.masses[lowest] * (at_parts >= _PART), len(codes.masses))
+        whole = (most[level] >= FITS) & (described[level] >= _WHOLE * codes.masses[level])
+        places = np.where((places < 0) & whole, level, places)
+    return WholeSegments(places, best)
+
+
+def name_probabilities(strengths: FloatArray) -> FloatArray:
+    """Probabilities of words ``[W]`` from their strengths; what is left to 1 is the probability of no word."""
+    odds = np.exp(_SLOPE * (strengths - FITS))
+    return np.asarray(odds / (1 + odds.sum()))

@@ -1,0 +1,97 @@
+"""Hidden Gaussians: those inside things, or under them, which the training views hardly show.
+
+Nothing shows what they mean. A selection of what can be seen leaves them out, so that boxes and silhouettes end where
+things end. An edit of a thing takes those inside it along (`whole_things`), so that less of a core stays behind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.segments import Segments
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.sampling import evenly
+
+_HIDDEN = 0.05
+"""Gaussians of which the views show a smaller share are hidden. Chosen on the second scene among 0.005 to 0.1."""
+_MOSTLY = 0.5
+_NEIGHBORS, _BESIDE = 6, 2
+_VIEWS = 64
+_OPEN = 0.9
+"""Quantile of the shares at which nothing hides a Gaussian; the unit of the masses drops out."""
+
+
+def hidden_gaussians(gaussians: Gaussians, cameras: Sequence[Camera], masses: Tensor) -> Tensor:
+    """Which Gaussians are hidden ``[N]`` bool; the arguments are those of `shown_shares`."""
+    if not cameras or not len(gaussians):
+        return torch.zeros_like(gaussians.opacities, dtype=torch.bool)
+    return torch.from_numpy(shown_shares(gaussians, cameras, masses) < _HIDDEN).to(gaussians.device)
+
+
+@torch.no_grad()
+def shown_shares(gaussians: Gaussians, cameras: Sequence[Camera], masses: Tensor) -> NDArray[np.float64]:
+    """What the views show of each Gaussian, as a share of what they would show without the others ``[N]``.
+
+    Args:
+        gaussians: The scene.
+        cameras: Its training views; at most 64 of them are looked at.
+        masses: Visible weights over all training views ``[N]``, in any unit.
+    """
+    means = gaussians.means.double().cpu().numpy()
+    # Seen from the side of its two longer axes.
+    areas = np.sort(gaussians.scales.double().cpu().numpy(), 1)[:, 1:].prod(1)
+    alone = np.zeros(len(means))
+    for camera in evenly(cameras, _VIEWS):
+        local = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        depth = np.maximum(local[:, 2], 1e-6)
+        x, y = (local @ camera.K.T)[:, :2].T / depth
+        inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        alone += inside / depth**2
+    alone *= areas * gaussians.opacities.double().cpu().numpy()
+    shares = masses.double().cpu().numpy() / np.maximum(alone, 1e-12)
+    seen = alone > 0
+    level = float(np.quantile(shares[seen], _OPEN)) if seen.any() else 0.0
+    return np.where(seen, np.minimum(shares / max(level, 1e-12), 1.0), 0.0)
+
+
+def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
+    """What can be seen of a selection. Hidden Gaussians still link what they connect, such as a lamp and its foot."""
+    if not bool((chosen.mask & hidden).any()):
+        return chosen
+    return replace(chosen, mask=chosen.mask & ~hidden, parts=tuple(chosen.instances))
+
+
+@torch.no_grad()
+def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -> Selection:
+    """A selection with what belongs to its things besides: their borders, and the hidden Gaussians in them.
+
+    A segment belongs to it if half of what the views show of the segment is selected, and a hidden Gaussian if two of
+    its six nearest neighbors that can be seen are.
+
+    Args:
+        chosen: The selection.
+        hidden: Which Gaussians of the scene are hidden ``[N]`` bool.
+        segments: The segments of the scene; None takes the selection as it is.
+    """
+    if segments is None or not chosen:
+        return chosen
+    count, mask = segments.levels.shape[1], chosen.mask.cpu().numpy().copy()
+    labels, masses = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
+    taken = np.bincount(labels, masses * mask, count) >= _MOSTLY * np.bincount(labels, masses, count)
+    mask |= (taken & (np.bincount(labels, mask, count) > 0))[labels]
+    unsure = np.flatnonzero(hidden.cpu().numpy() & ~mask)
+    firm = np.flatnonzero(~hidden.cpu().numpy())
+    if len(unsure) and len(firm) >= _NEIGHBORS:
+        means = chosen.gaussians.means.detach().cpu().double().numpy()
+        _, nearest = cKDTree(means[firm]).query(means[unsure], k=_NEIGHBORS)
+        mask[unsure] = mask[firm[nearest]].sum(1) >= _BESIDE
+    return replace(chosen, mask=torch.from_numpy(mask).to(chosen.mask.device), parts=())

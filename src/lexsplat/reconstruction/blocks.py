@@ -1,0 +1,304 @@
+"""Reconstruction by blocks, for captures whose Gaussians do not fit into the memory of one reconstruction.
+
+As in VastGaussian and CityGaussian, the ground plane is cut into cells with equal numbers of points. A block is a
+cell with a margin, the views that see it, and a thinned rest of the points, which explains what these views show of
+other cells. Each block is reconstructed alone. Of each result only the Gaussians inside the cell are kept.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.gaussians import TENSORS, Gaussians
+from lexsplat.reconstruction.settings import ReconstructionConfig
+from lexsplat.reconstruction.trainer import Reconstructor
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import CaptureError, FileFormatError, TrainingError
+from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.training import Checkpoint
+from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, results
+
+if TYPE_CHECKING:
+    from lexsplat.captures import Capture, View
+    from lexsplat.captures.sfm.triangulation import InitialPoints
+
+SHARE_OUTSIDE = 2.0
+"""Gaussians that a block may have, in those that its cell keeps: the others explain what lies outside of the cell."""
+
+_MARGIN = 0.15
+_SEEN_SHARE = 0.15
+_FEWEST_VIEWS = 3
+_MOST_BLOCKS = 1024
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of a capture that is reconstructed alone.
+
+    Args:
+        low: Lower ends of the cell ``[2]`` on the ground plane; -inf at the border of the capture.
+        high: Upper ends ``[2]``; inf at the border.
+        names: Training views that see it.
+        chosen: Indices of its initial points ``[P']``.
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    names: tuple[str, ...]
+    chosen: NDArray[np.int64]
+
+    def holds(
+        self, ground: NDArray[np.float64], margin: float | NDArray[np.float64] = 0.0
+    ) -> NDArray[np.bool_]:
+        """Which places ``[N, 2]`` on the ground plane lie in the cell with a margin on all sides ``[N]``."""
+        return np.all((ground >= self.low - margin) & (ground < self.high + margin), axis=1)
+
+
+@dataclass(frozen=True)
+class BlockRun:
+    """How blocks are reconstructed.
+
+    Args:
+        device: Device to train on.
+        seed: Seed of each block's training.
+        memory: Host memory of one block in bytes.
+        folder: Where the results of blocks are kept for the next run.
+        key: Fingerprint of everything that the result depends on.
+        checkpoint_seconds: Seconds between two checkpoints of a block.
+        workers: Where the blocks are reconstructed: one after the other in this process, or side by side.
+        listener: Receives an event of stage "blocks" after each.
+    """
+
+    device: str
+    seed: int
+    memory: int
+    folder: Path
+    key: str
+    checkpoint_seconds: float = 20.0
+    workers: Workers = IN_PROCESS
+    listener: Listener = silent
+
+
+def number_of_blocks(blocks: str, config: ReconstructionConfig, device: str, memory: int) -> int:
+    """The number that ``--blocks`` means; 1 is a reconstruction in one piece.
+
+    Args:
+        blocks: "none", a number, or "auto": as few as fit into the memory.
+        config: Settings, for their limit of Gaussians.
+        device: "cpu" or "cuda".
+        memory: Host memory of one reconstruction in bytes.
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+    if blocks == "auto":
+        need = 2 * config.cap(torch.device(device)) * budget.GAUSSIAN_BYTES
+        return 1 if device != "cpu" or need <= memory else math.ceil(SHARE_OUTSIDE * need / memory)
+    if blocks == "none":
+        return 1
+    if not blocks.isdecimal() or not 1 <= int(blocks) <= _MOST_BLOCKS:
+        raise ValueError(f"blocks must be auto, none or a number from 1 to {_MOST_BLOCKS}, got {blocks!r}")
+    return int(blocks)
+
+
+def ground_axes(up: Up) -> NDArray[np.float64]:
+    """Two unit vectors ``[2, 3]`` that span the ground plane.
+
+    Raises:
+        CaptureError: If the cameras do not tell which way is up.
+    """
+    if not up.reliable:
+        raise CaptureError(
+            "--blocks",
+            expected="a ground plane, to cut the capture on",
+            found="cameras that do not tell which way is up",
+            remedy="give --up X,Y,Z or --blocks none",
+        )
+    first = np.cross(up.direction, np.eye(3)[np.abs(up.direction).argmin()])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up.direction, first)])
+
+
+def cut_blocks(
+    capture: Capture, points: NDArray[np.float32], axes: NDArray[np.float64], count: int
+) -> list[Block]:
+    """Cut a capture into blocks of equal numbers of points.
+
+    Args:
+        capture: Its training views.
+        points: Initial points ``[P, 3]``.
+        axes: From `ground_axes`.
+        count: Number of blocks.
+
+    Raises:
+        CaptureError: If a block has too few points, or too few views see it.
+    """
+    ground = points @ axes.T
+    cells: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    _cut(ground, np.full(2, -np.inf), np.full(2, np.inf), count, cells)
+    seen = {view.name: _points_in_image(view, points) for view in capture.train_views}
+    blocks = []
+    for number, (low, high) in enumerate(cells, start=1):
+        cell = Block(low, high, (), np.zeros(0, np.int64))
+        own = ground[cell.holds(ground)]
+        margin = _MARGIN * (np.ptp(own, axis=0) if len(own) else np.zeros(2))
+        inside = cell.holds(ground, margin)
+        names = tuple(
+            name
+            for name, shown in seen.items()
+            if (shown & inside).sum() >= _SEEN_SHARE * max(1, shown.sum())
+        )
+        if len(names) < _FEWEST_VIEWS or not len(own):
+            raise CaptureError(
+                f"block {number} of {count}",
+                expected=f"points, and at least {_FEWEST_VIEWS} views that show them",
+                found=f"{len(own):,} points and {len(names)} views",
+                remedy="give a smaller --blocks",
+            )
+        outside = np.flatnonzero(~inside)
+        thinned = outside[:: max(1, len(outside) // max(1, int(inside.sum())))]
+        chosen = np.sort(np.concatenate([np.flatnonzero(inside), thinned]))
+        blocks.append(Block(low, high, names, chosen))
+    return blocks
+
+
+def _cut(
+    ground: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    count: int,
+    cells: list[tuple[NDArray[np.float64], NDArray[np.float64]]],
+) -> None:
+    """Halve a cell across its longer side until there are ``count`` cells of equal numbers of points."""
+    if count == 1:
+        cells.append((low, high))
+        return
+    if len(ground) < 2:
+        sides = np.zeros(2)
+    else:  # stray points far away do not decide which side is longer
+        sides = np.diff(np.quantile(ground, [0.02, 0.98], axis=0), axis=0)[0]
+    axis, first = int(sides.argmax()), count // 2
+    at = float(np.quantile(ground[:, axis], first / count)) if len(ground) else 0.0
+    middle_high, middle_low = high.copy(), low.copy()
+    middle_high[axis] = middle_low[axis] = at
+    below = ground[:, axis] < at
+    _cut(ground[below], low, middle_high, first, cells)
+    _cut(ground[~below], middle_low, high, count - first, cells)
+
+
+def _points_in_image(view: View, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points ``[P]`` fall into the image of a view."""
+    camera = view.camera
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    depth = np.maximum(local[:, 2:], 1e-9)
+    x, y = (local[:, :2] / depth * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]).T
+    return (local[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What the tasks of all blocks read."""
+
+    capture: Capture
+    points: InitialPoints
+    config: ReconstructionConfig
+    axes: NDArray[np.float64]
+    folder: SharedFolder
+    run: BlockRun
+
+
+def reconstruct_blocks(
+    capture: Capture, config: ReconstructionConfig, points: InitialPoints, up: Up, count: int, run: BlockRun
+) -> Gaussians:
+    """Reconstruct a capture block by block; blocks that an earlier run has finished are kept.
+
+    Args:
+        capture: Views and split.
+        config: Settings of the whole; each block has its share of the Gaussians and of the iterations.
+        points: Initial points of the whole.
+        up: Up direction.
+        count: Number of blocks.
+        run: How they are reconstructed.
+
+    Raises:
+        CaptureError: If there is no ground plane, or a block has no views.
+        MemoryBudgetError: If a block does not fit into ``run.memory``.
+        TrainingError: If blocks diverge; the others are kept.
+    """
+    axes = ground_axes(up)
+    blocks = cut_blocks(capture, points.points, axes, count)
+    cap = math.ceil(SHARE_OUTSIDE * config.cap(torch.device(run.device)) / count)
+    if run.device == "cpu":
+        what, need = f"{cap:,} Gaussians of a block", 2 * cap * budget.GAUSSIAN_BYTES
+        budget.require("reconstruct", need, run.memory, what, "a larger --blocks")
+    items = {f"block {number} of {count}": block for number, block in enumerate(blocks, start=1)}
+    parts: list[Gaussians] = []
+    with SharedFolder.offered(run.folder) as folder:
+        listener, workers = run.listener, run.workers
+        if workers.distributed:  # listeners stay here
+            run = replace(run, listener=silent)
+        own = replace(run, workers=IN_PROCESS)
+        shared = _Shared(capture, points, replace(config, max_gaussians=cap), axes, folder, own)
+        needs = Needs(memory=run.memory, gpu=run.device == "cuda")
+        listener(Event("blocks", 0, count))
+        for part in results(workers.map(_reconstruct_block, shared, items, needs)):
+            parts.append(part)
+            listener(Event("blocks", len(parts), count, {"gaussians": float(sum(map(len, parts)))}))
+    tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in TENSORS}
+    return Gaussians(**tensors, antialiased=config.antialiased)
+
+
+def _reconstruct_block(shared: _Shared, block: Block) -> Gaussians:
+    """The Gaussians of a block's cell, from its file if an earlier run has finished it; on the CPU."""
+    run, folder = shared.run, shared.folder
+    key = fingerprint(run.key, [block.low.tolist(), block.high.tolist()])
+    path = folder.path / f"{key}.safetensors"
+    if folder.is_visible and path.exists():
+        try:
+            return Gaussians(**read_tensors(path)[0], antialiased=shared.config.antialiased)
+        except (FileFormatError, TypeError, ValueError):
+            path.unlink()
+    found = _train_block(shared, block, path)
+    if len(found) == 0:
+        raise TrainingError(
+            "reconstruction",
+            expected="Gaussians in every block",
+            found="a block without",
+            remedy="give a smaller --blocks",
+        )
+    if folder.is_visible:
+        write_tensors(path, found.tensors(), {})
+    return found
+
+
+def _train_block(shared: _Shared, block: Block, path: Path) -> Gaussians:
+    """Train a block on its views, as often a view as in the whole, and keep what lies in its cell."""
+    run, views, points = shared.run, shared.capture.views, shared.points
+    part = replace(
+        shared.capture, views={n: views[n] for n in block.names}, train_names=block.names, test_names=()
+    )
+    share = len(block.names) / len(shared.capture.train_names)
+    config = replace(shared.config, iterations=max(1, round(share * shared.config.iterations)))
+    start = replace(points, points=points.points[block.chosen], colors=points.colors[block.chosen])
+    trainer = Reconstructor(part, config, start, device=run.device, seed=run.seed, memory=run.memory)
+    checkpoint = None
+    if shared.folder.is_visible:
+        checkpoint = Checkpoint(
+            path.with_suffix(".training.safetensors"), path.stem, every=run.checkpoint_seconds
+        )
+    trainer.run(run.listener, checkpoint)
+    gaussians = trainer.gaussians().to("cpu")
+    inside = block.holds(gaussians.means.numpy().astype(np.float64) @ shared.axes.T)
+    if checkpoint is not None:
+        checkpoint.remove()
+    return gaussians.select(torch.from_numpy(inside)).map(lambda tensor: tensor.clone())

@@ -1,0 +1,197 @@
+"""Work that is a map over views, blocks or scenes: in this process, or on Ray where ``--workers`` asks for it.
+
+Results arrive in the order of the items, whichever worker finishes first. What is added up from them is therefore
+added in one order, and any number of workers gives the same bits.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from lexsplat.runtime.errors import LexsplatError
+
+S = TypeVar("S")
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What one task needs of the machine that it runs on.
+
+    Args:
+        memory: Host memory in bytes; 0 leaves it to the engine.
+        gpu: Whether it computes on a GPU, of which it then gets one of its own.
+        result: Size of its result in bytes, if it may be large.
+    """
+
+    memory: int = 0
+    gpu: bool = False
+    result: int = 0
+
+
+ANY_MACHINE = Needs()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of one task.
+
+    Args:
+        name: Name of its item.
+        result: What it returned; None if it failed.
+        error: Why it failed, for a reason of its own. A lost worker is no such reason: the task is done again.
+    """
+
+    name: str
+    result: Any = None
+    error: LexsplatError | None = None
+
+
+class Workers(Protocol):
+    """An engine that runs tasks."""
+
+    @property
+    def distributed(self) -> bool:
+        """Whether tasks run in other processes."""
+
+    def map(
+        self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
+    ) -> Iterator[Outcome]:
+        """Run ``work(shared, item)`` for every item.
+
+        Args:
+            work: A function of a module. It may run more than once for an item, so it writes files atomically.
+            shared: What all tasks read, sent to each worker once.
+            items: What tells the tasks apart, by name.
+            needs: What one task needs.
+
+        Yields:
+            The outcomes in the order of the items.
+        """
+
+
+class InProcess:
+    """The engine without workers: one task after the other."""
+
+    distributed = False
+
+    def map(
+        self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
+    ) -> Iterator[Outcome]:
+        """See `Workers.map`."""
+        for name, item in items.items():
+            try:
+                outcome = Outcome(name, work(shared, item))
+            except LexsplatError as error:
+                outcome = Outcome(name, error=error)
+            yield outcome
+
+
+IN_PROCESS = InProcess()
+
+
+def results(outcomes: Iterator[Outcome]) -> Iterator[Any]:
+    """The results of the tasks that succeed; failures are raised once, after the last task.
+
+    Raises:
+        LexsplatError: The first failure. Further ones are counted and named in it.
+    """
+    failed: list[Outcome] = []
+    for outcome in outcomes:
+        if outcome.error is None:
+            yield outcome.result
+        else:
+            failed.append(outcome)
+    raise_failures(failed)
+
+
+def raise_failures(failed: list[Outcome]) -> None:
+    """Raise the first failure, with the names of the others; nothing if there is none."""
+    errors = [(outcome.name, outcome.error) for outcome in failed if outcome.error is not None]
+    if not errors:
+        return
+    first = errors[0][1]
+    if len(errors) > 1:
+        others = ", ".join(name for name, _ in errors[1:4]) + (", ..." if len(errors) > 4 else "")
+        found = f"{first.found} (and {len(errors) - 1} more failed: {others})".strip()
+        raise type(first)(first.subject, expected=first.expected, found=found, remedy=first.remedy) from first
+    raise first
+
+
+def open_workers(spec: str, paths: tuple[Path, ...] = ()) -> AbstractContextManager[Workers]:
+    """The engine of ``--workers``.
+
+    Args:
+        spec: "none"; "ray" for the cluster of ``RAY_ADDRESS``, or else a Ray on this machine; an address
+            "ray://HOST:PORT".
+        paths: Files and folders that every worker must see.
+
+    Raises:
+        WorkersError: If Ray is not installed or cannot be reached, or a worker cannot do the work.
+    """
+    check_spec(spec)
+    if spec == "none":
+        return _in_process()
+    from lexsplat.runtime.ray_workers import ray_workers
+
+    return ray_workers(None if spec == "ray" else spec, paths)
+
+
+def check_spec(spec: str) -> None:
+    """Refuse a value of ``--workers`` that names no engine.
+
+    Raises:
+        ValueError: It is neither "none" nor "ray" nor an address.
+    """
+    host, colon, port = spec.removeprefix("ray://").rpartition(":")
+    address = spec.startswith("ray://") and host and colon and port.isdigit()
+    if spec not in ("none", "ray") and not address:
+        raise ValueError(f"workers must be none, ray or ray://HOST:PORT, got {spec!r}")
+
+
+@contextmanager
+def _in_process() -> Iterator[Workers]:
+    yield IN_PROCESS
+
+
+@dataclass(frozen=True)
+class SharedFolder:
+    """A folder of results that workers write to where they see it.
+
+    Args:
+        path: The folder, absolute.
+        token: Content of the file by which a worker recognizes the folder.
+    """
+
+    path: Path
+    token: str
+
+    @classmethod
+    @contextmanager
+    def offered(cls, path: Path) -> Iterator[SharedFolder]:
+        """Mark a folder so that workers recognize it; the mark is removed at the end."""
+        folder = cls(path.resolve(), uuid.uuid4().hex)
+        folder.path.mkdir(parents=True, exist_ok=True)
+        folder._mark.write_text(folder.token, encoding="ascii")
+        try:
+            yield folder
+        finally:
+            folder._mark.unlink(missing_ok=True)
+
+    @property
+    def is_visible(self) -> bool:
+        """Whether this process sees the folder itself, not one of the same name on another machine."""
+        try:
+            return self._mark.read_text(encoding="ascii") == self.token
+        except OSError:
+            return False
+
+    @property
+    def _mark(self) -> Path:
+        return self.path / f".workers-{self.token}"

@@ -1,0 +1,44 @@
+"""Facts about a scene folder, read from its records: nothing of the scene itself is loaded."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lexsplat.geometry.world import world_of
+from lexsplat.scenes.folder import SceneFolder
+
+
+def scene_facts(folder: SceneFolder) -> dict[str, Any]:
+    """The document of ``lexsplat info --json``: facts about a scene folder."""
+    record = folder.record
+    views = folder.read_cameras()
+    splits = [view.split for view in views.values()]
+    sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in views.values()})
+    config = record.get("config", {})
+    stages = record["stages"]
+    language = stages.get("language", {})
+    codes = language if "codes" in language else stages.get("codebook", {})  # the stage that found them
+    facts: dict[str, Any] = {
+        "scene": str(folder.root),
+        "capture": record.get("capture"),
+        "views": {"training": splits.count("train"), "held out": splits.count("test")},
+        "size": ", ".join(sizes),
+        **world_of(record, {name: view.camera for name, view in views.items()}).to_json(),
+        "finished": ", ".join(stages) or "nothing yet",
+        "seconds": folder.stage_seconds(),
+        "gaussians": stages.get("reconstruct", {}).get("gaussians"),
+        "codes": codes.get("codes"),
+        "codes_used": codes.get("codes_used"),
+        "segments": language.get("segments"),
+        "method": language.get("method"),
+        "clip": config.get("clip"),
+        "dino": config.get("dino")
+        if stages.get("features", {}).get("dino", "codebook" in stages)
+        else "not used",
+        "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
+        "language_bytes": folder.bytes_on_disk(folder.language_path),
+        "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
+        "warnings": len(record.get("warnings", [])),
+        "lexsplat": record.get("provenance", {}).get("lexsplat"),
+    }
+    return facts

@@ -1,0 +1,107 @@
+"""Values of other programs' files: bounds on counts, bytes as opacities, and numbers that cannot be rendered.
+
+Formats allow more than rendering does: opacities of 0 and 1 have infinite logits, sizes of 0 infinite logarithms.
+Those are moved to the nearest number that renders alike. Gaussians with NaN are dropped, with a warning.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import LARGEST, Gaussians
+from lexsplat.runtime.errors import FileFormatError
+
+logger = logging.getLogger(__name__)
+
+MOST_DROPPED = 0.1
+"""Share of invalid Gaussians above which a file counts as damaged."""
+
+_LARGEST_LOGIT = 20.0
+_SMALLEST_LOG_SCALE = math.log(1e-12)
+_ALWAYS_ALLOWED = 10_000
+_MOST_PER_BYTE = 8
+
+
+def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
+    """The Gaussians with infinite logits and logarithms made finite, and without those that cannot be rendered.
+
+    Raises:
+        FileFormatError: If there are none, or more than `MOST_DROPPED` of them cannot be rendered.
+    """
+    quats = gaussians.quats.clone()
+    quats[(quats == 0).all(1)] = quats.new_tensor([1.0, 0, 0, 0])
+    gaussians = replace(
+        gaussians,
+        quats=quats,
+        log_scales=gaussians.log_scales.clamp_min(_SMALLEST_LOG_SCALE),  # NaN stays NaN
+        opacity_logits=gaussians.opacity_logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT),
+    )
+    if len(gaussians) == 0:
+        raise FileFormatError(path, expected="at least one Gaussian", found="none")
+    damage = gaussians.find_invalid()
+    if not damage:
+        return gaussians
+    valid = _valid(gaussians)
+    count = int((~valid).sum())
+    if count > MOST_DROPPED * len(gaussians):
+        found = f"{count:,} of {len(gaussians):,} Gaussians that cannot be rendered: {damage}"
+        raise FileFormatError(path, expected="finite numbers", found=found, remedy="regenerate the file")
+    logger.warning("%s: %d of %d Gaussians dropped: %s", path, count, len(gaussians), damage)
+    return gaussians.select(valid)
+
+
+def _valid(gaussians: Gaussians) -> Tensor:
+    """Which Gaussians `Gaussians.find_invalid` accepts ``[N]``."""
+    valid = torch.ones(len(gaussians), dtype=torch.bool)
+    for name, tensor in gaussians.tensors().items():
+        rows = tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None]
+        limit = math.log(LARGEST) if name == "log_scales" else LARGEST
+        size = rows if name == "log_scales" else rows.abs()
+        valid &= (torch.isfinite(rows) & (size <= limit)).all(1)
+    return valid
+
+
+def check_count(path: Path, count: int, size: int) -> None:
+    """Refuse counts that a compressed file of ``size`` bytes cannot hold, before memory is taken for them.
+
+    Raises:
+        FileFormatError: If there are more than 8 Gaussians for each byte; few Gaussians are always allowed.
+    """
+    if count > max(_ALWAYS_ALLOWED, _MOST_PER_BYTE * size):
+        raise FileFormatError(
+            path, expected=f"Gaussians that fit into {size:,} bytes", found=f"a count of {count:,}"
+        )
+
+
+def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
+    """Opacity logits of opacities in steps of 1/255.
+
+    Bytes 0 and 255 are read as 0.25 and 254.75, because the logits of opacities 0 and 1 are infinite.
+    """
+    values = torch.from_numpy(opacities.astype(np.float32)) / 255
+    return values.clamp(0.25 / 255, 1 - 0.25 / 255).logit()
+
+
+def as_tensor(values: NDArray) -> Tensor:
+    """A float32 tensor of its own memory."""
+    return torch.from_numpy(np.array(values, dtype=np.float32))
+
+
+def read_content(path: Path, kind: str) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        FileFormatError: If it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(path, expected=f"a readable {kind} file", found=str(error.strerror)) from error

@@ -1,0 +1,179 @@
+"""SOG, PlayCanvas's splats in WebP pictures: ``meta.json`` with pictures beside it, or all in one zip archive.
+
+Pixel i of each picture belongs to Gaussian i. Positions are 16-bit steps between bounds of sign(x) ln(1 + |x|), low
+and high bytes in two pictures. Scales and colors are indices into tables of up to 256 numbers. Rotations are the
+smallest three components, and alpha tells which one is left out. Spherical harmonics are indices into a palette,
+itself a picture. Version 2 is read and written. GaussForge is not used: damaged files crash its reader, and its
+writer mixes up the components of rotations.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.foreign import as_tensor, check_count, logits_of_bytes, read_content
+
+META = "meta.json"
+"""The part that names the others; alone in a folder with pictures, the name of the file."""
+
+PALETTE_WIDTH = 64
+"""Entries in a row of the palette's picture."""
+
+COEFFICIENTS = (0, 3, 8, 15)
+"""Coefficients of the spherical harmonics for each number of bands."""
+
+SMALL = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+"""Components wxyz that are stored, for each that is left out."""
+
+FIRST_TAG = 252
+"""Alpha of a rotation whose w is left out; x, y and z follow."""
+
+_LARGEST_META = 16 << 20
+_BYTES_A_PIXEL = 8
+_FURTHER_BYTES = 16 << 20
+_FURTHER_PIXELS = 1 << 20  # a palette of 65,536 entries with 15 coefficients
+
+_Load = Callable[[str, int], bytes]
+
+
+def read_sog(path: Path) -> Gaussians:
+    """Read a ``.sog`` archive, or an unbundled SOG by its ``meta.json``, in the axes of a PLY.
+
+    Raises:
+        FileFormatError: If a part is missing or damaged, larger than its count allows, or of another version.
+    """
+    try:
+        if path.name == META:
+            return _read(path, lambda name, limit: _beside(path, name, limit), _total_size(path))
+        with zipfile.ZipFile(io.BytesIO(read_content(path, ".sog"))) as archive:
+            return _read(path, lambda name, limit: _in_archive(archive, name, limit), path.stat().st_size)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise FileFormatError(path, expected="a SOG archive", found=f"damaged content: {error}") from error
+    except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
+        found = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileFormatError(
+            path, expected="a SOG of version 2", found=f"damaged content: {found}"
+        ) from error
+
+
+def _total_size(path: Path) -> int:
+    return sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix == ".webp")
+
+
+def _beside(path: Path, name: str, limit: int) -> bytes:
+    with open(path.with_name(name), "rb") as file:
+        return _whole(file.read(limit + 1), name, limit)
+
+
+def _in_archive(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    with archive.open(name) as file:
+        return _whole(file.read(limit + 1), name, limit)
+
+
+def _whole(content: bytes, name: str, limit: int) -> bytes:
+    if len(content) > limit:
+        raise ValueError(f"{name} has more than {limit:,} bytes")
+    return content
+
+
+def _read(path: Path, load: _Load, size: int) -> Gaussians:
+    meta = json.loads(load(META, _LARGEST_META))
+    if meta.get("version") != 2:
+        raise FileFormatError(path, expected="SOG of version 2", found=f"version {meta.get('version', 1)}")
+    count = meta["count"]
+    if type(count) is not int or count < 0:
+        raise ValueError(f"a count of {count!r}")
+    check_count(path, count, size)
+
+    def picture(part: str, index: int = 0) -> NDArray[np.uint8]:
+        return _pixels(load, meta[part]["files"][index], count).reshape(-1, 4)[:count]
+
+    def looked_up(part: str) -> NDArray[np.float32]:
+        table = _table(meta[part])
+        return table[picture(part)[:, :3]]
+
+    sh0 = picture("sh0")
+    return Gaussians(
+        means=as_tensor(_positions(picture("means", 0), picture("means", 1), meta["means"])),
+        quats=as_tensor(_quats(picture("quats"))),
+        log_scales=as_tensor(looked_up("scales")),
+        opacity_logits=logits_of_bytes(sh0[:, 3]),
+        sh0=as_tensor(_table(meta["sh0"])[sh0[:, :3]])[:, None],
+        shN=as_tensor(_harmonics(load, meta["shN"], picture("shN", 1)))
+        if meta.get("shN")
+        else torch.zeros(count, 0, 3),
+        antialiased=meta.get("model") == "antialiased",
+    )
+
+
+def _pixels(load: _Load, name: str, count: int) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 4]`` of at least ``count`` pixels, and not of many more."""
+    if not isinstance(name, str) or Path(name).name != name or "\\" in name:
+        raise ValueError(f"a part named {str(name)[:80]!r}")
+    content = load(name, _BYTES_A_PIXEL * count + _FURTHER_BYTES)
+    try:
+        picture = Image.open(io.BytesIO(content), formats=["WEBP"])
+        if not count <= picture.width * picture.height <= 4 * count + _FURTHER_PIXELS:
+            raise ValueError(f"{name} of {picture.width} x {picture.height} pixels for {count:,}")
+        return np.asarray(picture.convert("RGBA"))
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _table(part: dict[str, Any]) -> NDArray[np.float32]:
+    """The 256 numbers that a picture's bytes are indices of; a shorter table ends in NaN."""
+    numbers = list(part["codebook"])
+    if len(numbers) == 256 and numbers[0] is None:  # early versions of SuperSplat: the steps are nearly equal
+        numbers[0] = numbers[1] + (numbers[1] - numbers[255]) / 255
+    if not 0 < len(numbers) <= 256:
+        raise ValueError(f"a codebook of {len(numbers)} numbers")
+    return np.append(np.array(numbers, np.float64), np.full(256 - len(numbers), np.nan)).astype(np.float32)
+
+
+def _positions(low: NDArray[np.uint8], high: NDArray[np.uint8], part: dict[str, Any]) -> NDArray[np.float64]:
+    first, last = (np.array(part[name], np.float64).reshape(3) for name in ("mins", "maxs"))
+    steps = low[:, :3] + 256.0 * high[:, :3]
+    values = first + steps / 65535 * (last - first)
+    with np.errstate(over="ignore"):  # infinity is refused later
+        return np.sign(values) * np.expm1(np.abs(values))
+
+
+def _quats(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Quaternions wxyz; other tags than the four mean no rotation."""
+    small = (pixels[:, :3] / 255 * 2 - 1) / math.sqrt(2)
+    quats = np.zeros((len(pixels), 4))
+    quats[:, 0] = 1
+    for left_out, kept in enumerate(SMALL):
+        rows = pixels[:, 3] == FIRST_TAG + left_out
+        quats[np.ix_(rows, kept)] = small[rows]
+        quats[rows, left_out] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
+    return quats
+
+
+def _harmonics(load: _Load, part: dict[str, Any], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Coefficients ``[N, 3 | 8 | 15, 3]`` of the palette's entries."""
+    width, entries = COEFFICIENTS[part["bands"]], part["count"]
+    if not width or type(entries) is not int or not 0 < entries <= 1 << 16:
+        raise ValueError(f"a palette of {entries!r} entries with {part['bands']!r} bands")
+    picture = _pixels(load, part["files"][0], width)
+    if picture.shape[1] != PALETTE_WIDTH * width:
+        raise ValueError(f"a palette {picture.shape[1]} pixels wide")
+    palette = _table(part)[picture[..., :3]].reshape(-1, width, 3)
+    index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
+    if len(index) and index.max() >= len(palette):
+        raise ValueError(f"palette entry {index.max()} of {len(palette)}")
+    return palette[index]

@@ -1,0 +1,230 @@
+"""SPZ, Niantic's compressed splats (github.com/nianticlabs/spz): versions 2 to 4 are read, 3 and 4 written.
+
+A file holds streams of bytes, one a property: positions as 24-bit fixed-point numbers, logarithms of scales in steps
+of 1/16, opacities and colors in 8 bits, rotations by their smallest three components, spherical harmonics in 8 bits.
+Versions 2 and 3 are one gzip stream, version 4 has a zstd stream for each. GaussForge and its copy of Niantic's code
+are not used: damaged headers of version 4 make it take gigabytes, and it drops the antialiasing flag.
+
+The axes are y up and z backward; those of a PLY are y down and z forward. The two differ by half a turn about x.
+"""
+
+from __future__ import annotations
+
+import gzip
+import logging
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+import zstandard
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.foreign import as_tensor, check_count, logits_of_bytes, read_content
+from lexsplat.scenes.transforms import transformed
+
+logger = logging.getLogger(__name__)
+
+HALF_TURN = np.diag([1.0, -1.0, -1.0])
+"""Rotation between the axes of SPZ and those of a PLY."""
+
+_HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, streams
+_HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # the same, and where the table of contents begins
+_MAGIC = b"NGSP"
+_ANTIALIASED, _EXTENSIONS = 1, 2
+_COLOR_SCALE = 0.15
+_MOST_FRACTIONAL_BITS = 30
+_FIXED_LIMIT = (1 << 23) - 1
+_ROUGH_BITS = {1: 5, 2: 4, 3: 4, 4: 4}
+"""Bits kept of the spherical harmonics of each degree, as Niantic's writer does: the rest compresses away."""
+
+
+def _layout(version: int, degree: int) -> dict[str, int]:
+    """Bytes a Gaussian of every stream, in the order of the file."""
+    sizes = {"positions": 9, "alphas": 1, "colors": 3, "scales": 3, "rotations": 3 if version == 2 else 4}
+    return sizes | ({"sh": 3 * ((degree + 1) ** 2 - 1)} if degree else {})
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read an SPZ file of version 2, 3 or 4, in the axes of a PLY.
+
+    Raises:
+        FileFormatError: If the file is damaged or has another version.
+    """
+    content = read_content(path, ".spz")
+    try:
+        head = zlib.decompressobj(31).decompress(content, 16) if content[:2] == b"\x1f\x8b" else content[:32]
+        magic, version, count, degree, bits, flags, _ = _HEADER.unpack_from(head)
+        known = (2, 3) if content[:2] == b"\x1f\x8b" else (4,)
+        if magic != _MAGIC or version not in known or degree > 4 or bits > _MOST_FRACTIONAL_BITS:
+            found = f"version {version}" if magic == _MAGIC else "another file"
+            raise FileFormatError(path, expected="SPZ of version 2 or 3 in gzip, or 4", found=found)
+        check_count(path, count, len(content))
+        layout = _layout(version, degree)
+        sizes = {name: size * count for name, size in layout.items()}
+        streams = _inflated_4(content, sizes) if version == 4 else _inflated(content, sizes)
+    except (zlib.error, zstandard.ZstdError, struct.error, EOFError) as error:
+        raise FileFormatError(path, expected="an SPZ file", found=f"damaged content: {error}") from error
+    if flags & _EXTENSIONS:
+        logger.warning("%s: its extensions are ignored; they may name other axes", path)
+    arrays = {
+        name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
+    }
+    gaussians = _unpacked(arrays, version, bits, bool(flags & _ANTIALIASED))
+    return transformed(gaussians, rotation=HALF_TURN)
+
+
+def _inflated(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
+    """The streams of versions 2 and 3.
+
+    Raises:
+        EOFError: If the file is cut.
+    """
+    stream = zlib.decompressobj(31)
+    data = stream.decompress(content, _HEADER.size + sum(sizes.values()))
+    stream.decompress(stream.unconsumed_tail, 1 << 20)  # extensions and the checksum
+    if len(data) < _HEADER.size + sum(sizes.values()) or not stream.eof:
+        raise EOFError("the file is cut")
+    streams, start = {}, _HEADER.size
+    for name, size in sizes.items():
+        streams[name] = data[start : start + size]
+        start += size
+    return streams
+
+
+def _inflated_4(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
+    """The streams of version 4.
+
+    Raises:
+        EOFError: If the file is cut or sizes disagree.
+    """
+    *_, number, contents = _HEADER_4.unpack_from(content)
+    start = contents + 16 * number
+    if number != len(sizes) or contents < _HEADER_4.size:
+        raise EOFError(f"{number} streams instead of {len(sizes)}")
+    streams = {}
+    for index, (name, size) in enumerate(sizes.items()):
+        packed, unpacked = struct.unpack_from("<QQ", content, contents + 16 * index)
+        if unpacked != size or start + packed > len(content):
+            raise EOFError(f"a stream of {packed} and {unpacked} bytes")
+        with zstandard.ZstdDecompressor().stream_reader(content[start : start + packed]) as reader:
+            streams[name] = reader.read(size) if size else b""
+        if len(streams[name]) != size:
+            raise EOFError("a stream is cut")
+        start += packed
+    return streams
+
+
+def _unpacked(arrays: dict[str, NDArray[np.uint8]], version: int, bits: int, antialiased: bool) -> Gaussians:
+    """The Gaussians of the streams ``[N, bytes]``, in the axes of SPZ."""
+    count = len(arrays["alphas"])
+    padded = np.zeros((count, 3, 4), np.uint8)
+    padded[..., 1:] = arrays["positions"].reshape(count, 3, 3)
+    fixed = padded.view("<i4")[..., 0] >> 8
+    sh = arrays.get("sh", np.zeros((count, 0), np.uint8))
+    return Gaussians(
+        means=as_tensor(np.ldexp(fixed.astype(np.float64), -bits)),
+        quats=as_tensor(_quats_2(arrays["rotations"]) if version == 2 else _quats(arrays["rotations"])),
+        log_scales=as_tensor(arrays["scales"] / 16 - 10),
+        opacity_logits=logits_of_bytes(arrays["alphas"][:, 0]),
+        sh0=as_tensor((arrays["colors"] / 255 - 0.5) / _COLOR_SCALE)[:, None],
+        shN=as_tensor((sh.reshape(count, sh.shape[1] // 3, 3).astype(np.float32) - 128) / 128),
+        antialiased=antialiased,
+    )
+
+
+def _quats_2(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Quaternions wxyz of version 2: x, y and z in 8 bits each; w is positive."""
+    xyz = packed / 127.5 - 1
+    return np.column_stack([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1))), xyz])
+
+
+def _quats(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Quaternions wxyz of versions 3 and 4: which of xyzw is largest (2 bits), the others in 10 bits each."""
+    words = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    largest = words >> 30
+    fields = np.stack([words >> 20, words >> 10, words], 1) & 1023
+    small = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / 511 * math.sqrt(0.5)
+    quats = np.zeros((len(words), 4))
+    for index in range(4):
+        rows, others = largest == index, [i for i in range(4) if i != index]
+        quats[np.ix_(rows, others)] = small[rows]
+        quats[rows, index] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
+    return quats[:, [3, 0, 1, 2]]
+
+
+def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
+    """Write an SPZ file; the order of the Gaussians is preserved.
+
+    Args:
+        gaussians: Gaussians in the axes of a PLY.
+        path: The file.
+        version: 4, or 3 for programs that read no newer one.
+
+    Raises:
+        ValueError: If a value is NaN or infinite, a center is farther than 8,388,607 units from the origin, or the
+            version is neither 3 nor 4.
+    """
+    if version not in (3, 4):
+        raise ValueError(f"version must be 3 or 4, got {version}")
+    g = transformed(gaussians.detach().to("cpu"), rotation=HALF_TURN)
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in g.tensors().values()):
+        raise ValueError("the Gaussians contain NaN or infinity")
+    farthest = max(float(g.means.abs().max()) if len(g) else 0.0, 1e-6)
+    if farthest > _FIXED_LIMIT:
+        raise ValueError(
+            f"SPZ holds centers up to {_FIXED_LIMIT:,} units from the origin, got {farthest:,.0f}"
+        )
+    bits = min(math.floor(math.log2(_FIXED_LIMIT / farthest)), 23)
+    streams = {name: array.tobytes() for name, array in _packed(g, bits).items()}
+    fields = (_MAGIC, version, len(g), g.sh_degree, bits, _ANTIALIASED if g.antialiased else 0)
+    if version == 3:
+        content = _HEADER.pack(*fields, 0) + b"".join(streams.values())
+        path.write_bytes(gzip.compress(content, mtime=0))
+        return
+    packed = {name: zstandard.ZstdCompressor(level=12).compress(data) for name, data in streams.items()}
+    table = b"".join(struct.pack("<QQ", len(packed[name]), len(data)) for name, data in streams.items())
+    header = _HEADER_4.pack(*fields, len(streams), _HEADER_4.size)
+    path.write_bytes(header + table + b"".join(packed.values()))
+
+
+def _packed(g: Gaussians, bits: int) -> dict[str, NDArray]:
+    """The streams of versions 3 and 4, in the order of the file."""
+    fixed = np.round(np.ldexp(g.means.double().numpy(), bits)).clip(-_FIXED_LIMIT, _FIXED_LIMIT)
+    arrays = {
+        "positions": fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[..., :3],
+        "alphas": _bytes(g.opacities * 255),
+        "colors": _bytes((g.sh0[:, 0] * _COLOR_SCALE + 0.5) * 255),
+        "scales": _bytes((g.log_scales + 10) * 16),
+        "rotations": _packed_quats(torch.nn.functional.normalize(g.quats.double(), dim=1).numpy()),
+    }
+    if g.sh_degree:
+        degrees = np.repeat(np.arange(1, g.sh_degree + 1), 2 * np.arange(1, g.sh_degree + 1) + 1)
+        steps = np.array([1 << (8 - _ROUGH_BITS[int(degree)]) for degree in degrees])[:, None]
+        values = np.round(g.shN.double().numpy() * 128) + 128
+        arrays["sh"] = (np.floor((values + steps // 2) / steps) * steps).clip(0, 255).astype(np.uint8)
+    return arrays
+
+
+def _bytes(values: Tensor) -> NDArray[np.uint8]:
+    return values.round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _packed_quats(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """Quaternions wxyz of unit length in 32 bits each; see `_quats`."""
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest = np.abs(xyzw).argmax(1)
+    rows = np.arange(len(xyzw))
+    xyzw = xyzw * np.where(xyzw[rows, largest] < 0, -1, 1)[:, None]
+    kept = np.arange(4)[None].repeat(len(xyzw), 0)
+    kept = kept[kept != largest[:, None]].reshape(-1, 3)
+    small = np.take_along_axis(xyzw, kept, 1)
+    fields = np.round(np.abs(small) * math.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
+    fields |= np.where(small < 0, 512, 0).astype(np.uint32)
+    words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+    return words.astype("<u4")

@@ -1,0 +1,17 @@
+"""Many scenes, searched at once: which of them holds a thing, and where.
+
+    library = lexsplat.open_library("rooms")
+    library.add("scans/kitchen")
+    for hit in library.search("fire extinguisher").hits:
+        print(hit.scene, hit.present, hit.count)
+
+Two stages: `lexsplat.scenes.library.bounds` rules out scenes by their codes alone, and the scenes that are left are
+asked themselves (`Scene.find`), so that a library and its scenes never disagree.
+"""
+
+from __future__ import annotations
+
+from lexsplat.scenes.library.library import Library, open_library
+from lexsplat.scenes.library.searching import Found, Hit
+
+__all__ = ["Found", "Hit", "Library", "open_library"]

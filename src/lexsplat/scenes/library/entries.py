@@ -1,0 +1,278 @@
+"""What a library keeps of a scene, in files that no other scene shares.
+
+::
+
+    library.json                       format_version and the library's own name on a server
+    scenes/NAME.json                   the record: where the scene is, which version of it, its encoder
+    scenes/NAME.CONTENT.safetensors    the codes, named after their hash, and the record again
+    scenes/NAME.jpg                    a picture of the scene
+    texts/                             embeddings of the texts that were asked
+
+The record is written last and replaced as a whole: a scene is in the library when its record is. Codes that no record
+names were left by a killed writer; the next one removes them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from lexsplat.queries.everyday import OFFSET, EverydayScale, everyday_words
+from lexsplat.runtime.device import one_thread
+from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.fingerprints import digest, fingerprint
+from lexsplat.scenes.finding import middle_camera
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.scene import Scene
+
+BUNDLED = "demo"
+"""The path of the bundled scene, wherever it is installed."""
+_THUMBNAIL = 320
+"""Longer side of a picture in pixels."""
+_RIDGE = 0.1
+"""Weight of the squared length of the estimate of the offset; the everyday words have about a thousand terms."""
+_GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """A scene of a library.
+
+    Args:
+        name: Its name in the library.
+        path: Its folder; "demo" is the bundled scene.
+        beside: Its folder relative to the library, for scenes that were moved together with it.
+        state: Hash of its finished stages: another one after a build.
+        encoder: Hash of its text encoder; "" if the build did not record it.
+        clip: Name or folder of that encoder.
+        content: Hash of its codes.
+        codes: Number of codes K.
+        gaussians: Number of Gaussians.
+        views: Number of views.
+    """
+
+    name: str
+    path: str
+    beside: str
+    state: str
+    encoder: str
+    clip: str
+    content: str
+    codes: int
+    gaussians: int
+    views: int
+
+    @property
+    def group(self) -> str:
+        """Scenes of one group have the same text embeddings."""
+        return self.encoder or f"name-{fingerprint(self.clip)}"
+
+    @property
+    def codes_file(self) -> str:
+        """Name of the file of its codes."""
+        return f"{self.name}.{self.content}.safetensors"
+
+    def folder(self, root: Path) -> Path:
+        """Where the scene is now: at its place relative to the library, as both may have moved, else at its path."""
+        if self.path == BUNDLED:
+            return BUNDLED_SCENE
+        together = (root / self.beside).resolve()
+        return together if (together / "scene.json").is_file() else Path(self.path)
+
+
+def state_of(folder: SceneFolder) -> str:
+    """A hash that changes with every build of a scene; its scale and its name do not matter."""
+    return fingerprint(folder.record["stages"])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Codes:
+    """What decides whether a scene may hold a text (`lexsplat.queries.everyday`).
+
+    Args:
+        units: Codewords of unit length ``[K, D]``, float16.
+        shared: Their cosines with the mean of the everyday words ``[K]``.
+        limits: Square root of the best height of an everyday word at each code times that of the scene ``[K]``.
+        shares: Share of the visible weight that each code stands for ``[K]``; 0 for codes that nothing shows.
+        offset: For index servers: a linear estimate of the offset of a text t, offset[:D].t - offset[D], fitted to
+            the everyday words ``[D + 1]``.
+    """
+
+    units: Tensor
+    shared: Tensor
+    limits: Tensor
+    shares: Tensor
+    offset: Tensor
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def content(self) -> str:
+        """A hash of all values."""
+        return digest(bytes(tensor.contiguous().numpy().data) for tensor in self.tensors().values())
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, scene: Scene) -> Codes:
+        """The codes of a scene.
+
+        Raises:
+            ModelError: If the everyday words are new to its folder and its encoder cannot be loaded.
+        """
+        field, count = scene.field, len(scene.field.codebook.clip)
+        masses = field.segments.masses if field.segments else scene.gaussians.opacities
+        weights, seen = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.bool)
+        for rows in torch.arange(len(masses), device=masses.device).split(_GAUSSIANS):
+            probabilities = field.select(rows).code_probabilities().cpu()
+            weights += masses[rows].cpu().double() @ probabilities.double()
+            seen |= (probabilities > 0).any(
+                0
+            )  # also where next to nothing is visible: the bound holds for any place
+        shares = (weights / weights.sum().clamp_min(1e-12)).clamp_min(1e-9) * seen
+        words = scene.embed(everyday_words()).cpu()
+        return cls.made(field.codebook.clip.cpu(), words, scene.everyday_scale, shares.float())
+
+    @classmethod
+    @one_thread()
+    def made(cls, codewords: Tensor, words: Tensor, scale: EverydayScale, shares: Tensor) -> Codes:
+        """The codes of a codebook ``[K, D]``, from unit embeddings of the everyday words ``[W, D]``."""
+        units, mean = torch.nn.functional.normalize(codewords.float(), dim=-1), scale.mean.cpu()
+        centered = words - mean
+        offsets = (units @ centered.T).quantile(OFFSET, dim=0)
+        ridge = _RIDGE * torch.eye(units.shape[1])
+        fitted = torch.linalg.solve(centered.T @ centered + ridge, centered.T @ offsets)
+        limits = (scale.best.cpu() * scale.peak).sqrt()
+        return cls(units.half(), units @ mean, limits, shares, torch.cat([fitted, (fitted @ mean)[None]]))
+
+
+def record_of(root: Path, name: str, path: str, scene: Scene, codes: Codes) -> Record:
+    """The record of an open scene.
+
+    Args:
+        root: The library.
+        name: The scene's name in it.
+        path: The scene's folder, absolute, or `BUNDLED`.
+        scene: The scene, from a folder.
+        codes: Its codes.
+    """
+    if scene.folder is None:
+        raise SceneFolderError(name, expected="a scene in a folder", found="one in memory")
+    return Record(
+        name=name,
+        path=path,
+        beside="" if path == BUNDLED else os.path.relpath(path, root.resolve()),
+        state=state_of(scene.folder),
+        encoder=scene.encoder_identity().get("encoder_hash", ""),
+        clip=scene.clip,
+        content=codes.content(),
+        codes=len(codes.units),
+        gaussians=len(scene.gaussians),
+        views=len(scene.views),
+    )
+
+
+def write_entry(root: Path, record: Record, codes: Codes, picture: Image.Image | None) -> None:
+    """Write or replace the entry of a scene; the record comes last.
+
+    Raises:
+        OSError: If it cannot be written; the earlier entry stays.
+    """
+    stage = root / "scenes"
+    copy = json.dumps(dataclasses.asdict(record))
+    write_tensors(stage / record.codes_file, codes.tensors(), {"record": copy})
+    if picture is not None:
+        with atomic_path(stage / f"{record.name}.jpg") as temporary:
+            picture.save(temporary, format="JPEG", quality=85)
+    write_json(stage / f"{record.name}.json", record)
+
+
+def picture_of(scene: Scene) -> Image.Image | None:
+    """A scene as the middle camera sees it; None without views."""
+    camera = middle_camera(scene)
+    if camera is None:
+        return None
+    small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _THUMBNAIL))
+    pixels = (scene.render(small).image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return Image.fromarray(pixels)
+
+
+def read_record(path: Path) -> Record:
+    """The record in a file.
+
+    Raises:
+        FileFormatError: If it is damaged.
+    """
+    found = read_json(path, remedy=f"lexsplat library verify {path.parents[1]} --repair")
+    return checked_record(found, path)
+
+
+def checked_record(content: Any, path: Path) -> Record:
+    """A record from plain data.
+
+    Raises:
+        FileFormatError: If an entry is missing or of a wrong type.
+    """
+    try:
+        values: dict[str, Any] = {
+            field.name: (int if field.type == "int" else str)(content[field.name])
+            for field in dataclasses.fields(Record)
+        }
+        sound = values["name"] == path.name.split(".")[0] and re.fullmatch(r"[0-9a-f]+", values["content"])
+        if sound and re.fullmatch(r"[\w-]*", values["encoder"]) and values["codes"] > 0:
+            return Record(**values)
+        found = "other values"
+    except (KeyError, TypeError, ValueError) as error:
+        found = repr(error)[:80]
+    raise FileFormatError(
+        path,
+        expected="the record of a scene",
+        found=found,
+        remedy=f"lexsplat library verify {path.parents[1]} --repair",
+    )
+
+
+def recovered_record(stage: Path, name: str) -> Record | None:
+    """The record of a scene from the copy in the file of its codes; None if that is damaged as well."""
+    for path in stage.glob(f"{name}.*.safetensors"):
+        try:
+            _, metadata = read_tensors(path)
+            return checked_record(json.loads(metadata["record"]), path)
+        except (FileFormatError, KeyError, ValueError):
+            continue
+    return None
+
+
+def map_codes(path: Path, record: Record) -> Codes:
+    """The codes of a scene, mapped from their file.
+
+    Raises:
+        FileFormatError: If the file is missing, or its content is not that of the record.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            codes = Codes(**{field.name: file.get_tensor(field.name) for field in dataclasses.fields(Codes)})
+        if codes.content() == record.content and len(codes.units) == record.codes:
+            return codes
+        found = "damaged content (the hash differs)"
+    except OSError as error:
+        found = str(error.strerror)
+    except (SafetensorError, TypeError) as error:
+        found = str(error)[:80]
+    raise FileFormatError(
+        path,
+        expected="the codes that were written",
+        found=found,
+        remedy=f"lexsplat library verify {path.parents[1]} --repair",
+    )

@@ -1,0 +1,430 @@
+"""A library of scenes in a folder: added to, removed from, verified and searched."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import re
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lexsplat.features.text import TextCache, TextTower, load_text
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.relevancy import CANONICAL_PHRASES, embed_prompts
+from lexsplat.runtime.bounded import Bounded
+from lexsplat.runtime.device import choose_device
+from lexsplat.runtime.errors import FileFormatError, LexsplatError, LibraryError
+from lexsplat.runtime.files import locked, read_json, write_json
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.library.entries import (
+    BUNDLED,
+    Codes,
+    Record,
+    map_codes,
+    picture_of,
+    read_record,
+    record_of,
+    recovered_record,
+    state_of,
+    write_entry,
+)
+from lexsplat.scenes.library.searching import Found, search
+from lexsplat.scenes.library.server import Server
+from lexsplat.scenes.reading import read_scene
+from lexsplat.scenes.scene import Scene, open_scene
+
+FORMAT_VERSION = 1
+COMPARED = (*everyday_words(), *CANONICAL_PHRASES)
+"""Texts that every question is compared with."""
+_OPEN_SCENES = 16
+"""Scenes that stay open, at most."""
+
+
+class _OwnTexts:
+    """The texts of a scene as a text tower: what its folder has cached needs no model."""
+
+    def __init__(self, scene: Scene, content_hash: str) -> None:
+        self.scene, self.content_hash = scene, content_hash
+
+    def encode_text(self, prompts: Any) -> Tensor:
+        return self.scene.encode_text(list(prompts))
+
+
+class Library:
+    """Scenes that are searched together. One process at a time may change a library; any number may read it.
+
+    Args:
+        root: Its folder.
+        device: Where scenes are opened: "auto", "cpu" or "cuda".
+        index: Address of an index server, such as "http://localhost:8000"; None compares with all scenes.
+
+    Raises:
+        LibraryError: If there is no library, or one of another format version.
+    """
+
+    def __init__(self, root: str | Path, device: str = "auto", index: str | None = None) -> None:
+        self.root, self._device = Path(root), device
+        facts = self._facts()
+        self.server = Server(index, facts["name"], self.root) if index else None
+        self._texts = TextCache(self.root / "texts")
+        self._towers: dict[str, TextTower] = {}
+        self._records: dict[str, tuple[tuple[int, int], Record]] = {}
+        self._codes: dict[str, tuple[str, Codes]] = {}
+        self._scenes: Bounded[tuple[str, str, str], Scene] = Bounded(_OPEN_SCENES)
+        self.damaged: dict[str, FileFormatError] = {}
+        """Scenes whose record or codes cannot be read, by name."""
+
+    @classmethod
+    def create(cls, root: str | Path, device: str = "auto", index: str | None = None) -> Library:
+        """Open a library; a new or empty folder becomes one.
+
+        Raises:
+            LibraryError: If the folder has files of another program.
+        """
+        path = Path(root)
+        if path.exists() and (
+            not path.is_dir() or (any(path.iterdir()) and not (path / "library.json").exists())
+        ):
+            raise LibraryError(
+                path, expected="a library or a new folder", found="other files", remedy="give another folder"
+            )
+        if not (path / "library.json").exists():
+            write_json(path / "library.json", {"format_version": FORMAT_VERSION, "name": uuid.uuid4().hex})
+        return cls(root, device, index)
+
+    def __repr__(self) -> str:
+        return f"Library({str(self.root)!r}, scenes={len(self.names())})"
+
+    def _facts(self) -> dict[str, Any]:
+        path = self.root / "library.json"
+        if not path.is_file():
+            raise LibraryError(
+                self.root,
+                expected="a library of scenes",
+                found="no library.json in it" if self.root.exists() else "no such folder",
+                remedy=f"make one with: lexsplat library add {self.root} SCENE",
+            )
+        facts = read_json(
+            path, remedy=f'write {{"format_version": {FORMAT_VERSION}, "name": "rooms"}} into it'
+        )
+        version = facts.get("format_version") if isinstance(facts, dict) else None
+        if version != FORMAT_VERSION or not re.fullmatch(r"\w{1,40}", str(facts.get("name"))):
+            raise LibraryError(
+                path,
+                expected=f"format_version {FORMAT_VERSION} and a name",
+                found=repr(version)[:40],
+                remedy="add the scenes to a new library with this version of lexsplat",
+            )
+        return facts
+
+    # -- what it holds
+
+    @property
+    def stage(self) -> Path:
+        """The folder of the entries."""
+        return self.root / "scenes"
+
+    def names(self) -> list[str]:
+        """The names of all scenes, in order, whether their records can be read or not."""
+        return sorted(path.stem for path in self.stage.glob("*.json") if not path.name.startswith("."))
+
+    def record(self, name: str) -> Record | None:
+        """The record of a scene; None if it cannot be read (`damaged`)."""
+        path = self.stage / f"{name}.json"
+        try:
+            facts = path.stat()
+            stamp = (facts.st_mtime_ns, facts.st_size)
+            known = self._records.get(name)
+            if known is None or known[0] != stamp:
+                known = self._records[name] = (stamp, read_record(path))
+            self.damaged.pop(name, None)
+            return known[1]
+        except FileNotFoundError:  # removed in the meantime
+            return None
+        except FileFormatError as error:
+            self.damaged[name] = error
+            return None
+
+    def records(self) -> list[Record]:
+        """The records of all scenes that can be read."""
+        return [record for name in self.names() if (record := self.record(name)) is not None]
+
+    def codes(self, record: Record) -> Codes | None:
+        """The codes of a scene, checked when they are first read; None if they are damaged (`damaged`)."""
+        known = self._codes.get(record.name)
+        if known is None or known[0] != record.content:
+            try:
+                known = (record.content, map_codes(self.stage / record.codes_file, record))
+            except FileFormatError as error:
+                now = self.record(record.name)
+                if now is None or now.content != record.content:  # replaced or removed in the meantime
+                    return None if now is None else self.codes(now)
+                self.damaged[record.name] = error
+                return None
+            self._codes[record.name] = known
+        return known[1]
+
+    def scene(self, name: str) -> Scene:
+        """A scene, as it is now.
+
+        Raises:
+            LibraryError: If the library has no such scene.
+            SceneFolderError: If its folder is gone.
+            FileFormatError: If its record or one of its files is damaged.
+        """
+        record = self.record(name)
+        if record is None:
+            raise self.damaged.get(name) or self._unknown(name)
+        path = record.folder(self.root)
+        folder = SceneFolder.open(path)
+        key = (name, str(path), state_of(folder))
+        return self._scenes.get_or_make(key, lambda: self._open(path))
+
+    def _open(self, path: Path) -> Scene:
+        """A scene that shares text embeddings and encoders with the others."""
+        found = read_scene(path, choose_device(self._device))
+        clip = found.folder.record.get("config", {}).get("clip", "bundled")
+        known = found.folder.record["stages"].get("features", {}).get("clip_hash", "")
+        encode = functools.partial(self.encode, known, clip)
+        return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder, encode_text=encode)
+
+    # -- text
+
+    def encode(self, content_hash: str, clip: str, texts: list[str]) -> Tensor:
+        """Embeddings ``[T, D]`` of texts by one of the encoders; known texts need no model.
+
+        Raises:
+            ModelError: If the encoder cannot be loaded.
+            LibraryError: If it is not the one of the scenes.
+        """
+        if not content_hash:
+            return torch.cat([self._tower(clip).encode_text([text]) for text in texts])
+        try:
+            return self._texts.encode(content_hash, texts, lambda: self._tower(clip))
+        except ValueError as error:
+            raise LibraryError(
+                clip,
+                expected=f"the encoder of the scenes ({content_hash[:12]})",
+                found="another one",
+                remedy="put the right one there, or build the scenes again and add them again",
+            ) from error
+
+    def _tower(self, clip: str) -> TextTower:
+        if clip not in self._towers:
+            self._towers[clip] = load_text(clip, choose_device(self._device))
+        return self._towers[clip]
+
+    def embed(self, content_hash: str, clip: str, texts: list[str]) -> Tensor:
+        """Unit embeddings ``[T, D]`` of prompts, as `Scene.embed` of the scenes with this encoder."""
+        return embed_prompts(texts, functools.partial(self.encode, content_hash, clip))
+
+    # -- changing it
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Lock the library for a change, and remove what killed writers left.
+
+        Raises:
+            LibraryError: If another process changes it, or nothing can be written.
+        """
+
+        def refusal(holder: str) -> LibraryError:
+            return LibraryError(
+                self.root,
+                expected="a library that no other process changes",
+                found=f"process {holder} at work",
+                remedy="run the command again when it is done",
+            )
+
+        try:
+            with locked(self.root, refusal):
+                self._sweep()
+                if self.server:
+                    self.server.check()  # before anything is changed
+                yield
+        except OSError as error:
+            raise LibraryError(
+                error.filename or self.root,
+                expected="to be written",
+                found=str(error.strerror or error),
+                remedy="run the command again when that is mended; the library is as it was before",
+            ) from error
+
+    def _sweep(self) -> None:
+        """Remove codes and pictures that no record names."""
+        names = set(self.names())
+        kept = {record.codes_file for record in self.records()}
+        for path in [*self.stage.glob("*.safetensors"), *self.stage.glob("*.jpg")]:
+            name = path.name.split(".")[0]
+            damaged = name in self.damaged  # its codes hold the only copy of the record
+            if name not in names or (path.suffix == ".safetensors" and path.name not in kept and not damaged):
+                path.unlink(missing_ok=True)
+
+    def add(self, path: str | Path) -> Record:
+        """Add a scene, or bring its entry up to date after a build or a move.
+
+        Returns:
+            Its record. A new scene is named after its folder, with a number if the name is taken.
+
+        Raises:
+            SceneFolderError: If it is not a finished scene.
+            FileFormatError: If one of its files is damaged.
+            LibraryError: If another process changes the library, the disk is full, or the server fails.
+        """
+        with self._changing():
+            record = self._add(path)
+        return record
+
+    def _add(self, path: str | Path, name: str | None = None) -> Record:
+        scene = open_scene(path, device=self._device)
+        folder = scene.folder
+        if folder is None:
+            raise ValueError("a scene that was opened has a folder")
+        place = BUNDLED if folder.is_bundled else str(folder.root.resolve())
+        name = name or self._name_for(place, state_of(folder))
+        before = self.record(name)
+        scene.embed(COMPARED)  # in one call, so that the cache of the scene is written once
+        known = scene.encoder_identity().get("encoder_hash")
+        codes = Codes.of(scene)
+        record = record_of(self.root, name, place, scene, codes)
+        write_entry(self.root, record, codes, picture_of(scene))
+        if known:  # what the scene has in its cache, all of its scenes have
+            self._texts.encode(known, COMPARED, lambda: _OwnTexts(scene, known))
+        if before is not None and before.codes_file != record.codes_file:
+            (self.stage / before.codes_file).unlink(missing_ok=True)
+        if self.server:
+            self.server.put(record, codes, self.stage)
+        return record
+
+    def _name_for(self, place: str, state: str) -> str:
+        """The name of a known or moved scene, or a new one after the folder."""
+        for record in self.records():
+            now = str(record.folder(self.root))
+            if place in (record.path, now):
+                return record.name
+            if record.state == state and not (Path(now) / "scene.json").is_file():
+                return record.name  # its folder is gone, and here is the same build
+        base = re.sub(r"[^\w-]+", "_", Path(place).name).strip("_")[:80] or "scene"
+        taken, name, number = {known.lower() for known in self.names()}, base, 2
+        while name.lower() in taken:
+            name, number = f"{base}-{number}", number + 1
+        return name
+
+    def remove(self, scene: str) -> str:
+        """Remove a scene by its name or folder; the scene itself stays.
+
+        Raises:
+            LibraryError: If there is no such scene, another process changes the library, or the server fails.
+        """
+        with self._changing():
+            name = self._known(scene)
+            record = self.record(name)
+            (self.stage / f"{name}.json").unlink(missing_ok=True)
+            self._sweep()
+            if self.server and record is not None:
+                self.server.drop(record, self.stage)
+        return name
+
+    def _known(self, scene: str) -> str:
+        if scene in self.names():
+            return scene
+        place = BUNDLED if scene == BUNDLED else str(Path(scene).resolve())
+        for record in self.records():
+            if place in (record.path, str(record.folder(self.root))):
+                return record.name
+        raise self._unknown(scene)
+
+    def _unknown(self, scene: str) -> LibraryError:
+        names = self.names()
+        known = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        return LibraryError(
+            f"scene {scene[:80]!r}",
+            expected="the name or folder of a scene in the library",
+            found="no such scene",
+            remedy=f"it has {len(names)} scenes: {known}" if names else "the library is empty",
+        )
+
+    # -- asking it
+
+    def search(self, phrase: str, limit: int = 10) -> Found:
+        """The scenes that hold what a phrase names, with its places in them.
+
+        Args:
+            phrase: What to look for; with relations as in `Scene.find`.
+            limit: Number of scenes, at most.
+
+        Raises:
+            QueryError: If the phrase is empty.
+            LibraryError: If the server cannot answer.
+        """
+        return search(self, phrase, limit)
+
+    # -- mending it
+
+    def verify(self, repair: bool = False) -> dict[str, str]:
+        """What is wrong with each scene, by name: its record, its codes, or its own folder.
+
+        Args:
+            repair: Mend what can be mended: read damaged entries and rebuilt scenes again, and bring the server to
+                the state of the library. Scenes that are gone stay.
+
+        Returns:
+            What is (still) wrong; empty if nothing.
+
+        Raises:
+            LibraryError: If another process changes the library, the disk is full, or the server fails.
+        """
+        if not repair:
+            if self.server:
+                self.server.groups(self.stage)
+            return self._problems()
+        with self._changing():
+            for name in self._problems():
+                self._repair(name)
+            if self.server:
+                entries = [(record, codes) for record in self.records() if (codes := self.codes(record))]
+                self.server.repair(entries, self.stage)
+            return self._problems()
+
+    def _problems(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for name in self.names():
+            self._codes.pop(name, None)
+            record = self.record(name)
+            if record is None or self.codes(record) is None:
+                found[name] = str(self.damaged[name])
+                continue
+            try:
+                if state_of(SceneFolder.open(record.folder(self.root))) != record.state:
+                    found[name] = (
+                        f"{record.path}: rebuilt since it was added; lexsplat library verify {self.root} --repair"
+                    )
+            except LexsplatError as error:
+                found[name] = f"{error}, or if it was moved: lexsplat library add {self.root} NEW_PLACE"
+        return found
+
+    def _repair(self, name: str) -> None:
+        """Recover the record of a scene from its codes, or read the scene again; a scene that is gone stays."""
+        record = self.record(name) or recovered_record(self.stage, name)
+        if record is not None and (record.folder(self.root) / "scene.json").is_file():
+            with contextlib.suppress(LexsplatError):  # `verify` tells what is still wrong
+                self._add(record.folder(self.root), name)
+
+
+def open_library(path: str | Path, *, device: str = "auto", index: str | None = None) -> Library:
+    """Open a library of scenes.
+
+    Args:
+        path: A folder made by ``lexsplat library add``.
+        device: "auto", "cpu" or "cuda".
+        index: Address of an index server; None compares with all scenes.
+
+    Raises:
+        LibraryError: If there is no library.
+    """
+    return Library(path, device, index)

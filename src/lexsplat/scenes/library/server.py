@@ -1,0 +1,267 @@
+"""The codes of a library on an index server: Chroma, by its HTTP API.
+
+The files of the library stay the truth. The server proposes scenes by the inner product of the codes with a text, and
+the bounds of these scenes are computed from their files (`lexsplat.scenes.library.bounds`). The bound of code k is
+
+    (u_k.t - c_k - q) / z_k    with z_k = sqrt(b_k peak), c_k = u_k.mean of the everyday words,
+
+where q is a quantile over the codes of the scene. With the linear estimate a.t - a0 of the quantile (`Codes.offset`),
+the vector ((u_k - a) / z_k, (a0 - c_k) / z_k) is stored, and (t, 1) is asked. A last coordinate makes all vectors
+equally long, and is 0 in a text: graphs of neighbors by inner product are poor where lengths differ.
+
+Each encoder has a collection. Its metadata hold the state of the library, "changing" while it is written: a search
+on a server that holds another state is refused, and `Server.repair` uploads what it lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.runtime.errors import BackendError, LibraryError
+from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.scenes.library.entries import Codes, Record
+
+VERSION = "1."
+"""First characters of the versions of the API that are understood."""
+CONNECT_SECONDS, ANSWER_SECONDS = 5.0, 60.0
+_PLACE = "/tenants/default_tenant/databases/default_database/collections"
+_HNSW = {"space": "ip", "ef_construction": 200, "max_neighbors": 32, "ef_search": 1000}
+"""The graph of Chroma's index."""
+_LENGTH = 16.0
+"""Length of all vectors; longer ones stay as they are."""
+_BATCH = 1000
+_PAGE = 10_000
+_CHANGING = "changing"
+
+
+def code_vectors(codes: Codes) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The visible codes of a scene: their numbers ``[V]`` and vectors ``[V, D + 2]``."""
+    seen = (codes.shares > 0).nonzero()[:, 0]
+    shift = codes.offset[-1] - codes.shared
+    vectors = torch.cat([codes.units.float() - codes.offset[:-1], shift[:, None]], 1) / codes.limits[:, None]
+    rest = (_LENGTH**2 - vectors.square().sum(1)).clamp_min(0).sqrt()
+    return seen.numpy(), torch.cat([vectors, rest[:, None]], 1)[seen].numpy()
+
+
+def listing(stage: Path) -> str:
+    """A hash of which version of which scene a library holds."""
+    return fingerprint(sorted(path.name for path in stage.glob("[!.]*.safetensors")))
+
+
+class Server:
+    """The collections of one library on a server.
+
+    Args:
+        url: Its address, such as "http://localhost:8000".
+        library: The library's own name.
+        root: Its folder, for the remedies of errors.
+
+    Raises:
+        LibraryError: If it is no address.
+        BackendError: If the package httpx2 is missing.
+    """
+
+    def __init__(self, url: str, library: str, root: Path) -> None:
+        try:
+            import httpx2
+        except ImportError as error:
+            raise BackendError(
+                "--index",
+                expected="the package httpx2",
+                found="none",
+                remedy='pip install "lexsplat[library]"',
+            ) from error
+        if not url.startswith(("http://", "https://")):
+            raise LibraryError(f"--index {url}", expected="an address such as http://localhost:8000")
+        self.url, self._prefix = url.rstrip("/"), f"lexsplat-{library}-"
+        self._client = httpx2.Client(timeout=httpx2.Timeout(ANSWER_SECONDS, connect=CONNECT_SECONDS))
+        self._errors = (httpx2.ConnectError, httpx2.ConnectTimeout), httpx2.TimeoutException, httpx2.HTTPError
+        self._mending = f"lexsplat library verify {root} --repair --index {self.url}"
+        self._known = False
+
+    def check(self) -> None:
+        """Refuse a server that is not there or has another API; asked once.
+
+        Raises:
+            LibraryError: If it is not there or has another API.
+        """
+        if self._known:
+            return
+        version = self._ask("GET", "/version")
+        if not isinstance(version, str) or not version.startswith(VERSION):
+            raise LibraryError(
+                self.url,
+                expected=f"Chroma with API {VERSION}x",
+                found=repr(version)[:60],
+                remedy="use Chroma 1",
+            )
+        self._known = True
+
+    def put(self, record: Record, codes: Codes, stage: Path) -> None:
+        """Store the codes of a scene in place of those of an earlier version.
+
+        Raises:
+            LibraryError: If the server fails.
+        """
+        place = self._collection(record)
+        self._mark(_CHANGING)
+        self._delete(place, {"where": {"scene": record.name}})
+        self._upsert(place, record, codes)
+        self._mark(listing(stage))
+
+    def drop(self, record: Record, stage: Path) -> None:
+        """Delete the codes of a scene.
+
+        Raises:
+            LibraryError: If the server fails.
+        """
+        self._mark(_CHANGING)
+        for place, _ in self._collections():
+            self._delete(place, {"where": {"scene": record.name}})
+        self._mark(listing(stage))
+
+    def groups(self, stage: Path) -> list[tuple[str, str, str]]:
+        """The collections: their places, and hash and name of the encoder of each.
+
+        Raises:
+            LibraryError: If the server fails or holds another state of the library.
+        """
+        found = self._collections()
+        wanted = listing(stage)
+        states = {facts.get("state") for _, facts in found} or {listing(Path("/nowhere"))}
+        if states != {wanted}:
+            raise LibraryError(
+                self.url,
+                expected="the scenes of the library as they are now",
+                found="an interrupted change" if _CHANGING in states else "another state of it",
+                remedy=self._mending,
+            )
+        return [(place, facts["encoder"], facts["clip"]) for place, facts in found]
+
+    def nearest(self, place: str, texts: Tensor, count: int) -> list[str]:
+        """Names of scenes with the codes that fit texts ``[P, D]`` best, each once.
+
+        Args:
+            place: The collection.
+            texts: Unit embeddings.
+            count: Number of codes for each text.
+
+        Raises:
+            LibraryError: If the server fails.
+        """
+        asked = torch.cat([texts.cpu().float(), torch.tensor([[1.0, 0.0]]).expand(len(texts), 2)], dim=1)
+        body = {"query_embeddings": asked.tolist(), "n_results": count, "include": ["metadatas"]}
+        found = self._ask("POST", f"{place}/query", body)["metadatas"]
+        return list(dict.fromkeys(each["scene"] for row in found for each in row))
+
+    def repair(self, entries: Iterable[tuple[Record, Codes]], stage: Path) -> tuple[int, int]:
+        """Upload the scenes that the server lacks, and delete codes of scenes that the library does not hold.
+
+        Returns:
+            Number of scenes that were uploaded and number of codes that were deleted.
+
+        Raises:
+            LibraryError: If the server fails.
+        """
+        wanted: dict[str, list[tuple[Record, Codes]]] = {}
+        for record, codes in entries:
+            wanted.setdefault(self._collection(record), []).append((record, codes))
+        self._mark(_CHANGING)
+        uploaded = deleted = 0
+        for place, _ in self._collections():
+            there = set(self._identifiers(place))
+            for record, codes in wanted.get(place, []):
+                own = {_identifier(record, int(code)) for code in code_vectors(codes)[0]}
+                if not own <= there:
+                    self._upsert(place, record, codes)
+                    uploaded += 1
+                there -= own
+            strays = sorted(there)
+            for start in range(0, len(strays), _BATCH):
+                self._delete(place, {"ids": strays[start : start + _BATCH]})
+            deleted += len(strays)
+        self._mark(listing(stage))
+        return uploaded, deleted
+
+    # -- the API
+
+    def _collection(self, record: Record) -> str:
+        """The place of the collection of the scene's encoder; made if there is none."""
+        name = f"{self._prefix}{record.group}"
+        known = [place for place, facts in self._collections() if facts["name"] == name]
+        if known:
+            return known[0]
+        facts = {"encoder": record.encoder, "clip": record.clip, "state": _CHANGING}
+        body = {"name": name, "get_or_create": True, "metadata": facts, "configuration": {"hnsw": _HNSW}}
+        return f"{_PLACE}/{self._ask('POST', _PLACE, body)['id']}"
+
+    def _collections(self) -> list[tuple[str, dict[str, str]]]:
+        """Place and metadata of each collection of the library."""
+        self.check()
+        listed = self._ask("GET", f"{_PLACE}?limit=10000")
+        return [
+            (f"{_PLACE}/{each['id']}", {**each["metadata"], "name": each["name"]})
+            for each in listed
+            if each["name"].startswith(self._prefix)
+        ]
+
+    def _mark(self, state: str) -> None:
+        for place, facts in self._collections():
+            metadata = {"encoder": facts["encoder"], "clip": facts["clip"], "state": state}
+            self._ask("PUT", place, {"new_metadata": metadata})
+
+    def _upsert(self, place: str, record: Record, codes: Codes) -> None:
+        numbers, vectors = code_vectors(codes)
+        for start in range(0, len(numbers), _BATCH):
+            some = slice(start, start + _BATCH)
+            body = {
+                "ids": [_identifier(record, int(code)) for code in numbers[some]],
+                "embeddings": vectors[some].tolist(),
+                "metadatas": [{"scene": record.name}] * len(numbers[some]),
+            }
+            self._ask("POST", f"{place}/upsert", body)
+
+    def _delete(self, place: str, which: Mapping[str, Any]) -> None:
+        self._ask("POST", f"{place}/delete", dict(which))
+
+    def _identifiers(self, place: str) -> Iterator[str]:
+        start = 0
+        while True:
+            page = self._ask("POST", f"{place}/get", {"limit": _PAGE, "offset": start, "include": []})["ids"]
+            yield from page
+            if len(page) < _PAGE:
+                return
+            start += _PAGE
+
+    def _ask(self, method: str, path: str, body: Any = None) -> Any:
+        """The JSON that the server answers.
+
+        Raises:
+            LibraryError: If it does not answer in time, or with an error.
+        """
+        absent, late, other = self._errors
+        remedy = f"the library is whole: mend the server, then run {self._mending}"
+        try:
+            answer = self._client.request(method, f"{self.url}/api/v2{path}", json=body)
+            if answer.is_success:
+                return answer.json()
+            found = f"status {answer.status_code} {answer.text[:160]}".strip()
+        except absent:
+            found = "no connection"
+            remedy = "start it (chroma run --path FOLDER), or leave --index out to compare with all scenes"
+        except late:
+            found = f"no answer within {ANSWER_SECONDS:.0f} seconds"
+        except (other, ValueError) as error:
+            found = str(error)[:160] or type(error).__name__
+        raise LibraryError(self.url, expected="an answer of Chroma 1", found=found, remedy=remedy)
+
+
+def _identifier(record: Record, code: int) -> str:
+    return f"{record.name}/{record.content}/{code}"

@@ -1,0 +1,224 @@
+"""Everything in a scene: its objects with names, colors, places and sizes, as selections, data and a picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from lexsplat.queries.colors import color_words
+from lexsplat.queries.objects import name_probabilities, whole_segments
+from lexsplat.queries.relations import same
+from lexsplat.queries.relevancy import check_prompts
+from lexsplat.queries.selection import Selection
+from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import atomic_path
+from lexsplat.scenes.answers import rests_on
+from lexsplat.scenes.formats.tables import colors_of
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
+
+MAX_WORDS = 2000
+"""Phrases of a vocabulary, at most."""
+_MAX_BYTES = 1 << 20
+_MAX_LENGTH = 120
+_NAMES = 3
+_LEAST_PROBABILITY = 0.01
+_TILE = (200, 150)
+_LINE = 16
+_COLUMNS = 5
+_MARGIN = 0.35
+"""Space around an object in its thumbnail, as a share of its size."""
+NO_SEGMENTS = "the scene has no segments: objects are found by single words; lexsplat language adds segments"
+
+
+def read_vocabulary(path: Path) -> list[str]:
+    """The phrases of a text file, one a line; empty lines and lines that start with # are skipped.
+
+    Raises:
+        FileFormatError: If the file cannot be read, is not text, is too large or has no phrase.
+    """
+    remedy = f"give a UTF-8 text file with one name a line, at most {MAX_WORDS:,}"
+
+    def refused(expected: str, found: str) -> FileFormatError:
+        return FileFormatError(path, expected=expected, found=found, remedy=remedy)
+
+    try:
+        with open(path, "rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise refused("a readable file", error.strerror or type(error).__name__) from error
+    if len(content) > _MAX_BYTES:
+        raise refused(f"at most {_MAX_BYTES:,} bytes", "more")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise refused("text in UTF-8", f"other bytes at {error.start}") from error
+    lines = (" ".join(line.split()) for line in text.splitlines())
+    phrases = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    if not phrases:
+        raise refused("at least one name", "none")
+    strange = next((line for line in phrases if len(line) > _MAX_LENGTH or not line.isprintable()), None)
+    if strange is not None:
+        raise refused(f"names of at most {_MAX_LENGTH} characters", repr(strange)[:60])
+    if len(phrases) > MAX_WORDS:
+        raise refused(f"at most {MAX_WORDS:,} names", f"{len(phrases):,}")
+    return phrases
+
+
+def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection, ...]:
+    """The objects of a scene, those that the views show most of first.
+
+    Args:
+        scene: The scene.
+        vocabulary: What they may be called; () takes the everyday names of `lexsplat.queries.vocabulary`.
+
+    Returns:
+        Selections that share no Gaussian, each with its name in ``phrase`` and its likeliest names in ``names``.
+
+    Raises:
+        QueryError: If a phrase is empty.
+    """
+    words = check_prompts(list(vocabulary) or default_vocabulary(scene.clip))
+    if scene.field.segments is None:
+        return _named_by_words(scene, words)
+    judge, segments, texts = scene.presence_classifier, scene.field.segments, scene.embed(words)
+    codes = judge.segment_codes
+    if codes is None:
+        return ()
+    whole = whole_segments(codes, lambda part: judge.strengths(texts[part], codes.distributions), len(words))
+    named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
+    found: list[Selection] = []
+    for number in named[named >= 0].unique().tolist():
+        mask, name = named[segments.labels] == number, words[number]
+        both = Selection(scene.gaussians, scene.cameras, mask, mask.float(), 0.5, "yes", name, scene.world)
+        for each in [both] if name in STUFF else both.instances:
+            each = each.within(~scene.hidden)
+            found.append(_named(each, words, judge.strengths(texts, _mean_codes(scene, each)[None])[0]))
+    return tuple(sorted(found, key=lambda each: -float(segments.masses[each.mask].sum())))
+
+
+def _shown(scene: Scene) -> torch.Tensor:
+    """What the training views show of each Gaussian ``[N]``; its opacity where that is not known."""
+    segments = scene.field.segments
+    return scene.gaussians.opacities.detach() if segments is None else segments.masses
+
+
+def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:
+    weights = _shown(scene)[thing.mask]
+    return (weights / weights.sum().clamp_min(1e-12)) @ scene.field.select(thing.indices).code_probabilities()
+
+
+def list_document(
+    scene: Scene, vocabulary: Sequence[str] = (), picture: Path | None = None
+) -> dict[str, Any]:
+    """The document of ``lexsplat list --json``.
+
+    Args:
+        scene: The scene.
+        vocabulary: What objects may be called (`objects_of`).
+        picture: Where the sheet of thumbnails goes; None writes none.
+    """
+    things = scene.objects if not vocabulary else objects_of(scene, vocabulary)
+    if picture is not None:
+        write_sheet(scene, things, picture)
+    return {
+        "scene": str(scene.folder.root) if scene.folder else None,
+        "rests_on": rests_on(scene),
+        **scene.world.to_json(),
+        "words": len(vocabulary) or len(default_vocabulary(scene.clip)),
+        "note": "" if scene.field.segments else NO_SEGMENTS,
+        "picture": None if picture is None else str(picture),
+        "objects": [_entry(scene, thing) for thing in things],
+    }
+
+
+def _entry(scene: Scene, thing: Selection) -> dict[str, Any]:
+    """One object of `list_document`."""
+    colors = colors_of(thing.selected).astype(np.float64) / 255
+    weights = _shown(scene)[thing.mask].double().cpu().numpy()
+    return {
+        **thing.geometry(),
+        "names": [{"name": name, "probability": round(share, 4)} for name, share in thing.names],
+        "colors": color_words(colors, weights),
+        "surface": thing.phrase in SURFACES,
+    }
+
+
+def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Selection:
+    """An object with its likeliest names, its own name first, and the strength of that name as its scores."""
+    shares = name_probabilities(strengths)
+    order = np.argsort(-shares, kind="stable")[:_NAMES]
+    names = [(words[place], float(shares[place])) for place in order if shares[place] >= _LEAST_PROBABILITY]
+    own = words.index(thing.phrase)
+    if thing.phrase != (names or [("", 0.0)])[0][0]:
+        names = [(thing.phrase, float(shares[own])), *(entry for entry in names if entry[0] != thing.phrase)]
+    strength = min(max(float(strengths[own]), 0.0), 1.0)
+    return replace(thing, names=tuple(names[:_NAMES]), scores=thing.mask * strength)
+
+
+def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]:
+    """The objects of a scene without segments: the instances of all words, each place under its best word."""
+    answers = scene.ask(words)
+    found = [
+        instance
+        for number, presence in enumerate(answers.presences)
+        if presence != "no"
+        for instance in answers.selection(number).instances
+    ]
+    kept: list[Selection] = []
+    for instance in sorted(found, key=lambda each: -each.score):
+        if not any(same(instance, other) or _is_part(instance, other) for other in kept):
+            kept.append(replace(instance, names=((instance.phrase, instance.score),)))
+    return tuple(kept)
+
+
+def _is_part(instance: Selection, other: Selection) -> bool:
+    """Whether another name has most of it: a part of a thing is no object; a coin on a table is one."""
+    shared = int((instance.mask & other.mask).sum())
+    return other.phrase not in SURFACES and shared > 0.5 * len(instance)
+
+
+def write_sheet(scene: Scene, things: Sequence[Selection], path: Path) -> None:
+    """Write a PNG with a thumbnail of each object in the view that shows it best, and its name below."""
+    width, height = _TILE[0], _TILE[1] + _LINE
+    columns = max(1, min(_COLUMNS, len(things)))
+    sheet = Image.new(
+        "RGB", (columns * width, max(1, math.ceil(len(things) / columns)) * height), (30, 30, 34)
+    )
+    draw = ImageDraw.Draw(sheet)
+    for number, thing in enumerate(things):
+        left, top = number % columns * width, number // columns * height
+        tile = _thumbnail(scene, thing)
+        sheet.paste(tile, (left + (width - tile.width) // 2, top + (_TILE[1] - tile.height) // 2))
+        label = f"{number + 1}. {thing.phrase}".encode("latin-1", "replace").decode("latin-1")[:32]
+        draw.text((left + 4, top + _TILE[1] + 2), label, fill="white")  # the built-in font has latin-1 alone
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="PNG")
+
+
+def _thumbnail(scene: Scene, thing: Selection) -> Image.Image:
+    """The part of its best view around an object."""
+    camera = scene.cameras.get(thing.best_view)
+    if camera is None:
+        return Image.new("RGB", _TILE)
+    image = scene.render(camera).image.clamp(0, 1).cpu().numpy()
+    local = thing.box.corners @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = local @ camera.K.T
+    pixels = pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-6)
+    low, high = pixels.min(0), pixels.max(0)
+    reach = _MARGIN * float((high - low).max())
+    limits = np.array([camera.width, camera.height])
+    first = np.clip(low - reach, 0, limits - 2).astype(int)
+    last = np.clip(high + reach, first + 2, limits).astype(int)
+    tile = Image.fromarray((image[first[1] : last[1], first[0] : last[0]] * 255).round().astype(np.uint8))
+    tile.thumbnail(_TILE, Image.Resampling.LANCZOS)
+    return tile

@@ -1,0 +1,113 @@
+"""What a page knows of its scene before it reads a file: ``manifest.json``."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from typing import Any
+
+import numpy as np
+
+from lexsplat import __version__
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.scenes.scene import Scene
+
+FORMAT, FORMAT_VERSION = "lexsplat-page", 2
+MOST_OBJECTS = 200
+"""Entries of the list of objects, at most."""
+
+
+def scene_manifest(
+    scene: Scene,
+    gaussians: Gaussians,
+    file: str,
+    rotation: tuple[float, float, float, float],
+    title: str = "",
+) -> dict[str, Any]:
+    """What every page says of its scene.
+
+    Args:
+        scene: The scene.
+        gaussians: Those of its Gaussians that the page draws, in the order of the file.
+        file: Name of their file.
+        rotation: xyzw from the axes of the file to those of the scene.
+        title: Title of the page; empty takes the name of the scene folder.
+    """
+    record = scene.folder.record if scene.folder else {}
+    built_with = {key: record.get("provenance", {}).get(key) for key in ("lexsplat", "versions", "seed")}
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "lexsplat": __version__,
+        "title": one_line(title) or _name(scene),
+        "description": "",
+        "scene": {
+            "file": file,
+            "gaussians": len(gaussians),
+            "of": len(scene.gaussians),
+            "rotation": rotation,
+            "antialiased": gaussians.antialiased,
+            "up": [round(float(value), 6) + 0.0 for value in scene.world.up.direction],
+            "meters_per_unit": scene.world.meters_per_unit,
+            "start_view": min(scene.views, default=""),
+        },
+        "server": None,
+        "language": None,
+        "words": {"phrases": "words.txt", "table": None, "count": 0},
+        "text": None,
+        "objects": None,
+        "views": view_entries(scene),
+        "licenses": {"page.js": "Apache-2.0 and those of LICENSES.txt"},
+        "provenance": {**scene.encoder_identity(), "built_with": built_with},
+    }
+
+
+def _name(scene: Scene) -> str:
+    if scene.folder is None:
+        return "scene"
+    return "demo" if scene.folder.is_bundled else scene.folder.root.resolve().name
+
+
+def object_entries(scene: Scene) -> list[dict[str, Any]]:
+    """Name, center and size of the objects of a scene, in world units, and in meters where the scale is known.
+
+    Raises:
+        ModelError: If the text encoder cannot be loaded.
+    """
+    entries = []
+    for found in scene.objects[:MOST_OBJECTS]:
+        meters = found.size_meters
+        known = {} if meters is None else {"size_meters": meters.round(4).tolist()}
+        size = found.size.round(4).tolist()
+        entries.append(
+            {"name": found.phrase, "center": found.center.round(4).tolist(), "size": size, **known}
+        )
+    return entries
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks, at most 500 characters."""
+    return " ".join(text.split())[:500]
+
+
+def checksums(content: bytes) -> dict[str, Any]:
+    """The entry of a file in the manifest."""
+    return {
+        "bytes": len(content),
+        "crc32": zlib.crc32(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+
+
+def view_entries(scene: Scene) -> list[dict[str, Any]]:
+    """The cameras of the views for the page, in the order of their names."""
+    return [
+        {
+            "name": name,
+            "width": view.camera.width,
+            "height": view.camera.height,
+            "focal": [round(float(view.camera.K[axis, axis]), 4) for axis in (0, 1)],
+            "viewmat": [round(float(value), 6) for value in np.asarray(view.camera.viewmat).ravel()],
+        }
+        for name, view in sorted(scene.views.items())
+    ]

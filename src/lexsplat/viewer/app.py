@@ -1,0 +1,132 @@
+"""The paths of the viewer (Starlette): the page and its files, and what the page asks."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import quote
+
+from PIL import Image
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from lexsplat.captures.capture import Capture
+from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.runtime.errors import BackendError, LexsplatError, QueryError
+from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file
+from lexsplat.scenes.serving import error_document
+from lexsplat.viewer.requests import Asked, read_document
+from lexsplat.viewer.session import Session
+
+_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}
+_PHOTO_SIDE = 1600
+"""Longer side of photos in pixels, at most."""
+
+Work = Callable[[Session, dict[str, Any]], Response]
+
+
+def make_app(session: Session) -> Starlette:
+    """The application; put a `lexsplat.viewer.guard.Guard` in front of it."""
+    photos = _Photos(session)
+    return Starlette(
+        routes=[
+            Route("/", lambda _: _text(folder_index(session.content.manifest), "text/html")),
+            Route("/manifest.json", lambda _: JSONResponse(session.content.manifest)),
+            Route("/photo/{number:int}", photos.answer),
+            _posted("/ask", session, lambda s, data: _bytes(s.ask(Asked.from_json(data)))),
+            _posted("/click", session, lambda s, data: _bytes(s.what_is(Asked.from_json(data)))),
+            _posted("/details", session, lambda s, data: JSONResponse(s.details(Asked.from_json(data)))),
+            _posted("/download", session, _download),
+            _posted("/edit", session, _edit),
+            _posted("/colors", session, lambda s, data: _bytes(s.colors(str(data.get("mode"))))),
+            _posted("/objects", session, lambda s, _: JSONResponse(s.objects())),
+            _posted(
+                "/vocabulary", session, lambda s, data: JSONResponse(s.set_vocabulary(data.get("phrases")))
+            ),
+            Route("/{name}", lambda request: _file(session, request.path_params["name"])),
+        ]
+    )
+
+
+def _posted(path: str, session: Session, work: Work) -> Route:
+    """A path that answers a JSON object; work for different pages waits for each other."""
+
+    def answer(body: bytes) -> Response:
+        try:
+            data = read_document(body)
+            with session.lock:
+                if data.get("version") != session.version:
+                    return JSONResponse({"version": session.version}, 409)  # the page shows an earlier scene
+                return work(session, data)
+        except LexsplatError as error:
+            return JSONResponse(error_document(error), 400)
+        except (ValueError, OSError) as error:
+            return JSONResponse({"error": {"message": " ".join(str(error).split())[:300]}}, 400)
+
+    async def endpoint(request: Request) -> Response:
+        return await run_in_threadpool(answer, await request.body())
+
+    return Route(path, endpoint, methods=["POST"])
+
+
+def _download(session: Session, data: dict[str, Any]) -> Response:
+    name, content = session.export(Asked.from_json(data), str(data.get("format")))
+    named = {"Content-Disposition": f"attachment; filename*=utf-8''{quote(name)}"}
+    return Response(content, media_type="application/octet-stream", headers=named)
+
+
+def _edit(session: Session, data: dict[str, Any]) -> Response:
+    return JSONResponse(session.edit(str(data.get("action")), Asked.from_json(data), data))
+
+
+def _file(session: Session, name: str) -> Response:
+    files = session.content.files
+    if name in files:
+        return _bytes(files[name])
+    if name in PAGE_FILES:
+        return Response(page_file(name), media_type=_TYPES[name.rpartition(".")[2]])
+    return Response("not found\n", 404, media_type="text/plain")
+
+
+def _bytes(content: bytes) -> Response:
+    return Response(content, media_type="application/octet-stream")
+
+
+def _text(content: str, kind: str) -> Response:
+    return Response(content, media_type=kind)
+
+
+class _Photos:
+    """The photos that the scene was built from, if they are still there."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._capture: Capture | None = None
+
+    async def answer(self, request: Request) -> Response:
+        """The photo of a view, by its number in the manifest."""
+        return await run_in_threadpool(self._photo, request.path_params["number"])
+
+    def _photo(self, number: int) -> Response:
+        try:
+            views = self._session.content.manifest["views"]
+            folder = self._session.scene.folder
+            if folder is None or number >= len(views):
+                raise QueryError("photo", expected="a view of a scene folder", found="none")
+            with self._session.lock:
+                self._capture = self._capture or reload_capture(folder)
+            view = self._capture.views[views[number]["name"]]
+            shrink = min(1.0, _PHOTO_SIDE / max(view.camera.width, view.camera.height))
+            size = (max(1, round(view.camera.width * shrink)), max(1, round(view.camera.height * shrink)))
+            pixels = (view.load_image(size) * 255).round().astype("uint8")
+            content = io.BytesIO()
+            Image.fromarray(pixels).save(content, format="JPEG", quality=88)
+            return Response(content.getvalue(), media_type="image/jpeg")
+        except (LexsplatError, OSError) as error:
+            known = error if isinstance(error, LexsplatError) else BackendError("photo", found=str(error))
+            return Response(json.dumps(error_document(known)), 404, media_type="application/json")

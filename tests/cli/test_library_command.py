@@ -1,0 +1,112 @@
+"""``lexsplat library``: many scenes from the command line."""
+
+import json
+import shutil
+
+import pytest
+from PIL import Image
+from support.command_line import fails_in_one_line
+from support.library_scenes import OTHERS, copied, install, write_scene
+from support.schemas import validated
+
+from lexsplat import cli
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two scenes and a library of them; read-only."""
+    root = tmp_path_factory.mktemp("rooms")
+    write_scene(root / "kitchen")
+    write_scene(root / "office", OTHERS)
+    assert (
+        cli.main(["library", "add", str(root / "library"), str(root / "kitchen"), str(root / "office")]) == 0
+    )
+    return root
+
+
+@pytest.fixture
+def rooms(made, tmp_path, monkeypatch):
+    install(monkeypatch)
+    return copied(made, tmp_path / "rooms")
+
+
+def run(capsys, action, rooms, *arguments):
+    capsys.readouterr()
+    assert cli.main(["library", action, str(rooms / "library"), *map(str, arguments)]) == 0
+    return capsys.readouterr().out
+
+
+def document(capsys, *arguments):
+    found = json.loads(run(capsys, *arguments, "--json"))
+    validated("library", found)
+    return found
+
+
+def test_all_actions_answer_in_their_schema(rooms, capsys):
+    assert [scene["name"] for scene in document(capsys, "list", rooms)["scenes"]] == ["kitchen", "office"]
+    mug, candle, dog = document(capsys, "search", rooms, "mug", "candle", "dog")["phrases"]
+    assert [[hit["scene"] for hit in each["hits"]] for each in (mug, candle, dog)] == [
+        ["kitchen"],
+        ["office"],
+        [],
+    ]
+    assert (mug["scenes"], mug["opened"], mug["unopened"], mug["skipped"]) == (2, 1, 0, [])
+    assert mug["hits"][0]["thumbnail"] == str(rooms / "library" / "thumbnails" / "kitchen" / "mug.jpg")
+    assert Image.open(mug["hits"][0]["thumbnail"]).size == (32, 24)
+    assert document(capsys, "verify", rooms) == {"library": str(rooms / "library"), "problems": []}
+    assert document(capsys, "remove", rooms, "office")["removed"] == ["office"]
+    assert [scene["name"] for scene in document(capsys, "add", rooms, rooms / "office")["scenes"]] == [
+        "office"
+    ]
+
+
+def test_people_read_where_things_are(rooms, capsys, tmp_path):
+    said = run(capsys, "search", rooms, "mug", "--thumbnails", tmp_path / "found")
+    assert "mug: in 1 of 2 scenes" in said
+    assert '1. kitchen: present: yes. 1 found for "mug": mug at (0.9' in said
+    assert str(tmp_path / "found" / "kitchen" / "mug.jpg") in said
+    assert "2 scenes, 1 encoders" in run(capsys, "list", rooms)
+    assert "2 scenes are sound" in run(capsys, "verify", rooms)
+
+
+def test_without_thumbnails_a_search_writes_nothing(rooms, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (rooms / "library").rglob("*")}
+    (found,) = document(capsys, "search", rooms, "mug", "--thumbnails", "none")["phrases"]
+    assert "thumbnail" not in found["hits"][0]
+    assert {path: path.stat().st_mtime_ns for path in (rooms / "library").rglob("*")} == before
+
+
+def test_what_is_wrong_is_told_in_one_line_with_its_remedy(rooms, capsys):
+    library = str(rooms / "library")
+    fails_in_one_line(
+        capsys, ["library", "search", str(rooms), "mug"], "library.json", "lexsplat library add"
+    )
+    fails_in_one_line(capsys, ["library", "add", library, str(rooms / "nowhere")], "no such folder")
+    fails_in_one_line(capsys, ["library", "remove", library, "attic"], "no such scene", "kitchen, office")
+    index = ["--index", "http://127.0.0.1:9"]
+    fails_in_one_line(capsys, ["library", "search", library, "mug", *index], "no connection", "chroma run")
+    shutil.rmtree(rooms / "kitchen")
+    fails_in_one_line(capsys, ["library", "verify", library], "1 of 2 with a problem", "--repair")
+    fails_in_one_line(capsys, ["library", "verify", library, "--repair"], "1 of 2 with a problem")
+    (hit,) = document(capsys, "search", rooms, "candle")["phrases"][0]["hits"]
+    assert hit["scene"] == "office"
+    assert document(capsys, "search", rooms, "mug")["phrases"][0]["skipped"][0]["scene"] == "kitchen"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["search", "LIB"], "PHRASE"),
+        (["add", "LIB"], "SCENE"),
+        (["remove", "LIB"], "SCENE"),
+        (["list", "LIB", "x"], "list takes no SCENE"),
+        (["search", "LIB", "mug", "--limit", "0"], "limit must be at least 1"),
+        (["sing", "LIB"], "sing"),
+        ([], "LIB"),
+    ],
+)
+def test_wrong_usage_is_refused(capsys, arguments, told):
+    with pytest.raises(SystemExit) as refusal:
+        cli.main(["library", *arguments])
+    assert refusal.value.code == 2
+    assert told.lower() in capsys.readouterr().err.lower()

@@ -1,0 +1,109 @@
+"""``lexsplat list``: the objects of the bundled scene, and vocabularies of all kinds."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support.command_line import fails_in_one_line
+from support.schemas import validated
+
+from lexsplat import cli, open_scene
+from lexsplat.scenes.objects import MAX_WORDS, list_document, objects_of
+
+PLACES = {  # tools/demo_scene/layouts.py
+    "apple": (-0.55, -0.75), "rubber duck": (0.35, -0.8), "mug": (-0.15, -0.1), "stack of books": (1.25, 0.2),
+    "vase": (-1.1, 0.45), "ring": (1.0, -0.8), "traffic cone": (-1.55, -0.5), "potted plant": (0.2, 0.95),
+    "table lamp": (1.5, 0.95), "banana": (-0.55, -1.25), "teddy bear": (-0.6, 0.75), "pumpkin": (0.65, 0.1),
+    "toy car": (1.55, -0.5), "bottle": (-1.6, 0.9),
+}  # fmt: skip
+COLORS = {"apple": "red", "rubber duck": "yellow", "mug": "blue", "vase": "white", "traffic cone": "orange",
+          "potted plant": "green", "banana": "yellow", "teddy bear": "brown", "pumpkin": "orange", "toy car": "red",
+          "bottle": "green"}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return open_scene("demo", device="cpu")
+
+
+def test_each_thing_of_the_layout_is_listed_once_at_its_place_in_its_color(capsys):
+    assert cli.main(["list", "demo", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    validated("list", document)
+    things = {thing["name"]: thing for thing in document["objects"] if not thing["surface"]}
+    assert len(things) == sum(not thing["surface"] for thing in document["objects"])
+    assert things.keys() == PLACES.keys()
+    for name, place in PLACES.items():
+        assert things[name]["center"][:2] == pytest.approx(place, abs=0.25), name
+        assert things[name]["names"][0]["name"] == name
+    assert {name: things[name]["colors"][0] for name in COLORS} == COLORS
+
+
+def test_objects_share_no_gaussian(demo):
+    shared = torch.stack([thing.mask for thing in demo.objects]).sum(0)
+    assert int(shared.max()) == 1
+
+
+def test_a_vocabulary_names_the_things(demo, tmp_path, capsys):
+    file = tmp_path / "names.txt"
+    file.write_text("\ufeff# fruit\n\n apple \nbanana\nbanana\n", encoding="utf-8")
+    assert cli.main(["list", "demo", "--vocabulary", str(file), "--csv"]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert {"apple", "banana"} == {row["name"] for row in rows}
+    assert float(rows[0]["center_x"]) == pytest.approx(float(rows[0]["center_x"]))
+    assert rows[0]["size_meters_x"] == "", "the scale is unknown"
+    assert objects_of(demo, ["unicorn", "swimming pool"]) == ()
+
+
+def test_thumbnails_show_the_objects(demo, tmp_path):
+    document = list_document(demo, (), tmp_path / "new" / "sheet.png")
+    with Image.open(document["picture"]) as sheet:
+        pixels = np.asarray(sheet)
+    assert pixels.shape[1] == 5 * 200
+    number = next(n for n, thing in enumerate(document["objects"]) if thing["name"] == "apple")
+    top, left = number // 5 * 166, number % 5 * 200
+    middle = pixels[top + 50 : top + 100, left + 75 : left + 125].reshape(-1, 3).astype(float).mean(0)
+    assert middle[0] > 2 * middle[1:].max(), "red"
+
+
+def test_an_object_of_a_scene_without_segments_is_found_by_its_word_and_the_list_says_so(demo):
+    field = demo.field.select(torch.arange(len(demo.gaussians)))
+    field.segments = None
+    plain = demo.with_content(demo.gaussians, field)
+    document = list_document(plain)
+    assert "no segments" in document["note"]
+    validated("list", document)
+    assert {"mug", "pumpkin", "teddy bear"} <= {thing["name"] for thing in document["objects"]}
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "none"), (b"# nothing\n\n", "none"), (b"\xff\xfe\x00a", "UTF-8"), (b"mug\n\x00\x01\n", "characters"),
+        (b"a" * 200, "characters"), (b"word\n" * 300_000, "bytes"),
+        ("\n".join(map(str, range(MAX_WORDS + 1))).encode(), "2,001"),
+    ],
+    ids=["empty", "comments alone", "not UTF-8", "not text", "a long name", "a huge file", "too many names"],
+)  # fmt: skip
+def test_a_damaged_vocabulary_is_refused_in_one_line(tmp_path, capsys, content, told):
+    file = tmp_path / "names.txt"
+    file.write_bytes(content)
+    fails_in_one_line(
+        capsys, ["list", "demo", "--vocabulary", str(file)], "names.txt", "one name a line", told
+    )
+
+
+def test_a_missing_vocabulary_and_a_folder_are_refused(tmp_path, capsys):
+    for path in (tmp_path, tmp_path / "nothing"):
+        fails_in_one_line(capsys, ["list", "demo", "--vocabulary", str(path)], "a readable file")
+
+
+@pytest.mark.parametrize("options", [["--csv", "--json"], ["--output", "a.png"]])
+def test_options_that_exclude_each_other_are_refused(options):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["list", "demo", *options])
+    assert stop.value.code == 2

@@ -1,0 +1,131 @@
+"""Features, averages and scenes on workers are those of one process; what fails is told and the rest is kept."""
+
+import dataclasses
+import json
+import shutil
+
+import pytest
+import torch
+from support.color_encoder import ColorClip, ColorDino
+from support.schemas import SCHEMAS
+from support.tiny_capture import QUICK_BUILD
+
+from lexsplat import cli
+from lexsplat.captures import load_capture
+from lexsplat.features import FeatureMap, FeatureMaps, extract_features
+from lexsplat.language.methods.averaged import MOST_SHARDS, SHARD_VIEWS, view_shards
+from lexsplat.pipeline import distribution
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.distribution import extract_on_workers, scene_tasks
+from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.workers import IN_PROCESS, SharedFolder
+
+CONFIG = BuildConfig(device="cpu", encoder_device="cpu")
+
+
+class Encoders:
+    clip, dino = ColorClip(), ColorDino()
+
+
+@pytest.fixture
+def capture(tiny_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(distribution, "_encoders", lambda *_: Encoders())
+    return load_capture(shutil.copytree(tiny_capture, tmp_path / "capture"))
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("visible", [True, False], ids=["shared files", "object store"])
+def test_features_of_workers_are_those_of_one_process(visible, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(SharedFolder, "is_visible", visible)
+    events, cache = [], tmp_path / "cache"
+    extract_on_workers(capture, CONFIG, Encoders(), cache, IN_PROCESS, events.append)
+    assert [event.done for event in events] == list(range(1, 13))
+    torch.set_num_threads(1)
+    extract_features(capture, ColorClip(), ColorDino(), CONFIG.features, cache_dir=tmp_path / "one")
+    assert files(cache) == files(tmp_path / "one")
+    extract_on_workers(capture, CONFIG, Encoders(), cache, IN_PROCESS, events.append)
+    assert len(events) == 12, "nothing is missing any more"
+
+
+def test_a_broken_photo_is_told_and_the_other_views_are_kept(capture, tmp_path):
+    broken = capture.views["view_03.png"].image_path
+    broken.write_bytes(broken.read_bytes()[:2000])
+    with pytest.raises(CaptureError, match=r"view_03\.png"):
+        extract_on_workers(capture, CONFIG, Encoders(), tmp_path / "cache", IN_PROCESS)
+    assert len(files(tmp_path / "cache")) == 22, "two files for each of eleven views"
+
+
+def test_a_photo_that_a_worker_does_not_see_is_told_with_the_remedy(capture, tmp_path):
+    capture.views["view_05.png"].image_path.unlink()
+    view = capture.views["view_05.png"]
+    with SharedFolder.offered(tmp_path / "cache") as cache:
+        shared = distribution._Extraction(capture, CONFIG, cache)
+        with pytest.raises(CaptureError, match=r"a photo that every worker sees.*every node mounts"):
+            distribution._extract_view(shared, view)
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 5000])
+def test_shards_depend_on_the_views_alone(count):
+    names = [f"{i:05}" for i in range(count)]
+    shards = view_shards(names)
+    assert [name for shard in shards for name in shard] == names
+    assert len(shards) <= MOST_SHARDS
+    assert all(len(shard) >= min(SHARD_VIEWS, count) for shard in shards[:-1])
+
+
+def test_feature_maps_travel_without_what_they_keep():
+    import pickle
+
+    maps = FeatureMaps(["a"], _one_map)
+    assert maps["a"] is maps["a"]
+    copy = pickle.loads(pickle.dumps(maps))
+    assert copy.cached_bytes == 0
+    assert torch.equal(copy["a"].clip, maps["a"].clip)
+
+
+def _one_map(name):
+    return FeatureMap(torch.ones(2, 2, 3))
+
+
+def test_two_captures_of_one_name_are_refused(tmp_path):
+    sources = {tmp_path / "a" / "room": CONFIG, tmp_path / "b" / "room": CONFIG}
+    with pytest.raises(CaptureError, match="expected captures of different names"):
+        scene_tasks(sources, tmp_path / "scenes")
+    tasks = scene_tasks({tmp_path / "room": dataclasses.replace(CONFIG, workers="ray")}, tmp_path / "scenes")
+    assert tasks["room"].config.workers == "none"
+    assert tasks["room"].output == tmp_path / "scenes" / "room"
+
+
+@pytest.mark.slow
+def test_many_captures_make_many_scenes_and_one_that_fails_is_told(tiny_capture, tmp_path, capsys):
+    for name in ("bath", "kitchen"):
+        shutil.copytree(tiny_capture, tmp_path / "captures" / name)
+    (tmp_path / "captures" / "attic").mkdir()
+    rooms = [str(path) for path in sorted((tmp_path / "captures").iterdir())]
+    arguments = ["build", *rooms, "--output", str(tmp_path / "scenes"), *QUICK_BUILD]
+    assert cli.main(arguments) == 1
+    said = capsys.readouterr()
+    assert "error: " in said.err
+    assert "expected 3 scenes, found 1 failed, told above" in said.err
+    assert "attic: " in said.err
+    for name in ("bath", "kitchen"):
+        assert (tmp_path / "scenes" / name / "language.safetensors").exists()
+        assert f"{name}: finished reconstruct, features, language" in said.out
+
+
+@pytest.mark.slow
+def test_progress_as_json_is_one_event_a_line_in_its_schema(tiny_capture, tmp_path, capsys):
+    from jsonschema import Draft202012Validator
+
+    schema = Draft202012Validator(json.loads((SCHEMAS / "progress.json").read_text()))
+    arguments = ["reconstruct", str(tiny_capture), "--output", str(tmp_path / "s"), *QUICK_BUILD]
+    assert cli.main([*arguments, "--progress", "json"]) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {event["stage"] for event in events} == {"reconstruct"}
+    for event in events:
+        schema.validate(event)
+    assert events[-1]["done"] == events[-1]["total"] == 120
+    assert events[-1]["seconds_left"] == 0

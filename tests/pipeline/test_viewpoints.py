@@ -1,0 +1,203 @@
+"""Claims about views chosen from splats alone, on scenes whose surfaces are known."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.captures import load_capture
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
+from lexsplat.geometry.rotations import rotation_about
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.inputs import reload_capture
+from lexsplat.pipeline.viewpoints import choosing
+from lexsplat.pipeline.viewpoints.choosing import choose_views, surface_share
+from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
+from lexsplat.runtime.errors import CaptureError
+from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.ply import write_ply
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(autouse=True)
+def _few_candidates(monkeypatch):
+    """Choices of a test take seconds."""
+    monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
+
+
+def solid(points: np.ndarray) -> Gaussians:
+    """Opaque Gaussians that close the gaps between points."""
+    colors = np.random.default_rng(0).uniform(0, 1, points.shape)
+    made = gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
+    made.log_scales -= 0.1
+    return made
+
+
+def on_sphere(center, radius: float, count: int, seed: int) -> np.ndarray:
+    directions = np.random.default_rng(seed).normal(size=(count, 3))
+    return np.asarray(center) + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def on_table(seed: int = 0) -> np.ndarray:
+    """Three balls on a square table top at z = 0."""
+    floor = np.random.default_rng(seed).uniform(-1, 1, (4000, 3)) * [1.5, 1.5, 0.002]
+    balls = [
+        on_sphere((x, y, r), r, 1200, seed + 1)
+        for x, y, r in ((0, 0, 0.4), (0.8, 0.3, 0.3), (-0.7, 0.5, 0.35))
+    ]
+    return np.concatenate([floor, *balls])
+
+
+def in_room(seed: int = 0) -> np.ndarray:
+    """The walls, floor and ceiling of a closed room of 4 x 4 x 2.5, with two balls on the floor."""
+    generator = np.random.default_rng(seed)
+    points = generator.uniform(-1, 1, (9000, 3))
+    axis = generator.choice(3, len(points), p=[0.28, 0.28, 0.44])
+    points[np.arange(len(points)), axis] = np.sign(points[np.arange(len(points)), axis])
+    balls = [on_sphere((x, y, -0.9), 0.35, 800, seed + 1) for x, y in ((1.0, 1.0), (-1.0, 0.5))]
+    return np.concatenate([points * [2, 2, 1.25], *balls])
+
+
+@pytest.mark.slow
+def test_views_of_things_on_a_table_come_from_above_and_see_nearly_everything():
+    gaussians = solid(on_table())
+    chosen = choose_views(gaussians)
+    assert chosen.up.direction @ UP > 0.99
+    positions = np.stack([camera.position for camera in chosen.cameras])
+    assert (positions[:, 2] > 0).all()
+    assert chosen.unseen < 0.05 * chosen.visible
+    assert chosen.visible > 0.8 * len(gaussians)
+    for camera in chosen.cameras:  # level: the right axis is horizontal
+        assert abs(camera.viewmat[0, :3] @ UP) < 0.02
+
+
+@pytest.mark.slow
+def test_the_up_direction_turns_with_the_scene():
+    turn = rotation_about(np.array([1.0, 0.3, 0.2]), 70)
+    chosen = choose_views(solid(on_table() @ turn.T))
+    assert chosen.up.direction @ (turn @ UP) > 0.98
+
+
+@pytest.mark.slow
+def test_views_of_a_closed_room_come_from_inside():
+    chosen = choose_views(solid(in_room()), up=UP)
+    positions = np.stack([camera.position for camera in chosen.cameras])
+    assert (np.abs(positions) < [2, 2, 1.25]).all()
+    assert chosen.unseen < 0.1 * chosen.visible
+
+
+@pytest.mark.slow
+def test_a_choice_is_the_same_twice_and_a_given_up_direction_is_kept():
+    gaussians = solid(on_table())
+    first, second = (choose_views(gaussians, up=np.array([0.0, 0.1, 2.0])) for _ in range(2))
+    assert [c.position.tolist() for c in first.cameras] == [c.position.tolist() for c in second.cameras]
+    np.testing.assert_allclose(first.up.direction, np.array([0, 0.1, 2]) / np.hypot(0.1, 2))
+
+
+def test_a_pixel_shows_a_surface_if_what_is_blended_lies_at_one_depth():
+    """Left to right: a surface at 2; half at 1 and half at 3; a hole; a thin layer of fog over nothing."""
+    depth = np.array([[2, 2, 0, 2]], np.float32)
+    square = np.array([[4.0, 5.0, 0, 4.0]], np.float32)
+    alpha = np.array([[1, 1, 0, 0.3]], np.float32)
+    assert surface_share(depth, square, alpha) == pytest.approx(1 / 3)
+    assert surface_share(depth, square, np.zeros((1, 4), np.float32)) == 0
+
+
+def test_floaters_in_front_of_a_surface_lower_its_share():
+    wall = np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * [1, 1, 0.001]
+    camera = look_at(np.array([0, 0, 3.0]), np.zeros(3), np.array([0, 1.0, 0]), 48, 36, 0.5)
+    clean = solid(wall)
+    dust = solid(np.random.default_rng(1).uniform([-0.7, -0.7, 0.5], [0.7, 0.7, 1.9], (150, 3)))
+    dust.log_scales[:] = np.log(0.05)
+    dust.opacity_logits[:] = 0
+    both = Gaussians(**{n: torch.cat([t, getattr(dust, n)]) for n, t in clean.tensors().items()})
+    with torch.no_grad():
+        before, after = (choosing._look(scene, camera)[1] for scene in (clean, both))
+    assert before > 0.95
+    assert after < 0.8 * before
+
+
+@pytest.mark.parametrize("count", [0, 1, 60])
+def test_splats_without_surfaces_are_refused(count):
+    """None, one, and many at one point."""
+    one = gaussians_from_points(np.zeros((1, 3)), np.ones((1, 3)), opacity=0.9)
+    with pytest.raises(CaptureError, match="form surfaces"):
+        choose_views(one.select(torch.zeros(count, dtype=torch.long)))
+
+
+def test_fog_in_which_no_place_shows_a_surface_is_refused():
+    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
+    fog = gaussians_from_points(points, np.ones_like(points), opacity=0.35)
+    fog.log_scales -= 1.2
+    with pytest.raises(CaptureError, match=r"none of \d+ tried"):
+        choose_views(fog)
+
+
+@pytest.mark.slow
+def test_a_flat_picture_is_looked_at_with_a_warning(caplog):
+    picture = np.random.default_rng(0).uniform(-1, 1, (4000, 3)) * [1.3, 0, 1]
+    with caplog.at_level(logging.WARNING, "lexsplat"):
+        chosen = choose_views(solid(picture), up=UP, subject=Path("picture.ply"))
+    assert "picture.ply: all Gaussians lie in one plane" in caplog.text
+    assert len(chosen.cameras) >= 1
+
+
+@pytest.mark.slow
+def test_a_wrong_up_direction_is_a_warning(caplog):
+    with caplog.at_level(logging.WARNING, "lexsplat"):
+        chosen = choose_views(solid(on_table()), up=-UP)
+    assert "--up is not the direction in which things seem to stand (0,0,1)" in caplog.text
+    assert chosen.up.direction @ UP == -1
+
+
+def test_chosen_views_are_kept_as_a_capture_with_a_contact_sheet(tmp_path):
+    gaussians = solid(on_table())
+    cameras = tuple(
+        look_at(np.array([x, -3.0, 1.5]), np.zeros(3), UP, *choosing.SIZE, 0.7) for x in (-1.0, 0.0, 1.0)
+    )
+    chosen = choosing.ChosenViews(cameras, choosing.Up(UP, True), 3, 0, 10, 0)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "view_007.jpg").write_bytes(b"of an earlier choice")
+    write_chosen_capture(gaussians, chosen, tmp_path)
+    capture = load_capture(tmp_path, test_every=0)
+    assert list(capture.views) == ["view_000.jpg", "view_001.jpg", "view_002.jpg"]
+    for view, camera in zip(capture.views.values(), cameras):
+        np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
+        np.testing.assert_allclose(view.camera.K, camera.K, atol=1e-9)
+        assert view.load_image((8, 6)).std() > 0.01
+    assert (tmp_path / "contact_sheet.jpg").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_build_of_splats_alone_keeps_its_views_and_repeats_no_choice(tmp_path):
+    splats, output = tmp_path / "theirs.ply", tmp_path / "scene"
+    write_ply(solid(on_table()), splats)
+    config = BuildConfig(clip="bundled", dino="none", device="cpu", up="0,0,1")
+    events = []
+    folder = build(None, output, config, until="reconstruct", splats=splats)
+    again = build(None, output, config, until="reconstruct", splats=splats, listener=events.append)
+    assert folder.record["stages"]["views"] == again.record["stages"]["views"]
+    assert "views" not in {event.stage for event in events}
+    views = again.read_cameras()
+    assert len(views) == again.record["stages"]["views"]["views"] >= 8
+    assert {view.split for view in views.values()} == {"train"}
+    assert (output / "poses" / "contact_sheet.jpg").is_file()
+    moved = output.rename(tmp_path / "moved")
+    assert len(reload_capture(SceneFolder.open(moved)).train_names) == len(views)
+    with pytest.raises(ValueError, match="a capture or splats"):
+        build(None, tmp_path / "nothing", config)
+
+
+def test_a_build_whose_views_cannot_be_chosen_leaves_nothing(tmp_path):
+    splats = tmp_path / "one.ply"
+    write_ply(gaussians_from_points(np.zeros((1, 3)), np.ones((1, 3))), splats)
+    with pytest.raises(CaptureError, match=r"one\.ply: expected at least 50 Gaussians"):
+        build(None, tmp_path / "scene", BuildConfig(clip="bundled", device="cpu"), splats=splats)
+    assert not (tmp_path / "scene").exists()

@@ -1,0 +1,75 @@
+"""Objects from segments: the language of segments, and which of them one name describes as a whole."""
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.language.segment_codes import SegmentCodes, segment_codes
+from lexsplat.language.segments import Segments
+from lexsplat.queries.colors import color_words
+from lexsplat.queries.objects import name_probabilities, whole_segments
+
+LEVELS = torch.tensor([[0, 1, 2, 3, 4], [0, 0, 1, 2, 3], [0, 0, 1, 2, 2]])
+
+
+def test_segments_have_the_mean_language_of_their_gaussians_and_each_has_one_number():
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.randint(0, 5, (200,), generator=generator)
+    probabilities, masses = torch.rand(200, 7, generator=generator), torch.rand(200, generator=generator)
+    found = segment_codes(Segments(labels, masses, LEVELS), lambda index: probabilities[index])
+    assert len(found.masses) == 5 + 1 + 1, "two merges make two new segments"
+    for numbers, level in zip(found.numbers, LEVELS.numpy()):
+        for segment in np.unique(level):
+            (number,) = np.unique(numbers[level == segment])
+            members = torch.from_numpy(level == segment)[labels]
+            expected = (probabilities * masses[:, None])[members].sum(0) / masses[members].sum()
+            torch.testing.assert_close(found.distributions[number], expected)
+            assert found.masses[number] == pytest.approx(float(masses[members].sum()))
+
+
+def codes_of(masses) -> SegmentCodes:
+    """The segments of `LEVELS`: 5 is the union of 0 and 1, and 6 that of 3 and 4."""
+    numbers = np.array([[0, 1, 2, 3, 4], [5, 5, 2, 3, 4], [5, 5, 2, 6, 6]])
+    whole = [*masses, masses[0] + masses[1], masses[3] + masses[4]]
+    return SegmentCodes(numbers, torch.zeros(7, 1), np.array(whole, float))
+
+
+def wholes(strengths, masses=(1, 1, 1, 1, 1)):
+    table = np.array(strengths, float)
+    return whole_segments(codes_of(masses), lambda part: table[:, part], table.shape[1])
+
+
+def test_the_coarsest_segment_that_a_name_describes_with_its_parts_is_an_object():
+    #            mug  nose bear
+    strengths = [[0.8, 0.1, 0.1], [0.7, 0.1, 0.1], [0.1, 0.1, 0.1], [0.1, 0.9, 0.5], [0.1, 0.1, 0.9],
+                 [0.9, 0.1, 0.1], [0.1, 0.2, 0.9]]  # fmt: skip
+    found = wholes(strengths)
+    assert found.places.tolist() == [5, 5, -1, 6, 6]
+    assert found.words[[5, 6]].tolist() == [0, 2]
+
+
+def test_a_segment_of_two_things_is_divided():
+    strengths = [[0.9, 0.1], [0.1, 0.9], [0.1, 0.1], [0.9, 0.1], [0.1, 0.4], [0.7, 0.2], [0.7, 0.2]]
+    assert wholes(strengths).places.tolist() == [0, 1, -1, 3, -1]
+    assert wholes(strengths, (9, 1, 1, 9, 1)).places.tolist() == [5, 5, -1, 6, 6], "by what the views show"
+
+
+def test_probabilities_of_names_leave_a_rest_for_other_names():
+    shares = name_probabilities(np.array([0.9, 0.8, 0.1]))
+    assert shares[0] > shares[1] > shares[2] > 0
+    assert shares[0] / shares[1] == pytest.approx(np.exp(12 * 0.1))
+    assert shares.sum() < 1
+    assert name_probabilities(np.full(3, 0.1)).sum() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("colors", "weights", "words"),
+    [
+        ([[0.7, 0.1, 0.1]], [1], ["red"]),
+        ([[0.35, 0.05, 0.05]], [1], ["red"]),
+        ([[0.95, 0.95, 0.95], [0.05, 0.05, 0.05]], [2, 1], ["white", "black"]),
+        ([[0.1, 0.2, 0.7], [0.9, 0.8, 0.2]], [9, 1], ["blue"]),
+    ],
+)
+def test_colors_are_named_by_the_weight_that_shows_them(colors, weights, words):
+    assert color_words(np.array(colors), np.array(weights, float)) == words

@@ -1,0 +1,155 @@
+"""Blocks: cut on the ground plane with the views that see them, reconstructed apart, merged by their cells."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from support.tiny_capture import QUICK_BUILD
+
+from lexsplat import cli
+from lexsplat.captures import load_capture
+from lexsplat.captures.sfm.triangulation import InitialPoints
+from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.cameras import Camera
+from lexsplat.reconstruction import blocks
+from lexsplat.reconstruction.blocks import (
+    BlockRun,
+    cut_blocks,
+    ground_axes,
+    number_of_blocks,
+    reconstruct_blocks,
+)
+from lexsplat.reconstruction.settings import ReconstructionConfig
+from lexsplat.runtime.errors import CaptureError, MemoryBudgetError
+from lexsplat.scenes.folder import SceneFolder
+
+UP = Up(np.array([0.0, 0.0, 1.0]), True)
+CONFIG = ReconstructionConfig(iterations=30, max_gaussians=600, sh_degree=0)
+
+
+@pytest.fixture(scope="module")
+def capture(tiny_capture):
+    return load_capture(tiny_capture)
+
+
+@pytest.fixture
+def points(capture):
+    return InitialPoints(capture.points, capture.point_colors, "capture", "")
+
+
+def street(capture, length: float = 40.0):
+    """Views every two meters along x that look sideways, and points on the house fronts three meters away."""
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    some, views = next(iter(capture.views.values())), {}
+    K = np.array([[50.0, 0, 48], [0, 50.0, 36], [0, 0, 1]])
+    for x in np.arange(0.0, length, 2.0):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ np.array([x, 0.0, 1.5])
+        name = f"{x:04.1f}"
+        views[name] = dataclasses.replace(some, name=name, camera=Camera(96, 72, K, pose))
+    rng = np.random.default_rng(0)
+    places = np.column_stack(
+        [rng.uniform(0, length, 4000), rng.uniform(2.9, 3.1, 4000), rng.uniform(0, 3, 4000)]
+    )
+    return dataclasses.replace(capture, views=views, train_names=tuple(views), test_names=()), places.astype(
+        np.float32
+    )
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 9])
+def test_cells_cover_the_plane_once_with_equal_numbers_of_points(count, capture):
+    made, places = street(capture)
+    axes = ground_axes(UP)
+    cut = cut_blocks(made, places, axes, count)
+    anywhere = np.random.default_rng(1).normal(0, 100, (500, 2))
+    assert (sum(block.holds(anywhere).astype(int) for block in cut) == 1).all(), "also far away"
+    numbers = [block.holds(places @ axes.T).sum() for block in cut]
+    assert sum(numbers) == 4000
+    np.testing.assert_allclose(numbers, 4000 / count, rtol=0.02)
+
+
+def test_a_block_of_a_street_has_the_views_in_front_of_it_and_few_points_of_the_others(capture):
+    made, places = street(capture)
+    axes = ground_axes(UP)
+    for block in cut_blocks(made, places, axes, 4):
+        own = places[block.holds(places @ axes.T)][:, 0]
+        near = {name for name in made.views if own.min() <= float(name) <= own.max()}
+        assert near <= set(block.names)
+        # A view shows three meters to either side; the margin is 1.5 m.
+        assert all(own.min() - 5 < float(name) < own.max() + 5 for name in block.names)
+        assert len(block.chosen) < 0.7 * len(places)
+
+
+def test_blocks_that_no_view_sees_are_refused(capture):
+    made, places = street(capture)
+    behind = places.copy()
+    behind[places[:, 0] > 20, 1] -= 50.0
+    with pytest.raises(
+        CaptureError, match=r"block \d of 4: expected points, and at least 3 views .*smaller --blocks"
+    ):
+        cut_blocks(made, behind, ground_axes(UP), 4)
+
+
+def test_captures_without_a_ground_plane_are_refused():
+    with pytest.raises(
+        CaptureError, match=r"--blocks: expected a ground plane.*give --up X,Y,Z or --blocks none"
+    ):
+        ground_axes(dataclasses.replace(UP, reliable=False))
+
+
+def test_auto_takes_as_few_blocks_as_fit():
+    config = ReconstructionConfig(max_gaussians=1_000_000)
+    need = 2 * 1_000_000 * 1_700
+    assert number_of_blocks("auto", config, "cpu", need) == 1
+    assert number_of_blocks("auto", config, "cpu", need - 1) == 3, "a block has twice its share of Gaussians"
+    assert number_of_blocks("auto", config, "cpu", need // 4) == 8
+    assert number_of_blocks("none", config, "cpu", 1) == 1
+    for wrong in ("0", "-1", "2.5", "many", "", "100000"):
+        with pytest.raises(ValueError, match="blocks must be auto, none or a number"):
+            number_of_blocks(wrong, config, "cpu", need)
+
+
+def test_merged_gaussians_lie_each_in_the_cell_of_its_block_and_a_second_run_keeps_finished_blocks(
+    capture, points, tmp_path, monkeypatch
+):
+    trained, events = [], []
+    train = blocks._train_block
+
+    def counted(shared, block, path):
+        trained.append(block)
+        found = train(shared, block, path)
+        assert block.holds(found.means.numpy() @ shared.axes.T).all()
+        return found
+
+    monkeypatch.setattr(blocks, "_train_block", counted)
+    run = BlockRun("cpu", 0, 1 << 30, tmp_path, "key", listener=events.append)
+    first = reconstruct_blocks(capture, CONFIG, points, UP, 3, run)
+    assert len(trained) == 3
+    assert [e.done for e in events if e.stage == "blocks"] == [0, 1, 2, 3]
+    assert 0 < len(first) <= 2 * CONFIG.max_gaussians
+    next(tmp_path.glob("*.safetensors")).unlink()
+    again = reconstruct_blocks(capture, CONFIG, points, UP, 3, run)
+    assert len(trained) == 4
+    assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), again.tensors().values()))
+
+
+def test_a_block_that_does_not_fit_is_refused_before_it_starts(capture, points, tmp_path):
+    run = BlockRun("cpu", 0, 1 << 20, tmp_path, "key")
+    with pytest.raises(
+        MemoryBudgetError, match=r"Gaussians of a block, found --memory 1MB; .*larger --blocks"
+    ):
+        reconstruct_blocks(capture, CONFIG, points, UP, 2, run)
+
+
+@pytest.mark.slow
+def test_build_with_blocks_makes_a_scene_and_repeats_nothing(tiny_capture, tmp_path):
+    output = tmp_path / "scene"
+    arguments = ["build", str(tiny_capture), "--output", str(output), *QUICK_BUILD, "--blocks", "2"]
+    assert cli.main(arguments) == 0
+    folder = SceneFolder.open(output)
+    assert folder.record["stages"]["reconstruct"]["blocks"] == 2
+    assert not (output / "checkpoints" / "blocks").exists()
+    before = folder.gaussians_path.stat().st_mtime_ns
+    assert cli.main(arguments) == 0
+    assert folder.gaussians_path.stat().st_mtime_ns == before

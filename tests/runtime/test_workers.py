@@ -1,0 +1,185 @@
+"""Workers: one map with results in order, in this process and on a real Ray whose nodes are killed."""
+
+import os
+import random
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from support import two_nodes
+
+from lexsplat.runtime import ray_workers
+from lexsplat.runtime.errors import CaptureError, WorkersError
+from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, check_spec, open_workers, results
+
+ONES = np.ones(1000, np.float32)
+SEEDS = {f"part {seed}": seed for seed in range(12)}
+
+
+def total(workers, work=two_nodes.noisy_sum, items=SEEDS) -> np.ndarray:
+    found = np.zeros_like(ONES)
+    for part in results(workers.map(work, ONES, items)):
+        found += part
+    return found
+
+
+@pytest.fixture(scope="module")
+def nodes():
+    pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
+    started = two_nodes.TwoNodes()
+    yield started
+    started.stop()
+
+
+@pytest.fixture(scope="module")
+def on_ray(nodes):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_ADDRESS", nodes.address)
+        with open_workers("ray") as workers:
+            yield workers
+
+
+def test_the_order_of_this_sum_matters():
+    backwards = dict(reversed(SEEDS.items()))
+    assert not np.array_equal(total(IN_PROCESS), total(IN_PROCESS, items=backwards))
+
+
+def test_one_failure_is_raised_after_the_others_are_done():
+    found = results(IN_PROCESS.map(two_nodes.one_broken, None, {str(i): i for i in range(5)}))
+    assert [next(found) for _ in range(4)] == [0, 1, 3, 4]
+    with pytest.raises(CaptureError, match="photo 2: expected a photo, found a torn file"):
+        next(found)
+
+
+def test_several_failures_are_one_error_that_names_them():
+    with pytest.raises(CaptureError) as caught:
+        list(results(IN_PROCESS.map(two_nodes.one_broken, None, {"a": 2, "b": 1, "c": 2, "d": 2})))
+    assert str(caught.value).endswith("found a torn file (and 2 more failed: c, d); replace it")
+
+
+@pytest.mark.parametrize("spec", ["slurm", "ray://", "ray://host", "ray://host:port", "ray:", ""])
+def test_unknown_engines_are_refused(spec):
+    with pytest.raises(ValueError, match="workers must be none, ray or ray://HOST:PORT"):
+        check_spec(spec)
+
+
+def test_a_folder_is_recognized_by_its_content_and_not_by_its_name(tmp_path):
+    with SharedFolder.offered(tmp_path / "there") as folder:
+        assert folder.is_visible
+        assert not SharedFolder(folder.path, "another token").is_visible
+    assert list((tmp_path / "there").iterdir()) == []
+
+
+def test_without_the_package_the_remedy_is_told(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with (
+        pytest.raises(WorkersError, match=r"found none installed; pip install 'lexsplat\[cluster\]'"),
+        open_workers("ray"),
+    ):
+        pass
+
+
+def test_nodes_with_another_version_or_none_or_without_the_capture_are_refused():
+    own, code = ray_workers.version_of_lexsplat(), ray_workers.code_identity()
+    ray_workers._check_probe("a", own, code, [])
+    for answer, message in (
+        (("", "", []), "node a: expected lexsplat .*, found no lexsplat; install the same"),
+        (("0.0.9", "x", []), "found 0.0.9; install"),
+        ((own, "x", []), "found .* with other code; install"),
+        ((own, code, ["/data/room"]), "found no such file or folder; put capture and scene on a file system"),
+    ):
+        with pytest.raises(WorkersError, match=message):
+            ray_workers._check_probe("a", *answer)
+
+
+@pytest.mark.slow
+def test_two_nodes_give_the_bits_of_this_process_in_order(on_ray):
+    np.testing.assert_array_equal(total(on_ray), total(IN_PROCESS))
+    found = [o.result for o in on_ray.map(two_nodes.late_first, None, {str(i): i for i in range(6)})]
+    assert found == list(range(6))
+
+
+@pytest.mark.slow
+def test_a_task_that_fails_on_a_node_is_told_with_its_name_and_the_rest_is_kept(on_ray):
+    outcomes = list(on_ray.map(two_nodes.one_broken, None, {str(i): i for i in range(5)}))
+    assert [o.result for o in outcomes] == [0, 1, None, 3, 4]
+    assert isinstance(outcomes[2].error, CaptureError)
+    assert str(outcomes[2].error).startswith("photo 2: expected a photo")
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_replaced(on_ray, tmp_path):
+    found = [o.result for o in on_ray.map(two_nodes.dies_once, tmp_path, {"a": 0, "b": 1})]
+    assert found == [0, 1]
+
+
+@pytest.mark.slow
+def test_a_task_that_kills_every_worker_is_told_and_the_rest_is_kept(on_ray, monkeypatch):
+    monkeypatch.setattr(ray_workers, "RETRIES", 1)
+    outcomes = list(on_ray.map(two_nodes.always_dies, None, {str(i): i for i in range(3)}))
+    assert [o.result for o in outcomes] == [0, None, 2]
+    assert "its worker died 2 times" in str(outcomes[1].error)
+
+
+@pytest.mark.slow
+def test_tasks_that_no_node_can_hold_are_refused(on_ray):
+    with pytest.raises(WorkersError, match="a node with 1048576MB of memory for a task, found at most"):
+        list(on_ray.map(two_nodes.late_first, None, {"a": 1}, Needs(memory=1 << 40)))
+    with pytest.raises(WorkersError, match=r"object store of Ray: .*--object-store-memory"):
+        list(on_ray.map(two_nodes.late_first, None, {"a": 1}, Needs(result=1 << 40)))
+
+
+@pytest.mark.slow
+def test_nodes_killed_at_twenty_random_moments_change_no_bit(nodes, on_ray):
+    expected, kills, rng = total(IN_PROCESS), 0, random.Random(7)
+    while kills < 20:
+        found = np.zeros_like(ONES)
+        for part in results(on_ray.map(two_nodes.slow_sum, ONES, SEEDS)):
+            found += part
+            if (
+                kills < 20 and rng.random() < 0.7
+            ):  # tasks run on, here only the next result is not yet asked for
+                time.sleep(rng.uniform(0.0, 0.4))
+                nodes.replace(rng.randrange(2))
+                kills += 1
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_cluster_that_is_not_there_is_told_in_one_line(monkeypatch):
+    pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with (
+        pytest.raises(WorkersError, match=r"Ray at 127\.0\.0\.1:1: expected a running cluster"),
+        open_workers("ray"),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_a_cluster_that_disappears_ends_in_one_line(tmp_path):
+    pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
+    started = two_nodes.TwoNodes(1)
+    try:
+        script = (
+            "from support import two_nodes; from lexsplat.runtime.workers import open_workers\n"
+            "from lexsplat.runtime.errors import WorkersError\n"
+            "try:\n"
+            "    with open_workers('ray') as workers:\n"
+            "        print('connected', flush=True)\n"
+            "        list(workers.map(two_nodes.late_first, None, {'a': 1}))\n"
+            "        ones, items = __import__('numpy').ones(9), {str(i): i for i in range(999)}\n"
+            "        list(workers.map(two_nodes.slow_sum, ones, items))\n"
+            "except WorkersError as error: print(error, flush=True)\n"
+        )
+        environment = {**os.environ, "RAY_ADDRESS": started.address}
+        driver = subprocess.Popen(
+            [sys.executable, "-c", script], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        assert driver.stdout.readline() == "connected\n"
+        time.sleep(2)
+        started.cluster.head_node.kill_all_processes(check_alive=False, allow_graceful=False)
+        assert "finished work is kept; run the same command again" in driver.communicate(timeout=120)[0]
+    finally:
+        started.stop()

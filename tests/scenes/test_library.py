@@ -1,0 +1,431 @@
+"""A library of scenes: it agrees with its scenes, keeps encoders apart, and is whole whatever happens to it."""
+
+import dataclasses
+import json
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.library_scenes import OTHERS, THINGS, copied, install, write_scene
+
+import lexsplat
+from lexsplat import open_scene
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.grammar import understand
+from lexsplat.queries.presence import NO
+from lexsplat.queries.relevancy import gaussian_relevancy
+from lexsplat.runtime.errors import FileFormatError, LibraryError, QueryError, SceneFolderError
+from lexsplat.runtime.files import read_json, write_json
+from lexsplat.scenes.answers import find_phrase
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.library import Library
+from lexsplat.scenes.library.bounds import phrase_bound, presence_bounds
+from lexsplat.scenes.library.entries import Codes
+from lexsplat.scenes.library.searching import spellings_of
+
+
+@pytest.fixture(autouse=True)
+def _encoders(monkeypatch):
+    install(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    """Three scenes and a library of them; read-only."""
+    root = tmp_path_factory.mktemp("rooms")
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch)
+        write_scene(root / "kitchen")
+        write_scene(root / "office", OTHERS)
+        write_scene(root / "lab", (*OTHERS[:3], *THINGS[:2]), encoder="def")
+        library = Library.create(root / "library")
+        for name in ("kitchen", "office", "lab"):
+            library.add(root / name)
+    return root
+
+
+@pytest.fixture
+def copy(rooms, tmp_path) -> Path:
+    """A copy of scenes and library that may be changed."""
+    return copied(rooms, tmp_path / "rooms")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+def hits(library: Library, phrase: str) -> list[str]:
+    return [hit.scene for hit in library.search(phrase).hits]
+
+
+# -- searching
+
+
+def test_scenes_that_hold_a_thing_are_found_whatever_their_encoder(rooms):
+    library = lexsplat.open_library(rooms / "library")
+    found = library.search("mug")
+    assert {hit.scene for hit in found.hits} == {"kitchen", "lab"}
+    assert {hit.to_dict()["encoder"] for hit in found.hits} == {"models/abc", "models/def"}
+    assert (found.scenes, found.opened, found.unopened, found.skipped) == (3, 2, 0, {})
+    assert sorted(hits(library, "candle")) == ["lab", "office"]
+    assert hits(library, "piano") == []
+
+
+def test_a_library_answers_as_its_scenes_do(rooms):
+    library = lexsplat.open_library(rooms / "library")
+    for phrase in ("mug", "mug and vase", "largest chair", "vase next to lamp", "dog"):
+        expected = {}
+        for name in ("kitchen", "office", "lab"):
+            answer = find_phrase(open_scene(rooms / name), phrase)
+            if answer["present"] != "no":
+                expected[name] = answer
+        assert {hit.scene: hit.answer for hit in library.search(phrase).hits} == expected, phrase
+
+
+def test_no_scene_is_ruled_out_that_holds_the_thing():
+    """The bound is at least the strength of presence, for any word: otherwise the two stages would disagree."""
+    scene, words = open_scene("demo"), list(everyday_words()[::20])
+    question = scene.question(words)
+    scores = gaussian_relevancy(scene.field, question)
+    strengths = [
+        each.strength for each in scene.presence_classifier.evidence(words, question.positives, scores)
+    ]
+    bounds = presence_bounds([Codes.of(scene)], scene.embed(words))[0]
+    assert (bounds >= np.array(strengths) - 0.005).all()
+    assert np.corrcoef(bounds, strengths)[0, 1] > 0.95
+    assert sum(strength >= NO for strength in strengths) > 2  # both kinds are among the words
+    assert (bounds < NO).sum() > 30
+
+
+def test_bounds_are_those_of_a_loop_in_float64():
+    rng = np.random.default_rng(0)
+    units = rng.normal(size=(7, 5))
+    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    mean, limits, shares = (
+        rng.normal(size=5) / 5,
+        rng.uniform(0.1, 0.3, 7),
+        np.array([0.5, 0, 0.1, 0.1, 0.1, 0.1, 0.1]),
+    )
+    tensors = [torch.from_numpy(array).float() for array in (units, units @ mean, limits, shares)]
+    codes, text = Codes(tensors[0].half(), *tensors[1:], torch.zeros(6)), rng.normal(size=5)
+    unit = text / np.linalg.norm(text)
+    cosines = [float(np.float16(units[k]) @ unit) - float(units[k] @ mean) for k in range(7)]
+    offset = np.quantile(cosines, 0.4)
+    expected = max(0.0, *((cosines[k] - offset) / limits[k] for k in range(7) if shares[k] > 0))
+    found = presence_bounds([codes, codes], torch.from_numpy(text)[None])
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("phrase", "bound"),
+    [
+        ("mug", 0.9),
+        ("mug on the table", 0.5),
+        ("mug or dog", 0.9),
+        ("mug without the dog", 0.9),
+        ("largest dog", 0.1),
+        ("two mugs next to the table", 0.5),
+        ("what is on the table?", 0.5),
+        ("everything", 2.0),
+    ],
+)
+def test_the_bound_of_a_phrase_follows_from_those_of_its_things(phrase, bound):
+    known = {"mug": np.array([0.9]), "table": np.array([0.5]), "dog": np.array([0.1])}
+    assert np.max(phrase_bound(understand(phrase).phrase, known)) == pytest.approx(bound)
+
+
+def test_a_kind_is_compared_by_the_names_of_its_members_as_the_scenes_answer_it():
+    compared = spellings_of(understand("toy next to mug").phrase, "bundled")
+    assert {"toy", "rubber duck", "teddy bear", "toy car"} <= set(compared["toy"])
+    assert compared["mug"] == ("mug",)
+
+
+def test_the_order_and_the_bits_of_an_answer_do_not_depend_on_the_number_of_threads(rooms):
+    library = lexsplat.open_library(rooms / "library")
+    codes, texts = [library.codes(record) for record in library.records()], torch.randn(3, 96)
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(presence_bounds(codes, texts))
+    finally:
+        torch.set_num_threads(before)
+    assert np.array_equal(*found)
+
+
+def test_a_limit_leaves_the_best_scenes_and_tells_of_the_others(rooms):
+    library = lexsplat.open_library(rooms / "library")
+    found = library.search("mug", limit=1)
+    assert len(found.hits) == 1
+    assert found.hits[0].bound == max(hit.bound for hit in library.search("mug").hits)
+    assert (found.opened, found.unopened) == (1, 1)
+
+
+def test_a_hit_has_a_picture_with_a_frame_around_the_thing(rooms, tmp_path):
+    hit = lexsplat.open_library(rooms / "library").search("mug").hits[0]
+    path = hit.write_picture(tmp_path)
+    assert path == tmp_path / hit.scene / "mug.jpg"
+    assert (
+        np.array(hit.picture()).tolist()
+        != np.array(hit.opened.render(hit.answer["best_view"]).image).tolist()
+    )
+    red = (np.array(hit.picture()) == (255, 0, 0)).all(-1)
+    assert 20 < red.sum() < red.size / 2
+
+
+@pytest.mark.parametrize("phrase", ["", "   ", 7, ["mug"] * 0])
+def test_no_phrase_is_refused(rooms, phrase):
+    with pytest.raises(QueryError):
+        lexsplat.open_library(rooms / "library").search(phrase)
+
+
+def test_scenes_whose_encoder_is_gone_are_told_and_the_others_answer(copy, monkeypatch):
+    from lexsplat.runtime.errors import ModelError
+
+    known = Library.create.__globals__["load_text"]
+
+    def load(name, *rest):
+        if "def" in name:
+            raise ModelError(name, expected="a model", found="nothing")
+        return known(name, *rest)
+
+    monkeypatch.setattr("lexsplat.scenes.library.library.load_text", load)
+    found = Library(copy / "library").search("mug and griffin")  # a word that is in no cache
+    assert [hit.scene for hit in found.hits] == ["kitchen"]
+    assert "expected a model" in found.skipped["lab"]
+
+
+def test_another_encoder_under_the_same_name_is_refused(copy, monkeypatch):
+    from support.library_scenes import Tower
+
+    monkeypatch.setattr("lexsplat.scenes.library.library.load_text", lambda *_: Tower("other"))
+    found = Library(copy / "library").search("griffin")
+    assert set(found.skipped) == {"kitchen", "office", "lab"}
+    assert all("found another one" in problem for problem in found.skipped.values())
+
+
+# -- changing
+
+
+def test_equal_additions_make_equal_files_and_touch_no_other_scene(copy):
+    first, second = Library.create(copy / "first"), Library.create(copy / "second")
+    first.add(copy / "kitchen")
+    before = contents(first.stage)
+    first.add(copy / "office")
+    after = contents(first.stage)
+    assert {name: after[name] for name in before} == before
+    for name in ("office", "kitchen"):
+        second.add(copy / name)
+    assert contents(second.stage) == after
+
+
+def test_scenes_of_one_name_get_numbers_and_one_folder_is_one_scene(tmp_path):
+    for place in ("north", "south"):
+        write_scene(tmp_path / place / "room 1")
+    library = Library.create(tmp_path / "library")
+    assert library.add(tmp_path / "north" / "room 1").name == "room_1"
+    assert library.add(tmp_path / "south" / "room 1").name == "room_1-2"
+    assert library.add(tmp_path / "north" / ".." / "north" / "room 1").name == "room_1"
+    assert library.names() == ["room_1", "room_1-2"]
+
+
+def test_a_removed_scene_leaves_no_file_and_stays_itself(copy):
+    library = Library(copy / "library")
+    assert library.remove(str(copy / "kitchen")) == "kitchen"
+    assert not list(library.stage.glob("kitchen*"))
+    assert hits(library, "vase") == []
+    open_scene(copy / "kitchen")
+    with pytest.raises(LibraryError, match="no such scene; it has 2 scenes: lab, office"):
+        library.remove("kitchen")
+
+
+def test_an_open_library_sees_what_another_process_adds_and_removes(copy):
+    reader, writer = Library(copy / "library"), Library(copy / "library")
+    assert hits(reader, "vase") == ["kitchen"]
+    writer.remove("kitchen")
+    assert hits(reader, "vase") == []
+    writer.add(copy / "kitchen")
+    assert hits(reader, "vase") == ["kitchen"]
+
+
+def test_the_bundled_scene_is_known_by_its_word(tmp_path):
+    library = Library.create(tmp_path / "library")
+    record = library.add("demo")
+    assert (record.name, record.path, record.folder(library.root)) == ("demo", "demo", BUNDLED_SCENE)
+    assert library.remove("demo") == "demo"
+
+
+# -- what happens to scenes
+
+
+def test_a_library_that_moved_with_its_scenes_finds_them(copy):
+    moved = copy.rename(copy.with_name("elsewhere"))
+    library = Library(moved / "library")
+    assert hits(library, "vase") == ["kitchen"]
+    assert library.verify() == {}
+
+
+def test_a_scene_that_moved_alone_is_told_and_added_under_its_name(copy):
+    library = Library(copy / "library")
+    (copy / "kitchen").rename(copy / "galley")
+    found = library.search("vase")
+    assert "no such folder" in found.skipped["kitchen"]
+    assert "library add" in library.verify()["kitchen"]
+    assert library.verify(repair=True).keys() == {"kitchen"}  # nothing is dropped
+    assert library.add(copy / "galley").name == "kitchen"
+    assert library.verify() == {}
+    assert hits(library, "vase") == ["kitchen"]
+
+
+def test_a_rebuilt_scene_is_told_and_its_old_codes_are_dropped(copy):
+    library = Library(copy / "library")
+    write_scene(copy / "kitchen", OTHERS, build=2)
+    assert "rebuilt since it was added" in library.verify()["kitchen"]
+    assert hits(library, "vase") == []  # the scene itself is asked
+    assert library.verify(repair=True) == {}
+    assert sorted(hits(library, "candle")) == ["kitchen", "lab", "office"]
+    assert len(list(library.stage.glob("kitchen.*.safetensors"))) == 1
+
+
+def test_a_scene_of_another_format_version_is_told(copy):
+    record = read_json(copy / "kitchen" / "scene.json")
+    write_json(copy / "kitchen" / "scene.json", {**record, "format_version": 99})
+    library = Library(copy / "library")
+    assert "format_version 1, found 99" in library.search("vase").skipped["kitchen"]
+    with pytest.raises(SceneFolderError, match="found 99"):
+        library.add(copy / "kitchen")
+
+
+# -- damage
+
+
+def damage(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        damage,
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.read_bytes()[:-9]),
+        Path.unlink,
+    ],
+    ids=["one bit", "empty", "truncated", "missing"],
+)
+def test_damaged_codes_are_refused_and_repaired_from_the_scene(copy, harm):
+    before = contents(copy / "library" / "scenes")
+    (file,) = (copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    harm(file)
+    library = Library(copy / "library")
+    found = library.search("mug")
+    assert [hit.scene for hit in found.hits] == ["lab"]
+    assert "--repair" in found.skipped["kitchen"]
+    assert library.verify().keys() == {"kitchen"}
+    assert library.verify(repair=True) == {}
+    assert contents(library.stage).keys() == before.keys()
+    assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "{}", "null", '{"name": "office"}', '{"name": "../../x"}', "\0\0\0\0"],
+)
+def test_a_damaged_record_is_told_and_recovered_from_the_codes(copy, text):
+    before = contents(copy / "library" / "scenes")
+    (copy / "library" / "scenes" / "kitchen.json").write_text(text)
+    library = Library(copy / "library")
+    assert library.search("mug").skipped.keys() == {"kitchen"}
+    library.remove("office")  # other work goes on, and keeps what repairs the record
+    assert library.verify(repair=True) == {}
+    assert (
+        json.loads(contents(library.stage)["kitchen.json"])["content"]
+        == json.loads(before["kitchen.json"])["content"]
+    )
+
+
+@pytest.mark.parametrize(
+    "change", [{"content": "../x"}, {"encoder": "a/b"}, {"codes": -1}, {"codes": "many"}]
+)
+def test_a_record_with_values_that_no_library_writes_is_refused(copy, change):
+    path = copy / "library" / "scenes" / "kitchen.json"
+    write_json(path, {**read_json(path), **change})
+    library = Library(copy / "library")
+    assert library.record("kitchen") is None
+    assert isinstance(library.damaged["kitchen"], FileFormatError)
+
+
+def test_a_folder_that_is_no_library_is_refused(tmp_path, copy):
+    with pytest.raises(LibraryError, match="no such folder; make one with: lexsplat library add"):
+        lexsplat.open_library(tmp_path / "nowhere")
+    with pytest.raises(LibraryError, match="other files"):
+        Library.create(copy / "kitchen")
+    for facts in ({"format_version": 2, "name": "x"}, {"format_version": 1, "name": "../x"}, [], {}):
+        (copy / "library" / "library.json").write_text(json.dumps(facts))
+        with pytest.raises(LibraryError, match="expected format_version 1"):
+            Library(copy / "library")
+
+
+def test_a_scene_that_is_not_finished_is_refused_and_nothing_changes(copy):
+    before = contents(copy / "library" / "scenes")
+    SceneFolder(copy / "begun").save()
+    with pytest.raises(SceneFolderError, match="finished stages"):
+        Library(copy / "library").add(copy / "begun")
+    assert contents(copy / "library" / "scenes") == before
+
+
+def _hold(root, ready, release):
+    with Library(root)._changing():
+        ready.set()
+        release.wait(60)
+
+
+@pytest.mark.slow
+def test_a_second_writer_is_refused_and_readers_are_not(copy):
+    context = multiprocessing.get_context("spawn")
+    ready, release = context.Event(), context.Event()
+    process = context.Process(target=_hold, args=(copy / "library", ready, release))
+    process.start()
+    try:
+        assert ready.wait(120)
+        library = Library(copy / "library")
+        for change in (lambda: library.add(copy / "kitchen"), lambda: library.remove("kitchen")):
+            with pytest.raises(LibraryError, match=f"process {process.pid} at work"):
+                change()
+        assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
+    finally:
+        release.set()
+        process.join()
+    library.add(copy / "kitchen")
+
+
+def test_a_full_disk_is_told_and_the_entry_stays(copy, monkeypatch):
+    before = contents(copy / "library" / "scenes")
+    write_scene(copy / "kitchen", OTHERS, build=2)
+    library = Library(copy / "library")
+    full = OSError(28, "No space left on device", "scenes/kitchen.json")
+    for step in ("write_tensors", "atomic_path", "write_json"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"lexsplat.scenes.library.entries.{step}", lambda *_: (_ for _ in ()).throw(full))
+            with pytest.raises(LibraryError, match="No space left on device; run the command again"):
+                library.add(copy / "kitchen")
+        kept = {name: data for name, data in contents(library.stage).items() if name in before}
+        assert {name: kept[name] for name in before if not name.endswith(".jpg")} == {
+            name: before[name] for name in before if not name.endswith(".jpg")
+        }
+    library.add(copy / "kitchen")
+    assert library.verify() == {}
+
+
+def test_every_field_of_a_record_is_kept_twice(rooms):
+    """The copy in the codes is what a damaged record is recovered from."""
+    from lexsplat.runtime.files import read_tensors
+
+    record = Library(rooms / "library").record("kitchen")
+    _, header = read_tensors(rooms / "library" / "scenes" / record.codes_file)
+    assert json.loads(header["record"]) == dataclasses.asdict(record)

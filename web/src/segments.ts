@@ -1,0 +1,133 @@
+// Whole segments are taken or left: lexsplat.queries.segments in the browser. tests/scenes/test_published_page.py
+// compares the scores.
+
+import { DataUtils } from "three";
+import type { Language } from "./language";
+import { PageError } from "./manifest";
+
+/** A cut is above this share of the best segment's score. */
+const LOWEST = 0.3;
+const BORDER = 0.5;
+/** Share of a splat's own relevancy in its score; the rest is its segment's. */
+const OWN_SHARE = 0.7;
+const STEEPNESS = 8;
+
+interface Cut {
+  scores: Float64Array;
+  gap: number;
+  limit: number;
+  taken: number;
+  left: number;
+}
+
+export class Segments {
+  /** Segment of each splat at the lowest level, and what the training views show of it. */
+  readonly #labels: Uint16Array | Uint32Array;
+  readonly #masses: Float64Array;
+  /** Segment at each level of each lowest segment, the lowest level first. */
+  readonly #levels: Uint32Array[];
+  readonly #sums: Float64Array;
+  /** 1 for each splat that no view shows; selections leave it out. */
+  readonly hidden: Uint8Array;
+
+  /** `content` is L and S, the levels [L, S], the labels [N], the masses [N] and `hidden` [N] (lexsplat.scenes.publishing.sidecar). */
+  constructor(content: Uint8Array<ArrayBuffer>, count: number) {
+    const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
+    const levels = view.getUint32(0, true);
+    const segments = view.getUint32(4, true);
+    const wide = segments > 65536;
+    let at = 8;
+    if (content.length !== at + 4 * levels * segments + count * ((wide ? 4 : 2) + 3)) {
+      throw new PageError("segments.bin: its length does not fit the scene; publish the scene again.");
+    }
+    const read = (length: number, bytes: number): ArrayBuffer => {
+      at += length * bytes;
+      return content.slice(at - length * bytes, at).buffer;
+    };
+    this.#levels = Array.from({ length: levels }, () => new Uint32Array(read(segments, 4)));
+    this.#labels = wide ? new Uint32Array(read(count, 4)) : new Uint16Array(read(count, 2));
+    this.#masses = Float64Array.from(new Uint16Array(read(count, 2)), (half) => DataUtils.fromHalfFloat(half));
+    this.hidden = content.slice(at);
+    this.#sums = new Float64Array(segments);
+    this.#labels.forEach((label, i) => (this.#sums[label] += this.#masses[i]));
+  }
+
+  /** The mean distributions over K codes of all segments of all levels, one after the other. */
+  distributions(language: Language): Float32Array {
+    const { numCodes } = language;
+    const own = new Float32Array(4);
+    const lowest = new Float64Array(this.#sums.length * numCodes);
+    this.#labels.forEach((label, i) => {
+      language.weights(i, own);
+      for (let t = 0; t < 4; t++) lowest[label * numCodes + language.codes[4 * i + t]] += this.#masses[i] * own[t];
+    });
+    const found = this.#levels.map((level) => {
+      const count = level.reduce((most, segment) => Math.max(most, segment), 0) + 1;
+      const means = new Float64Array(count * numCodes);
+      const masses = new Float64Array(count);
+      level.forEach((segment, s) => {
+        masses[segment] += this.#sums[s];
+        for (let k = 0; k < numCodes; k++) means[segment * numCodes + k] += lowest[s * numCodes + k];
+      });
+      return Float32Array.from(means, (value, i) => value / Math.max(masses[Math.floor(i / numCodes)], 1e-12));
+    });
+    const whole = new Float32Array(found.reduce((sum, part) => sum + part.length, 0));
+    found.reduce((start, part) => (whole.set(part, start), start + part.length), 0);
+    return whole;
+  }
+
+  /** Scores by segments from those of single splats: at least 0.5 exactly where a segment is taken. */
+  scores(own: Float32Array): Float32Array {
+    const lowest = new Float64Array(this.#sums.length);
+    this.#labels.forEach((label, i) => (lowest[label] += this.#masses[i] * own[i]));
+    let best: { cut: Cut; level: Uint32Array } | null = null;
+    for (const level of [...this.#levels].reverse()) {
+      const cut = cutOf(level, lowest, this.#sums); // coarse levels first: of equal gaps the first one wins
+      if (best === null || before(best.cut, cut)) best = { cut, level };
+    }
+    const { cut, level } = best!;
+    const spread = Math.max(cut.taken - cut.left, 1e-6);
+    return own.map((value, i) => {
+      const whole = cut.scores[level[this.#labels[i]]];
+      const blended = OWN_SHARE * value + (1 - OWN_SHARE) * whole;
+      const steep = 1 / (1 + Math.exp(-Math.min(60, Math.max(-60, ((blended - cut.limit) * STEEPNESS) / spread))));
+      return BORDER * Number(whole >= cut.limit) + (1 - BORDER) * steep;
+    });
+  }
+}
+
+/** Whether the second cut answers better: what it takes lies above the border, then by its gap. */
+function before(first: Cut, second: Cut): boolean {
+  const [a, b] = [first.taken >= BORDER, second.taken >= BORDER];
+  return a === b ? second.gap > first.gap : b;
+}
+
+/** The widest gap between the sorted scores of the segments of a level. */
+function cutOf(level: Uint32Array, lowest: Float64Array, lowestMasses: Float64Array): Cut {
+  const count = level.reduce((most, segment) => Math.max(most, segment), 0) + 1;
+  const sums = new Float64Array(count);
+  const masses = new Float64Array(count);
+  level.forEach((segment, i) => {
+    sums[segment] += lowest[i];
+    masses[segment] += lowestMasses[i];
+  });
+  const scores = sums.map((sum, segment) => sum / Math.max(masses[segment], 1e-12));
+  const ranked = scores.slice().sort().reverse();
+  let place = 0;
+  const gapAt = (n: number): number => (ranked[n] >= LOWEST * ranked[0] ? ranked[n] - ranked[n + 1] : -1);
+  for (let n = 1; n + 1 < count; n++) if (gapAt(n) > gapAt(place)) place = n;
+  const single = count === 1;
+  const limit = single ? ranked[0] : (ranked[place] + ranked[place + 1]) / 2;
+  const mean = (side: (score: number) => boolean): number => {
+    let sum = 0;
+    let mass = 0;
+    scores.forEach((score, segment) => {
+      if (!side(score)) return;
+      sum += sums[segment];
+      mass += masses[segment];
+    });
+    return sum / Math.max(mass, 1e-12);
+  };
+  if (single) return { scores, gap: 0, limit, taken: ranked[0], left: 0 };
+  return { scores, gap: gapAt(place), limit, taken: mean((score) => score >= limit), left: mean((score) => score < limit) };
+}

@@ -1,0 +1,86 @@
+// Answers without a server: the dictionary, then the text tower, then whole segments.
+
+import { type Answer, type Clicked, type Source, answered, painted } from "./answers";
+import { Dictionary, normalize } from "./dictionary";
+import type { Geometry, Place } from "./geometry";
+import { type Language, shownSplats } from "./language";
+import { BORDER, type Presence, hasColor, isPart, peakOf, presenceOf } from "./rules";
+import type { Segments } from "./segments";
+import type { Stage } from "./stage";
+import type { Description } from "./tower";
+import type { TowerLoader } from "./tower-loader";
+
+export class Tables implements Source {
+  readonly examples: string[];
+  readonly #shown: Uint32Array;
+
+  constructor(
+    readonly stage: Stage,
+    readonly geometry: Geometry,
+    readonly language: Language,
+    readonly segments: Segments | null,
+    readonly dictionary: Dictionary,
+    readonly loader: TowerLoader | null,
+  ) {
+    this.#shown = shownSplats(geometry.opacities);
+    dictionary.rank(language, this.#shown);
+    this.examples = dictionary.examples(4);
+  }
+
+  complete(text: string): string[] {
+    return this.dictionary.complete(text);
+  }
+
+  async answer(prompt: string, color: string): Promise<Answer | null> {
+    const known = this.dictionary.find(prompt);
+    if (known >= 0) {
+      const own = this.language.scores(this.dictionary.table(known));
+      const presence = this.dictionary.presence(known);
+      const phrase = this.dictionary.phrases[known];
+      return answered(prompt, color, { phrase, from: "dictionary", ...this.#whole(own, presence) });
+    }
+    const phrase = normalize(prompt);
+    const described = (await (await this.loader?.load())?.describe(phrase)) ?? null;
+    if (!described) return null;
+    const own = this.language.scores(described.table);
+    const presence = this.#presence(phrase, own, described);
+    return answered(prompt, color, { phrase, from: "text tower", ...this.#whole(own, presence) });
+  }
+
+  /** As `lexsplat.queries.presence` has it: parts at segments, all else at objects. */
+  #presence(phrase: string, own: Float32Array, { heights, best, rule, places, colored }: Description): Presence {
+    if (this.#shown.length === 0) return "no";
+    if (!this.segments || !places || !colored) {
+      return presenceOf(heights, peakOf(own, this.language, this.#shown), best, rule, rule.yes);
+    }
+    if (isPart(phrase, rule)) {
+      this.#parts ??= this.segments.distributions(this.language);
+      return presenceOf(heights, this.#parts, best, rule, rule.yes);
+    }
+    return hasColor(phrase, rule)
+      ? presenceOf(heights, places, colored, rule, rule.yes_colored)
+      : presenceOf(heights, places, best, rule, rule.yes_object);
+  }
+  #parts: Float32Array | null = null;
+
+  /** By segments, something would always be taken: what is not here keeps the scores of single splats. */
+  #whole(own: Float32Array, presence: Presence) {
+    const scores = this.segments && presence !== "no" ? this.segments.scores(own) : own;
+    return { scores, presence, threshold: BORDER };
+  }
+
+  async refine(answer: Answer): Promise<void> {
+    if (answer.places) return;
+    const hidden = this.segments?.hidden;
+    const seen = (place: Place): Place => (hidden ? { ...place, splats: place.splats.filter((i) => !hidden[i]) } : place);
+    const found = painted(answer) ? this.geometry.places(answer.scores, answer.threshold) : [];
+    answer.places = found.map(seen).filter(({ splats }) => splats.length > 0);
+  }
+
+  async whatIs(x: number, y: number): Promise<Clicked | null> {
+    const hit = this.geometry.hit(this.stage.ray(x, y));
+    if (!hit) return null;
+    const names = this.dictionary.name(this.language.distribution(hit.splats, hit.shares), 4);
+    return { names, point: hit.point.toArray(), found: null };
+  }
+}

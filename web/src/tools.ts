@@ -1,0 +1,58 @@
+// The tools at the side, and the keys that press them.
+
+import type { App } from "./app";
+import { h, iconButton } from "./dom";
+import { helpDialog } from "./panels";
+
+/** The toolbar; its listeners end with `signal`. */
+export function toolbar(app: App, signal: AbortSignal): HTMLElement {
+  const press = (button: HTMLButtonElement, on: boolean): void => button.setAttribute("aria-pressed", String(on));
+  const { manifest, server } = app;
+  const views = iconButton("views", "Where the photos were taken", () => press(views, app.views.toggle()), "v");
+  const objects = iconButton("objects", "Objects in this scene", () => press(objects, app.objects.toggle()), "o");
+  const measure = iconButton("measure", "Measure between two points", () => {
+    press(measure, app.measure.toggle());
+    app.note(app.measure.active ? "Click on two points." : "");
+  }, "m");
+  const heat = iconButton("heat", "Show heat instead of marks", () => press(heat, app.toggleHeat()), "h");
+  const dialog = helpDialog(manifest, server);
+  const buttons: Record<string, HTMLButtonElement> = { v: views, o: objects, m: measure, h: heat };
+  if (server) {
+    const colors = iconButton("colors", "Language, codes, uncertainty", () => app.run(async () => press(colors, await app.nextColors())), "c");
+    const { steps, undone } = server.entry;
+    const undo = iconButton("undo", steps.length ? `Undo: ${steps.at(-1)!}` : "Nothing to undo", () => app.run(() => server.edit("undo", {})), "z");
+    const redo = iconButton("redo", undone ? "Redo" : "Nothing to redo", () => app.run(() => server.edit("redo", {})), "y");
+    undo.disabled = steps.length === 0;
+    redo.disabled = undone === 0;
+    press(colors, false);
+    Object.assign(buttons, { c: colors, z: undo, y: redo });
+  }
+  Object.assign(buttons, {
+    0: iconButton("whole", "Back to the start", () => app.start(null), "0"),
+    p: iconButton("picture", "Save the picture", () => app.run(() => app.savePicture()), "p"),
+    r: iconButton("video", "Record a video", () => app.run(() => app.saveVideo()), "r"),
+    l: iconButton("link", "Copy the link", () => app.run(() => app.copyLink()), "l"),
+    t: iconButton("theme", "Light or dark", () => app.theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"), "t"),
+    "?": iconButton("help", "Help and about", () => dialog.showModal(), "?"),
+  });
+  for (const button of [views, objects, measure, heat]) press(button, false);
+  addEventListener("keydown", (event) => key(event, app, buttons), { signal });
+  return h("nav", { class: "tools", "aria-label": "Tools" }, ...Object.values(buttons), dialog);
+}
+
+function key(event: KeyboardEvent, app: App, buttons: Record<string, HTMLButtonElement>): void {
+  const { target } = event;
+  const typing =
+    target instanceof HTMLTextAreaElement || target instanceof HTMLSelectElement ||
+    (target instanceof HTMLInputElement && !["range", "color", "checkbox"].includes(target.type));
+  if (typing || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+  if (event.key === "/") {
+    event.preventDefault();
+    app.search.input.focus();
+  } else if (event.key === "Escape") app.clear();
+  else if (buttons[event.key]) buttons[event.key].click();
+  else if (event.key === "[" || event.key === "]") app.views.step(event.key === "]" ? 1 : -1);
+  else if ((target === app.stage.canvas || target === document.body) && app.stage.key(event.key, event.shiftKey)) {
+    event.preventDefault();
+  }
+}

@@ -1,0 +1,114 @@
+// What a server can do with an answer: facts, files, and edits that are shown before they are done.
+
+import * as THREE from "three";
+import { type Answer } from "./answers";
+import { h, save } from "./dom";
+import type { Geometry } from "./geometry";
+import { type Change, CHANGES, type Preview } from "./painter";
+import type { Server } from "./server";
+
+export interface BenchHost {
+  preview(preview: Preview | null): void;
+  jump(view: string): void;
+  /** Run something that may fail with a line for the visitor. */
+  run(work: () => Promise<void>): void;
+}
+
+const LABELS: Record<Change, string> = {
+  delete: "Delete it", keep: "Keep only it", recolor: "Recolor", move: "Move", duplicate: "Duplicate",
+};
+
+/** The part of a card that opens: size, photos, download, edit. */
+export function workbench(answer: Answer, server: Server, geometry: Geometry, up: THREE.Vector3, host: BenchHost): HTMLElement {
+  const facts = h("p", { class: "fine" });
+  const middle = answer.places?.[answer.place]?.center.clone() ?? new THREE.Vector3();
+  const photos = h("p", { class: "examples" });
+  const instance = (): number | null => (answer.places && answer.places.length > 1 ? answer.place : null);
+  const formats = h("select", { "aria-label": "File format" }, ...server.entry.formats.map((name) => h("option", { value: name, text: name })));
+  const download = h("button", {
+    type: "button",
+    text: "Download",
+    onclick: () =>
+      host.run(async () => {
+        const { name, file } = await server.download(answer, instance(), formats.value);
+        save(file, name);
+      }),
+  });
+  const element = h(
+    "details",
+    {
+      class: "bench",
+      ontoggle: () => {
+        if (!element.open) return host.preview(null);
+        host.run(async () => {
+          const found = await server.details(answer, instance());
+          middle.fromArray(found.center); // about which the server turns and scales
+          const lengths = (found.size_meters ?? found.size).map((value) => value.toPrecision(3)).join(" × ");
+          const unit = found.size_meters ? "m" : "units";
+          const at = found.center.map((value) => value.toFixed(2)).join(", ");
+          facts.textContent = `${lengths} ${unit} at ${at}; ${found.gaussians.toLocaleString("en")} Gaussians`;
+          photos.replaceChildren("Seen best in: ", ...found.views.map(({ name }) => h("button", { type: "button", text: name, onclick: () => host.jump(name) })));
+        });
+      },
+    },
+    h("summary", { text: "Size, file, edit" }),
+    facts,
+    photos,
+    h("div", { class: "row" }, formats, download),
+    editor(answer, server, geometry, { up, middle }, host, instance),
+  );
+  return element;
+}
+
+function editor(
+  answer: Answer, server: Server, geometry: Geometry, axes: { up: THREE.Vector3; middle: THREE.Vector3 }, host: BenchHost,
+  instance: () => number | null,
+): HTMLElement {
+  const input = (label: string, value: string, step = "any"): HTMLInputElement =>
+    h("input", { type: "number", value, step, "aria-label": label, title: label, oninput: () => show() });
+  const color = h("input", { type: "color", value: "#2f6fdf", "aria-label": "New color", oninput: () => show() });
+  const by = ["x", "y", "z"].map((axis) => input(`Shift along ${axis}, units of the scene`, "0", "0.05"));
+  const turn = input("Turn, degrees", "0", "5");
+  const scale = input("Size, factor", "1", "0.1");
+  const moving = h("div", { class: "row numbers", hidden: true }, "by", ...by, "turn", turn, "×", scale);
+  const change = h(
+    "select",
+    { "aria-label": `Edit ${answer.prompt}`, onchange: () => show() },
+    h("option", { value: "", text: "Edit …" }),
+    ...CHANGES.map((name) => h("option", { value: name, text: LABELS[name] })),
+  );
+  const apply = h("button", { type: "button", text: "Apply", onclick: () => host.run(() => server.edit(change.value, values())) });
+  const amount = (field: HTMLInputElement, least = -Infinity): number => {
+    const value = Number(field.value);
+    return Number.isFinite(value) && value > least ? value : Number(field.defaultValue);
+  };
+  const values = () => ({
+    ...answer.asked,
+    instance: instance(),
+    color: [1, 3, 5].map((at) => parseInt(color.value.slice(at, at + 2), 16) / 255),
+    by: by.map((field) => amount(field)),
+    turn: amount(turn),
+    scale: amount(scale, 0),
+  });
+  const show = (): void => {
+    const kind = change.value as Change | "";
+    moving.hidden = kind !== "move" && kind !== "duplicate";
+    color.hidden = kind !== "recolor";
+    apply.hidden = kind === "";
+    if (kind === "") return host.preview(null);
+    const only = instance();
+    const splats = only === null ? answer.places!.flatMap((place) => place.splats) : answer.places![only].splats;
+    host.preview({
+      change: kind,
+      splats,
+      color: color.value,
+      light: geometry.light(splats),
+      by: new THREE.Vector3(...by.map((field) => amount(field))),
+      pivot: axes.middle,
+      turn: new THREE.Quaternion().setFromAxisAngle(axes.up, THREE.MathUtils.degToRad(amount(turn))),
+      scale: amount(scale, 0),
+    });
+  };
+  color.hidden = apply.hidden = true;
+  return h("div", {}, h("div", { class: "row" }, change, color, apply), moving);
+}
