@@ -12,7 +12,7 @@ from lexsplat.queries import thresholds as threshold_rule
 from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes import scene as scene_module
-from lexsplat.scenes.answers import _default_views, find_phrases
+from lexsplat.scenes.answers import default_views, find_phrases
 from lexsplat.scenes.exporting import export_gaussians, export_scene
 from lexsplat.scenes.folder import BUNDLED_SCENE, StoredView
 from lexsplat.scenes.scene import open_scene
@@ -173,10 +173,10 @@ def test_representations_are_short(scene):
     assert len(repr(scene.find("ball 0"))) < 100
 
 
-def test_default_views_are_evenly_spaced_held_out_views(scene):
+def testdefault_views_are_evenly_spaced_held_out_views(scene):
     camera = scene.views["view0"].camera
     scene.views = {f"v{n:02}": StoredView(f"v{n:02}", camera, "test") for n in range(11)}
-    assert _default_views(scene) == ["v00", "v02", "v04", "v06", "v08", "v10"]
+    assert default_views(scene) == ["v00", "v02", "v04", "v06", "v08", "v10"]
 
 
 def test_an_export_replaces_a_file_only_with_overwrite(scene, tmp_path):
