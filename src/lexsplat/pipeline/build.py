@@ -92,14 +92,14 @@ def build(
     with folder.locked():
         try:
             # Errors in ground truth and encoders are reported before structure from motion, not after it.
-            photos = PhotoSurvey(0, SIZE)
+            photos: PhotoSurvey | None = PhotoSurvey(0, SIZE)
             if source is not None:
                 photos = survey_photos(source, folder.root, config, test_names)
             encodes = until != "reconstruct" and "features" not in folder.record["stages"]
             another = folder.record.get("config", {}).get("clip") != model_place(config.clip)
             if encodes or (another and until != "reconstruct"):  # its architecture decides settings
                 fetch_clip(config)
-            if encodes:
+            if checks := photos is not None and encodes:
                 sized = config.resolved(device, photos.size)
                 check_encoders(sized, source or splats, photos.count, photos.size)
             if source is None:
@@ -115,7 +115,7 @@ def build(
                 load_external_features(config.features_from, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             with open_workers(config.workers, (capture.root,)) as builder.workers:
-                return builder.run(until, encoders_checked=encodes)
+                return builder.run(until, encoders_checked=checks)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw()
