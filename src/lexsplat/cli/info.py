@@ -27,8 +27,8 @@ class Info:
         if self.json:
             print_json(facts)
             return
-        if facts["method"] == "averaged" and facts["segments"] is None:
-            facts["segments"] = "none; lexsplat language makes them, for answers by whole things"
+        if facts["method"] is not None and facts["segments"] is None:
+            facts["segments"] = "none; the method averaged makes them, for answers by whole things"
         width = max(len(name) for name in facts)
         for name, value in facts.items():
             value = "unknown" if value is None else value
