@@ -123,20 +123,49 @@ def judge(monkeypatch):
     scale = EverydayScale.of(codewords, embed([str(word) for word in range(WORDS)]))
     classifier = PresenceClassifier(made.gaussians, field, scale, embed)
 
-    def strength(phrase):
-        return classifier.evidence([phrase], embed([phrase]), torch.zeros(1, 500))[0].strength
+    return classifier
 
-    return strength
+
+def strength(judge, phrase):
+    return judge.evidence([phrase], Words()([phrase]), torch.zeros(1, 500))[0].strength
 
 
 def test_objects_are_judged_and_not_their_parts(judge):
-    assert judge("2") > YES
-    assert judge("3") < NO, "a stripe of the ball"
+    assert strength(judge, "2") > YES
+    assert strength(judge, "3") < NO, "a stripe of the ball"
 
 
 def test_a_color_is_that_of_the_thing(judge):
-    assert min(judge("red 0"), judge("green 1")) > YES
-    assert max(judge("green 0"), judge("red 1")) < YES
+    assert min(strength(judge, phrase) for phrase in ("red 0", "green 1")) > YES
+    assert max(strength(judge, phrase) for phrase in ("green 0", "red 1")) < YES
+
+
+def test_things_with_a_color_are_compared_with_objects_in_any_color(judge):
+    embed, scale, codes = Words(), judge.scale, judge.language.codebook.clip
+    found = judge.best_heights(["0", "red 0", "green 0"])
+    # A stripe is no object, so no phrase of "3" takes part.
+    colored = embed([f"{color} {thing}" for color in ("red", "green") for thing in (0, 1, 2)])
+    expected = torch.maximum(scale.best, scale.heights(codes, colored).amax(1))
+    torch.testing.assert_close(found, torch.stack([scale.best, expected, expected], dim=1))
+    assert (expected[:2] > 1.1 * scale.best[:2]).all(), "the red 0 and the green 1"
+
+
+def test_parts_are_compared_with_everyday_words_whatever_their_color(judge, monkeypatch):
+    from lexsplat.queries import presence
+
+    monkeypatch.setattr(presence, "is_part", lambda phrase: phrase == "red 0 1")
+    found = judge.best_heights(["red 0 1", "red 0"])
+    assert torch.equal(found[:, 0], judge.scale.best)
+    assert not torch.equal(found[:, 1], judge.scale.best)
+
+
+def test_the_wrong_color_is_less_relevant_at_a_thing(judge):
+    asked, codes = ["green 0", "red 0"], judge.language.codebook.clip
+    texts = Words()(asked)
+    plain = judge.scale.relevancy(codes, texts)
+    colored = judge.scale.relevancy(codes, texts, judge.best_heights(asked))
+    assert colored[0, 0] < 0.5 * plain[0, 0], "a green 0 where the 0 is red"
+    assert colored[0, 1] == plain[0, 1] > 0.9
 
 
 @pytest.mark.parametrize(

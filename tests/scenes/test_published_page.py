@@ -28,6 +28,7 @@ PROMPTS = (
     "something to drink from",
     "the handle of that blue mug",  # in no dictionary
     "Café's über-mug, 42!",  # accents, marks and digits
+    "blue tea mug",  # compared with other things with a color
     "zebra",  # not in the scene
     "qwzx blorp",
 )

@@ -34,7 +34,7 @@ export function heightsOf(codewords: Float32Array, text: Float32Array, mean: Flo
   return shared.map((value) => value - offset);
 }
 
-/** Relevancy of each code for a phrase with these heights; `best` is the best height of an everyday word there. */
+/** Relevancy of each code for a phrase with these heights; `best` has the heights that it is compared with there. */
 export function relevancyOf(heights: Heights, best: Float32Array, rule: EverydayRule): Table {
   const count = Math.max(1, Math.round(rule.peak_share * heights.length));
   const highest = heights.slice().sort().subarray(-count);

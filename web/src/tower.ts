@@ -2,7 +2,7 @@
 
 import type { Table } from "./language";
 import type { EverydayRule, Manifest } from "./manifest";
-import { type Heights, heightsOf, relevancyOf } from "./rules";
+import { type Heights, hasColor, heightsOf, isPart, relevancyOf } from "./rules";
 import { Tokenizer } from "./tokenizer";
 
 /** What a phrase means to the codes of the scene. */
@@ -89,7 +89,8 @@ export class TextTower {
     const [codewords, mean, best] = ["codewords", "mean", "best"].map((name) => this.#get(name).data as Float32Array);
     const heights = heightsOf(codewords, embedding, mean, everyday);
     const [places, colored] = ["places", "best_colored"].map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
-    return { table: relevancyOf(heights, best, everyday), heights, best, rule: everyday, places, colored };
+    const compared = colored && hasColor(phrase, everyday) && !isPart(phrase, everyday) ? colored : best;
+    return { table: relevancyOf(heights, compared, everyday), heights, best, rule: everyday, places, colored };
   }
 
   /** The embedding of a phrase, of unit length. */

@@ -14,7 +14,9 @@ text, because most codes do not show it. Two ratios of heights have no unit and 
 - h_kp over the text's own best height: whether another code fits the text better.
 
 A code shows what a text names if both ratios exceed `BORDER`. The relevancy is a logistic function of the lesser one,
-0.5 at the border. Presence (`lexsplat.queries.presence`) reads the same heights.
+0.5 at the border. Everyday words name no color: "green apple" may exceed them all at a green bowl, where "green bowl"
+describes more. So a thing with a color is also compared with the scene's objects in any color. Presence
+(`lexsplat.queries.presence`) reads the same heights.
 
 The constants were chosen on the second bundled scene with the bundled encoder and three encoders of
 ``benchmarks/web_like.py`` together (docs/selection.md). None depends on the encoder.
@@ -83,11 +85,18 @@ class EverydayScale:
         """Heights of texts ``[P, D]`` at the codes ``[K, D]``: ``[K, P]``."""
         return _heights(codewords, torch.nn.functional.normalize(texts.to(self.mean), dim=-1), self.mean)
 
-    def relevancy(self, codewords: Tensor, texts: Tensor) -> Tensor:
-        """Relevancy in 0..1 of each code for each text ``[K, P]``."""
+    def relevancy(self, codewords: Tensor, texts: Tensor, best: Tensor | None = None) -> Tensor:
+        """Relevancy in 0..1 of each code for each text ``[K, P]``.
+
+        Args:
+            codewords: CLIP part of the codebook ``[K, D]``, of any length.
+            texts: Embeddings ``[P, D]``, of any length.
+            best: Positive heights that each text is compared with at each code ``[K, P]``; None takes `best`, those
+                of everyday words (`lexsplat.queries.presence.PresenceClassifier.best_heights` has others).
+        """
         heights = self.heights(codewords, texts)
         own = heights / _peaks(heights).clamp_min(_LEAST)
-        ratio = torch.minimum(own, heights / self.best[:, None])
+        ratio = torch.minimum(own, heights / (self.best[:, None] if best is None else best))
         return torch.sigmoid(STEEPNESS * (ratio - BORDER))
 
 

@@ -102,6 +102,14 @@ class PresenceClassifier:
         return segment_codes(segments, lambda index: self.language.select(index).code_probabilities())
 
     @torch.no_grad()
+    def best_heights(self, phrases: Sequence[str]) -> Tensor:
+        """Heights that phrases are compared with at each code ``[K, P]``.
+
+        They are those of everyday words and, for things with a color, of the scene's objects in any color.
+        """
+        return torch.stack([self._best(phrase) for phrase in phrases], dim=1)
+
+    @torch.no_grad()
     def evidence(self, phrases: Sequence[str], texts: Tensor, scores: Tensor) -> list[Evidence]:
         """Evidence for phrases.
 
@@ -116,16 +124,14 @@ class PresenceClassifier:
         codes = self.segment_codes
         found = []
         for number, phrase in enumerate(phrases):
-            best, yes = self.scale.best, YES
+            yes = YES
             if codes is None:
                 places = self._peak(scores[number])[None]
             elif is_part(phrase):
                 places = codes.distributions
             else:
-                places, yes = self._objects[0], YES_OBJECT
-                if has_color(phrase):
-                    best, yes = self._best_colored, YES_COLORED
-            ratios, reached = self._compared(heights[:, number : number + 1], places, best)
+                places, yes = self._objects[0], YES_COLORED if has_color(phrase) else YES_OBJECT
+            ratios, reached = self._compared(heights[:, number : number + 1], places, self._best(phrase))
             place = _strength(ratios, reached)[:, 0].argmax()
             found.append(Evidence(float(ratios[place]), float(reached[place]), yes))
         return found
@@ -169,6 +175,10 @@ class PresenceClassifier:
             return self.scale.best
         heights = self.scale.heights(self.language.codebook.clip, self._embed(phrases))
         return torch.maximum(self.scale.best, heights.amax(1))
+
+    def _best(self, phrase: str) -> Tensor:
+        """The heights ``[K]`` that a phrase is compared with."""
+        return self._best_colored if has_color(phrase) and not is_part(phrase) else self.scale.best
 
     def _compared(self, heights: Tensor, places: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
         """Ratios and heights of phrases at places ``[V, P]`` each, from their heights at the codes ``[K, P]``."""

@@ -102,12 +102,14 @@ class Question:
         negatives: Text embeddings of the negatives ``[M, D]``, M > 0, of any length.
         config: Temperature and form.
         scale: What everyday words reach in the scene; replaces the negatives in form "code".
+        best: Heights that each prompt is compared with at each code ``[K, P]``; None takes those of the scale.
     """
 
     positives: Tensor
     negatives: Tensor
     config: QueryConfig = field(default_factory=QueryConfig)
     scale: EverydayScale | None = None
+    best: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.positives)
@@ -220,7 +222,7 @@ def code_relevancy(codewords: Tensor, question: Question) -> Tensor:
     """
     positives, negatives = question.units(codewords)
     if question.scale is not None:
-        return question.scale.relevancy(codewords, positives)
+        return question.scale.relevancy(codewords, positives, question.best)
     unit = torch.nn.functional.normalize(codewords.float(), dim=-1)
     return pairwise_relevancy(unit @ positives.T, unit @ negatives.T, question.config.temperature)
 

@@ -188,8 +188,11 @@ class Scene:
 
     def question(self, prompts: str | Sequence[str]) -> Question:
         """The embedded prompts with what they are compared with."""
-        scale = self.everyday_scale if self.query.everyday else None
-        return Question(self.embed(prompts), self.embed(self.query.compared), self.query, scale)
+        texts = self.embed(prompts), self.embed(self.query.compared)
+        if not self.query.everyday:
+            return Question(*texts, self.query)
+        best = self.presence_classifier.best_heights(check_prompts(prompts))
+        return Question(*texts, self.query, self.everyday_scale, best)
 
     @property
     def everyday_scale(self) -> EverydayScale:
@@ -224,9 +227,8 @@ class Scene:
         presences = tuple(word.presence for word in words)
         scores = torch.stack([word.scores for word in words])
         if given is not None:
-            return Answers(
-                tuple(prompts), scores, torch.full((len(words),), given), presences, self, automatic=False
-            )
+            limits = torch.full((len(words),), given)
+            return Answers(tuple(prompts), scores, limits, presences, self, automatic=False)
         unknown = {prompt: word for prompt, word in zip(prompts, words) if word.threshold is None}
         if unknown:
             with self._working:
@@ -346,9 +348,7 @@ class Scene:
         presences = self.presence_classifier.classify(prompts, question.positives, scores)
         formed = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
-        return [
-            Word(row.clone(), own.clone(), presence) for row, own, presence in zip(formed, scores, presences)
-        ]
+        return [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
         """The automatic thresholds of words, from one rendering of the training views.

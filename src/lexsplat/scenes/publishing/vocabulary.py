@@ -81,7 +81,7 @@ def asked_phrases(scene: Scene) -> list[str]:
 def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]:
     """Relevancy of every phrase for every code, ``[P, K]`` uint8 in 255ths, and its presence: "y", "u" or "n".
 
-    Both are relative to everyday words (`lexsplat.queries.everyday`).
+    Both are relative to everyday words (`lexsplat.queries.everyday`), as the answers of a scene are.
 
     Raises:
         ModelError: If the text encoder cannot be loaded.
@@ -92,7 +92,8 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
     for start in range(0, len(phrases), _BATCH):
         batch = phrases[start : start + _BATCH]
         texts = embed_prompts(batch, scene.preload().encode_text, scene.query.templates)
-        relevancy = scale.relevancy(codewords, texts.to(codewords.device))
+        best = scene.presence_classifier.best_heights(batch)
+        relevancy = scale.relevancy(codewords, texts.to(codewords.device), best)
         tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
         scores = field.scores(relevancy).T.contiguous()
         presences += [presence[0] for presence in scene.presence_classifier.classify(batch, texts, scores)]
