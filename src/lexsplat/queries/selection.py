@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
+
+if TYPE_CHECKING:
+    from lexsplat.queries.seen import Seen
 
 Presence = Literal["yes", "no", "unsure"]
 PRESENCES: tuple[Presence, ...] = ("no", "unsure", "yes")
@@ -63,6 +66,7 @@ class Selection:
         world: Up and scale of the scene; None takes up from the cameras.
         parts: Its instances where they are known, such as objects that touch each other; () takes clusters.
         names: Its likeliest names and their probabilities, if it is an object of `Scene.objects`.
+        seen: What the views show of the scene's segments; None renders the views.
     """
 
     gaussians: Gaussians
@@ -75,6 +79,7 @@ class Selection:
     world: World | None = None
     parts: tuple[Selection, ...] = ()
     names: tuple[tuple[str, float], ...] = ()
+    seen: Seen | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.gaussians),)
@@ -109,7 +114,7 @@ class Selection:
         """Number of instances."""
         return len(self.instances)
 
-    @property
+    @cached_property
     def indices(self) -> Tensor:
         """Indices of its Gaussians ``[M]``."""
         return self.mask.nonzero()[:, 0]
@@ -122,8 +127,8 @@ class Selection:
     @cached_property
     def score(self) -> float:
         """Mean score of its Gaussians, weighted by opacity; 0 for an empty selection."""
-        weights = self.gaussians.opacities[self.mask]
-        return float((self.scores[self.mask] * weights).sum() / weights.sum().clamp_min(1e-12))
+        weights = self.gaussians.opacity_logits[self.indices].sigmoid()
+        return float((self.scores[self.indices] * weights).sum() / weights.sum().clamp_min(1e-12))
 
     @cached_property
     def up(self) -> Up:
@@ -191,6 +196,9 @@ class Selection:
     @cached_property
     def view_shares(self) -> list[tuple[str, float]]:
         """The views that show most of it and the share of the image it covers there, at most 8; best first."""
+        if self.seen is not None and self:
+            found = self.seen.shares(self.indices, None if self.seen.complete else _promising_views(self))
+            return found if found and found[0][1] > 0 else [(name, 0.0) for name in _promising_views(self)]
         shares = [(name, _visible_share(self, self.cameras[name])) for name in _promising_views(self)]
         return sorted(shares, key=lambda entry: -entry[1])
 
@@ -356,8 +364,8 @@ class Selection:
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centers ``[M, 3]`` and opacities ``[M]`` of the selected Gaussians."""
-        means = self.gaussians.means[self.mask].detach().cpu().double().numpy()
-        return means, self.gaussians.opacities[self.mask].detach().cpu().double().numpy()
+        opacities = self.gaussians.opacity_logits.detach()[self.indices].sigmoid()
+        return self.gaussians.means.detach()[self.indices].cpu().double().numpy(), opacities.cpu().double().numpy()
 
     def _reach(self, distance: float | None) -> float:
         if distance is not None:
@@ -372,7 +380,7 @@ class Selection:
         sample = points[:: max(1, len(points) // 4096)]
         neighbors = min(7, len(points))
         if neighbors < 2:
-            return float(self.gaussians.scales[self.mask].max())
+            return float(self.gaussians.log_scales[self.indices].exp().max())
         apart, _ = cKDTree(points).query(sample, k=neighbors)
         return float(np.median(apart[:, -1]))
 
@@ -401,7 +409,7 @@ def _promising_views(selection: Selection) -> list[str]:
     if not selection or not selection.cameras:
         return []
     points, weights = selection._points()
-    sizes = selection.gaussians.scales[selection.mask].detach().cpu().numpy()
+    sizes = selection.gaussians.log_scales.detach()[selection.indices].exp().cpu().numpy()
     areas = weights * np.sort(sizes, axis=1)[:, 1:].prod(1)
     step = max(1, len(points) // 2048)
     points, areas = points[::step], areas[::step]

@@ -26,6 +26,8 @@ _HIDDEN = 0.05
 _MOSTLY = 0.5
 _NEIGHBORS, _BESIDE = 6, 2
 _VIEWS = 64
+_ROWS = 1 << 14
+"""Gaussians that are projected at a time: their arrays stay in the cache of a core."""
 _OPEN = 0.9
 """Quantile of the shares at which nothing hides a Gaussian; the unit of the masses drops out."""
 
@@ -46,21 +48,27 @@ def shown_shares(gaussians: Gaussians, cameras: Sequence[Camera], masses: Tensor
         cameras: Its training views; at most 64 of them are looked at.
         masses: Visible weights over all training views ``[N]``, in any unit.
     """
-    means = gaussians.means.double().cpu().numpy()
+    alone = torch.cat([_alone(part, evenly(cameras, _VIEWS)) for part in gaussians.means.split(_ROWS)]).numpy()
     # Seen from the side of its two longer axes.
-    areas = np.sort(gaussians.scales.double().cpu().numpy(), 1)[:, 1:].prod(1)
-    alone = np.zeros(len(means))
-    for camera in evenly(cameras, _VIEWS):
-        local = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        depth = np.maximum(local[:, 2], 1e-6)
-        x, y = (local @ camera.K.T)[:, :2].T / depth
-        inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        alone += inside / depth**2
-    alone *= areas * gaussians.opacities.double().cpu().numpy()
+    areas = gaussians.scales.double().cpu().sort(1).values[:, 1:].prod(1)
+    alone *= (areas * gaussians.opacities.double().cpu()).numpy()
     shares = masses.double().cpu().numpy() / np.maximum(alone, 1e-12)
     seen = alone > 0
     level = float(np.quantile(shares[seen], _OPEN)) if seen.any() else 0.0
     return np.where(seen, np.minimum(shares / max(level, 1e-12), 1.0), 0.0)
+
+
+def _alone(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """Sum of the inverse squares of the depths of points ``[n, 3]`` in the views that hold them ``[n]``."""
+    means = means.double().cpu()
+    total = torch.zeros(len(means), dtype=torch.float64)
+    for camera in cameras:
+        matrix = torch.from_numpy(camera.K @ camera.viewmat[:3])
+        x, y, depth = (means @ matrix[:, :3].T + matrix[:, 3]).T
+        front = depth.clamp_min(1e-6)
+        inside = (x >= 0) & (y >= 0) & (x < camera.width * front) & (y < camera.height * front) & (depth > 0)
+        total += inside / front.square()
+    return total
 
 
 def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:

@@ -112,6 +112,7 @@ class Answers:
             self.presences[index],
             self.prompts[index],
             self.scene.world,
+            seen=self.scene.seen,
         )
         if self.prompts[index].lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))

@@ -99,7 +99,9 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     found: list[Selection] = []
     for number in named[named >= 0].unique().tolist():
         mask, name = named[segments.labels] == number, words[number]
-        both = Selection(scene.gaussians, scene.cameras, mask, mask.float(), 0.5, "yes", name, scene.world)
+        both = Selection(
+            scene.gaussians, scene.cameras, mask, mask.float(), phrase=name, world=scene.world, seen=scene.seen
+        )
         for each in [both] if name in STUFF else both.instances:
             each = each.within(~scene.hidden)
             found.append(_named(each, words, judge.strengths(texts, _mean_codes(scene, each)[None])[0]))

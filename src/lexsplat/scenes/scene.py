@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -36,9 +37,9 @@ from lexsplat.queries.relevancy import (
     render_relevancy,
 )
 from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
+from lexsplat.queries.seen import Seen
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
-from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
@@ -48,6 +49,7 @@ from lexsplat.scenes.answers import Answers, Word
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.objects import objects_of
+from lexsplat.scenes.kept import seen_of
 from lexsplat.scenes.reading import read_scene
 
 _KEPT_BYTES = 128 << 20
@@ -324,7 +326,8 @@ class Scene:
             QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
         hit = surface_at(self.gaussians, self.camera(view), x, y)
-        return select_hit(hit, self.gaussians, self.field, self.cameras, self.world)
+        found = select_hit(hit, self.gaussians, self.field, self.cameras, self.world)
+        return replace(found, seen=self.seen)
 
     @property
     def presence_classifier(self) -> PresenceClassifier:
@@ -334,12 +337,15 @@ class Scene:
         return self._classifier
 
     @cached_property
+    def seen(self) -> Seen | None:
+        """What its views show of its segments; None for a scene without segments."""
+        return seen_of(self)
+
+    @property
     def hidden(self) -> Tensor:
         """Gaussians ``[N]`` bool that the views hardly show, as far as a scene with segments knows."""
-        if (segments := self.field.segments) is None:
-            return torch.zeros_like(self.gaussians.opacities, dtype=torch.bool)
-        seen_by = [view.camera for view in self.views.values() if view.split == "train"]
-        return hidden_gaussians(self.gaussians, seen_by, segments.masses)
+        nothing = torch.zeros_like(self.gaussians.opacity_logits, dtype=torch.bool)
+        return nothing if self.seen is None else self.seen.hidden
 
     def _new_words(self, prompts: list[str]) -> list[Word]:
         """Scores and presence of prompts that were not asked before."""

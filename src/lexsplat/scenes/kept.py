@@ -1,0 +1,84 @@
+"""What a scene keeps on disk so that its first question is fast: what its views show, and the words it compares with.
+
+``checkpoints/seen.safetensors`` is written whole or not at all, after a build. It names the Gaussians, segments and
+cameras that it was computed from. A file of others, or a damaged one, counts as none: what it holds is then computed
+when it is asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lexsplat.queries.seen import MOST_VIEWS, Seen
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import digest
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
+
+log = logging.getLogger("lexsplat")
+
+_VERSION = 1
+"""Raised when the content is computed in another way."""
+
+
+def seen_of(scene: Scene) -> Seen | None:
+    """What the views of a scene show of its segments, from disk where it is kept; None without segments."""
+    segments = scene.field.segments
+    if segments is None:
+        return None
+    training = [name for name, view in scene.views.items() if view.split == "train"]
+    cameras, kept = scene.cameras, None
+    path = _path(scene)
+    if path is not None and path.exists():
+        try:
+            tensors, facts = read_tensors(path)
+            views = min(len(cameras), MOST_VIEWS)
+            fits = tensors["shares"].shape == (segments.levels.shape[1], views)
+            if fits and tensors["hidden"].shape == segments.labels.shape and facts.get("of") == _key(scene):
+                kept = tensors
+        except (FileFormatError, KeyError) as error:
+            log.warning("%s: computed again (%s)", path, str(error)[:100])
+    return Seen(scene.gaussians, cameras, training, segments, kept)
+
+
+def keep(scene: Scene) -> None:
+    """Compute what the first questions need, and write it into the folder of the scene; nothing if it cannot be.
+
+    Args:
+        scene: As its folder has it.
+    """
+    path = _path(scene)
+    if path is None or scene.seen is None:
+        return
+    try:
+        scene.seen.complete_all(scene.listener)
+        write_tensors(path, scene.seen.tensors(), {"of": _key(scene)})
+    except OSError as error:  # the file is optional
+        log.warning("%s: not kept (%s)", path, error.strerror)
+
+
+def _path(scene: Scene) -> Path | None:
+    return None if scene.folder is None else scene.folder.root / "checkpoints" / "seen.safetensors"
+
+
+def _key(scene: Scene) -> str:
+    """Hash of everything that the file depends on."""
+    return digest(_parts(scene))
+
+
+def _parts(scene: Scene) -> Iterator[bytes]:
+    yield f"{_VERSION}".encode()
+    gaussians, segments = scene.gaussians, scene.field.segments
+    tensors = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits]
+    for tensor in [*tensors, *([segments.labels, segments.masses] if segments else [])]:
+        yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
+    for name, view in scene.views.items():
+        yield f"{name}\0{view.split}\0{view.camera.width}x{view.camera.height}".encode()
+        yield view.camera.K.tobytes() + view.camera.viewmat.tobytes()
