@@ -399,8 +399,10 @@ class Selection:
         rows, columns = np.nonzero(np.isfinite(apart))
         edges = (np.ones(len(rows)), (rows, neighbors[rows, columns]))
         _, found = connected_components(coo_array(edges, shape=(len(firm), len(firm))), directed=False)
-        _, nearest = tree.query(points)  # faint Gaussians join the cluster of the nearest firm one
-        labels = found[nearest].astype(np.intp)
+        labels, faint = np.zeros(len(points), np.intp), np.setdiff1d(np.arange(len(points)), firm)
+        labels[firm] = found
+        if len(faint):  # they join the cluster of the nearest firm one
+            labels[faint] = found[tree.query(points[faint])[1]]
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 
