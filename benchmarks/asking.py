@@ -2,9 +2,9 @@
 
     python benchmarks/asking.py [SCENE] [--copies 25] [--folder FOLDER] [--json FILE]
 
-With ``--copies`` the scene is laid side by side that many times, with every view of every fifth copy, and written as a
-scene folder of its own: 25 copies of the bundled scene have a million Gaussians. "fresh" opens the scene with an empty
-cache of the user and without what the scene keeps; "kept" opens it again in a process of its own. Processor seconds of
+With ``--copies`` the scene is laid side by side that many times, with every view of every fifth copy, in a
+folder of its own: 25 copies of the bundled scene have a million Gaussians. "fresh" opens it with an empty
+cache of the user; "kept" opens it again, in a process of its own. Processor seconds of
 all threads: they hardly depend on other programs on the machine.
 """
 
@@ -29,8 +29,8 @@ import lexsplat
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField
 from lexsplat.language.segments import Segments
-from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.scene import Scene
 
 APART = 8.0

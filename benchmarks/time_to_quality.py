@@ -82,7 +82,9 @@ def main() -> None:
     parser.add_argument("captures", nargs="+", metavar="CAPTURE[=DOWNSCALE]")
     parser.add_argument("--base", metavar="COMMIT", help="commit to compare with; default: today's code")
     parser.add_argument("--base-settings", type=json.loads, default={}, metavar="JSON")
-    parser.add_argument("--settings", type=json.loads, default={}, metavar="JSON", help="changed fields of ours")
+    parser.add_argument(
+        "--settings", type=json.loads, default={}, metavar="JSON", help="changed fields of ours"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--on", choices=("validation", "test"), default="test")
     parser.add_argument("--goal", type=float, help="PSNR in dB; default: that of the capture")

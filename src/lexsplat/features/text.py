@@ -186,15 +186,16 @@ def _read(path: Path) -> dict[str, Tensor]:
     return dict(zip(texts, vectors))
 
 
-def texts_of_scene(folder: Path, *, shipped: bool) -> TextCache:
+def texts_of_scene(folder: Path, *, shipped: bool, common: Path | None = None) -> TextCache:
     """The cache of a scene: its own folder, so that a scene carries its words, and that of the user for all scenes.
 
     Args:
         folder: The scene's own folder of texts.
         shipped: Whether it belongs to the package and is never written.
+        common: A folder of texts that ships with the package, for scenes with the same encoder; never written.
     """
     try:
         users = [user_cache() / "texts"]
     except RuntimeError:
         users = []
-    return TextCache(*users, read_only=folder) if shipped else TextCache(folder, *users)
+    return TextCache(*users, read_only=folder) if shipped else TextCache(folder, *users, read_only=common)

@@ -17,10 +17,10 @@ from lexsplat.geometry.cameras import Camera
 
 _ANGLES = np.radians(np.arange(0.0, 90.0, 2.0))
 _DIRECTIONS = np.concatenate(
-    [np.stack([np.cos(_ANGLES), -np.sin(_ANGLES)], 1), np.stack([np.sin(_ANGLES), np.cos(_ANGLES)], 1)]
+    [np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1), np.stack([-np.sin(_ANGLES), np.cos(_ANGLES)], 1)]
 )
 """First and second axis of the boxes of all angles ``[2 A, 2]``."""
-_SAMPLE = 1024  # points that determine the rotation of a box
+_SAMPLE = 2048  # points that determine the rotation of a box
 
 
 class Box(NamedTuple):

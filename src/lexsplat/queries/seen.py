@@ -94,7 +94,9 @@ class Seen:
         """
         found = indices.cpu().numpy()
         labels, inverse = np.unique(self._labels[found], return_inverse=True)
-        taken = np.bincount(inverse, self._masses[found], len(labels)) / np.maximum(self._totals[labels], 1e-12)
+        taken = np.bincount(inverse, self._masses[found], len(labels)) / np.maximum(
+            self._totals[labels], 1e-12
+        )
         names = self._names if promising is None else [name for name in promising if name in self._cameras]
         shares = taken @ self._shares[labels] if promising is None else self._at(names, labels, taken)
         order = np.argsort(-shares, kind="stable")[:_BEST]

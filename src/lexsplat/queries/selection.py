@@ -365,7 +365,9 @@ class Selection:
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centers ``[M, 3]`` and opacities ``[M]`` of the selected Gaussians."""
         opacities = self.gaussians.opacity_logits.detach()[self.indices].sigmoid()
-        return self.gaussians.means.detach()[self.indices].cpu().double().numpy(), opacities.cpu().double().numpy()
+        return self.gaussians.means.detach()[
+            self.indices
+        ].cpu().double().numpy(), opacities.cpu().double().numpy()
 
     def _reach(self, distance: float | None) -> float:
         if distance is not None:

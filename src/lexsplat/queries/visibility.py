@@ -48,7 +48,9 @@ def shown_shares(gaussians: Gaussians, cameras: Sequence[Camera], masses: Tensor
         cameras: Its training views; at most 64 of them are looked at.
         masses: Visible weights over all training views ``[N]``, in any unit.
     """
-    alone = torch.cat([_alone(part, evenly(cameras, _VIEWS)) for part in gaussians.means.split(_ROWS)]).numpy()
+    alone = torch.cat(
+        [_alone(part, evenly(cameras, _VIEWS)) for part in gaussians.means.split(_ROWS)]
+    ).numpy()
     # Seen from the side of its two longer axes.
     areas = gaussians.scales.double().cpu().sort(1).values[:, 1:].prod(1)
     alone *= (areas * gaussians.opacities.double().cpu()).numpy()

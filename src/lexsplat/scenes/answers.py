@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,11 @@ from torch import Tensor
 
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.relevancy import check_prompts
+from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.thresholds import BORDER, scene_thresholds
 from lexsplat.queries.visibility import without_hidden
 from lexsplat.queries.vocabulary import STUFF
 from lexsplat.runtime.errors import QueryError
@@ -117,14 +119,54 @@ class Answers:
         if self.prompts[index].lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))
             return replace(seen, parts=(seen,)) if seen else seen
+        members = self._members(index)
+        if members:
+            known = (each.within(selection.mask) for each in members)
+            return replace(selection, parts=tuple(replace(each, scores=scores) for each in known if each))
         selection = selection.without_specks()
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)
         return without_hidden(selection, self.scene.hidden)
 
+    def _members(self, index: int) -> list[Selection]:
+        """The objects of the kind that a prompt names; none where it names no kind or is absent."""
+        prompt = self.prompts[index]
+        if self.presences[index] != "yes" or self.scene.query.fixed or not is_kind(prompt):
+            return []
+        return [each for each in self.scene.objects if is_of_kind(each.phrase, prompt)]
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""
         return {"answers": [self.selection(index).to_dict() for index in range(len(self))]}
+
+
+def automatic_thresholds(scene: Scene, words: Mapping[str, Word]) -> list[float]:
+    """The automatic threshold of each word, from one rendering of the training views.
+
+    Relative to everyday words and by segments, a score of 0.5 is the border itself.
+    """
+    question, query = scene.question(list(words)), scene.query
+    if query.fixed or question.scale is not None or form_used(scene.field, query) == "segment":
+        return [query.threshold if query.fixed else BORDER] * len(words)
+    training = [view.camera for view in scene.views.values() if view.split == "train"]
+    return scene_thresholds(
+        lambda camera: render_relevancy(scene.field, scene.gaussians, camera, question),
+        training or list(scene.cameras.values()),
+        [word.presence for word in words.values()],
+    ).tolist()
+
+
+def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word as it is, or with the objects of its kind ("toy") if the scene has any (`lexsplat.queries.kinds`)."""
+    if not is_kind(prompt) or scene.query.fixed:
+        return word
+    members = [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
+    if not members:
+        return word
+    taken = torch.stack([each.mask for each in members]).any(0)
+    # What is no member stays below the border, and what is a member reaches it.
+    inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
+    return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
 
 
 def answer_queries(

@@ -100,7 +100,13 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     for number in named[named >= 0].unique().tolist():
         mask, name = named[segments.labels] == number, words[number]
         both = Selection(
-            scene.gaussians, scene.cameras, mask, mask.float(), phrase=name, world=scene.world, seen=scene.seen
+            scene.gaussians,
+            scene.cameras,
+            mask,
+            mask.float(),
+            phrase=name,
+            world=scene.world,
+            seen=scene.seen,
         )
         for each in [both] if name in STUFF else both.instances:
             each = each.within(~scene.hidden)

@@ -39,17 +39,17 @@ from lexsplat.queries.relevancy import (
 from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
 from lexsplat.queries.seen import Seen
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.thresholds import BORDER, check_threshold, scene_thresholds
+from lexsplat.queries.thresholds import check_threshold
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.answers import Answers, Word
+from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind
 from lexsplat.scenes.finding import find_in, understood_in
-from lexsplat.scenes.folder import SceneFolder, StoredView
-from lexsplat.scenes.objects import objects_of
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView
 from lexsplat.scenes.kept import seen_of
+from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 
 _KEPT_BYTES = 128 << 20
@@ -96,7 +96,8 @@ class Scene:
         self._encoder: TextTower | None = None
         self._cache: TextCache | None = None
         if folder is not None:
-            self._cache = texts_of_scene(folder.root / "checkpoints" / "texts", shipped=folder.is_bundled)
+            own, common = (root / "checkpoints" / "texts" for root in (folder.root, BUNDLED_SCENE))
+            self._cache = texts_of_scene(own, shipped=folder.is_bundled, common=common)
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
         self._world: World | None = None
 
@@ -344,8 +345,7 @@ class Scene:
     @property
     def hidden(self) -> Tensor:
         """Gaussians ``[N]`` bool that the views hardly show, as far as a scene with segments knows."""
-        nothing = torch.zeros_like(self.gaussians.opacity_logits, dtype=torch.bool)
-        return nothing if self.seen is None else self.seen.hidden
+        return torch.zeros_like(self.gaussians.opacity_logits).bool() if not self.seen else self.seen.hidden
 
     def _new_words(self, prompts: list[str]) -> list[Word]:
         """Scores and presence of prompts that were not asked before."""
@@ -354,25 +354,12 @@ class Scene:
         presences = self.presence_classifier.classify(prompts, question.positives, scores)
         formed = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
-        return [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
+        words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
+        return [of_kind(self, prompt, word) for prompt, word in zip(prompts, words)]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
-        """The automatic thresholds of words, from one rendering of the training views.
-
-        Relative to everyday words and by segments, a score of 0.5 is the border itself.
-        """
-        question = self.question(list(words))
-        if self.query.fixed or question.scale is not None or form_used(self.field, self.query) == "segment":
-            found = [self.query.threshold if self.query.fixed else BORDER] * len(words)
-        else:
-            views = list(self.views.values())
-            training = [view.camera for view in views if view.split == "train"]
-            found = scene_thresholds(
-                lambda camera: render_relevancy(self.field, self.gaussians, camera, question),
-                training or [view.camera for view in views],
-                [word.presence for word in words.values()],
-            ).tolist()
-        for word, threshold in zip(words.values(), found):
+        """The automatic thresholds of words that have none yet."""
+        for word, threshold in zip(words.values(), automatic_thresholds(self, words)):
             word.threshold = threshold
 
     # -- views
@@ -415,9 +402,8 @@ class Scene:
             QueryError: If there is none, or several match.
         """
         if not isinstance(name, str):
-            raise QueryError(
-                "view", expected="the name of a view, a StoredView or a Camera", found=repr(name)[:60]
-            )
+            expected = "the name of a view, a StoredView or a Camera"
+            raise QueryError("view", expected=expected, found=repr(name)[:60])
         if name in self.views:
             return self.views[name]
         matches = [view for key, view in self.views.items() if Path(key).stem == Path(name).stem]
