@@ -167,10 +167,15 @@ class PresenceClassifier:
             dict.fromkeys(words[word] for word in named)
         )
 
+    @property
+    def colored(self) -> list[str]:
+        """The scene's objects in any color, as phrases."""
+        return [f"{color} {name}" for color in sorted(COLORS) for name in self._objects[1]]
+
     @cached_property
     def _best_colored(self) -> Tensor:
         """The best height at each code ``[K]`` of everyday words and of the scene's objects in any color."""
-        phrases = [f"{color} {name}" for color in sorted(COLORS) for name in self._objects[1]]
+        phrases = self.colored
         if not phrases:
             return self.scale.best
         heights = self.scale.heights(self.language.codebook.clip, self._embed(phrases))

@@ -70,7 +70,7 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
         ``[P, N]`` in 0..1, on the device of ``relevancy``; at least `SEGMENT_THRESHOLD` exactly where a segment is
         taken.
     """
-    own = relevancy.detach().cpu().double().numpy()
+    own = relevancy.detach().cpu().float().numpy()
     if own.shape[1] == 0 or len(own) == 0:
         return relevancy
     labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
@@ -84,11 +84,16 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
         keys = [(cut.taken[prompt] >= _BORDER, cut.gaps[prompt]) for cut in reversed(cuts)]
         place = len(cuts) - 1 - max(range(len(cuts)), key=lambda key: (keys[key], -key))
         cut = cuts[place]
-        of_segment = cut.scores[prompt][levels[place]][labels]
+        at_lowest = cut.scores[prompt][levels[place]]
         limit, spread = cut.limits[prompt], max(cut.taken[prompt] - cut.left[prompt], 1e-6)
-        blended = _OWN_SHARE * own[prompt] + (1 - _OWN_SHARE) * of_segment
-        steep = 1 / (1 + np.exp(-np.clip((blended - limit) * _STEEPNESS / spread, -60, 60)))
-        result[prompt] = SEGMENT_THRESHOLD * (of_segment >= limit) + (1 - SEGMENT_THRESHOLD) * steep
+        # Single precision, in place: this is all that is done for each Gaussian.
+        odds = ((1 - _OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
+        odds += np.float32(_OWN_SHARE) * own[prompt]
+        odds *= np.float32(-_STEEPNESS / spread)
+        steep = np.exp(np.clip(odds, -60, 60, out=odds), out=odds)
+        steep += 1
+        np.divide(np.float32(1 - SEGMENT_THRESHOLD), steep, out=result[prompt])
+        result[prompt] += np.where(at_lowest >= limit, SEGMENT_THRESHOLD, 0.0).astype(np.float32)[labels]
     return torch.from_numpy(result).to(relevancy)
 
 

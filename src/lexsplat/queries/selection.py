@@ -249,7 +249,7 @@ class Selection:
         mask = torch.zeros_like(self.mask)
         for instance in self.instances:
             mask |= instance.mask
-        return replace(self, mask=mask)
+        return replace(self, mask=mask, parts=tuple(self.instances))
 
     def convincing(self, scores: Tensor | None = None) -> Selection:
         """The instances whose peak is close to that of the best instance.
@@ -264,14 +264,14 @@ class Selection:
             return self
         compared = self.scores if scores is None else scores
         peaks = [
-            float(compared[one.mask].topk(min(_PEAK_COUNT, len(one))).values.mean()) for one in self.instances
+            float(compared[one.indices].topk(min(_PEAK_COUNT, len(one))).values.mean()) for one in self.instances
         ]
         limit = self.convincing_limit(max(peaks))
+        kept = tuple(instance for peak, instance in zip(peaks, self.instances) if peak >= limit)
         mask = torch.zeros_like(self.mask)
-        for peak, instance in zip(peaks, self.instances):
-            if peak >= limit:
-                mask |= instance.mask
-        return replace(self, mask=mask)
+        for instance in kept:
+            mask |= instance.mask
+        return replace(self, mask=mask, parts=kept)
 
     def convincing_limit(self, best: float) -> float:
         """The smallest score of an instance beside one that scores ``best``: `_CONVINCING`, in log-odds."""

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.seen import MOST_VIEWS, Seen
-from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.errors import FileFormatError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
 
@@ -49,19 +50,21 @@ def seen_of(scene: Scene) -> Seen | None:
 
 
 def keep(scene: Scene) -> None:
-    """Compute what the first questions need, and write it into the folder of the scene; nothing if it cannot be.
+    """Compute what the first questions need, and write it into the folder of the scene, as far as that is possible.
 
     Args:
-        scene: As its folder has it.
+        scene: As its folder has it; reports stages "words" and "views".
     """
     path = _path(scene)
-    if path is None or scene.seen is None:
+    if path is None:
         return
     try:
-        scene.seen.complete_all(scene.listener)
-        write_tensors(path, scene.seen.tensors(), {"of": _key(scene)})
-    except OSError as error:  # the file is optional
-        log.warning("%s: not kept (%s)", path, error.strerror)
+        scene.embed([*everyday_words(), *scene.presence_classifier.colored])  # its cache of texts keeps them
+        if scene.seen is not None and not scene.seen.complete:
+            scene.seen.complete_all(scene.listener)
+            write_tensors(path, scene.seen.tensors(), {"of": _key(scene)})
+    except (OSError, LexsplatError) as error:  # the file is optional, and questions tell of a missing encoder
+        log.warning("%s: not kept (%s)", path, str(error)[:200])
 
 
 def _path(scene: Scene) -> Path | None:
