@@ -1,6 +1,9 @@
 """Each example runs and prints the expected output."""
 
+import json
+import os
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -76,9 +79,32 @@ def test_07_tells_which_scenes_hold_a_thing(run, tmp_path):
     assert (tmp_path / "output" / "examples" / "found" / "demo" / "red_apple.jpg").stat().st_size > 1000
 
 
+def test_08_asks_from_a_shell():
+    environment = {**os.environ, "LEXSPLAT": f"{sys.executable} -m lexsplat", "PYTHON": sys.executable}
+    arguments = ["sh", EXAMPLES / "08_shell.sh", "demo", "apple", "unicorn", "mug left of"]
+    done = subprocess.run(arguments, capture_output=True, text=True, env=environment, timeout=300)
+    rows = [line.split("\t") for line in done.stdout.splitlines()]
+    assert done.returncode == 0, done.stderr
+    assert [row[0] for row in rows] == ["apple", "unicorn", "mug left of"]
+    assert rows[0][1:3] == ["yes", "1"]
+    assert rows[1][1:] == ["no", "0", "-"]
+
+
+def test_09_asks_in_a_notebook(capsys):
+    cells = json.loads((EXAMPLES / "09_notebook.ipynb").read_text())["cells"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    printed = capsys.readouterr().out
+    assert 'where is the mug? ("mug"): yes, mug' in printed
+    assert "is there a dog?" in printed.splitlines()[3]
+    assert printed.splitlines()[3].endswith("no, nothing")
+
+
 def test_every_example_is_listed_and_tested():
     listed = (EXAMPLES / "README.md").read_text()
     tested = Path(__file__).read_text()
-    for path in EXAMPLES.glob("[0-9]*.py"):
+    for path in EXAMPLES.glob("[0-9]*"):
         assert path.name in listed
         assert f'"{path.name}"' in tested

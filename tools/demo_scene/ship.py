@@ -22,6 +22,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.files import to_json
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.records import read_record
+from lexsplat.scenes.kept import keep
 from lexsplat.scenes.scene import open_scene
 
 KEPT = ("cameras.json", "gaussians.ply", "language.safetensors")
@@ -45,12 +46,17 @@ def main() -> None:
         )
         with ProgressBars() as bars:
             folder = build(demo_capture(), work, config, listener=bars)
-            quality = evaluate_scene(open_scene(work, device="cpu"), listener=bars)
+            scene = open_scene(work, device="cpu")
+            keep(scene)
+            quality = evaluate_scene(scene, listener=bars)
         BUNDLED_SCENE.mkdir(parents=True, exist_ok=True)
         texts = (
             Path("checkpoints") / "texts"
         )  # embeddings of everyday words: a question needs no other encoding
         shutil.copytree(work / texts, BUNDLED_SCENE / texts, dirs_exist_ok=True)
+        shutil.copyfile(
+            work / "checkpoints" / "seen.safetensors", BUNDLED_SCENE / "checkpoints" / "seen.safetensors"
+        )
         for name in KEPT:
             shutil.copyfile(work / name, BUNDLED_SCENE / name)
         write_record(folder.record)

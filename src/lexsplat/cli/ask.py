@@ -54,6 +54,7 @@ class Ask:
             print(sentence(find_phrase(served.scene, phrase), served.scene.world.meters_per_unit))
         if not self.stdin:
             return
+        served.warm()
         print(f"{self.scene}: ready, one question a line", file=sys.stderr, flush=True)
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
         for line in sys.stdin:

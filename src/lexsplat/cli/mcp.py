@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import threading
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -76,6 +77,8 @@ class Mcp:
         alone = [path for path in self.scenes if path not in libraries]
         scenes = open_scenes(alone, self.device, self.clip)
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
+        for served in scenes.values():  # meanwhile the client connects
+            threading.Thread(target=served.warm, daemon=True).start()
         if self.http:
             serve_http(server, self.host, self.port, self.token)
         else:

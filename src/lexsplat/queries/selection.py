@@ -264,7 +264,8 @@ class Selection:
             return self
         compared = self.scores if scores is None else scores
         peaks = [
-            float(compared[one.indices].topk(min(_PEAK_COUNT, len(one))).values.mean()) for one in self.instances
+            float(compared[one.indices].topk(min(_PEAK_COUNT, len(one))).values.mean())
+            for one in self.instances
         ]
         limit = self.convincing_limit(max(peaks))
         kept = tuple(instance for peak, instance in zip(peaks, self.instances) if peak >= limit)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.scene import Scene, open_scene
@@ -33,6 +35,14 @@ class OpenScene:
         self._lock = threading.Lock()
         self._scene = open_scene(path, device=device, clip=clip)
         self._state = self._stamp()
+
+    def warm(self) -> None:
+        """Load and compute what the first questions would wait for: the encoder, the dictionary, the objects."""
+        with contextlib.suppress(LexsplatError):  # the question that meets it tells it
+            scene = self.scene
+            scene.preload()
+            corrected("thing", ())
+            scene.find("where is the thing?")
 
     @property
     def scene(self) -> Scene:

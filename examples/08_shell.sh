@@ -1,0 +1,25 @@
+#!/bin/sh
+# Asks many things of a scene from a shell: one warm process, JSON lines in, JSON lines out.
+#
+#     sh examples/08_shell.sh [SCENE [THING ...]]
+#
+# SCENE is a folder that `lexsplat build` made, or the word "demo" for the scene that ships with lexsplat. Prints a
+# table: thing, whether it is there, how many, best view.
+scene=${1:-demo}
+[ $# -gt 0 ] && shift
+[ $# -gt 0 ] || set -- apple mug unicorn "thing left of the vase"
+
+for thing in "$@"; do
+    printf '{"ask": "%s", "id": "%s"}\n' "$thing" "$thing"
+done |
+    ${LEXSPLAT:-lexsplat} ask "$scene" --stdin |
+    while IFS= read -r line; do
+        printf '%s\n' "$line" | ${PYTHON:-python} -c '
+import json, sys
+answer = json.load(sys.stdin)
+if "error" in answer:
+    print(answer.get("id"), "error", answer["error"]["message"], sep="\t")
+else:
+    print(answer["id"], answer["present"], answer["count"], answer["best_view"] or "-", sep="\t")
+'
+    done

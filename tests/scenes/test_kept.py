@@ -1,0 +1,96 @@
+"""What a scene keeps on disk for its first questions, and kinds that are answered alike everywhere."""
+
+import shutil
+
+import pytest
+import torch
+
+from lexsplat.rendering import render
+from lexsplat.scenes.answers import answer_queries, find_phrase
+from lexsplat.scenes.folder import BUNDLED_SCENE
+from lexsplat.scenes.kept import keep
+from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.serving import OpenScene, answer_line
+
+SEEN = "checkpoints/seen.safetensors"
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return open_scene("demo", device="cpu")
+
+
+def test_the_bundled_scene_ships_what_its_views_show(demo):
+    assert demo.seen.complete, (
+        "run tools/demo_scene/ship.py, or lexsplat.scenes.kept.keep on the bundled scene"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phrase", ["mug", "table lamp", "tablecloth"])
+def test_the_share_of_a_view_is_that_of_a_rendering(demo, phrase):
+    found = demo.select(phrase)
+    for name, share in found.view_shares[:3]:
+        camera = demo.cameras[name].downscaled(max(1.0, demo.cameras[name].width / 120))
+        drawn = render(demo.gaussians, camera, features=found.mask[:, None].float(), color=False).features
+        assert share == pytest.approx(float(drawn.mean()), rel=0.15)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    folder = tmp_path / "scene"
+    shutil.copytree(BUNDLED_SCENE, folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_what_is_kept_is_what_is_computed_without_it(copy, demo):
+    (copy / SEEN).unlink()
+    scene = open_scene(copy, device="cpu")
+    assert not scene.seen.complete
+    assert torch.equal(scene.hidden, demo.hidden)
+    assert scene.select("mug").best_view == demo.select("mug").best_view
+    keep(scene)
+    again = open_scene(copy, device="cpu")
+    assert again.seen.complete
+    assert torch.equal(again.hidden, demo.hidden)
+    assert again.select("mug").view_shares == demo.select("mug").view_shares
+
+
+def test_a_damaged_file_or_one_of_another_scene_counts_as_none(copy):
+    content = (copy / SEEN).read_bytes()
+    for damaged in (content[:1000], b"", content[:-1] + bytes([content[-1] ^ 1])):
+        (copy / SEEN).write_bytes(damaged)
+        assert not open_scene(copy, device="cpu").seen.complete
+    (copy / SEEN).write_bytes(content)
+    scene = open_scene(copy, device="cpu")
+    scene.gaussians.means[0, 0] += 1  # before it is asked
+    assert not scene.seen.complete
+
+
+def test_edited_content_does_not_take_what_is_kept_of_the_scene(demo):
+    some = torch.arange(len(demo.gaussians)) % 2 == 0
+    assert not demo.with_content(demo.gaussians.select(some), demo.field.select(some)).seen.complete
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "count"), [("toy", 3), ("fruit", 2), ("musical instrument", 0)])
+def test_a_kind_has_the_same_presence_and_count_however_it_is_asked(demo, kind, count):
+    present = "yes" if count else "no"
+    answers = demo.ask(kind)
+    assert answers.presences == (present,)
+    assert answers.to_dict()["answers"][0]["count"] == count
+    assert (demo.select(kind).present, bool(demo.select(kind))) == (present, count > 0)
+    assert demo.find(kind).present == present
+    assert find_phrase(demo, kind)["count"] == count
+    (queried,) = answer_queries(demo, kind, ["view_033"], None, None)["prompts"]
+    assert (queried["present"], queried["gaussians"] > 0) == (present, count > 0)
+    assert answer_line(OpenScene("demo", "cpu"), f"how many {kind}s are there?")["count"] == count
+
+
+def test_the_members_of_a_kind_reach_its_threshold_and_nothing_else_does(demo):
+    answers = demo.ask("toy")
+    members = torch.stack(
+        [each.mask for each in demo.objects if each.phrase in ("toy car", "teddy bear", "rubber duck")]
+    )
+    assert torch.equal(answers.scores[0] >= answers.thresholds[0], members.any(0))
