@@ -2,6 +2,7 @@
 """The MCP server, through the client of the official package."""
 
 import asyncio
+import contextlib
 import socket
 import subprocess
 import sys
@@ -313,3 +314,41 @@ def test_over_standard_input_and_output_and_a_killed_server_is_noticed():
     _, errors = killed.communicate(timeout=30)
     assert killed.returncode != 0
     assert b"Traceback" not in errors
+
+
+@pytest.mark.slow
+def test_a_server_that_is_killed_while_it_is_asked_is_an_error_for_its_client_and_can_be_started_again():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "lexsplat", "mcp", "demo", "--http", "--port", str(port)]
+    url = f"http://127.0.0.1:{port}/mcp"
+
+    def started():
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for _ in range(1200):
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                return process
+            time.sleep(0.1)
+        process.kill()
+        raise AssertionError("the server does not listen")
+
+    async def ask_and_kill(process):
+        async with Client(url) as client:
+            assert not (await client.call_tool("count", {"phrase": "mug"})).is_error
+            process.kill()
+            process.wait(30)
+            await asyncio.wait_for(client.call_tool("count", {"phrase": "vase"}), 60)
+
+    process = started()
+    try:
+        with pytest.raises(BaseException):  # noqa: B017  (any error, but no answer and no hanging)
+            asyncio.run(ask_and_kill(process))
+    finally:
+        process.kill()
+    process = started()
+    try:
+        assert ask(url, "count", phrase="vase")[0].structured_content["count"] == 1
+    finally:
+        process.kill()
+        process.wait(30)

@@ -21,8 +21,8 @@ from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.files import to_json
 from lexsplat.scenes.folder import BUNDLED_SCENE
-from lexsplat.scenes.records import read_record
 from lexsplat.scenes.kept import keep
+from lexsplat.scenes.records import read_record
 from lexsplat.scenes.scene import open_scene
 
 KEPT = ("cameras.json", "gaussians.ply", "language.safetensors")
