@@ -2,9 +2,9 @@
 
     python benchmarks/time_to_quality.py demo second ../data/bonsai=4 --base d4e65b3 --seeds 0 1 2
 
-Both trainings run in slices that take turns, so that other work on the machine slows both. The time between two slices
-is interpolated. PSNR is measured outside the clock, on test views; ``--on validation`` takes every sixth training view
-instead, to choose settings by.
+Both trainings run in slices that take turns, so that other work on the machine slows both. The time between
+two slices is interpolated. PSNR is measured outside the clock, on test views; ``--on validation`` takes every
+sixth training view instead, to choose settings by.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ try:
 except ImportError:  # the flat modules before the fifteen packages
     from lexsplat.config import BuildConfig  # type: ignore[import-not-found,no-redef]
     from lexsplat.demo.demo import demo_capture  # type: ignore[no-redef]
+
     from lexsplat.scenes import initial_points  # type: ignore[attr-defined,no-redef]
     from lexsplat.scenes import load_scene as load_capture  # type: ignore[attr-defined,no-redef]
 from lexsplat.reconstruction import Reconstructor
