@@ -43,7 +43,7 @@ def test_query_answers_in_its_schema(built, tmp_path, capsys, more):
 
 
 def test_find_answers_in_its_schema(capsys):
-    found = answer(capsys, "find", "demo", "red apple", "unicorn", "lamp behind the books")
+    found = answer(capsys, "find", "demo", "red apple", "unicorn", "lamp next to the books")
     validated("find", found)
     assert [bool(phrase["instances"]) for phrase in found["phrases"]] == [True, False, True]
 

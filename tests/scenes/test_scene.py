@@ -11,7 +11,7 @@ import lexsplat
 from lexsplat.queries import thresholds as threshold_rule
 from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
 from lexsplat.runtime.errors import QueryError, SceneFolderError
-from lexsplat.scenes import scene as scene_module
+from lexsplat.scenes import answers as answers_module
 from lexsplat.scenes.answers import default_views, find_phrases
 from lexsplat.scenes.exporting import export_gaussians, export_scene
 from lexsplat.scenes.folder import BUNDLED_SCENE, StoredView
@@ -81,13 +81,13 @@ def test_the_requested_ball_is_selected(made):
 
 def test_a_known_prompt_renders_no_views_again(scene, monkeypatch):
     rendered = []
-    original = scene_module.render_relevancy
+    original = answers_module.render_relevancy
 
     def render(field, gaussians, camera, question):
         rendered.append(len(question))
         return original(field, gaussians, camera, question)
 
-    monkeypatch.setattr(scene_module, "render_relevancy", render)
+    monkeypatch.setattr(answers_module, "render_relevancy", render)
     scene.query = replace(scene.query, negatives=("object", "things"))  # everyday words need no views
     training = sum(view.split == "train" for view in scene.views.values())
     first = scene.ask(["ball 0", "ball 1"])
