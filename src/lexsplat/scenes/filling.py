@@ -227,7 +227,7 @@ def _fill_below(thing: Selection, gone: Tensor) -> Fill | None:
         return None
     local = (means - surface.origin) @ surface.axes.T
     reach = _REACH * surface.radius
-    near = (np.abs(local[:, :2] - surface.foot) <= reach).all(1)
+    near = np.asarray((np.abs(local[:, :2] - surface.foot) <= reach).all(1))
     members = firm[near[firm] & (np.abs(local[firm, 2]) <= _THICK * surface.radius)]
     picture, coverage = _seen_from_above(gaussians.select(torch.from_numpy(members).to(gone.device)), surface)
     side = (np.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
@@ -279,7 +279,7 @@ def painted_hole(picture: FloatArray, hole: NDArray[np.bool_], known: NDArray[np
         hole: Pixels to paint ``[H, W]``.
         known: Pixels whose color is known ``[H, W]``, at least one; none is in the hole.
     """
-    rim = known & binary_dilation(hole, iterations=_MARGIN)
+    rim = np.asarray(known & binary_dilation(hole, iterations=_MARGIN))
     points, places = np.argwhere(rim if rim.any() else known), np.argwhere(hole)
     weights = 1 / ((places[:, None] - points[None]) ** 2).sum(-1)
     colors = picture[tuple(points.T)]
