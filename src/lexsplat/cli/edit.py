@@ -56,6 +56,7 @@ class Edit:
         grow: Widen the selection by this distance in units of the scene.
         shrink: Narrow the selection by this distance in units of the scene.
         largest: Change only the largest of the things found.
+        fill: Close the surface under a deleted thing with the colors around, as no photo shows it.
         color: New color for recolor: three numbers in 0..1, "#ff8800" or a name such as orange.
         strength: Share of the new color, in 0..1.
         by: Shift in units of the scene, for move and duplicate.
@@ -75,6 +76,7 @@ class Edit:
     grow: float | None = None
     shrink: float | None = None
     largest: bool = False
+    fill: bool = True
     color: Color = None
     strength: float = 1.0
     by: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -156,8 +158,10 @@ class Edit:
             elif self.action in ("move", "duplicate"):
                 turn = rotation_about(chosen.up.direction, self.turn)
                 getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
+            elif self.action == "delete":
+                editor.delete(chosen, self.fill)
             else:
-                getattr(editor, self.action)(chosen)
+                editor.keep(chosen)
         except ValueError as error:  # numbers that are only invalid together or for these Gaussians
             raise QueryError(
                 self.action, expected="Gaussians that can be drawn afterwards", found=str(error)

@@ -29,6 +29,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
+from lexsplat.scenes.filling import Fill, fill_for, hidden_inside
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.scene import Scene
@@ -52,7 +53,8 @@ class Step:
     Args:
         kind: The operation.
         mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
-        values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center".
+        values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
+            "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`).
         phrase: What was asked for, for display.
     """
 
@@ -95,7 +97,7 @@ class Step:
             raise ValueError(f"not a step: {error!r}") from error
         if kind not in get_args(Kind) or len(bits) != count:
             raise ValueError(f"not a step: {kind!r}")
-        known = ("color", "strength", "rotation", "scale", "translation", "center")
+        known = ("color", "strength", "rotation", "scale", "translation", "center", "fill")
         values = {name: data[name] for name in known if name in data}
         return cls(kind, torch.from_numpy(bits.astype(bool)), values, str(data.get("phrase", "")))
 
@@ -111,6 +113,8 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     mask = step.mask.to(gaussians.device)
     if step.kind in ("delete", "keep"):
         kept = mask if step.kind == "keep" else ~mask
+        if "fill" in step.values:
+            return _filled(gaussians, language, kept, Fill.from_json(step.values["fill"]))
         return gaussians.select(kept), language.select(kept)
     if step.kind == "duplicate":
         everything = torch.arange(len(gaussians), device=gaussians.device)
@@ -131,6 +135,18 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
         tensors[name] = tensor.clone()
         tensors[name][mask] = getattr(changed, name)
     return replace(gaussians, **tensors), language
+
+
+def _filled(
+    gaussians: Gaussians, language: LanguageField, kept: Tensor, fill: Fill
+) -> tuple[Gaussians, LanguageField]:
+    """Some Gaussians of a scene and those of a fill, which take the language of their sources."""
+    remain, added = gaussians.select(kept), fill.gaussians(gaussians)
+    sources = torch.from_numpy(fill.sources.astype(np.int64)).to(kept.device)
+    tensors: dict[str, Any] = {
+        name: torch.cat([tensor, getattr(added, name)]) for name, tensor in remain.tensors().items()
+    }
+    return replace(remain, **tensors), language.select(torch.cat([kept.nonzero()[:, 0], sources]))
 
 
 def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
@@ -220,9 +236,14 @@ class Editor:
 
     # -- steps
 
-    def delete(self, chosen: Selection) -> None:
-        """Remove a selection."""
-        self._do("delete", chosen)
+    def delete(self, chosen: Selection, fill: bool = True) -> None:
+        """Remove a selection.
+
+        Args:
+            chosen: The selection.
+            fill: Close the surface under its things, which no photo shows (`lexsplat.scenes.filling`).
+        """
+        self._do("delete", chosen, **({"fill": None} if fill else {}))
 
     def keep(self, chosen: Selection) -> None:
         """Remove everything but a selection."""
@@ -308,6 +329,10 @@ class Editor:
                 remedy="try other words or a lower threshold",
             )
         whole = whole_things(chosen, self.scene.hidden, self.scene.field.segments)
+        if "fill" in values:
+            whole = replace(whole, mask=whole.mask | hidden_inside(whole, self.scene.hidden))
+            fill = fill_for(whole)
+            values = {} if fill is None else {"fill": fill.to_json()}
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
         self._advance(step)
         self.undone.clear()

@@ -1,0 +1,128 @@
+"""The hole under a deleted thing: on a table of known colors with a known hole."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from support.language_scene import make_codebook
+
+from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.geometry.world import World
+from lexsplat.language.fields import CodeField
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.editing import Editor
+from lexsplat.scenes.filling import Fill, fill_for, painted_hole
+from lexsplat.scenes.scene import Scene
+
+LEFT, RIGHT = np.array([0.8, 0.3, 0.1]), np.array([0.2, 0.5, 0.7])
+
+
+def table_with_a_ball(turned=None, ball_height=0.3):
+    """A table of two colors with a hole of radius 0.2 under a ball of radius 0.3, which has code 1."""
+    side = np.linspace(-1.5, 1.5, 76)
+    table = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    table = table[np.linalg.norm(table, axis=1) > 0.2]
+    table = np.concatenate([table, np.zeros((len(table), 1))], 1)
+    directions = np.random.default_rng(0).normal(size=(600, 3))
+    ball = 0.3 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [0, 0, ball_height]
+    points = np.concatenate([table, ball])
+    colors = np.concatenate([np.where(table[:, :1] < 0, LEFT, RIGHT), np.full_like(ball, 0.5)])
+    points = points if turned is None else points @ turned.T
+    gaussians = gaussians_from_points(points, colors, sh_degree=0, opacity=0.95)
+    gaussians.log_scales.fill_(float(np.log(0.025)))
+    codes = torch.cat([torch.zeros(len(table), 1), torch.ones(len(ball), 1)]).to(torch.uint8)
+    field = CodeField(make_codebook(2), codes, torch.ones(len(codes), 1), torch.zeros(len(codes)))
+    up = np.array([0, 0, 1.0]) if turned is None else turned[:, 2]
+    return Scene(gaussians, field, {}, "bundled"), World(Up(up, True))
+
+
+def ball_of(scene, world):
+    mask = scene.field.codes[:, 0] == 1
+    return Selection(scene.gaussians, {}, mask, mask.float(), phrase="ball", world=world)
+
+
+TURN = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+TURN = TURN * np.sign(np.linalg.det(TURN))
+
+
+@pytest.mark.parametrize("turned", [None, TURN])
+def test_a_deleted_thing_leaves_a_closed_surface_with_the_colors_around(turned):
+    scene, world = table_with_a_ball(turned)
+    editor = Editor(scene)
+    editor.delete(ball_of(scene, world))
+    after = editor.scene.gaussians
+    added = after.select(torch.arange(len(after)) >= int((scene.field.codes[:, 0] == 0).sum()))
+    places = added.means.double().numpy() @ (np.eye(3) if turned is None else turned)
+    assert np.abs(places[:, 2]).max() < 0.01, "in the plane of the table"
+    assert np.linalg.norm(places[:, :2], axis=1).max() < 0.3
+    # Every point of the hole lies within a standard deviation of a disk.
+    angle, radius = np.meshgrid(np.linspace(0, 6.2, 40), np.linspace(0, 0.17, 10))
+    hole = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1).reshape(-1, 1, 2)
+    apart = np.linalg.norm(hole - places[None, :, :2], axis=-1).min(1)
+    assert apart.max() < float(added.scales[:, 0].max()) * 1.5
+    colors = added.sh0[:, 0].double().numpy() * 0.28209479177387814 + 0.5
+    assert np.abs(colors[places[:, 0] < -0.15] - LEFT).max() < 0.15
+    assert np.abs(colors[places[:, 0] > 0.15] - RIGHT).max() < 0.15
+    assert not editor.scene.field.codes.any(), "the language of the table"
+
+
+def test_nothing_is_filled_where_a_thing_stands_on_nothing_or_a_fill_is_not_wanted():
+    hanging, world = table_with_a_ball(ball_height=2.0)
+    assert fill_for(ball_of(hanging, world)) is None
+    scene, world = table_with_a_ball()
+    editor = Editor(scene)
+    editor.delete(ball_of(scene, world), fill=False)
+    assert torch.equal(editor.scene.gaussians.means, scene.gaussians.means[scene.field.codes[:, 0] == 0])
+
+
+def test_a_journal_replays_a_fill_and_its_undo(tmp_path):
+    scene, world = table_with_a_ball()
+    editor = Editor(scene, tmp_path / "edits.jsonl")
+    editor.delete(ball_of(scene, world))
+    again = Editor(scene, tmp_path / "edits.jsonl")
+    for name, tensor in editor.scene.gaussians.tensors().items():
+        assert torch.equal(again.scene.gaussians.tensors()[name], tensor), name
+    assert again.undo()
+    assert torch.equal(again.scene.gaussians.means, scene.gaussians.means)
+
+
+def number_of_sources(fill):
+    return {**fill, "gaussians": fill["gaussians"] + 1}
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        number_of_sources,
+        lambda fill: {**fill, "gaussians": 10**9},
+        lambda fill: {**fill, "disks": "####"},
+        lambda fill: {**fill, "disks": None},
+        lambda fill: {},
+        lambda fill: Fill(np.array([10**6], "<i4"), np.zeros((1, 13), "<f4")).to_json(),
+        lambda fill: Fill(np.zeros(1, "<i4"), np.full((1, 13), np.nan, "<f4")).to_json(),
+        lambda fill: "fill",
+    ],
+)
+def test_a_damaged_fill_is_told_in_one_line(tmp_path, broken):
+    scene, world = table_with_a_ball()
+    journal = tmp_path / "edits.jsonl"
+    Editor(scene, journal).delete(ball_of(scene, world))
+    header, line = journal.read_text().splitlines()
+    step = json.loads(line)
+    step["fill"] = broken(step["fill"])
+    journal.write_text(f"{header}\n{json.dumps(step)}\n")
+    with pytest.raises(FileFormatError) as error:
+        Editor(scene, journal)
+    assert "\n" not in str(error.value)
+
+
+def test_a_hole_takes_the_colors_around_by_inverse_squared_distance():
+    picture = np.zeros((1, 5, 3))
+    picture[0, 0], picture[0, 4] = 0.2, 0.8
+    hole = np.array([[False, True, True, True, False]])
+    found = painted_hole(picture, hole, ~hole)[:, 0]
+    expected = [(0.2 + 0.8 / 9) / (1 + 1 / 9), 0.5, (0.2 / 9 + 0.8) / (1 / 9 + 1)]
+    np.testing.assert_allclose(found, expected)
