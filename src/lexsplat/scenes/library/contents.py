@@ -36,8 +36,8 @@ from lexsplat.scenes.scene import Scene
 
 _MOST = 2048
 """Segments of the lowest kept level, at most, unless the coarsest level has more."""
-_POINTS = 16
-"""Points of a segment that are kept, at most: they give boxes and frames."""
+_POINTS, _ALL_POINTS = 16, 12_000
+"""Points of a segment that are kept, at most, unless fewer than the latter would be: they give boxes and frames."""
 _PICTURES = 8
 """Pictures of a scene, at most: one bit of a byte tells whether a picture shows a point."""
 _SIDE, _QUALITY = 320, 70
@@ -220,7 +220,7 @@ def _language(scene: Scene, segments: Segments) -> dict[str, Tensor]:
         "places": tables["places"].cpu().half(),
         "mean": scale.mean.cpu(),
         "best": scale.best.cpu(),
-        "best_colored": tables["best_colored"].cpu().float(),
+        "best_colored": tables["best_colored"].cpu().float().clone(),  # may be `best` itself
         "peak": torch.tensor([scale.peak]),
     }
 
@@ -268,7 +268,9 @@ def _points(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     numbers = np.bincount(labels[order], minlength=count)
     first = np.cumsum(numbers) - numbers
     rank = np.arange(len(order)) - first[labels[order]]
-    step = -(-numbers // _POINTS)[labels[order]]  # every second or third of them, and so on
+    step = -(-numbers // max(_POINTS, _ALL_POINTS // count))[
+        labels[order]
+    ]  # every second or third of them, and so on
     chosen = order[rank % np.maximum(step, 1) == 0]
     means = scene.gaussians.means.detach().cpu()[torch.from_numpy(chosen)]
     of = labels[chosen]

@@ -178,6 +178,17 @@ class Codes:
         return cls(units.half(), units @ mean, limits, shares, torch.cat([fitted, (fitted @ mean)[None]]))
 
 
+class OwnTexts:
+    """The texts of a scene as a text tower: what its folder has cached needs no model."""
+
+    def __init__(self, scene: Scene, content_hash: str) -> None:
+        self.scene, self.content_hash = scene, content_hash
+
+    def encode_text(self, prompts: Any) -> Tensor:
+        """Embeddings ``[T, D]`` of texts."""
+        return self.scene.encode_text(list(prompts))
+
+
 def record_of(
     root: Path, name: str, path: str, scene: Scene, codes: Codes, contents: Contents | None
 ) -> Record:

@@ -44,7 +44,7 @@ _SMALLEST_SHARE = 0.1
 _PEAK_COUNT = 20
 _LARGE = 0.05
 """Phrases without an everyday name that select this share of a scene are left to it."""
-_BOXED = 1000
+_BOXED = 400
 """Points that a box is fitted to, at most."""
 
 Array = NDArray[Any]

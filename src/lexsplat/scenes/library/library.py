@@ -26,6 +26,7 @@ from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import (
     BUNDLED,
     Codes,
+    OwnTexts,
     Record,
     map_codes,
     picture_of,
@@ -47,16 +48,6 @@ _OPEN_SCENES = 16
 """Scenes that stay open, at most."""
 _KEPT_CONTENTS = 512
 """Scenes whose segments and objects stay mapped, at most."""
-
-
-class _OwnTexts:
-    """The texts of a scene as a text tower: what its folder has cached needs no model."""
-
-    def __init__(self, scene: Scene, content_hash: str) -> None:
-        self.scene, self.content_hash = scene, content_hash
-
-    def encode_text(self, prompts: Any) -> Tensor:
-        return self.scene.encode_text(list(prompts))
 
 
 class Library:
@@ -316,7 +307,7 @@ class Library:
         record = record_of(self.root, name, place, scene, codes, contents)
         write_entry(self.root, record, codes, contents, picture_of(scene))
         if known:  # what the scene has in its cache, all of its scenes have
-            self._texts.encode(known, COMPARED, lambda: _OwnTexts(scene, known))
+            self._texts.encode(known, COMPARED, lambda: OwnTexts(scene, known))
         for file in before.files - record.files if before is not None else ():
             (self.stage / file).unlink(missing_ok=True)
         if self.server:

@@ -69,7 +69,10 @@ class Hit:
         return f"{self.scene}: present: {self.present}. {self.sentence}{self._sizes()}"
 
     def _sizes(self) -> str:
-        scale, unit = (self.world.meters_per_unit or 1.0), "m" if self.world.meters_per_unit else "scene units"
+        scale, unit = (
+            (self.world.meters_per_unit or 1.0),
+            "m" if self.world.meters_per_unit else "scene units",
+        )
         sizes = [each["size"] for each in self.answer["instances"][:8]]
         told = "; ".join(" x ".join(f"{side * scale:.2f}" for side in size) for size in sizes)
         return f" Size: {told} {unit}." if told else ""
