@@ -55,6 +55,7 @@ def main() -> None:
     parser.add_argument(
         "--mixed", type=int, default=2000, help="scenes whose codes are mixed; others have the same codes"
     )
+    parser.add_argument("--texts", type=int, default=len(TEXTS), help="number of texts that are asked")
     parser.add_argument(
         "--copies", action="store_true", help="copies of the bundled scene, which can be opened"
     )
