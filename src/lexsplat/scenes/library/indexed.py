@@ -181,7 +181,8 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     (presence,) = judge.classify([thing.text], unit, torch.zeros(1, 1))
     if presence == "no":
         return Indexed({**_answer([], presence), **common}, contents)
-    by_code = judge.scale.relevancy(judge.language.codebook.clip, unit)[:, 0].numpy()
+    best = judge.best_heights([thing.text])
+    by_code = judge.scale.relevancy(judge.language.codebook.clip, unit, best)[:, 0].numpy()
     own = torch.from_numpy(np.clip(_spread(contents) @ by_code, 0, 1))[None]
     scores, counts = segment_relevancy(own, _segments(contents))[0].numpy(), contents.counts.numpy()
     taken = np.flatnonzero((scores >= SEGMENT_THRESHOLD) & (counts > 0))
