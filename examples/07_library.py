@@ -22,17 +22,17 @@ for scene in scenes:
     library.add(scene)
 print(library)
 
-# %% One row for each scene that holds a thing. `pandas.DataFrame(rows)` shows them as a table.
+# %% One row for each thing. `pandas.DataFrame(rows)` shows them as a table.
 rows = []
 for phrase in phrases:
     found = library.search(phrase)
+    rows += found.rows()
     for hit in found.hits:
-        first = hit.answer["instances"][0]
-        row = {"phrase": phrase, "scene": hit.scene, "present": hit.present, "count": hit.count}
-        rows.append({**row, "center": first["center"], "size": first["size"], "view": first["best_view"]})
         hit.write_picture(Path("output/examples/found"))
-    print(f"{phrase}: in {len(found.hits)} of {found.scenes} scenes, {found.opened} opened")
+    print(found)
 
 # %% The table
+if rows:
+    print(" | ".join(rows[0]))
 for row in rows:
     print(" | ".join(str(value) for value in row.values()))

@@ -17,6 +17,7 @@ import torch
 from lexsplat.codebook import Codebook
 from lexsplat.features.text import TextCache, TextTower, load_text
 from lexsplat.language.fields import CodeField
+from lexsplat.language.segments import Segments
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.runtime.files import write_tensors
 from lexsplat.scenes.folder import SceneFolder
@@ -46,7 +47,9 @@ class Tower:
         return torch.stack([embedding(prompt, self.content_hash) for prompt in prompts]).float()
 
 
-def write_scene(path: Path, things: Sequence[str] = THINGS, encoder: str = "abc", build: int = 1) -> Path:
+def write_scene(
+    path: Path, things: Sequence[str] = THINGS, encoder: str = "abc", build: int = 1, segments: bool = False
+) -> Path:
     """A finished scene folder.
 
     Args:
@@ -54,15 +57,21 @@ def write_scene(path: Path, things: Sequence[str] = THINGS, encoder: str = "abc"
         things: Names of the five balls, everyday words.
         encoder: Hash of the encoder.
         build: Number of the build: another one is a rebuilt scene.
+        segments: Whether each ball is a segment, so that the index can answer.
     """
     assert set(things) <= set(everyday_words())
     made = make_scene(per_ball=40)
     units = torch.stack([embedding(thing, encoder) for thing in things]).float()
     count = len(made.labels)
+    labels = torch.from_numpy(made.labels)
+    balls = Segments(labels, torch.ones(count), torch.arange(len(things))[None]) if segments else None
     field = CodeField(
-        Codebook(units), torch.from_numpy(made.labels.astype(np.uint8))[:, None], torch.ones(count, 1),
+        Codebook(units),
+        labels.to(torch.uint8)[:, None],
+        torch.ones(count, 1),
         torch.zeros(count),
-    )  # fmt: skip
+        segments=balls,
+    )
     folder = SceneFolder(path)
     path.mkdir(parents=True, exist_ok=True)
     folder.record["config"] = {"clip": f"models/{encoder}"}

@@ -12,7 +12,7 @@ from lexsplat.cli.options import Device, check_phrases, print_json
 from lexsplat.runtime.errors import LibraryError
 
 if TYPE_CHECKING:
-    from lexsplat.scenes.library import Found, Library
+    from lexsplat.scenes.library import Library
 
 _REQUIRED = "(required)"
 Action = tyro.conf.Positional[
@@ -47,6 +47,7 @@ class LibraryCommand:
         words: Scene folders or the word "demo" for add, names or folders for remove, phrases for search.
         limit: Scenes of an answer, at most.
         thumbnails: Folder of the pictures that search writes; "none" writes none.
+        confirm: Search asks the scenes themselves, also where the library can tell without opening them.
         repair: Mend what verify finds.
         index: Address of a Chroma server that proposes scenes, such as http://localhost:8000.
         device: "auto" takes CUDA where there is a GPU.
@@ -58,6 +59,7 @@ class LibraryCommand:
     words: Words = ()
     limit: int = 10
     thumbnails: Path | None = None
+    confirm: bool = False
     repair: bool = False
     index: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
     device: Device = "auto"
@@ -133,22 +135,17 @@ class LibraryCommand:
         folder = self.thumbnails or self.library / "thumbnails"
         answers = []
         for phrase in self.words:
-            found = library.search(phrase, self.limit)
+            found = library.search(phrase, self.limit, confirm=self.confirm)
             answer = found.to_dict()
             if str(self.thumbnails) != "none":
                 for hit, entry in zip(found.hits, answer["hits"]):
                     entry["thumbnail"] = str(hit.write_picture(folder))
-            self._print(found, answer)
+            self._say(repr(found))
+            self._say_pictures(answer)
             answers.append(answer)
         return {"phrases": answers}
 
-    def _print(self, found: Found, answer: dict[str, Any]) -> None:
-        from lexsplat.scenes.serving import sentence
-
-        more = f"; {found.unopened} more may hold it" if found.unopened else ""
-        self._say(f"{found.phrase}: in {len(found.hits)} of {found.scenes} scenes{more}")
-        for number, (hit, entry) in enumerate(zip(found.hits, answer["hits"]), start=1):
-            said = sentence(hit.answer, hit.opened.world.meters_per_unit)
-            self._say(f"  {number}. {hit.scene}: present: {hit.present}. {said} {entry.get('thumbnail', '')}")
-        for problem in found.skipped.values():
-            self._say(f"  skipped: {problem}")
+    def _say_pictures(self, answer: dict[str, Any]) -> None:
+        for number, hit in enumerate(answer["hits"], start=1):
+            if "thumbnail" in hit:
+                self._say(f"  picture {number}: {hit['thumbnail']}")

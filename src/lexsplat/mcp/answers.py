@@ -201,6 +201,7 @@ class Hit(World):
     path: str
     encoder: str
     bound: Annotated[float, Field(description="Upper bound of the strength of presence.")]
+    source: Annotated[Literal["index", "scene"], Field(description="What answered.")]
     present: Literal["yes", "unsure"]
     count: Count
     gaussians: Count

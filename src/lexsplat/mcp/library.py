@@ -8,7 +8,6 @@ from pydantic import Field
 
 from lexsplat.mcp import answers
 from lexsplat.mcp.tools import PhraseText, Reply, Tools
-from lexsplat.scenes.serving import sentence
 
 
 class LibraryTools(Tools):
@@ -23,9 +22,7 @@ class LibraryTools(Tools):
         if self.library is None:
             raise ValueError("there is no library")
         found = self.library.search(phrase, limit)
-        listed = "; ".join(
-            f"{hit.scene}: {sentence(hit.answer, hit.opened.world.meters_per_unit)}" for hit in found.hits
-        )
+        listed = "; ".join(map(repr, found.hits))
         said = f"In {len(found.hits)} of {found.scenes} scenes: {listed}" if found.hits else "In no scene."
         more = f" {found.unopened} more scenes may hold it." if found.unopened else ""
         skipped = f" {len(found.skipped)} scenes could not be asked." if found.skipped else ""

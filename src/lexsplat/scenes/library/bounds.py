@@ -60,14 +60,9 @@ def presence_bounds(codes: Sequence[Codes], texts: Tensor) -> FloatArray:
             for row, place in zip(heights, places):
                 wide.copy_(codes[place].units)
                 row[:] = (wide @ unit - codes[place].shared[:, None]).numpy()
-            limits = np.stack([_limits(codes[p]) for p in places])
+            limits = np.stack([codes[p].full for p in places])
             found[places] = _best((heights - _offset(heights)) / limits[:, :, None])
     return found
-
-
-def _limits(codes: Codes) -> NDArray[np.float32]:
-    """Heights at the strength 1; infinite for codes that nothing shows."""
-    return torch.where(codes.shares > 0, codes.limits, math.inf).numpy()
 
 
 def _offset(heights: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -5,6 +5,7 @@
     library.json                       format_version and the library's own name on a server
     scenes/NAME.json                   the record: where the scene is, which version of it, its encoder
     scenes/NAME.CONTENT.safetensors    the codes, named after their hash, and the record again
+    scenes/NAME.CONTENTS.objects.safetensors    segments, objects and pictures, of scenes with segments
     scenes/NAME.jpg                    a picture of the scene
     texts/                             embeddings of the texts that were asked
 
@@ -15,13 +16,17 @@ names were left by a killed writer; the next one removes them.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+import math
 import os
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -32,6 +37,7 @@ from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_j
 from lexsplat.runtime.fingerprints import digest, fingerprint
 from lexsplat.scenes.finding import middle_camera
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.library.contents import Contents
 from lexsplat.scenes.scene import Scene
 
 BUNDLED = "demo"
@@ -58,6 +64,7 @@ class Record:
         codes: Number of codes K.
         gaussians: Number of Gaussians.
         views: Number of views.
+        contents: Hash of what is kept of its segments and objects; "" if it has no segments.
     """
 
     name: str
@@ -70,6 +77,7 @@ class Record:
     codes: int
     gaussians: int
     views: int
+    contents: str = ""
 
     @property
     def group(self) -> str:
@@ -80,6 +88,16 @@ class Record:
     def codes_file(self) -> str:
         """Name of the file of its codes."""
         return f"{self.name}.{self.content}.safetensors"
+
+    @property
+    def contents_file(self) -> str:
+        """Name of the file of its segments and objects; "" if there is none."""
+        return f"{self.name}.{self.contents}.objects.safetensors" if self.contents else ""
+
+    @property
+    def files(self) -> set[str]:
+        """Names of its files of tensors."""
+        return {self.codes_file, self.contents_file} - {""}
 
     def folder(self, root: Path) -> Path:
         """Where the scene is now: at its place relative to the library, as both may have moved, else at its path."""
@@ -112,6 +130,11 @@ class Codes:
     limits: Tensor
     shares: Tensor
     offset: Tensor
+
+    @functools.cached_property
+    def full(self) -> NDArray[np.float32]:
+        """Heights at the strength 1 ``[K]``; infinite for codes that nothing shows."""
+        return torch.where(self.shares > 0, self.limits, math.inf).numpy()
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
@@ -155,7 +178,20 @@ class Codes:
         return cls(units.half(), units @ mean, limits, shares, torch.cat([fitted, (fitted @ mean)[None]]))
 
 
-def record_of(root: Path, name: str, path: str, scene: Scene, codes: Codes) -> Record:
+class OwnTexts:
+    """The texts of a scene as a text tower: what its folder has cached needs no model."""
+
+    def __init__(self, scene: Scene, content_hash: str) -> None:
+        self.scene, self.content_hash = scene, content_hash
+
+    def encode_text(self, prompts: Any) -> Tensor:
+        """Embeddings ``[T, D]`` of texts."""
+        return self.scene.encode_text(list(prompts))
+
+
+def record_of(
+    root: Path, name: str, path: str, scene: Scene, codes: Codes, contents: Contents | None
+) -> Record:
     """The record of an open scene.
 
     Args:
@@ -164,6 +200,7 @@ def record_of(root: Path, name: str, path: str, scene: Scene, codes: Codes) -> R
         path: The scene's folder, absolute, or `BUNDLED`.
         scene: The scene, from a folder.
         codes: Its codes.
+        contents: Its segments and objects.
     """
     if scene.folder is None:
         raise SceneFolderError(name, expected="a scene in a folder", found="one in memory")
@@ -178,10 +215,13 @@ def record_of(root: Path, name: str, path: str, scene: Scene, codes: Codes) -> R
         codes=len(codes.units),
         gaussians=len(scene.gaussians),
         views=len(scene.views),
+        contents="" if contents is None else contents.content(),
     )
 
 
-def write_entry(root: Path, record: Record, codes: Codes, picture: Image.Image | None) -> None:
+def write_entry(
+    root: Path, record: Record, codes: Codes, contents: Contents | None, picture: Image.Image | None
+) -> None:
     """Write or replace the entry of a scene; the record comes last.
 
     Raises:
@@ -189,6 +229,8 @@ def write_entry(root: Path, record: Record, codes: Codes, picture: Image.Image |
     """
     stage = root / "scenes"
     copy = json.dumps(dataclasses.asdict(record))
+    if contents is not None:
+        write_tensors(stage / record.contents_file, contents.tensors(), {})
     write_tensors(stage / record.codes_file, codes.tensors(), {"record": copy})
     if picture is not None:
         with atomic_path(stage / f"{record.name}.jpg") as temporary:
@@ -226,8 +268,12 @@ def checked_record(content: Any, path: Path) -> Record:
         values: dict[str, Any] = {
             field.name: (int if field.type == "int" else str)(content[field.name])
             for field in dataclasses.fields(Record)
+            if field.name in content or field.default is dataclasses.MISSING
         }
-        sound = values["name"] == path.name.split(".")[0] and re.fullmatch(r"[0-9a-f]+", values["content"])
+        hashes = values["content"], values.get("contents") or "0"
+        sound = values["name"] == path.name.split(".")[0] and all(
+            re.fullmatch("[0-9a-f]+", h) for h in hashes
+        )
         if sound and re.fullmatch(r"[\w-]*", values["encoder"]) and values["codes"] > 0:
             return Record(**values)
         found = "other values"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import re
 import uuid
 from collections.abc import Iterator
@@ -21,9 +22,11 @@ from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, LibraryError
 from lexsplat.runtime.files import locked, read_json, write_json
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import (
     BUNDLED,
     Codes,
+    OwnTexts,
     Record,
     map_codes,
     picture_of,
@@ -43,16 +46,8 @@ COMPARED = (*everyday_words(), *CANONICAL_PHRASES)
 """Texts that every question is compared with."""
 _OPEN_SCENES = 16
 """Scenes that stay open, at most."""
-
-
-class _OwnTexts:
-    """The texts of a scene as a text tower: what its folder has cached needs no model."""
-
-    def __init__(self, scene: Scene, content_hash: str) -> None:
-        self.scene, self.content_hash = scene, content_hash
-
-    def encode_text(self, prompts: Any) -> Tensor:
-        return self.scene.encode_text(list(prompts))
+_KEPT_CONTENTS = 512
+"""Scenes whose segments and objects stay mapped, at most."""
 
 
 class Library:
@@ -76,6 +71,7 @@ class Library:
         self._records: dict[str, tuple[tuple[int, int], Record]] = {}
         self._codes: dict[str, tuple[str, Codes]] = {}
         self._scenes: Bounded[tuple[str, str, str], Scene] = Bounded(_OPEN_SCENES)
+        self._contents: Bounded[str, Contents] = Bounded(_KEPT_CONTENTS)
         self.damaged: dict[str, FileFormatError] = {}
         """Scenes whose record or codes cannot be read, by name."""
 
@@ -131,17 +127,20 @@ class Library:
 
     def names(self) -> list[str]:
         """The names of all scenes, in order, whether their records can be read or not."""
-        return sorted(path.stem for path in self.stage.glob("*.json") if not path.name.startswith("."))
+        listed = os.listdir(self.stage) if self.stage.is_dir() else []
+        return sorted(file[:-5] for file in listed if file.endswith(".json") and file[0] != ".")
 
     def record(self, name: str) -> Record | None:
         """The record of a scene; None if it cannot be read (`damaged`)."""
-        path = self.stage / f"{name}.json"
+        return self._record(name, self.stage / f"{name}.json")
+
+    def _record(self, name: str, path: Path | os.DirEntry[str]) -> Record | None:
         try:
             facts = path.stat()
             stamp = (facts.st_mtime_ns, facts.st_size)
             known = self._records.get(name)
             if known is None or known[0] != stamp:
-                known = self._records[name] = (stamp, read_record(path))
+                known = self._records[name] = (stamp, read_record(Path(path)))
             self.damaged.pop(name, None)
             return known[1]
         except FileNotFoundError:  # removed in the meantime
@@ -152,7 +151,12 @@ class Library:
 
     def records(self) -> list[Record]:
         """The records of all scenes that can be read."""
-        return [record for name in self.names() if (record := self.record(name)) is not None]
+        if not self.stage.is_dir():
+            return []
+        with os.scandir(self.stage) as listed:
+            entries = [each for each in listed if each.name.endswith(".json") and each.name[0] != "."]
+        records = (self._record(each.name[:-5], each) for each in sorted(entries, key=lambda each: each.name))
+        return [record for record in records if record is not None]
 
     def codes(self, record: Record) -> Codes | None:
         """The codes of a scene, checked when they are first read; None if they are damaged (`damaged`)."""
@@ -168,6 +172,15 @@ class Library:
                 return None
             self._codes[record.name] = known
         return known[1]
+
+    def contents(self, record: Record) -> Contents:
+        """What is kept of the segments and objects of a scene, checked when it is first read.
+
+        Raises:
+            FileFormatError: If it is missing or damaged.
+        """
+        path = self.stage / record.contents_file
+        return self._contents.get_or_make(str(path), lambda: map_contents(path, record.contents))
 
     def scene(self, name: str) -> Scene:
         """A scene, as it is now.
@@ -258,7 +271,7 @@ class Library:
     def _sweep(self) -> None:
         """Remove codes and pictures that no record names."""
         names = set(self.names())
-        kept = {record.codes_file for record in self.records()}
+        kept = {file for record in self.records() for file in record.files}
         for path in [*self.stage.glob("*.safetensors"), *self.stage.glob("*.jpg")]:
             name = path.name.split(".")[0]
             damaged = name in self.damaged  # its codes hold the only copy of the record
@@ -290,13 +303,13 @@ class Library:
         before = self.record(name)
         scene.embed(COMPARED)  # in one call, so that the cache of the scene is written once
         known = scene.encoder_identity().get("encoder_hash")
-        codes = Codes.of(scene)
-        record = record_of(self.root, name, place, scene, codes)
-        write_entry(self.root, record, codes, picture_of(scene))
+        codes, contents = Codes.of(scene), Contents.of(scene)
+        record = record_of(self.root, name, place, scene, codes, contents)
+        write_entry(self.root, record, codes, contents, picture_of(scene))
         if known:  # what the scene has in its cache, all of its scenes have
-            self._texts.encode(known, COMPARED, lambda: _OwnTexts(scene, known))
-        if before is not None and before.codes_file != record.codes_file:
-            (self.stage / before.codes_file).unlink(missing_ok=True)
+            self._texts.encode(known, COMPARED, lambda: OwnTexts(scene, known))
+        for file in before.files - record.files if before is not None else ():
+            (self.stage / file).unlink(missing_ok=True)
         if self.server:
             self.server.put(record, codes, self.stage)
         return record
@@ -351,18 +364,19 @@ class Library:
 
     # -- asking it
 
-    def search(self, phrase: str, limit: int = 10) -> Found:
+    def search(self, phrase: str, limit: int = 10, *, confirm: bool = False) -> Found:
         """The scenes that hold what a phrase names, with its places in them.
 
         Args:
             phrase: What to look for; with relations as in `Scene.find`.
             limit: Number of scenes, at most.
+            confirm: Ask the scenes themselves also where the index can tell.
 
         Raises:
             QueryError: If the phrase is empty.
             LibraryError: If the server cannot answer.
         """
-        return search(self, phrase, limit)
+        return search(self, phrase, limit, confirm)
 
     # -- mending it
 
@@ -398,6 +412,12 @@ class Library:
             record = self.record(name)
             if record is None or self.codes(record) is None:
                 found[name] = str(self.damaged[name])
+                continue
+            try:
+                if record.contents:
+                    map_contents(self.stage / record.contents_file, record.contents)
+            except FileFormatError as error:
+                found[name] = str(error)
                 continue
             try:
                 if state_of(SceneFolder.open(record.folder(self.root))) != record.state:

@@ -1,4 +1,4 @@
-"""The two stages of a search in a library: bounds from codes, then answers of the scenes themselves."""
+"""The two stages of a search in a library: bounds from codes, then answers from the index or of the scenes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
+from torch import Tensor
 
+from lexsplat.geometry.world import World
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_of_kind
-from lexsplat.queries.phrases import Phrase, things_of
+from lexsplat.queries.phrases import Phrase, Thing, things_of
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import PRESENCES, Presence
 from lexsplat.queries.spelling import corrected
@@ -21,9 +23,12 @@ from lexsplat.rendering import render
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import file_name, find_phrase
+from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.bounds import CERTAIN, SURELY_NOT, phrase_bound, presence_bounds
-from lexsplat.scenes.library.entries import Record
+from lexsplat.scenes.library.entries import Record, state_of
+from lexsplat.scenes.library.indexed import Indexed, answer_from, decidable, with_world
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.serving import sentence
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
@@ -32,8 +37,8 @@ _COVERED = 0.3
 """A pixel shows a thing if the thing covers this share of it."""
 PROPOSED = 1000
 """Codes that a server proposes for each text."""
-_OPENED = 4
-"""Scenes that are opened for each one that is asked for, at most."""
+_ASKED = 4
+"""Scenes that are looked at for each one that is wanted, at most."""
 
 
 @dataclass(frozen=True)
@@ -44,15 +49,43 @@ class Hit:
         scene: Its name in the library.
         path: Its folder.
         bound: Upper bound of the strength of presence, from its codes.
-        answer: The answer of the scene, as of `lexsplat.scenes.answers.find_phrase`.
-        opened: The scene.
+        answer: The answer, as of `lexsplat.scenes.answers.find_phrase`.
+        clip: Name of its encoder.
+        world: Its up direction and scale.
+        library: The library.
+        indexed: The answer from the index; None if the scene itself was asked.
     """
 
     scene: str
     path: str
     bound: float
     answer: dict[str, Any]
-    opened: Scene = field(repr=False)
+    clip: str
+    world: World
+    library: Library = field(repr=False)
+    indexed: Indexed | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        return f"{self.scene}: present: {self.present}. {self.sentence}{self._sizes()}"
+
+    def _sizes(self) -> str:
+        scale, unit = (
+            (self.world.meters_per_unit or 1.0),
+            "m" if self.world.meters_per_unit else "scene units",
+        )
+        sizes = [each["size"] for each in self.answer["instances"][:8]]
+        told = "; ".join(" x ".join(f"{side * scale:.2f}" for side in size) for size in sizes)
+        return f" Size: {told} {unit}." if told else ""
+
+    @property
+    def opened(self) -> Scene:
+        """The scene; opened where that was not necessary for the answer."""
+        return self.library.scene(self.scene)
+
+    @property
+    def source(self) -> str:
+        """What answered: "index" or "scene"."""
+        return "index" if self.indexed else "scene"
 
     @property
     def present(self) -> Presence:
@@ -64,15 +97,28 @@ class Hit:
         """Number of things found."""
         return self.answer["count"]
 
+    @property
+    def sentence(self) -> str:
+        """The answer in one plain sentence."""
+        return sentence(self.answer, self.world.meters_per_unit)
+
     def picture(self, side: int = 320) -> Image.Image:
-        """The view that shows the first thing best, with a frame around it; the longer side in pixels."""
-        things = self.opened.find(self.answer["phrase"]).instances
-        name = things[0].best_view if things else next(iter(self.opened.views))
-        camera = self.opened.camera(name)
+        """The view that shows the first thing best, with a frame around it; the longer side in pixels.
+
+        From the index, it is the best of the eight views that the library keeps, of at most 320 pixels.
+        """
+        kept = self.indexed.picture(side) if self.indexed else None
+        return self._rendered(side) if kept is None else kept
+
+    def _rendered(self, side: int) -> Image.Image:
+        scene = self.opened
+        things = scene.find(self.answer["phrase"]).instances
+        name = things[0].best_view if things else next(iter(scene.views))
+        camera = scene.camera(name)
         camera = camera.downscaled(max(1.0, max(camera.width, camera.height) / side))
         carried = things[0].mask[:, None].float() if things else None
         with torch.no_grad():
-            shown = render(self.opened.gaussians, camera, features=carried)
+            shown = render(scene.gaussians, camera, features=carried)
         image = Image.fromarray((shown.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
         if shown.features is not None and bool((seen := shown.features[..., 0] > _COVERED).any()):
             ys, xs = (each.cpu().numpy() for each in seen.nonzero(as_tuple=True))
@@ -95,9 +141,10 @@ class Hit:
         return {
             "scene": self.scene,
             "path": self.path,
-            "encoder": self.opened.clip,
+            "encoder": self.clip,
             "bound": round(self.bound, 4),
-            **self.opened.world.to_json(),
+            "source": self.source,
+            **self.world.to_json(),
             **answer,
         }
 
@@ -112,9 +159,8 @@ class Found:
         hits: The scenes that hold it: "yes" before "unsure", then by their bounds.
         scenes: Number of scenes in the library.
         opened: Number of scenes that were asked themselves.
-        unopened: Number of scenes that may hold it as well and were not opened.
+        unopened: Number of scenes that may hold it as well and were not looked at.
         skipped: Scenes that could not be asked, and why.
-        notes: Other things to know.
     """
 
     phrase: str
@@ -124,6 +170,28 @@ class Found:
     opened: int
     unopened: int
     skipped: dict[str, str]
+
+    def __repr__(self) -> str:
+        more = f"; {self.unopened} more may hold it" if self.unopened else ""
+        head = f"{self.phrase}: in {len(self.hits)} of {self.scenes} scenes{more}"
+        told = [f"  {number}. {hit}" for number, hit in enumerate(self.hits, start=1)]
+        return "\n".join([head, *told, *(f"  skipped: {problem}" for problem in self.skipped.values())])
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row for each thing, as for a table: `pandas.DataFrame(found.rows())`."""
+        return [
+            {
+                "phrase": self.phrase,
+                "scene": hit.scene,
+                "present": hit.present,
+                "count": hit.count,
+                **dict(zip(("x", "y", "z"), thing["center"])),
+                **dict(zip(("width", "depth", "height"), thing["size"])),
+                "view": thing["best_view"],
+            }
+            for hit in self.hits
+            for thing in hit.answer["instances"]
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -138,33 +206,78 @@ class Found:
         }
 
 
-def search(library: Library, phrase: str, limit: int) -> Found:
+def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
     """The scenes of a library that hold what a phrase names (`Library.search`)."""
     if limit < 1:
         raise QueryError("limit", expected="at least 1", found=str(limit))
-    text = check_prompts(phrase)[0]
-    understood = understand(text).phrase
+    asking = _Asking(library, check_prompts(phrase)[0], confirm)
+    understood = understand(asking.text).phrase
     skipped: dict[str, str] = {}
     ranked = candidates(library, understood, skipped)
     hits: list[Hit] = []
-    opened = 0
+    asked = opened = 0
     for name, bound in ranked:
-        if opened == _OPENED * limit or sum(hit.present == "yes" for hit in hits) == limit:
+        if asked == _ASKED * limit or sum(hit.present == "yes" for hit in hits) == limit:
             break
-        opened += 1
+        asked += 1
         try:
-            scene = library.scene(name)
-            answer = find_phrase(scene, text)
+            hit = asking.hit(name, bound)
         except LexsplatError as error:
             skipped[name] = str(error)
+            opened += 1
             continue
-        if answer["present"] != "no":
-            hits.append(Hit(name, str(scene.folder.root) if scene.folder else "", bound, answer, scene))
+        opened += hit.source == "scene"
+        if hit.present != "no":
+            hits.append(hit)
     hits.sort(key=lambda hit: (-PRESENCES.index(hit.present), -hit.bound, hit.scene))
     names = library.names()
     skipped.update({name: str(error) for name, error in library.damaged.items() if name in names})
-    unopened = len(ranked) - opened
-    return Found(text, str(understood), tuple(hits[:limit]), len(names), opened, unopened, skipped)
+    unopened = len(ranked) - asked
+    return Found(asking.text, str(understood), tuple(hits[:limit]), len(names), opened, unopened, skipped)
+
+
+class _Asking:
+    """One question to many scenes: what is the same for all of them is worked out once.
+
+    Args:
+        library: The library.
+        text: The phrase.
+        confirm: Whether the scenes themselves are asked in any case.
+    """
+
+    def __init__(self, library: Library, text: str, confirm: bool) -> None:
+        self.library, self.text, self.confirm = library, text, confirm
+        self._things: dict[str, Thing | None] = {}
+        self._texts: dict[str, Tensor] = {}
+
+    def hit(self, name: str, bound: float) -> Hit:
+        """The answer of a scene, also if it is "no".
+
+        Raises:
+            LexsplatError: If it cannot be asked.
+        """
+        record = self.library.record(name)
+        if record is not None and record.contents and not self.confirm:
+            folder = SceneFolder.open(record.folder(self.library.root))
+            found = self._indexed(record) if state_of(folder) == record.state else None
+            if found is not None:
+                found, world = with_world(found, folder.record.get("world"))
+                path = str(folder.root)
+                return Hit(name, path, bound, found.answer, record.clip, world, self.library, found)
+        scene = self.library.scene(name)
+        answer, path = find_phrase(scene, self.text), str(scene.folder.root) if scene.folder else ""
+        return Hit(name, path, bound, answer, scene.clip, scene.world, self.library)
+
+    def _indexed(self, record: Record) -> Indexed | None:
+        if record.clip not in self._things:
+            self._things[record.clip] = decidable(self.text, record.clip)
+        thing, codes = self._things[record.clip], self.library.codes(record)
+        if thing is None or codes is None:
+            return None
+        if record.group not in self._texts:
+            self._texts[record.group] = self.library.embed(record.encoder, record.clip, [thing.text])[0]
+        contents = self.library.contents(record)
+        return answer_from(contents, codes.units, thing, self.text, self._texts[record.group].cpu())
 
 
 def candidates(library: Library, phrase: Phrase, skipped: dict[str, str]) -> list[tuple[str, float]]:

@@ -1,0 +1,324 @@
+"""What a library keeps of a scene with segments, so that most questions are answered without opening it.
+
+Language, places and pictures are kept by segment, not by Gaussian: a phrase takes or leaves whole segments
+(`lexsplat.queries.segments`), and `lexsplat.scenes.library.indexed` finds out which from what is here. Segments are
+those of the lowest level that has at most `_MOST`. Everything is in one file of tensors, named after its hash.
+
+Dimension letters: L levels, S segments of the lowest kept level, K codes, D dimensions, V objects, M sampled points,
+E links between segments, W pictures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.language.segment_codes import segment_codes
+from lexsplat.language.segments import Segments
+from lexsplat.rendering import render
+from lexsplat.runtime.device import one_thread
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.fingerprints import digest
+from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.scene import Scene
+
+_MOST = 2048
+"""Segments of the lowest kept level, at most, unless the coarsest level has more."""
+_POINTS, _ALL_POINTS = 16, 12_000
+"""Points of a segment that are kept, at most, unless fewer than the latter would be: they give boxes and frames."""
+_PICTURES = 8
+"""Pictures of a scene, at most: one bit of a byte tells whether a picture shows a point."""
+_SIDE, _QUALITY = 320, 70
+"""Longer side of a picture in pixels, and quality of its JPEG."""
+_BEHIND = 0.05
+"""A picture shows a point that lies at most this share of its distance behind what is drawn there."""
+_NEIGHBORS = 8
+_FAINT = 0.1
+"""Gaussians of lower opacity link nothing, as in `lexsplat.queries.selection`."""
+
+Array = NDArray[Any]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Contents:
+    """The segments, objects and pictures of a scene.
+
+    Args:
+        levels: Segment at each level of each segment ``[L, S]`` int32, the lowest level first.
+        masses: What the training views show of each segment ``[S]``.
+        rows: First entry of each segment in the two next tensors ``[S + 1]`` int32.
+        columns: Codes that occur in each segment, int16.
+        shares: Their shares, float16.
+        places: Mean distributions over the codes of the objects ``[V, K]`` float16, where presence is judged.
+        mean: Mean of the everyday words ``[D]``.
+        best: The best height of an everyday word at each code ``[K]``.
+        best_colored: The same with the scene's objects in any color ``[K]``.
+        peak: How high the scene's own things reach ``[1]``.
+        counts: Number of visible Gaussians of each segment ``[S]`` int32.
+        opacities: Their total opacity ``[S]``.
+        spacings: Median distance of a Gaussian of the segment to its sixth neighbor ``[S]``, world units.
+        links: Segments that are neighbors ``[E, 2]`` int32.
+        gaps: Smallest distance between Gaussians of the two ``[E]``, world units.
+        centers: Mean of the points of each segment ``[S, 3]``, world units.
+        starts: First point of each segment ``[S + 1]`` int32.
+        offsets: Points relative to these centers ``[M, 3]`` float16.
+        weights: Their opacities ``[M]`` float16.
+        seen: Which pictures show each point ``[M]`` uint8, one bit for each picture.
+        sizes: Width and height of the pictures in pixels ``[W, 2]`` int32.
+        intrinsics: Of the pictures, in pixels ``[W, 3, 3]``.
+        poses: World to camera ``[W, 4, 4]``.
+        ends: Where the files of the pictures end ``[W]`` int32.
+        pictures: The files, JPEG, one after the other, uint8.
+        facts: Names of the pictures ("views"), up direction ("world"), and the objects with name, place and size.
+    """
+
+    levels: Tensor
+    masses: Tensor
+    rows: Tensor
+    columns: Tensor
+    shares: Tensor
+    places: Tensor
+    mean: Tensor
+    best: Tensor
+    best_colored: Tensor
+    peak: Tensor
+    counts: Tensor
+    opacities: Tensor
+    spacings: Tensor
+    links: Tensor
+    gaps: Tensor
+    centers: Tensor
+    starts: Tensor
+    offsets: Tensor
+    weights: Tensor
+    seen: Tensor
+    sizes: Tensor
+    intrinsics: Tensor
+    poses: Tensor
+    ends: Tensor
+    pictures: Tensor
+    facts: Mapping[str, Any]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name; the facts as bytes of JSON."""
+        names = [field.name for field in dataclasses.fields(self) if field.name != "facts"]
+        text = json.dumps(self.facts, ensure_ascii=False, sort_keys=True).encode("utf-8")
+        return {**{name: getattr(self, name) for name in names}, "facts": _bytes(text)}
+
+    def content(self) -> str:
+        """A hash of all values."""
+        return _content(self.tensors())
+
+    def camera(self, number: int) -> Camera:
+        """The camera of a picture."""
+        width, height = self.sizes[number].tolist()
+        return Camera(width, height, self.intrinsics[number].numpy(), self.poses[number].numpy())
+
+    def picture(self, number: int) -> Image.Image:
+        """A picture of the scene."""
+        start = int(self.ends[number - 1]) if number else 0
+        file = self.pictures[start : int(self.ends[number])].numpy().tobytes()
+        return Image.open(io.BytesIO(file)).convert("RGB")
+
+    @classmethod
+    @torch.no_grad()
+    @one_thread()
+    def of(cls, scene: Scene) -> Contents | None:
+        """What is kept of a scene; None if it has no segments.
+
+        Raises:
+            ModelError: If the everyday words are new to its folder and its encoder cannot be loaded.
+        """
+        if scene.field.segments is None or scene.presence_classifier.segment_codes is None:
+            return None
+        segments = _kept_levels(scene.field.segments)
+        points = _points(scene, segments)
+        pictures = _pictures(scene, points.pop("means"))
+        return cls(
+            **_language(scene, segments),
+            **_neighbors(scene, segments),
+            **points,
+            **{name: value for name, value in pictures.items() if name != "views"},
+            facts={
+                "views": pictures["views"],
+                "world": scene.world.to_json(),
+                "objects": [each.geometry() for each in scene.objects],
+            },
+        )
+
+
+def map_contents(path: Path, content: str) -> Contents:
+    """The contents in a file.
+
+    Raises:
+        FileFormatError: If it is missing, or its content is another one.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if _content(tensors) == content:
+            facts = json.loads(tensors.pop("facts").numpy().tobytes())
+            return Contents(**tensors, facts=facts)
+        found = "damaged content (the hash differs)"
+    except OSError as error:
+        found = str(error.strerror)
+    except (SafetensorError, TypeError, KeyError, ValueError) as error:
+        found = str(error)[:80]
+    raise FileFormatError(
+        path,
+        expected="the objects that were written",
+        found=found,
+        remedy=f"lexsplat library verify {path.parents[1]} --repair",
+    )
+
+
+def _content(tensors: Mapping[str, Tensor]) -> str:
+    return digest(bytes(tensors[name].contiguous().numpy().data) for name in sorted(tensors))
+
+
+def _bytes(content: bytes) -> Tensor:
+    return torch.from_numpy(np.frombuffer(content, np.uint8).copy())
+
+
+def _kept_levels(segments: Segments) -> Segments:
+    """The segments from the lowest level with at most `_MOST` upward."""
+    levels = segments.levels.cpu()
+    counts = [int(level.max()) + 1 for level in levels]
+    lowest = next((number for number, count in enumerate(counts) if count <= _MOST), len(counts) - 1)
+    base = levels[lowest]
+    kept = torch.zeros(len(levels) - lowest, counts[lowest], dtype=levels.dtype)
+    kept[:, base] = levels[lowest:]
+    return Segments(base[segments.labels.cpu()], segments.masses.cpu(), kept)
+
+
+def _language(scene: Scene, segments: Segments) -> dict[str, Tensor]:
+    """The language of segments and objects, and the scale of the scene."""
+    codes = segment_codes(segments, lambda index: scene.field.select(index).code_probabilities().cpu())
+    lowest = codes.distributions[torch.from_numpy(codes.numbers[0])].half()
+    rows, columns = lowest.nonzero(as_tuple=True)
+    tables, scale = scene.presence_classifier.tables, scene.everyday_scale
+    return {
+        "levels": segments.levels.int(),
+        "masses": torch.from_numpy(codes.masses[codes.numbers[0]]).float(),
+        "rows": torch.searchsorted(rows.contiguous(), torch.arange(len(lowest) + 1)).int(),
+        "columns": columns.short(),
+        "shares": lowest[rows, columns],
+        "places": tables["places"].cpu().half(),
+        "mean": scale.mean.cpu(),
+        "best": scale.best.cpu(),
+        "best_colored": tables["best_colored"].cpu().float().clone(),  # may be `best` itself
+        "peak": torch.tensor([scale.peak]),
+    }
+
+
+def _neighbors(scene: Scene, segments: Segments) -> dict[str, Tensor]:
+    """Sizes of the segments and distances between them."""
+    count, labels = segments.levels.shape[1], segments.labels.numpy()
+    opacities = scene.gaussians.opacities.detach().cpu().double().numpy()
+    seen = ~scene.hidden.cpu().numpy()
+    firm = np.flatnonzero(opacities >= _FAINT)  # hidden Gaussians link a lamp and its foot
+    means, of = scene.gaussians.means.detach().cpu().double().numpy()[firm], labels[firm]
+    spacings, pairs, gaps = np.zeros(count), np.zeros((0, 2), np.int64), np.zeros(0)
+    if len(firm) > 1:
+        neighbors = min(_NEIGHBORS + 1, len(firm))
+        apart, near = cKDTree(means).query(means, k=neighbors)
+        spacings = _medians(of, apart[:, min(6, neighbors - 1)], count)
+        first, second = np.repeat(of, neighbors), of[near.ravel()]
+        between = first != second
+        keys = np.minimum(first, second) * count + np.maximum(first, second)
+        order = np.lexsort((apart.ravel()[between], keys[between]))
+        found, places = np.unique(keys[between][order], return_index=True)
+        pairs, gaps = np.stack([found // count, found % count], 1), apart.ravel()[between][order][places]
+    return {
+        "counts": torch.from_numpy(np.bincount(labels[seen], minlength=count)).int(),
+        "opacities": torch.from_numpy(np.bincount(labels, opacities, count)).float(),
+        "spacings": torch.from_numpy(spacings).float(),
+        "links": torch.from_numpy(pairs).int(),
+        "gaps": torch.from_numpy(gaps).float(),
+    }
+
+
+def _medians(places: Array, values: Array, count: int) -> Array:
+    """The median of the values at each of ``count`` places; 0 where there are none."""
+    order = np.lexsort((values, places))
+    numbers = np.bincount(places, minlength=count)
+    middle = np.minimum(np.cumsum(numbers) - numbers + numbers // 2, len(values) - 1)
+    return np.where(numbers > 0, values[order][middle], 0.0)
+
+
+def _points(scene: Scene, segments: Segments) -> dict[str, Tensor]:
+    """A sample of the visible Gaussians of each segment, and under "means" their positions."""
+    labels, count = segments.labels.numpy(), segments.levels.shape[1]
+    seen = np.flatnonzero(~scene.hidden.cpu().numpy())
+    order = seen[np.argsort(labels[seen], kind="stable")]
+    numbers = np.bincount(labels[order], minlength=count)
+    first = np.cumsum(numbers) - numbers
+    rank = np.arange(len(order)) - first[labels[order]]
+    step = -(-numbers // max(_POINTS, _ALL_POINTS // count))[
+        labels[order]
+    ]  # every second or third of them, and so on
+    chosen = order[rank % np.maximum(step, 1) == 0]
+    means = scene.gaussians.means.detach().cpu()[torch.from_numpy(chosen)]
+    of = labels[chosen]
+    kept = np.bincount(of, minlength=count)
+    sums = np.stack([np.bincount(of, means[:, axis].double().numpy(), count) for axis in range(3)], 1)
+    centers = torch.from_numpy(sums / np.maximum(kept, 1)[:, None]).float()
+    return {
+        "centers": centers,
+        "starts": torch.from_numpy(np.concatenate([[0], np.cumsum(kept)])).int(),
+        "offsets": (means - centers[torch.from_numpy(of)]).half(),
+        "weights": scene.gaussians.opacities.detach().cpu()[torch.from_numpy(chosen)].half(),
+        "means": means,
+    }
+
+
+def _pictures(scene: Scene, means: Tensor) -> dict[str, Any]:
+    """Pictures of the scene and which of the points ``[M, 3]`` they show."""
+    names, files, cameras = evenly(list(scene.views), _PICTURES), [], []
+    seen = np.zeros(len(means), np.uint8)
+    for number, name in enumerate(names):
+        camera = scene.camera(name)
+        camera = camera.downscaled(max(1.0, max(camera.width, camera.height) / _SIDE))
+        drawn = render(scene.gaussians, camera, depth=True)
+        pixels = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        file = io.BytesIO()
+        Image.fromarray(pixels).save(file, format="JPEG", quality=_QUALITY)
+        files.append(file.getvalue())
+        cameras.append(camera)
+        if drawn.depth is not None:
+            depth = drawn.depth.cpu().numpy()
+            x, y, z, inside = projected(camera, means.double().numpy())
+            at = depth[y[inside].astype(int), x[inside].astype(int)]
+            seen[np.flatnonzero(inside)[z[inside] <= at * (1 + _BEHIND)]] |= np.uint8(1 << number)
+    return {
+        "views": list(names),
+        "seen": torch.from_numpy(seen),
+        "sizes": torch.tensor([[c.width, c.height] for c in cameras], dtype=torch.int32).reshape(-1, 2),
+        "intrinsics": torch.from_numpy(np.array([c.K for c in cameras]).reshape(-1, 3, 3)).float(),
+        "poses": torch.from_numpy(np.array([c.viewmat for c in cameras]).reshape(-1, 4, 4)).float(),
+        "ends": torch.from_numpy(np.cumsum([len(file) for file in files], dtype=np.int64)).int(),
+        "pictures": _bytes(b"".join(files)),
+    }
+
+
+def projected(camera: Camera, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Pixels x and y and depths of points ``[M, 3]``, and whether they are in the image, ``[M]`` each."""
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    depth = np.maximum(local[:, 2], 1e-6)
+    x, y = (local @ camera.K.T)[:, :2].T / depth
+    inside = (local[:, 2] > 1e-3) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    return x, y, depth, inside

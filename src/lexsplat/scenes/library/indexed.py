@@ -1,0 +1,320 @@
+"""Answers from what a library keeps of a scene, without opening it.
+
+A phrase takes whole segments, and which ones follows from the language of the segments (`lexsplat.queries.segments`),
+so presence and selection are computed as in the scene, by the same functions. Instances, boxes and views come from
+links between segments and from sampled points. What needs more, such as relations of things, is left to the scene.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from lexsplat.geometry.boxes import fit_box
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
+from lexsplat.geometry.world import World
+from lexsplat.language.segment_codes import SegmentCodes, segment_codes
+from lexsplat.language.segments import Segments
+from lexsplat.queries.everyday import EverydayScale
+from lexsplat.queries.grammar import understand
+from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.phrases import Thing
+from lexsplat.queries.presence import PresenceClassifier
+from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
+from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.spelling import corrected
+from lexsplat.queries.vocabulary import NAMES, QUALITIES, STUFF, default_vocabulary
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.scenes.library.contents import Contents, projected
+
+_LINK = 2.5
+"""Largest distance between linked Gaussians, in distances to the sixth neighbor (`lexsplat.queries.selection`)."""
+_SMALLEST_SHARE = 0.1
+_PEAK_COUNT = 20
+_LARGE = 0.05
+"""Phrases without an everyday name that select this share of a scene are left to it."""
+_BOXED = 400
+"""Points that a box is fitted to, at most."""
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Indexed:
+    """An answer from the index.
+
+    Args:
+        answer: As of `lexsplat.scenes.answers.find_phrase`.
+        contents: What it was made from.
+        view: Number of the picture that shows the first thing best; -1 if none does.
+        frame: Left, upper, right and lower pixel of that thing in it.
+    """
+
+    answer: dict[str, Any]
+    contents: Contents
+    view: int = -1
+    frame: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+    def picture(self, side: int) -> Image.Image | None:
+        """The picture with the frame; None if the library has none of this thing."""
+        if self.view < 0:
+            return None
+        image = self.contents.picture(self.view)
+        ImageDraw.Draw(image).rectangle(list(self.frame), outline="red", width=2)
+        image.thumbnail((side, side))
+        return image
+
+
+class _KeptPresence(PresenceClassifier):
+    """`PresenceClassifier` with the places that were found when the scene was added."""
+
+    def __init__(self, contents: Contents, codes: Tensor) -> None:
+        self._contents = contents
+        scale = EverydayScale(contents.mean, contents.best, float(contents.peak))
+        kept = _KeptField(contents, codes)
+        super().__init__(_one_gaussian(), kept, scale, self._none)  # type: ignore[arg-type]
+
+    @staticmethod
+    def _none(_: Any) -> Tensor:
+        raise ValueError("the places of the scene are kept")
+
+    @property
+    def segment_codes(self) -> SegmentCodes | None:  # type: ignore[override]
+        return _KeptCodes(self._contents)  # type: ignore[return-value]
+
+    @property
+    def _objects(self) -> tuple[Tensor, tuple[str, ...]]:  # type: ignore[override]
+        return self._contents.places.float(), ()
+
+    @property
+    def _best_colored(self) -> Tensor:  # type: ignore[override]
+        return self._contents.best_colored
+
+
+class _KeptCodes:
+    """The language of the segments of all levels, made where a phrase names a part of a thing."""
+
+    def __init__(self, contents: Contents) -> None:
+        self._contents = contents
+
+    @property
+    def distributions(self) -> Tensor:
+        spread = torch.from_numpy(_spread(self._contents).toarray())
+        return segment_codes(_segments(self._contents), lambda index: spread[index]).distributions
+
+
+class _KeptCodebook:
+    def __init__(self, clip: Tensor) -> None:
+        self.clip, self.num_codes = clip, len(clip)
+
+
+class _KeptField:
+    """The language of the segments, as far as presence reads it."""
+
+    def __init__(self, contents: Contents, codes: Tensor) -> None:
+        self.codebook, self.segments = _KeptCodebook(codes.float()), _segments(contents)
+
+
+@functools.cache
+def _one_gaussian() -> Gaussians:
+    """What stands for geometry where rules read none."""
+    return gaussians_from_points(np.zeros((1, 3)), np.zeros((1, 3)), sh_degree=0, opacity=0.5)
+
+
+def _segments(contents: Contents) -> Segments:
+    return Segments(torch.arange(len(contents.masses)), contents.masses, contents.levels.long())
+
+
+def _spread(contents: Contents) -> csr_array:
+    """Distributions of the segments over the codes ``[S, K]``."""
+    shares, columns = contents.shares.float().numpy(), contents.columns.numpy()
+    shape = (len(contents.masses), len(contents.best))
+    return csr_array((shares, columns, contents.rows.numpy()), shape=shape)
+
+
+def decidable(phrase: str, clip: str) -> Thing | None:
+    """The thing that a phrase names, if the index can tell of it; None if scenes must be asked themselves.
+
+    Args:
+        phrase: What is looked for.
+        clip: Name of the encoder.
+    """
+    understood = understand(phrase)
+    thing = understood.phrase
+    if not isinstance(thing, Thing) or understood.note or (clip == "bundled" and not phrase.isascii()):
+        return None
+    if not thing.exact and corrected(thing.text, [*default_vocabulary(clip), *QUALITIES]) != thing.text:
+        return None
+    return thing
+
+
+def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, text: Tensor) -> Indexed | None:
+    """The answer of a scene, from what is kept of it.
+
+    Args:
+        contents: What is kept.
+        codes: Codewords of unit length ``[K, D]``.
+        thing: The thing that is looked for (`decidable`).
+        phrase: The phrase that named it.
+        text: Its unit embedding ``[D]``.
+
+    Returns:
+        The answer; None if the scene itself must be asked.
+    """
+    common = {"phrase": phrase, "understood": str(thing), "note": ""}
+    if not thing.exact and is_kind(thing.text):
+        known = [each for each in contents.facts["objects"] if is_of_kind(each["name"], thing.text)]
+        if known:
+            return _of_objects(contents, known, common)
+    judge, unit, words = _KeptPresence(contents, codes), text[None].float(), thing.text.lower().split()
+    (presence,) = judge.classify([thing.text], unit, torch.zeros(1, 1))
+    if presence == "no":
+        return Indexed({**_answer([], presence), **common}, contents)
+    best = judge.best_heights([thing.text])
+    by_code = judge.scale.relevancy(judge.language.codebook.clip, unit, best)[:, 0].numpy()
+    own = torch.from_numpy(np.clip(_spread(contents) @ by_code, 0, 1))[None]
+    scores, counts = segment_relevancy(own, _segments(contents))[0].numpy(), contents.counts.numpy()
+    taken = np.flatnonzero((scores >= SEGMENT_THRESHOLD) & (counts > 0))
+    large = counts[taken].sum() >= _LARGE * counts.sum() and NAMES.isdisjoint(words)
+    if not len(taken) or (large and words[-1] not in STUFF):
+        return None
+    parts = [taken] if words[-1] in STUFF else _instances(contents, taken, own[0].numpy())
+    found = [_instance(contents, part, scores, thing.text) for part in parts]
+    return Indexed({**_answer([each[0] for each in found], presence), **common}, contents, *found[0][1:])
+
+
+def _answer(instances: list[dict[str, Any]], presence: Presence) -> dict[str, Any]:
+    return {
+        "present": presence,
+        "count": len(instances),
+        "gaussians": sum(each["gaussians"] for each in instances),
+        "threshold": SEGMENT_THRESHOLD,
+        "best_view": instances[0]["best_view"] if instances else "",
+        "instances": instances,
+    }
+
+
+def _of_objects(contents: Contents, known: list[dict[str, Any]], common: Mapping[str, str]) -> Indexed:
+    """The objects of a kind, as they were when the scene was added."""
+    centers = contents.centers.numpy() @ np.array(known[0]["axes"]).T
+    low = np.array(known[0]["axes"]) @ known[0]["center"] - np.array(known[0]["size"]) / 2
+    inside = ((centers >= low) & (centers <= low + known[0]["size"])).all(1) & (contents.counts.numpy() > 0)
+    view, frame = _best_view(contents, np.flatnonzero(inside))
+    return Indexed({**_answer(known, "yes"), **common}, contents, view, frame)
+
+
+def _instances(contents: Contents, taken: Array, own: Array) -> list[Array]:
+    """The instances among taken segments, the largest first, without specks and what does not convince."""
+    sizes, opacities = contents.counts.numpy(), contents.opacities.numpy()
+    order = taken[np.argsort(contents.spacings.numpy()[taken], kind="stable")]
+    half = np.searchsorted(np.cumsum(sizes[order]), sizes[order].sum() / 2)
+    reach = _LINK * float(contents.spacings[int(order[half])])
+    chosen = np.zeros(len(sizes), bool)
+    chosen[taken] = True
+    links = contents.links.numpy()[chosen[contents.links.numpy()].all(1) & (contents.gaps.numpy() <= reach)]
+    edges = (np.ones(len(links)), (links[:, 0], links[:, 1]))
+    _, labels = connected_components(coo_array(edges, shape=(len(sizes),) * 2), directed=False)
+    totals = np.bincount(labels[taken], opacities[taken], labels.max() + 1)
+    ranked = [label for label in np.argsort(-totals, kind="stable") if totals[label] > 0]
+    parts = [
+        taken[labels[taken] == label] for label in ranked if totals[label] >= _SMALLEST_SHARE * totals.max()
+    ]
+    if len(parts) < 2:
+        return parts or [taken]
+    peaks = [_peak(own[part], sizes[part]) for part in parts]
+    nothing = Selection(
+        _one_gaussian(), {}, torch.zeros(1, dtype=torch.bool), torch.zeros(1), SEGMENT_THRESHOLD
+    )
+    limit = nothing.convincing_limit(max(peaks))
+    return [part for part, peak in zip(parts, peaks) if peak >= limit]
+
+
+def _peak(scores: Array, sizes: Array) -> float:
+    """The mean of the highest scores of twenty Gaussians."""
+    order = np.argsort(-scores, kind="stable")
+    before = np.cumsum(sizes[order]) - sizes[order]
+    counted = np.clip(_PEAK_COUNT - before, 0, sizes[order])
+    return float((scores[order] * counted).sum() / max(1, counted.sum()))
+
+
+def _point_rows(contents: Contents, part: Array) -> tuple[Array, Array]:
+    """Rows of the sampled points of segments, and their positions ``[m, 3]``."""
+    starts = contents.starts.numpy()
+    rows = np.concatenate([np.arange(starts[each], starts[each + 1]) for each in part])
+    of = np.repeat(part, starts[part + 1] - starts[part])
+    return rows, contents.centers.numpy()[of].astype(np.float64) + contents.offsets.numpy()[rows]
+
+
+def _instance(
+    contents: Contents, part: Array, scores: Array, name: str
+) -> tuple[dict[str, Any], int, tuple[int, int, int, int]]:
+    """An instance as plain data (`Selection.geometry`), its best picture and its frame there."""
+    rows, points = _point_rows(contents, part)
+    of = np.repeat(part, np.diff(contents.starts.numpy())[part])
+    kept = np.diff(contents.starts.numpy())[of]
+    # A point stands for the Gaussians of its segment that are not kept.
+    weights = contents.weights.numpy()[rows].astype(np.float64) * contents.counts.numpy()[of] / kept
+    up = np.array(contents.facts["world"]["up"]["direction"], np.float64)
+    thin = slice(None, None, -(-len(points) // _BOXED))
+    box, opacities = fit_box(points[thin], up, weights[thin]), contents.opacities.numpy()[part]
+    view, frame = _best_view(contents, part)
+    data = {
+        "name": name,
+        "gaussians": int(contents.counts.numpy()[part].sum()),
+        "score": round(float((scores[part] * opacities).sum() / max(opacities.sum(), 1e-12)), 4),
+        "center": [round(float(v), 5) for v in box.center],
+        "size": [round(float(v), 5) for v in 2 * box.half_sizes],
+        "axes": [[round(float(v), 5) for v in axis] for axis in box.axes],
+        "best_view": contents.facts["views"][view] if view >= 0 else "",
+    }
+    return data, view, frame
+
+
+def _best_view(contents: Contents, part: Array) -> tuple[int, tuple[int, int, int, int]]:
+    """The picture that shows most of segments, and the frame around what it shows; -1 if none does."""
+    if not len(part):
+        return -1, (0, 0, 0, 0)
+    rows, points = _point_rows(contents, part)
+    seen, best = contents.seen.numpy()[rows], (0.0, -1, (0, 0, 0, 0))
+    for number in range(len(contents.ends)):
+        here = (seen >> number & 1).astype(bool)
+        if not here.any():
+            continue
+        camera = contents.camera(number)
+        x, y, depth, inside = projected(camera, points[here])
+        shown = float((camera.K[0, 0] / depth[inside] ** 2).sum()) if inside.any() else 0.0
+        if shown > best[0]:
+            x, y = x[inside], y[inside]
+            edges = (x.min() - 2, y.min() - 2, x.max() + 2, y.max() + 2)
+            frame = tuple(round(float(edge)) for edge in edges)
+            best = (shown, number, frame)  # type: ignore[assignment]
+    return best[1], best[2]
+
+
+def with_world(indexed: Indexed, stored: Any) -> tuple[Indexed, World]:
+    """The answer in meters where the scene's scale has been set since it was added, and its world.
+
+    Args:
+        indexed: The answer.
+        stored: The entry "world" of its ``scene.json``, if it has one.
+    """
+    world = World.from_json(indexed.contents.facts["world"])
+    if isinstance(stored, Mapping):
+        with contextlib.suppress(SceneFolderError):
+            world = World.from_json(stored)
+    if world.meters_per_unit is None:
+        return indexed, world
+    for each in indexed.answer["instances"]:
+        each["size_meters"] = [round(v * world.meters_per_unit, 5) for v in each["size"]]
+    return indexed, world
