@@ -13,7 +13,6 @@ import json
 import logging
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -22,11 +21,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
-from lexsplat.geometry.gaussians import TENSORS, Gaussians
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, read_content
+from lexsplat.scenes.formats.foreign import as_tensor, joined, read_content
 from lexsplat.scenes.formats.gltf import EXTENSION, GENERATOR
 from lexsplat.scenes.transforms import transformed
 
@@ -74,7 +72,7 @@ def read_gltf(path: Path) -> Gaussians:
         ) from error
     if not parts:
         raise FileFormatError(path, expected=f"a primitive with {EXTENSION}", found="none")
-    return _joined(parts)
+    return joined(parts)
 
 
 def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -234,16 +232,3 @@ def _placed(gaussians: Gaussians, world: NDArray[np.float64]) -> Gaussians:
     ):
         raise ValueError("a node that mirrors or deforms its splats")
     return transformed(gaussians, rotation=world[:3, :3] / scale, scale=scale, translation=world[:3, 3])
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    """All Gaussians in one; missing spherical harmonics are zero."""
-    most = max(part.shN.shape[1] for part in parts)
-
-    def padded(part: Gaussians, name: str) -> Tensor:
-        tensor: Tensor = getattr(part, name)
-        missing = most - part.shN.shape[1] if name == "shN" else 0
-        return torch.nn.functional.pad(tensor, (0, 0, 0, missing)) if missing else tensor
-
-    tensors = {name: torch.cat([padded(part, name) for part in parts]) for name in TENSORS}
-    return replace(parts[0], **tensors, antialiased=all(part.antialiased for part in parts))
