@@ -156,7 +156,9 @@ def timed_fit(gaussians: Gaussians, views: TrainingViews, config: BuildConfig) -
     def listener(event: Event) -> None:
         last[event.stage] = time.process_time() - start
 
-    field = Averaged().fit(gaussians, views, config, FitRun(memory=parse_bytes(config.memory), listener=listener))
+    field = Averaged().fit(
+        gaussians, views, config, FitRun(memory=parse_bytes(config.memory), listener=listener)
+    )
     print("  ended after", {stage: f"{seconds:.1f} CPU s" for stage, seconds in last.items()}, flush=True)
     return field.weights
 

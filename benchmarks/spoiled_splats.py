@@ -25,7 +25,9 @@ from lexsplat.scenes.formats.spz import write_spz
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("splats", type=Path)
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()

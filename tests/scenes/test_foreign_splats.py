@@ -185,6 +185,11 @@ def test_a_buffer_beside_the_gltf_is_read_and_one_outside_the_folder_is_not(tmp_
         ({"scenes": [{"nodes": []}]}, "expected a primitive with KHR_gaussian_splatting, found none"),
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0, "_SCALE": 2, "_ROTATION": 1},
           "extensions": {"KHR_gaussian_splatting": {}}}]}]}, "no attribute KHR_gaussian_splatting:"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 9, "extensions": {"EXT_meshopt_compression": {}}}]},
+         "EXT_meshopt_compression is not supported, export it uncompressed"),
+        ({"meshes": [{"primitives": [{"attributes": {},
+          "extensions": {"KHR_gaussian_splatting": {"extensions": {"KHR_spz_2": {}}}}}]}]},
+         "KHR_spz_2 is not supported, export it uncompressed"),
     ],
 )  # fmt: skip
 def test_gltf_that_cannot_be_read_rightly_is_refused_with_its_reason(tmp_path, change, words):

@@ -24,7 +24,8 @@ def test_version_1_has_the_values_between_its_bounds(tmp_path, zipped):
             for part in (tmp_path / "unbundled").iterdir():
                 archive.write(part, part.name)
     found = read_splats(path)
-    assert len(found) == 10 and found.sh_degree == 1
+    assert len(found) == 10
+    assert found.sh_degree == 1
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(found, name), values, atol=2e-5, rtol=1e-5, err_msg=name)
 

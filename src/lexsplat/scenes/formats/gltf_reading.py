@@ -139,6 +139,7 @@ class _Document:
     def gaussians(self, primitive: dict[str, Any]) -> Gaussians:
         """The splats of a primitive in the axes of its node."""
         settings = _object(primitive["extensions"][EXTENSION])
+        _refuse_compression(settings)
         if settings.get("kernel", "ellipse") != "ellipse":
             raise ValueError(f"kernel {str(settings['kernel'])[:40]!r} instead of 'ellipse'")
         if settings.get("colorSpace") == "lin_rec709_display":
@@ -174,6 +175,7 @@ class _Document:
         if "sparse" in accessor or "bufferView" not in accessor:
             raise ValueError("a sparse accessor")
         view = self.item("bufferViews", accessor["bufferView"])
+        _refuse_compression(view)
         kind = np.dtype(_TYPES[accessor["componentType"]])
         if _WIDTHS[accessor["type"]] != width:
             raise ValueError(f"an accessor of {accessor['type']}")
@@ -207,6 +209,12 @@ class _Document:
                     raise ValueError(f"a buffer outside the folder: {uri[:80]!r}")
                 self.buffers[index] = beside.read_bytes()
         return self.buffers[index]
+
+
+def _refuse_compression(part: dict[str, Any]) -> None:
+    """Refuse data in another form, such as meshopt or SPZ; files need not say that they require it."""
+    if part.get("extensions"):
+        raise ValueError(f"{', '.join(part['extensions'])} is not supported, export it uncompressed")
 
 
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
