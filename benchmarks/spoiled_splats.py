@@ -1,8 +1,10 @@
 """Splats as they are found: compressed, without spherical harmonics, and with floaters; for `without_photos.py`.
 
     python benchmarks/spoiled_splats.py photos/gaussians.ply FOLDER
-    lexsplat language --splats FOLDER/floaters.ply --output floaters --clip bundled --dino bundled --codebook.num-codes 256
-    python benchmarks/without_photos.py photos floaters --refit
+    lexsplat language --splats FOLDER/floaters.ply --output chosen --clip bundled --codebook.num-codes 256
+    cp -r photos again  # the features of its photos are kept
+    lexsplat language --splats FOLDER/floaters.ply second --output again --clip bundled
+    python benchmarks/without_photos.py again chosen
 
 Floaters are a tenth as many as there are Gaussians: at random places of a box of twice the size of the scene without
 its background, of the sizes of random Gaussians doubled, of random colors, and of opacities from 0.2 to 0.95.
