@@ -401,8 +401,8 @@ def picture(width: int, height: int) -> bytes:
         ({"scales__webp": picture(2, 2)}, r"scales\.webp of 2 x 2 pixels for 20"),
         ({"sh0__webp": b"\x89PNG\r\n\x1a\n"}, r"sh0\.webp"),
         ({"shN_labels__webp": None}, "no item named"),
-        ({"meta__json": b'{"version": 1}'}, "expected SOG of version 2, found version 1"),
-        ({"meta__json": b'{"means": {"shape": [3, 3]}}'}, "expected SOG of version 2, found version 1"),
+        ({"meta__json": b'{"version": 3}'}, "expected SOG of version 1 or 2, found version 3"),
+        ({"meta__json": b'{"means": {"shape": [3, 3]}}'}, "version 1 or 2, found damaged content: 'sh0'"),
     ],
 )
 def test_zip_bombs_and_missing_parts_of_sog_are_refused(tmp_path, changed, words):
