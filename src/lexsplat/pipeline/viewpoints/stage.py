@@ -13,7 +13,6 @@ from lexsplat.geometry.world import parse_vector
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import existing_splats
 from lexsplat.pipeline.viewpoints.choosing import choose_views
-from lexsplat.pipeline.viewpoints.floaters import without_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.progress import NOTE, Listener
@@ -49,8 +48,7 @@ def capture_of_splats(
     if not (folder.is_finished("views", key) and (poses / "transforms.json").is_file()):
         start = time.perf_counter()
         folder.reopen("views")
-        everything = read_splats(splats)
-        gaussians = without_floaters(everything, splats).to(device)
+        gaussians = read_splats(splats).to(device)
         up = None if config.up is None else np.array(parse_vector(config.up))
         chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
         write_chosen_capture(gaussians, chosen, poses)
@@ -62,7 +60,6 @@ def capture_of_splats(
             "showed_no_surfaces": chosen.left_out,
             "visible": chosen.visible,
             "unseen": chosen.unseen,
-            "floaters": len(everything) - len(gaussians),
         }
         folder.finish("views", key, time.perf_counter() - start, **facts)
     folder.record["images"] = "poses/images"
