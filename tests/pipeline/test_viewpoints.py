@@ -85,6 +85,39 @@ def test_the_up_direction_turns_with_the_scene():
     assert chosen.up.direction @ (turn @ UP) > 0.98
 
 
+def box(low, high, count: int, seed: int) -> np.ndarray:
+    """Points on the six sides of a box."""
+    generator = np.random.default_rng(seed)
+    sizes = np.subtract(high, low)
+    areas = np.prod(sizes) / sizes
+    axis = generator.choice(3, count, p=areas / areas.sum())
+    points = generator.uniform(0, 1, (count, 3))
+    points[np.arange(count), axis] = generator.integers(0, 2, count)
+    return np.asarray(low) + points * sizes
+
+
+def furnished() -> np.ndarray:
+    """A closed room of 5 x 4 x 2.5 with a table, a wardrobe, a sofa and a ball on the table."""
+    return np.concatenate([
+        box((0, 0, 0), (5, 4, 2.5), 14000, 0), box((1.5, 1.2, 0.7), (3, 2.2, 0.76), 1500, 1),
+        *(box((x, y, 0), (x + 0.06, y + 0.06, 0.7), 80, 2) for x in (1.5, 2.9) for y in (1.2, 2.1)),
+        box((0, 3.4, 0), (1.8, 4, 1.9), 1800, 3), box((3.6, 0, 0), (5, 0.9, 0.45), 1500, 4),
+        box((3.6, 0, 0.45), (5, 0.25, 0.9), 700, 5), on_sphere((2.2, 1.7, 0.9), 0.13, 300, 6),
+    ])  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_furnished_room_is_looked_at_from_inside_at_eye_height():
+    """Up is not given. Most views are level with the eyes of a person, between 1.1 and 1.9 of 2.5."""
+    chosen = choose_views(solid(furnished()))
+    assert chosen.up.direction @ UP > 0.99
+    positions = np.stack([camera.position for camera in chosen.cameras])
+    assert ((positions > 0) & (positions < [5, 4, 2.5])).all()
+    assert ((positions[:, 2] > 1.1) & (positions[:, 2] < 1.9)).mean() > 0.7
+    assert chosen.unseen < 0.02 * chosen.visible
+    assert chosen.visible > 0.5 * len(furnished())  # sides of furniture face walls
+
+
 @pytest.mark.slow
 def test_views_of_a_closed_room_come_from_inside():
     chosen = choose_views(solid(in_room()), up=UP)

@@ -185,6 +185,11 @@ def test_a_buffer_beside_the_gltf_is_read_and_one_outside_the_folder_is_not(tmp_
         ({"scenes": [{"nodes": []}]}, "expected a primitive with KHR_gaussian_splatting, found none"),
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0, "_SCALE": 2, "_ROTATION": 1},
           "extensions": {"KHR_gaussian_splatting": {}}}]}]}, "no attribute KHR_gaussian_splatting:"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 9, "extensions": {"EXT_meshopt_compression": {}}}]},
+         "EXT_meshopt_compression is not supported, export it uncompressed"),
+        ({"meshes": [{"primitives": [{"attributes": {},
+          "extensions": {"KHR_gaussian_splatting": {"extensions": {"KHR_spz_2": {}}}}}]}]},
+         "KHR_spz_2 is not supported, export it uncompressed"),
     ],
 )  # fmt: skip
 def test_gltf_that_cannot_be_read_rightly_is_refused_with_its_reason(tmp_path, change, words):
@@ -396,8 +401,8 @@ def picture(width: int, height: int) -> bytes:
         ({"scales__webp": picture(2, 2)}, r"scales\.webp of 2 x 2 pixels for 20"),
         ({"sh0__webp": b"\x89PNG\r\n\x1a\n"}, r"sh0\.webp"),
         ({"shN_labels__webp": None}, "no item named"),
-        ({"meta__json": b'{"version": 1}'}, "expected SOG of version 2, found version 1"),
-        ({"meta__json": b'{"means": {"shape": [3, 3]}}'}, "expected SOG of version 2, found version 1"),
+        ({"meta__json": b'{"version": 3}'}, "expected SOG of version 1 or 2, found version 3"),
+        ({"meta__json": b'{"means": {"shape": [3, 3]}}'}, "version 1 or 2, found damaged content: 'sh0'"),
     ],
 )
 def test_zip_bombs_and_missing_parts_of_sog_are_refused(tmp_path, changed, words):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.sog_files import write_version_1
 from support.splats import half_turned, largest_differences, tame
 
 from lexsplat.geometry.gaussians import Gaussians
@@ -146,3 +147,20 @@ def test_the_glb_of_lexsplat_is_the_one_of_splat_transform_but_for_its_axes(tmp_
     transform(tmp_path / "g.ply", tmp_path / "theirs.glb")
     export_gaussians(g, tmp_path / "ours.glb")
     check(read_splats(tmp_path / "ours.glb"), read_splats(tmp_path / "theirs.glb"), EXACT)
+
+
+def test_both_read_sog_of_version_1_alike(tmp_path):
+    write_version_1(tmp_path / "a", 40)
+    transform(tmp_path / "a" / "meta.json", tmp_path / "theirs.ply")
+    check(by_plyfile(tmp_path / "theirs.ply"), read_splats(tmp_path / "a"), EXACT)
+
+
+def test_the_finest_level_of_its_streamed_sog_is_read(tmp_path):
+    g = tame(COUNT, 1)
+    write_ply(g, tmp_path / "fine.ply")
+    write_ply(g.select(torch.arange(0, COUNT, 4)), tmp_path / "coarse.ply")
+    levels = [str(tmp_path / "fine.ply"), "-l", "0", str(tmp_path / "coarse.ply"), "-l", "1"]
+    (tmp_path / "out").mkdir()
+    command = [str(program()), "-q", "-g", "cpu", *levels, str(tmp_path / "out" / "lod-meta.json")]
+    subprocess.run(command, check=True, capture_output=True)
+    check(g, read_splats(tmp_path / "out"), SOG | {"shN": 0.5})

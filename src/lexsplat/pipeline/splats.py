@@ -14,7 +14,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.sampling import evenly
-from lexsplat.scenes.formats.sog import META
+from lexsplat.scenes.formats.reading import splat_file
 
 CHECKED_VIEWS = 8
 """Number of views in which the Gaussians are looked for."""
@@ -27,16 +27,14 @@ MIN_AGREEMENT = 0.25
 
 
 def existing_splats(path: Path | None) -> Path:
-    """The path, if it is a file, or the ``meta.json`` of a folder with an unbundled SOG.
+    """The path, if it is a file, or the file that names the parts of a SOG in a folder.
 
     Raises:
         FileFormatError: If there is no such file.
     """
-    if path is not None and (path / META).is_file():
-        path = path / META
-    if path is None or not path.is_file():
+    if path is None or not splat_file(path).is_file():
         raise FileFormatError(path, expected="a file of Gaussians", found="no such file")
-    return path
+    return splat_file(path)
 
 
 def check_agreement(gaussians: Gaussians, views: list[View], subject: Path) -> None:

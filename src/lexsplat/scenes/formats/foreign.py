@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.geometry.gaussians import LARGEST, Gaussians
+from lexsplat.geometry.gaussians import LARGEST, TENSORS, Gaussians
 from lexsplat.runtime.errors import FileFormatError
 
 logger = logging.getLogger(__name__)
@@ -105,3 +105,16 @@ def read_content(path: Path, kind: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise FileFormatError(path, expected=f"a readable {kind} file", found=str(error.strerror)) from error
+
+
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """All Gaussians in one; missing spherical harmonics are zero."""
+    most = max(part.shN.shape[1] for part in parts)
+
+    def padded(part: Gaussians, name: str) -> Tensor:
+        tensor: Tensor = getattr(part, name)
+        missing = most - part.shN.shape[1] if name == "shN" else 0
+        return torch.nn.functional.pad(tensor, (0, 0, 0, missing)) if missing else tensor
+
+    tensors = {name: torch.cat([padded(part, name) for part in parts]) for name in TENSORS}
+    return replace(parts[0], **tensors, antialiased=all(part.antialiased for part in parts))

@@ -13,7 +13,6 @@ import json
 import logging
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -22,11 +21,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
-from lexsplat.geometry.gaussians import TENSORS, Gaussians
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, read_content
+from lexsplat.scenes.formats.foreign import as_tensor, joined, read_content
 from lexsplat.scenes.formats.gltf import EXTENSION, GENERATOR
 from lexsplat.scenes.transforms import transformed
 
@@ -74,7 +72,7 @@ def read_gltf(path: Path) -> Gaussians:
         ) from error
     if not parts:
         raise FileFormatError(path, expected=f"a primitive with {EXTENSION}", found="none")
-    return _joined(parts)
+    return joined(parts)
 
 
 def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -141,6 +139,7 @@ class _Document:
     def gaussians(self, primitive: dict[str, Any]) -> Gaussians:
         """The splats of a primitive in the axes of its node."""
         settings = _object(primitive["extensions"][EXTENSION])
+        _refuse_compression(settings)
         if settings.get("kernel", "ellipse") != "ellipse":
             raise ValueError(f"kernel {str(settings['kernel'])[:40]!r} instead of 'ellipse'")
         if settings.get("colorSpace") == "lin_rec709_display":
@@ -176,6 +175,7 @@ class _Document:
         if "sparse" in accessor or "bufferView" not in accessor:
             raise ValueError("a sparse accessor")
         view = self.item("bufferViews", accessor["bufferView"])
+        _refuse_compression(view)
         kind = np.dtype(_TYPES[accessor["componentType"]])
         if _WIDTHS[accessor["type"]] != width:
             raise ValueError(f"an accessor of {accessor['type']}")
@@ -211,6 +211,12 @@ class _Document:
         return self.buffers[index]
 
 
+def _refuse_compression(part: dict[str, Any]) -> None:
+    """Refuse data in another form, such as meshopt or SPZ; files need not say that they require it."""
+    if part.get("extensions"):
+        raise ValueError(f"{', '.join(part['extensions'])} is not supported, export it uncompressed")
+
+
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     """The transformation ``[4, 4]`` of a node to its parent."""
     if "matrix" in node:
@@ -234,16 +240,3 @@ def _placed(gaussians: Gaussians, world: NDArray[np.float64]) -> Gaussians:
     ):
         raise ValueError("a node that mirrors or deforms its splats")
     return transformed(gaussians, rotation=world[:3, :3] / scale, scale=scale, translation=world[:3, 3])
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    """All Gaussians in one; missing spherical harmonics are zero."""
-    most = max(part.shN.shape[1] for part in parts)
-
-    def padded(part: Gaussians, name: str) -> Tensor:
-        tensor: Tensor = getattr(part, name)
-        missing = most - part.shN.shape[1] if name == "shN" else 0
-        return torch.nn.functional.pad(tensor, (0, 0, 0, missing)) if missing else tensor
-
-    tensors = {name: torch.cat([padded(part, name) for part in parts]) for name in TENSORS}
-    return replace(parts[0], **tensors, antialiased=all(part.antialiased for part in parts))

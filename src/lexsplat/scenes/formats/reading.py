@@ -13,6 +13,7 @@ from lexsplat.scenes.formats.foreign import renderable
 from lexsplat.scenes.formats.gltf_reading import read_gltf
 from lexsplat.scenes.formats.ply import parse_ply
 from lexsplat.scenes.formats.sog import META, read_sog
+from lexsplat.scenes.formats.sog_streamed import LOD_META, read_streamed_sog
 from lexsplat.scenes.formats.splat import read_splat
 from lexsplat.scenes.formats.spz import read_spz
 
@@ -21,6 +22,7 @@ READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".splat": read_splat,
     ".spz": read_spz,
     ".sog": read_sog,
+    LOD_META: read_streamed_sog,
     META: read_sog,
     ".glb": read_gltf,
     ".gltf": read_gltf,
@@ -36,7 +38,7 @@ def read_splats(path: Path) -> Gaussians:
     rendered are dropped with a warning.
 
     Args:
-        path: The file; of an unbundled SOG, its ``meta.json`` or its folder.
+        path: The file; of an unbundled or streamed SOG, its ``meta.json`` or ``lod-meta.json``, or the folder.
 
     Raises:
         FileFormatError: If the ending is unknown, the content does not match it, or more than a tenth of the
@@ -44,12 +46,16 @@ def read_splats(path: Path) -> Gaussians:
         BackendError: If the format requires a library that is not installed.
     """
     refuse_pickle(path)
-    if (path / META).is_file():
-        path = path / META
+    path = splat_file(path)
     for ending, read in READERS.items():
         if path.name.lower().endswith(ending):
             return renderable(read(path), path)
     raise FileFormatError(path, expected="a name that ends in " + ", ".join(READERS), found=repr(path.suffix))
+
+
+def splat_file(path: Path) -> Path:
+    """The path, or of a folder with a SOG the file that names its parts."""
+    return next((path / name for name in (LOD_META, META) if (path / name).is_file()), path)
 
 
 def _is_compressed(path: Path) -> bool:

@@ -3,8 +3,9 @@
 Pixel i of each picture belongs to Gaussian i. Positions are 16-bit steps between bounds of sign(x) ln(1 + |x|), low
 and high bytes in two pictures. Scales and colors are indices into tables of up to 256 numbers. Rotations are the
 smallest three components, and alpha tells which one is left out. Spherical harmonics are indices into a palette,
-itself a picture. Version 2 is read and written. GaussForge is not used: damaged files crash its reader, and its
-writer mixes up the components of rotations.
+itself a picture. Version 2 is read and written. Version 1, which has even steps between two bounds in place of
+tables, and opacities as logits, is read. GaussForge is not used: damaged files crash its reader, and its writer mixes
+up the components of rotations.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ SMALL = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 FIRST_TAG = 252
 """Alpha of a rotation whose w is left out; x, y and z follow."""
 
+_BANDS = {PALETTE_WIDTH * width: bands for bands, width in enumerate(COEFFICIENTS)}
 _LARGEST_META = 16 << 20
 _BYTES_A_PIXEL = 8
 _FURTHER_BYTES = 16 << 20
@@ -66,7 +68,7 @@ def read_sog(path: Path) -> Gaussians:
     except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
         found = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileFormatError(
-            path, expected="a SOG of version 2", found=f"damaged content: {found}"
+            path, expected="a SOG of version 1 or 2", found=f"damaged content: {found}"
         ) from error
 
 
@@ -92,28 +94,27 @@ def _whole(content: bytes, name: str, limit: int) -> bytes:
 
 def _read(path: Path, load: _Load, size: int) -> Gaussians:
     meta = json.loads(load(META, _LARGEST_META))
-    if meta.get("version") != 2:
-        raise FileFormatError(path, expected="SOG of version 2", found=f"version {meta.get('version', 1)}")
-    count = meta["count"]
+    version = meta.get("version", 1)
+    if version not in (1, 2):
+        raise FileFormatError(path, expected="SOG of version 1 or 2", found=f"version {version!r:.40}")
+    count = meta["means"]["shape"][0] if version == 1 else meta["count"]
     if type(count) is not int or count < 0:
-        raise ValueError(f"a count of {count!r}")
+        raise ValueError(f"a count of {count!r:.40}")
     check_count(path, count, size)
 
     def picture(part: str, index: int = 0) -> NDArray[np.uint8]:
         return _pixels(load, meta[part]["files"][index], count).reshape(-1, 4)[:count]
 
-    def looked_up(part: str) -> NDArray[np.float32]:
-        table = _table(meta[part])
-        return table[picture(part)[:, :3]]
-
-    sh0 = picture("sh0")
+    table = _table if version == 2 else _even_steps
+    sh0, colors = picture("sh0"), table(meta["sh0"])
+    logits = logits_of_bytes(sh0[:, 3]) if version == 2 else as_tensor(_looked_up(colors, sh0)[:, 3])
     return Gaussians(
         means=as_tensor(_positions(picture("means", 0), picture("means", 1), meta["means"])),
         quats=as_tensor(_quats(picture("quats"))),
-        log_scales=as_tensor(looked_up("scales")),
-        opacity_logits=logits_of_bytes(sh0[:, 3]),
-        sh0=as_tensor(_table(meta["sh0"])[sh0[:, :3]])[:, None],
-        shN=as_tensor(_harmonics(load, meta["shN"], picture("shN", 1)))
+        log_scales=as_tensor(_looked_up(table(meta["scales"]), picture("scales")[:, :3])),
+        opacity_logits=logits,
+        sh0=as_tensor(_looked_up(colors, sh0[:, :3]))[:, None],
+        shN=as_tensor(_harmonics(load, meta["shN"], picture("shN", 1), table(meta["shN"])))
         if meta.get("shN")
         else torch.zeros(count, 0, 3),
         antialiased=meta.get("model") == "antialiased",
@@ -135,13 +136,28 @@ def _pixels(load: _Load, name: str, count: int) -> NDArray[np.uint8]:
 
 
 def _table(part: dict[str, Any]) -> NDArray[np.float32]:
-    """The 256 numbers that a picture's bytes are indices of; a shorter table ends in NaN."""
+    """The 256 numbers that a picture's bytes are indices of ``[256, 1]``; a shorter table ends in NaN."""
     numbers = list(part["codebook"])
     if len(numbers) == 256 and numbers[0] is None:  # early versions of SuperSplat: the steps are nearly equal
         numbers[0] = numbers[1] + (numbers[1] - numbers[255]) / 255
     if not 0 < len(numbers) <= 256:
         raise ValueError(f"a codebook of {len(numbers)} numbers")
-    return np.append(np.array(numbers, np.float64), np.full(256 - len(numbers), np.nan)).astype(np.float32)
+    table = np.append(np.array(numbers, np.float64), np.full(256 - len(numbers), np.nan))
+    return table.astype(np.float32)[:, None]
+
+
+def _even_steps(part: dict[str, Any]) -> NDArray[np.float32]:
+    """The same in version 1 ``[256, 1 | 3 | 4]``, for each channel or for all."""
+    first, last = (np.array(part[name], np.float64).reshape(1, -1) for name in ("mins", "maxs"))
+    return (first + np.linspace(0, 1, 256)[:, None] * (last - first)).astype(np.float32)
+
+
+def _looked_up(table: NDArray[np.float32], pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Numbers of the bytes of pixels ``[..., C]``, from a table ``[256, 1]`` or one for each channel."""
+    channels = pixels.shape[-1]
+    if table.shape[1] not in (1, channels, 4):
+        raise ValueError(f"bounds of {table.shape[1]} channels for {channels}")
+    return table[pixels, np.arange(channels) if table.shape[1] > 1 else 0]
 
 
 def _positions(low: NDArray[np.uint8], high: NDArray[np.uint8], part: dict[str, Any]) -> NDArray[np.float64]:
@@ -164,15 +180,18 @@ def _quats(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
     return quats
 
 
-def _harmonics(load: _Load, part: dict[str, Any], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _harmonics(
+    load: _Load, part: dict[str, Any], labels: NDArray[np.uint8], table: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Coefficients ``[N, 3 | 8 | 15, 3]`` of the palette's entries."""
-    width, entries = COEFFICIENTS[part["bands"]], part["count"]
+    picture = _pixels(load, part["files"][0], COEFFICIENTS[3])
+    bands = part.get("bands", _BANDS.get(picture.shape[1]))  # version 1 has the width of the picture alone
+    width, entries = COEFFICIENTS[bands] if bands in (1, 2, 3) else 0, part.get("count", 1 << 16)
     if not width or type(entries) is not int or not 0 < entries <= 1 << 16:
-        raise ValueError(f"a palette of {entries!r} entries with {part['bands']!r} bands")
-    picture = _pixels(load, part["files"][0], width)
+        raise ValueError(f"a palette of {entries!r:.40} entries with {bands!r:.40} bands")
     if picture.shape[1] != PALETTE_WIDTH * width:
         raise ValueError(f"a palette {picture.shape[1]} pixels wide")
-    palette = _table(part)[picture[..., :3]].reshape(-1, width, 3)
+    palette = _looked_up(table, picture[..., :3]).reshape(-1, width, 3)
     index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
     if len(index) and index.max() >= len(palette):
         raise ValueError(f"palette entry {index.max()} of {len(palette)}")
