@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import shutil
 
 import numpy as np
@@ -135,6 +136,28 @@ def test_answers_are_those_of_python(page, demo):
     assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
 
 
+KIND = """async (prompt) => {
+    const answer = await lexsplat.app.source.answer(prompt, "#fff");
+    await lexsplat.app.source.refine(answer);
+    const bytes = new Uint8Array(lexsplat.app.geometry.count);
+    answer.places.forEach((place, n) => place.splats.forEach((splat) => { bytes[splat] = n + 1; }));
+    return { presence: answer.presence, note: answer.note, labels: [...bytes] };
+}"""
+
+
+@pytest.mark.parametrize("prompt", ["toy", "some fruit", "something to eat", "animals", "clothes"])
+def test_a_kind_is_answered_by_the_objects_that_python_finds(page, demo, prompt):
+    found, selection = page.evaluate(KIND, prompt), demo.find(prompt)
+    assert found["presence"] == selection.present
+    labels = np.array(found["labels"])
+    assert labels.max() == selection.count
+    for instance in selection.instances:
+        own = np.unique(labels[instance.mask.numpy()])
+        assert len(own) == 1
+        assert np.array_equal(labels == own[0], instance.mask.numpy())
+        assert instance.phrase in found["note"]
+
+
 def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absent(browser, address, demo):
     page = open_page(browser, address + "#view=view_010.jpg", *SIZE)
     bare = "document.querySelectorAll('.bar, .tools, .title').forEach((one) => { one.style.visibility = 'hidden'; })"
@@ -183,6 +206,29 @@ def test_asking_speaks_shows_a_card_and_is_kept_in_the_link(page, browser, addre
     positions = [one.evaluate("lexsplat.app.stage.camera.position.toArray()") for one in (page, again)]
     assert np.allclose(*positions, atol=1e-3)
     again.close()
+
+
+def test_of_several_prompts_the_camera_flies_to_the_first_that_is_here(page):
+    ask(page, "zebra, rubber duck, unicorn")
+    offset = "lexsplat.app.stage.target.distanceTo(lexsplat.app.answers[1].places[0].center)"
+    assert page.evaluate(offset) < 1e-3
+
+
+def test_enter_on_the_picture_names_what_is_in_its_middle_and_measures(page):
+    page.evaluate("lexsplat.app.ask('rubber duck')")
+    until(page, "Boolean(document.querySelector('.card'))")
+    page.locator("canvas").focus()
+    page.keyboard.press("Enter")
+    until(page, "Boolean(document.querySelector('.status .examples button'))")
+    assert "duck" in " ".join(page.locator(".status .examples button").all_inner_texts())
+    page.keyboard.press("m")
+    page.keyboard.press("Enter")
+    for _ in range(4):
+        page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.distance').textContent !== ''")
+    assert float(page.locator(".distance").inner_text().split()[0]) > 0
+    page.keyboard.press("m")
 
 
 def test_the_search_box_completes_and_the_keyboard_suffices(page):
@@ -321,3 +367,28 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
         page = open_page(browser, address, script="HTMLCanvasElement.prototype.getContext = () => null")
         assert "needs WebGL 2" in page.locator(".failure").inner_text()
         page.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda m: m.pop("views"), "a list of cameras in views"),
+        (lambda m: m["scene"].pop("rotation"), "4 numbers in scene.rotation"),
+        (lambda m: m["scene"].update(gaussians="many"), "a number in scene.gaussians"),
+        (lambda m: m["views"][0].update(viewmat=[1]), "a list of cameras in views"),
+        (lambda m: m.update(language=None), "language or a server"),
+        (lambda m: m["files"].pop("scene.spz"), "scene.spz in files"),
+        (lambda m: m.clear(), "version 3 of a lexsplat page"),
+    ],
+)
+def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(browser, ball_page, change, told):
+    folder = ball_page()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with serving(folder) as address:
+        page = open_page(browser, address)
+        line = page.locator(".failure").inner_text().strip()
+        page.close()
+    assert line.startswith(f"manifest.json: expected {told}, found ")
+    assert "\n" not in line
