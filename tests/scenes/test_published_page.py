@@ -19,7 +19,7 @@ from support.viewer_scene import ball_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.picking import surface_at
 from lexsplat.rendering import render
-from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
+from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
 from lexsplat.scenes.scene import open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -261,6 +261,31 @@ def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_t
         page.close()
 
 
+@pytest.mark.parametrize("ending", ["ply", "spz", "sog"])
+def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_page, monkeypatch, ending):
+    if ending != "ply":
+        monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
+    if ending == "sog":
+        monkeypatch.setattr(splat_file, "LARGE_BYTES", 0)
+        monkeypatch.setattr(
+            splat_file, "write_spz", lambda gaussians, path, version: path.write_bytes(b" " * 10**7)
+        )
+    scene = ball_page.scene
+    folder = ball_page()
+    assert (folder / f"scene.{ending}").exists()
+    with serving(folder) as address:
+        page = open_page(browser, address)
+        geometry = page.evaluate(
+            "(({ centers, opacities }) => [[...centers], [...opacities]])(lexsplat.app.geometry)"
+        )
+        ask(page, "ball 3")
+        assert "here, one place" in page.locator(".card").inner_text()
+        page.close()
+    centers, opacities = np.array(geometry[0]).reshape(-1, 3), np.array(geometry[1])
+    assert np.abs(centers - scene.gaussians.means.numpy()).max() < 2e-3
+    assert np.abs(opacities - scene.gaussians.opacities.numpy()).max() < 0.01
+
+
 def test_a_click_names_the_thing(browser, ball_page):
     with serving(ball_page()) as address:
         page = open_page(browser, address + "#view=view0")
@@ -377,7 +402,7 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
         (lambda m: m["scene"].update(gaussians="many"), "a number in scene.gaussians"),
         (lambda m: m["views"][0].update(viewmat=[1]), "a list of cameras in views"),
         (lambda m: m.update(language=None), "language or a server"),
-        (lambda m: m["files"].pop("scene.spz"), "scene.spz in files"),
+        (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
         (lambda m: m.clear(), "version 3 of a lexsplat page"),
     ],
 )

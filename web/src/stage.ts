@@ -14,7 +14,7 @@ const MOST_RATE = 30;
 /** Seconds of the swing between two pictures of a video, at most. */
 const LONGEST_STEP = 0.2;
 
-const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY };
+const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY, sog: SplatFileType.PCSOGSZIP };
 
 export class Stage {
   readonly camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);

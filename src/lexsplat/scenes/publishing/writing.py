@@ -192,7 +192,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     start = _start_view(scene, options.start_view)
     kept = most_visible(scene.gaussians, options.max_splats or len(scene.gaussians))
     gaussians = scene.gaussians.select(kept.to(scene.gaussians.device)).to("cpu")
-    splats, rotation = write_splats(gaussians, folder)
+    splats, rotation = write_splats(gaussians, folder, shrink=True)
     identity = scene.encoder_identity()
     language = stored_language(scene.field, identity).select(kept)
     (folder / "codes.bin").write_bytes(splat_codes(language))
