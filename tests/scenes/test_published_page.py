@@ -14,12 +14,15 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from support.language_scene import CENTERS
 from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
+from support.siglip_folder import siglip_folder
 from support.viewer_scene import ball_scene
 
+from lexsplat.features.encoders import load_clip
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.picking import surface_at
 from lexsplat.rendering import render
 from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
+from lexsplat.scenes.publishing.manifest import checksums
 from lexsplat.scenes.scene import open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -78,7 +81,7 @@ def ball_page(tmp_path, monkeypatch):
     scene, ground_truth = ball_scene()
 
     def write(target=tmp_path / "page", **options):
-        publish(scene, target, PublishOptions(words_only=True, **options))
+        publish(scene, target, PublishOptions(**{"words_only": True, **options}))
         return target
 
     write.scene, write.ground_truth = scene, ground_truth
@@ -284,6 +287,55 @@ def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_pag
     centers, opacities = np.array(geometry[0]).reshape(-1, 3), np.array(geometry[1])
     assert np.abs(centers - scene.gaussians.means.numpy()).max() < 2e-3
     assert np.abs(opacities - scene.gaussians.opacities.numpy()).max() < 0.01
+
+
+def test_the_text_tower_of_siglip_answers_in_the_page_as_in_python(browser, ball_page, tmp_path):
+    pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
+    model = tmp_path / "siglip"
+    model.mkdir()
+    siglip_folder(model, width=32)
+    ball_page.scene.clip = str(model)
+    texts = ["A Car!", "the wooden table", "red mug, blue books and an apple on the table", "Ünknown 42"]
+    with serving(ball_page(words_only=False)) as address:
+        page = open_page(browser, address)
+        found = page.evaluate(
+            """async (texts) => {
+                const tower = await lexsplat.app.source.loader.load();
+                return texts.map((text) => [...tower.embed(text)]);
+            }""",
+            texts,
+        )
+        ask(page, "a green unicorn")
+        assert page.locator(".card strong").inner_text() == "a green unicorn"
+        page.close()
+    expected = load_clip(str(model)).encode_text(texts)
+    cosines = torch.nn.functional.cosine_similarity(torch.tensor(found), expected, dim=1)
+    assert float(cosines.min()) > 1 - 1e-3
+
+
+def test_a_large_text_tower_is_loaded_only_after_its_size_was_told(browser, ball_page, tmp_path):
+    model = tmp_path / "siglip"
+    model.mkdir()
+    siglip_folder(model, width=32)
+    ball_page.scene.clip = str(model)
+    folder = ball_page(words_only=False)
+    path = folder / "text.safetensors"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    content = path.read_bytes() + bytes(12_000_000 - path.stat().st_size)  # safetensors end before
+    path.write_bytes(content)
+    manifest["files"][path.name] = checksums(content)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with serving(folder) as address:
+        page = open_page(browser, address)
+        page.fill(".search input", "a green unicorn")
+        page.keyboard.press("Enter")
+        button = page.get_by_role("button", name="Load the text model (12 MB) to ask anything")
+        button.wait_for()
+        assert not [url for url in page.requested if url.endswith(path.name)]
+        button.click()
+        until(page, "Boolean(document.querySelector('.card'))")
+        assert [url for url in page.requested if url.endswith(path.name)]
+        page.close()
 
 
 def test_a_click_names_the_thing(browser, ball_page):

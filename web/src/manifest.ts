@@ -81,6 +81,10 @@ export interface Manifest {
     tokenizer: string;
     heads: number;
     activation: string;
+    /** Of the layer norms. */
+    epsilon: number;
+    /** Token that fills texts up, where all tokens see each other; null where they see those before them. */
+    padding: number | null;
     templates: string[];
     everyday: EverydayRule;
   } | null;
