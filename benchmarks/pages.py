@@ -2,12 +2,12 @@
 
     python benchmarks/pages.py [--repeats 5] [--json FILE]
 
-Headless Chromium with software WebGL opens both pages in turn, each in a fresh profile, from a server of the standard
-library on this machine. The first picture is the first frame that is closer to the finished one than to an empty page:
-frames are those that the browser presents. The first answer is the first frame after Enter that differs from the
-frame before. "cpu" is processor time of all processes of the browser, which depends less on other programs than wall
-time does. Bytes are those of the files, compressed as most web servers do (gzip). The viewer is fetched from npm into a
-temporary folder. Without npm or Chromium nothing is measured, and the reason is told.
+Headless Chromium with software WebGL opens both pages in turn, each in a fresh browser, from a server of the standard
+library on this machine. The first picture is the first presented frame that is closer to the finished one than to an
+empty page. The first answer is the first frame after Enter that differs from the frame before. "cpu" is processor time
+of all processes of the browser, which depends less on other programs than wall time does. Bytes are those of the
+files, compressed as most web servers do (gzip). The viewer is fetched from npm into a temporary folder. Without npm or
+Chromium nothing is measured, and the reason is told.
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ import os
 import shutil
 import statistics
 import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from PIL import Image
@@ -42,6 +44,8 @@ VIEWER = "@playcanvas/supersplat-viewer@1.36.2"
 PROMPT = "red apple"
 SIZE = {"width": 960, "height": 600}
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+FIRST_BYTE = "(performance.timeOrigin + performance.getEntriesByType('navigation')[0].responseStart) / 1000"
+"""When the page's first byte came, seconds since 1970."""
 _PACKED = {".js", ".css", ".html", ".json", ".txt", ".bin", ".ply", ".safetensors"}
 """Endings that web servers compress; the others are compressed already."""
 
@@ -69,9 +73,7 @@ class Recorder:
         self._used = self._processor_seconds()
         self._session.send("Page.startScreencast", {"format": "jpeg", "quality": 60, "everyNthFrame": 1})
         self.page.goto(address, wait_until="commit")
-        self.start = self.page.evaluate(
-            "(performance.timeOrigin + performance.timing.responseStart - performance.timing.navigationStart) / 1000"
-        )
+        self.start = self.page.evaluate(FIRST_BYTE)
 
     def _processor_seconds(self) -> float:
         return sum(one["cpuTime"] for one in self._system.send("SystemInfo.getProcessInfo")["processInfo"])
@@ -79,37 +81,38 @@ class Recorder:
     def _take(self, frame: dict[str, Any]) -> None:
         self._session.send("Page.screencastFrameAck", {"sessionId": frame["sessionId"]})
         picture = Image.open(io.BytesIO(base64.b64decode(frame["data"]))).convert("RGB").resize((240, 150))
-        used = self._processor_seconds() - self._used
-        self.frames.append((frame["metadata"]["timestamp"], used, np.asarray(picture, np.float32)))
+        self.frames.append((frame["metadata"]["timestamp"], self.used, np.asarray(picture, np.float32)))
 
-    def wait_until_quiet(self, seconds: float = 4.0) -> None:
-        """Wait until no frame came for some seconds."""
-        seen, since = -1, time.monotonic()
-        while time.monotonic() - since < seconds:
+    def wait_until_quiet(self, seconds: float = 3.0, most: float = 25.0) -> None:
+        """Wait until no frame came for some seconds, at most ``most``."""
+        end, seen, since = time.monotonic() + most, -1, time.monotonic()
+        while time.monotonic() < min(end, since + seconds):
             self.page.wait_for_timeout(100)
             if len(self.frames) != seen:
                 seen, since = len(self.frames), time.monotonic()
 
-    def first_near_the_last(self, after: int = 0) -> tuple[float, float, float]:
-        """When the first of the frames from ``after`` on was presented that is nearer to the last one than to a flat one.
+    @property
+    def used(self) -> float:
+        """Processor seconds of the browser since the start."""
+        return self._processor_seconds() - self._used
+
+    def first_near_the_last(self) -> tuple[float, float, float]:
+        """When the first frame was presented that is nearer to the last one than to a flat one.
 
         Returns:
             Seconds since the page's first byte, processor seconds since the start, and the time since 1970.
         """
         *_, last = self.frames[-1]
         far = np.abs(last - last.mean((0, 1))).mean()
-        for at, used, picture in self.frames[after:]:
+        for at, used, picture in self.frames:
             if np.abs(picture - last).mean() < far / 2:
                 return at - self.start, used, at
         raise RuntimeError("no picture")
 
     def bytes_until(self, moment: float, folder: Path) -> int:
         """Compressed bytes of the files that were asked for before a moment."""
-        names = [
-            url.split("?")[0].split("#")[0].rsplit("/", 1)[-1] or "index.html"
-            for url, at in self.files.items()
-            if at <= moment and url.startswith("http")
-        ]
+        addresses = [url for url, at in self.files.items() if at <= moment and url.startswith("http")]
+        names = [urlsplit(url).path.strip("/") or "index.html" for url in addresses]
         return sum(_size(folder / name) for name in names if (folder / name).is_file())
 
 
@@ -153,20 +156,16 @@ def ours(browser: Any, folder: Path) -> dict[str, float]:
         page.keyboard.press("End")
         recorder.wait_until_quiet()
         before, shown = len(recorder.frames), recorder.frames[-1][2]
-        used = recorder._processor_seconds()
+        used = recorder.used
         asked = time.time()
         page.keyboard.press("Enter")
         page.wait_for_selector(".card")
         page.evaluate("lexsplat.app.stage.settled()")
         recorder.wait_until_quiet()
-        print(
-            [round(float(np.abs(f[2] - shown).mean()), 1) for f in recorder.frames[before:]],
-            len(recorder.frames),
-        )
         changed = [frame for frame in recorder.frames[before:] if np.abs(frame[2] - shown).mean() > 4]
         row |= {
             "answer_s": changed[0][0] - asked,
-            "answer_cpu_s": changed[0][1] - (used - recorder._used),
+            "answer_cpu_s": changed[0][1] - used,
             "answer_mb": recorder.bytes_until(changed[0][0], folder) / 1e6,
         }
         recorder.context.close()
@@ -178,7 +177,7 @@ def theirs(browser: Any, folder: Path) -> dict[str, float]:
     with serving(folder) as address:
         recorder = Recorder(browser, f"{address}?content=scene.sog&webgl&noanim")
         recorder.page.wait_for_selector("canvas")
-        recorder.wait_until_quiet(8.0)
+        recorder.wait_until_quiet(8.0, 40.0)
         picture, used, at = recorder.first_near_the_last()
         row = {
             "picture_s": picture,
@@ -245,6 +244,7 @@ def main() -> None:
                 browser = driver.chromium.launch(executable_path=program, args=FLAGS)
                 row = measure(browser, work / folder)
                 browser.close()
+                print(f"round {repeat}: {title} {row}", file=sys.stderr, flush=True)
                 if repeat:  # the first round fills the caches of files
                     rows[title].append(row)
     medians = [
