@@ -2,12 +2,12 @@
 
     python benchmarks/pages.py [--repeats 5] [--json FILE]
 
-Headless Chromium with software WebGL opens both pages in turn, each in a fresh browser, from a server of the standard
-library on this machine. The first picture is the first presented frame that is closer to the finished one than to an
-empty page. The first answer is the first frame after Enter that differs from the frame before. "cpu" is processor time
-of all processes of the browser, which depends less on other programs than wall time does. Bytes are those of the
-files, compressed as most web servers do (gzip). The viewer is fetched from npm into a temporary folder. Without npm or
-Chromium nothing is measured, and the reason is told.
+Headless Chromium with software WebGL opens both pages in turn, each in a fresh browser, from a server of the
+standard library on this machine. The first picture is the first presented frame that is closer to the finished one
+than to an empty page. The first answer is the first frame after Enter that differs from the frame before. "cpu" is
+processor time of all processes of the browser, which depends less on other programs than wall time does. Bytes are
+those of the files, compressed as most web servers do (gzip). The viewer is fetched from npm into a temporary folder.
+Without npm or Chromium nothing is measured, and the reason is told.
 """
 
 from __future__ import annotations
