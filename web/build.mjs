@@ -27,7 +27,7 @@ await build({
   logLevel: "warning",
 });
 
-const packages = ["three", "@sparkjsdev/spark"];
+const packages = ["three", "@sparkjsdev/spark", "@huggingface/tokenizers"];
 const licenses = packages.map((name) => {
   const folder = join(here, "node_modules", name);
   const { version, license, homepage } = JSON.parse(readFileSync(join(folder, "package.json"), "utf8"));

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import shutil
@@ -13,6 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from support.encoder_folders import in_open_clip_names, in_timm_names, save_model, seeded, tiny_vit
 from support.refusals import assert_tells
+from support.siglip_folder import siglip_folder
 
 from lexsplat.features import hub
 from lexsplat.features.encoders import load_clip, load_dino
@@ -275,33 +275,23 @@ def test_a_model_of_the_other_kind_is_refused(clip_folder):
 
 
 def test_siglip_loads_with_its_tokenizer_of_sentencepiece(tmp_path):
-    spm = pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
-    from transformers import SiglipConfig, SiglipModel
-
-    words, model = "an apple a wooden table blue sky a car red mug the books", io.BytesIO()
-    lines, options = iter([words] * 50), {"hard_vocab_limit": False, "minloglevel": 5}
-    spm.SentencePieceTrainer.train(
-        sentence_iterator=lines,
-        model_writer=model,
-        vocab_size=60,
-        pad_id=-1,
-        bos_id=-1,
-        eos_id=1,
-        unk_id=0,
-        **options,
-    )
-    (tmp_path / "spiece.model").write_bytes(model.getvalue())
-    (tmp_path / "tokenizer_config.json").write_text(
-        json.dumps({"tokenizer_class": "SiglipTokenizer", "pad_token": "</s>", "eos_token": "</s>"})
-    )
-    reference = spm.SentencePieceProcessor(model_proto=model.getvalue())
-    tower = {"intermediate_size": 40, "num_hidden_layers": 1, "num_attention_heads": 2, "hidden_size": 24}
-    text = {**tower, "vocab_size": reference.get_piece_size(), "max_position_embeddings": 9}
-    config = SiglipConfig(text_config=text, vision_config={**tower, "image_size": 32, "patch_size": 8})
-    save_model(seeded(lambda: SiglipModel(config)), tmp_path)
-    ids = load_clip(str(tmp_path))._text_inputs(["A Car!"])["input_ids"][0].tolist()
+    pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
+    reference = siglip_folder(tmp_path)
+    encoder = load_clip(str(tmp_path))
+    ids = encoder._text_inputs(["A Car!"])["input_ids"][0].tolist()
     expected = reference.encode("a car")  # lower case, without punctuation
     assert ids == (expected + [1] * 9)[:9], "then the end of the text, as padding"
+
+
+@pytest.mark.parametrize("text", ["A Car!", "the  wooden-table", "ﬁne blue books, red", "Ünknown 42", "mug"])
+def test_the_tokenizer_of_siglip_is_exported_with_its_tokens(tmp_path, text):
+    pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
+    from tokenizers import Tokenizer
+
+    siglip_folder(tmp_path)
+    encoder = load_clip(str(tmp_path))
+    exported = Tokenizer.from_str(json.dumps(encoder.text_tower().tokenizer))
+    assert exported.encode(text).ids == encoder._tokenizer(text)["input_ids"]
 
 
 def test_the_tokenizer_of_siglip_needs_an_extra(copy, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import shutil
 
 import numpy as np
@@ -13,12 +14,15 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from support.language_scene import CENTERS
 from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
+from support.siglip_folder import siglip_folder
 from support.viewer_scene import ball_scene
 
+from lexsplat.features.encoders import load_clip
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.picking import surface_at
 from lexsplat.rendering import render
-from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
+from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
+from lexsplat.scenes.publishing.manifest import checksums
 from lexsplat.scenes.scene import open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -77,7 +81,7 @@ def ball_page(tmp_path, monkeypatch):
     scene, ground_truth = ball_scene()
 
     def write(target=tmp_path / "page", **options):
-        publish(scene, target, PublishOptions(words_only=True, **options))
+        publish(scene, target, PublishOptions(**{"words_only": True, **options}))
         return target
 
     write.scene, write.ground_truth = scene, ground_truth
@@ -135,6 +139,28 @@ def test_answers_are_those_of_python(page, demo):
     assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
 
 
+KIND = """async (prompt) => {
+    const answer = await lexsplat.app.source.answer(prompt, "#fff");
+    await lexsplat.app.source.refine(answer);
+    const bytes = new Uint8Array(lexsplat.app.geometry.count);
+    answer.places.forEach((place, n) => place.splats.forEach((splat) => { bytes[splat] = n + 1; }));
+    return { presence: answer.presence, note: answer.note, labels: [...bytes] };
+}"""
+
+
+@pytest.mark.parametrize("prompt", ["toy", "some fruit", "something to eat", "animals", "clothes"])
+def test_a_kind_is_answered_by_the_objects_that_python_finds(page, demo, prompt):
+    found, selection = page.evaluate(KIND, prompt), demo.find(prompt)
+    assert found["presence"] == selection.present
+    labels = np.array(found["labels"])
+    assert labels.max() == selection.count
+    for instance in selection.instances:
+        own = np.unique(labels[instance.mask.numpy()])
+        assert len(own) == 1
+        assert np.array_equal(labels == own[0], instance.mask.numpy())
+        assert instance.phrase in found["note"]
+
+
 def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absent(browser, address, demo):
     page = open_page(browser, address + "#view=view_010.jpg", *SIZE)
     bare = "document.querySelectorAll('.bar, .tools, .title').forEach((one) => { one.style.visibility = 'hidden'; })"
@@ -185,6 +211,29 @@ def test_asking_speaks_shows_a_card_and_is_kept_in_the_link(page, browser, addre
     again.close()
 
 
+def test_of_several_prompts_the_camera_flies_to_the_first_that_is_here(page):
+    ask(page, "zebra, rubber duck, unicorn")
+    offset = "lexsplat.app.stage.target.distanceTo(lexsplat.app.answers[1].places[0].center)"
+    assert page.evaluate(offset) < 1e-3
+
+
+def test_enter_on_the_picture_names_what_is_in_its_middle_and_measures(page):
+    page.evaluate("lexsplat.app.ask('rubber duck')")
+    until(page, "Boolean(document.querySelector('.card'))")
+    page.locator("canvas").focus()
+    page.keyboard.press("Enter")
+    until(page, "Boolean(document.querySelector('.status .examples button'))")
+    assert "duck" in " ".join(page.locator(".status .examples button").all_inner_texts())
+    page.keyboard.press("m")
+    page.keyboard.press("Enter")
+    for _ in range(4):
+        page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.distance').textContent !== ''")
+    assert float(page.locator(".distance").inner_text().split()[0]) > 0
+    page.keyboard.press("m")
+
+
 def test_the_search_box_completes_and_the_keyboard_suffices(page):
     page.keyboard.press("Escape")
     page.locator("canvas").focus()
@@ -212,6 +261,80 @@ def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_t
         page.keyboard.press("Enter")
         until(page, "document.querySelector('.status')?.textContent.includes('is not among')")
         assert page.locator(".card").count() == 0
+        page.close()
+
+
+@pytest.mark.parametrize("ending", ["ply", "spz", "sog"])
+def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_page, monkeypatch, ending):
+    if ending != "ply":
+        monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
+    if ending == "sog":
+        monkeypatch.setattr(splat_file, "LARGE_BYTES", 0)
+        monkeypatch.setattr(
+            splat_file, "write_spz", lambda gaussians, path, version: path.write_bytes(b" " * 10**7)
+        )
+    scene = ball_page.scene
+    folder = ball_page()
+    assert (folder / f"scene.{ending}").exists()
+    with serving(folder) as address:
+        page = open_page(browser, address)
+        geometry = page.evaluate(
+            "(({ centers, opacities }) => [[...centers], [...opacities]])(lexsplat.app.geometry)"
+        )
+        ask(page, "ball 3")
+        assert "here, one place" in page.locator(".card").inner_text()
+        page.close()
+    centers, opacities = np.array(geometry[0]).reshape(-1, 3), np.array(geometry[1])
+    assert np.abs(centers - scene.gaussians.means.numpy()).max() < 2e-3
+    assert np.abs(opacities - scene.gaussians.opacities.numpy()).max() < 0.01
+
+
+def test_the_text_tower_of_siglip_answers_in_the_page_as_in_python(browser, ball_page, tmp_path):
+    pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
+    model = tmp_path / "siglip"
+    model.mkdir()
+    siglip_folder(model, width=32)
+    ball_page.scene.clip = str(model)
+    texts = ["A Car!", "the wooden table", "red mug, blue books and an apple on the table", "Ünknown 42"]
+    with serving(ball_page(words_only=False)) as address:
+        page = open_page(browser, address)
+        found = page.evaluate(
+            """async (texts) => {
+                const tower = await lexsplat.app.source.loader.load();
+                return texts.map((text) => [...tower.embed(text)]);
+            }""",
+            texts,
+        )
+        ask(page, "a green unicorn")
+        assert page.locator(".card strong").inner_text() == "a green unicorn"
+        page.close()
+    expected = load_clip(str(model)).encode_text(texts)
+    cosines = torch.nn.functional.cosine_similarity(torch.tensor(found), expected, dim=1)
+    assert float(cosines.min()) > 1 - 1e-3
+
+
+def test_a_large_text_tower_is_loaded_only_after_its_size_was_told(browser, ball_page, tmp_path):
+    model = tmp_path / "siglip"
+    model.mkdir()
+    siglip_folder(model, width=32)
+    ball_page.scene.clip = str(model)
+    folder = ball_page(words_only=False)
+    path = folder / "text.safetensors"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    content = path.read_bytes() + bytes(12_000_000 - path.stat().st_size)  # safetensors end before
+    path.write_bytes(content)
+    manifest["files"][path.name] = checksums(content)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with serving(folder) as address:
+        page = open_page(browser, address)
+        page.fill(".search input", "a green unicorn")
+        page.keyboard.press("Enter")
+        button = page.get_by_role("button", name="Load the text model (12 MB) to ask anything")
+        button.wait_for()
+        assert not [url for url in page.requested if url.endswith(path.name)]
+        button.click()
+        until(page, "Boolean(document.querySelector('.card'))")
+        assert [url for url in page.requested if url.endswith(path.name)]
         page.close()
 
 
@@ -321,3 +444,28 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
         page = open_page(browser, address, script="HTMLCanvasElement.prototype.getContext = () => null")
         assert "needs WebGL 2" in page.locator(".failure").inner_text()
         page.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda m: m.pop("views"), "a list of cameras in views"),
+        (lambda m: m["scene"].pop("rotation"), "4 numbers in scene.rotation"),
+        (lambda m: m["scene"].update(gaussians="many"), "a number in scene.gaussians"),
+        (lambda m: m["views"][0].update(viewmat=[1]), "a list of cameras in views"),
+        (lambda m: m.update(language=None), "language or a server"),
+        (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
+        (lambda m: m.clear(), "version 3 of a lexsplat page"),
+    ],
+)
+def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(browser, ball_page, change, told):
+    folder = ball_page()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with serving(folder) as address:
+        page = open_page(browser, address)
+        line = page.locator(".failure").inner_text().strip()
+        page.close()
+    assert line.startswith(f"manifest.json: expected {told}, found ")
+    assert "\n" not in line

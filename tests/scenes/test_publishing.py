@@ -81,11 +81,33 @@ def test_the_manifest_lists_every_file_with_its_checksum(balls, tmp_path, small_
     )
 
 
-def test_the_splats_are_an_spz_in_the_order_of_the_codes(balls, tmp_path):
+def test_the_splats_are_an_spz_in_the_order_of_the_codes(balls, tmp_path, monkeypatch):
+    monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
     path, rotation = splat_file.write_splats(balls.gaussians, tmp_path)
     assert (path.name, rotation) == ("scene.spz", (1, 0, 0, 0))
     assert path.read_bytes()[:2] == b"\x1f\x8b", "the page's renderer reads gzip, not version 4"
     assert np.allclose(read_splats(path).means, balls.gaussians.means, atol=1e-4)
+
+
+def test_small_scenes_are_a_ply_without_loss_and_large_ones_the_smaller_of_spz_and_sog(
+    balls, tmp_path, monkeypatch
+):
+    path, rotation = splat_file.write_splats(balls.gaussians, tmp_path, shrink=True)
+    assert (path.name, rotation) == ("scene.ply", (0, 0, 0, 1))
+    assert torch.equal(read_splats(path).means, balls.gaussians.means)
+    path.unlink()
+    monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
+    monkeypatch.setattr(splat_file, "LARGE_BYTES", 0)
+    gaussians = balls.gaussians.map(torch.clone)
+    gaussians.shN = torch.randn(len(gaussians), 15, 3, generator=torch.Generator().manual_seed(0))
+    sizes = {}
+    for shrink in (False, True):
+        path, _ = splat_file.write_splats(gaussians, tmp_path, shrink)
+        sizes[path.suffix] = path.stat().st_size
+        assert [file.name for file in tmp_path.iterdir()] == [path.name]
+        assert np.allclose(read_splats(path).means, gaussians.means, atol=1e-3)
+        path.unlink()
+    assert sizes[".spz"] >= min(sizes.values())
 
 
 def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, small_dictionary):
@@ -104,10 +126,10 @@ def test_publishing_again_replaces_the_page_and_keeps_no_file_of_before(
 ):
     folder = tmp_path / "page"
     published(balls, folder, words_only=True)
-    monkeypatch.setattr(splat_file, "NAME", "other.spz")
+    monkeypatch.setattr(splat_file, "NAME", "other")
     manifest = published(balls, folder, words_only=True, title="again")
     assert {path.name for path in folder.iterdir()} == set(manifest["files"]) | {"manifest.json"}
-    assert not (folder / "scene.spz").exists()
+    assert not (folder / "scene.ply").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
 
 

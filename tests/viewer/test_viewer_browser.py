@@ -171,3 +171,41 @@ def test_a_video_is_recorded(page, tmp_path):
     kind, size = page.evaluate("lexsplat.app.stage.record(1).then((made) => [made.suffix, made.video.size])")
     assert kind in (".mp4", ".webm")
     assert size > 500
+
+
+def test_a_video_without_a_picture_is_told_and_not_saved(page):
+    told = page.evaluate(
+        """async () => {
+            const record = MediaRecorder.prototype.start;
+            MediaRecorder.prototype.start = function () { setTimeout(() => this.dispatchEvent(new Event("error"))); };
+            try {
+                return await lexsplat.app.stage.record(0.2).then(() => "saved", (error) => error.message);
+            } finally {
+                MediaRecorder.prototype.start = record;
+            }
+        }"""
+    )
+    assert told.startswith("The browser recorded no picture")
+
+
+def test_a_video_has_many_pictures_also_where_they_take_long(page):
+    drawn = page.evaluate(
+        """async () => {
+            const { stage } = lexsplat.app;
+            const own = stage.renderer.render;
+            let count = 0;
+            stage.renderer.render = function (...given) {
+                const end = performance.now() + 400;
+                while (performance.now() < end);
+                count++;
+                return own.apply(this, given);
+            };
+            try {
+                await stage.record(1);
+                return count;
+            } finally {
+                stage.renderer.render = own;
+            }
+        }"""
+    )
+    assert drawn >= 5

@@ -22,6 +22,8 @@ export interface Answer {
   /** Shown although the scene does not hold it. */
   anyway: boolean;
   places: Place[] | null;
+  /** The objects of a kind, which are its places for every threshold; null for other phrases. */
+  members: Place[] | null;
   /** The place that the camera looks at. */
   place: number;
   /** What the server was asked. */
@@ -32,7 +34,7 @@ export type Found = Pick<Answer, "phrase" | "from" | "scores" | "presence" | "th
 
 /** An answer as it is first shown. */
 export function answered(prompt: string, color: string, found: Found): Answer {
-  const fresh = { note: "", hidden: false, anyway: false, places: null, place: 0, asked: null };
+  const fresh = { note: "", hidden: false, anyway: false, places: null, members: null, place: 0, asked: null };
   return { ...fresh, prompt, color, automatic: found.threshold, ...found };
 }
 

@@ -7,6 +7,7 @@ import type { Geometry, Place } from "./geometry";
 import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./manifest";
 import { Measure } from "./measure";
 import { Overlay } from "./overlay";
+import { Notes } from "./notes";
 import { objectsPanel, viewsPanel } from "./panels";
 import { MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
@@ -31,7 +32,7 @@ export class App {
   readonly #overlay: Overlay;
   readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
   readonly #sheet: HTMLElement;
-  readonly #status = h("div", { class: "status", role: "status", "aria-live": "polite" });
+  readonly #notes: Notes;
   readonly #bounds: { center: THREE.Vector3; radius: number };
   readonly #life = new AbortController();
   #mode: Mode = "marks";
@@ -59,13 +60,15 @@ export class App {
     this.#overlay = new Overlay(stage);
     this.measure = new Measure(stage, geometry, this.#overlay, manifest);
     const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
-    this.objects = objectsPanel(list, ({ size }) => this.measure.sides(size), (object) => this.#goTo(object));
+    this.objects = objectsPanel(list, this.measure.sizes(), (object) => this.#goTo(object));
     const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }));
     const tries = h("p", { class: "examples" }, examples.length > 0 && "Try: ");
     for (const phrase of examples) {
       tries.append(h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, false)) }));
     }
-    this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, tries, this.#list, this.#status);
+    this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, tries, this.#list);
+    this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
+    this.#sheet.append(this.#notes.element);
     root.append(
       h("div", { class: "bar" }, this.search.element, this.#sheet),
       head,
@@ -129,9 +132,10 @@ export class App {
     for (const answer of this.answers) await this.source.refine(answer);
     this.#paint();
     this.#refresh();
-    const latest = this.answers.at(-1);
-    if (latest) this.#say(this.answers.slice(-prompts.length).map((answer) => `${answer.prompt}: ${spoken(answer)}`).join(". "));
-    if (fly && latest?.places?.length) this.#flyTo(latest);
+    const fresh = this.answers.slice(-prompts.length);
+    if (fresh.length) this.#notes.say(fresh.map((answer) => `${answer.prompt}: ${spoken(answer)}`).join(". "));
+    const first = fresh.find((answer) => painted(answer) && answer.places?.length);
+    if (fly && first) this.#flyTo(first);
   }
 
   #add(answer: Answer): void {
@@ -275,10 +279,11 @@ export class App {
     const { dictionary, loader } = this.source;
     const near = dictionary.similar(prompt);
     const count = dictionary.phrases.length.toLocaleString("en");
-    this.note(`“${prompt}” is not among the ${count} phrases of this page.`, near);
+    this.note(`“${prompt}” is not among the ${count} phrases of this page.`);
+    this.#notes.offer(near.map((phrase) => ({ phrase })), true, "Nearest: ");
     if (loader?.waiting) {
       const size = (loader.bytes / 1e6).toFixed(0);
-      this.#status.append(
+      this.#notes.append(
         h("button", {
           type: "button",
           text: `Load the text model (${size} MB) to ask anything`,
@@ -288,18 +293,8 @@ export class App {
     }
   }
 
-  note(text: string, near: string[] = []): void {
-    this.#status.replaceChildren(text ? h("p", { text }) : "");
-    if (near.length) {
-      this.#status.append(h("p", { class: "examples" }, "Nearest: ", ...near.map((phrase) => h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, true)) }))));
-    }
-    this.#sheet.classList.toggle("noted", Boolean(text));
-  }
-
-  #say(text: string): void {
-    if (this.#status.childElementCount === 0 || this.#status.firstElementChild?.className === "spoken") {
-      this.#status.replaceChildren(h("p", { class: "spoken", text }));
-    }
+  note(text: string): void {
+    this.#notes.tell(text);
   }
 
   /** What is under a point of the page, told as buttons that ask for it. */
@@ -324,11 +319,8 @@ export class App {
     this.measure.clear();
     this.#overlay.show([new THREE.Vector3(...clicked.point)]);
     this.note(sure.length ? "This may be:" : "No phrase of this page fits well. Nearest:");
-    this.#status.append(
-      h("p", { class: "examples" }, ...shown.map(({ phrase, score }) =>
-        h("button", { type: "button", text: phrase, title: `relevancy ${score.toFixed(2)}`, onclick: () => this.run(() => this.ask(phrase, false)) }))),
-      h("p", { class: "fine", text: `at ${clicked.point.map((value) => value.toFixed(2)).join(", ")}` }),
-    );
+    this.#notes.offer(shown.map(({ phrase, score }) => ({ phrase, title: `relevancy ${score.toFixed(2)}` })), false);
+    this.#notes.append(h("p", { class: "fine", text: `at ${clicked.point.map((value) => value.toFixed(2)).join(", ")}` }));
     this.stage.draw();
     return clicked;
   }
@@ -368,11 +360,15 @@ export class App {
     canvas.addEventListener("pointerup", (event) => {
       if (!down || Math.hypot(event.clientX - down.x, event.clientY - down.y) > 6 || event.timeStamp - down.time > 600) return;
       down = null;
-      const { clientX: x, clientY: y } = event;
-      if (this.measure.active) this.note(this.measure.click(x, y));
-      else this.run(async () => void (await this.whatIs(x, y)));
+      this.pick(event.clientX, event.clientY);
     }, { signal });
     addEventListener("hashchange", () => location.hash !== this.#written && this.run(() => this.restore()), { signal });
+  }
+
+  /** A click, or Enter for the middle of the picture: a point to measure, else the question what is there. */
+  pick(x: number, y: number): void {
+    if (this.measure.active) this.note(this.measure.click(x, y));
+    else this.run(async () => void (await this.whatIs(x, y)));
   }
 
   theme(name: string): void {

@@ -14,6 +14,11 @@ export function normalize(text: string): string {
   return phrase.trim() || plain;
 }
 
+/** A phrase as it is, and what it may be in the singular. */
+export function singulars(phrase: string): string[] {
+  return [phrase, phrase.replace(/ies$/, "y"), phrase.replace(/e?s$/, ""), phrase.replace(/s$/, "")];
+}
+
 export class Dictionary {
   readonly phrases: string[];
   /** What each phrase is: asked of this scene before (a), a name (n), a name with a color or part (c), a use (u). */
@@ -72,7 +77,7 @@ export class Dictionary {
   find(text: string): number {
     const plain = text.trim().toLowerCase();
     const phrase = normalize(text);
-    for (const form of [plain, phrase, phrase.replace(/ies$/, "y"), phrase.replace(/e?s$/, ""), phrase.replace(/s$/, "")]) {
+    for (const form of [plain, ...singulars(phrase)]) {
       const place = this.#places.get(form);
       if (place !== undefined) return place;
     }

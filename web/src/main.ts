@@ -4,6 +4,7 @@ import { App, failure } from "./app";
 import { Dictionary } from "./dictionary";
 import { h } from "./dom";
 import { Geometry } from "./geometry";
+import { Kinds } from "./kinds";
 import { Language } from "./language";
 import { Files, type Manifest, PageError } from "./manifest";
 import { Segments } from "./segments";
@@ -23,11 +24,12 @@ async function start(root: HTMLElement): Promise<App> {
   theme();
   const files = new Files();
   const progress = h("p", { class: "progress", role: "status", text: "Loading" });
-  const canvas = h("canvas", { tabindex: 0, "aria-label": "The scene. Arrow keys turn it, plus and minus approach." });
+  const keys = "Arrow keys turn it, plus and minus approach, Enter tells what is in its middle.";
+  const canvas = h("canvas", { tabindex: 0, "aria-label": `The scene. ${keys}` });
   root.append(canvas, progress);
   const manifest = await files.manifest();
   document.title = manifest.title;
-  canvas.setAttribute("aria-label", `${manifest.title}. Arrow keys turn it, plus and minus approach.`);
+  canvas.setAttribute("aria-label", `${manifest.title}. ${keys}`);
   if (!document.createElement("canvas").getContext("webgl2")) {
     throw new PageError("This page needs WebGL 2, which this browser does not offer; use a newer browser or allow hardware acceleration.");
   }
@@ -63,8 +65,9 @@ async function load(
     return app;
   }
   const { language } = manifest;
-  const [codes, table, segments] = await Promise.all([
+  const [codes, table, segments, members] = await Promise.all([
     files.read(language!.codes), files.read(words.table!), language!.segments ? files.read(language!.segments) : null,
+    files.read(language!.objects),
   ]);
   if (codes.length !== 8 * scene.gaussians) {
     throw new PageError(`${language!.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
@@ -74,7 +77,9 @@ async function load(
   const codesOf = new Language(codes, language!.num_codes);
   const loader = manifest.text ? new TowerLoader(files, manifest) : null;
   const whole = segments && new Segments(segments, scene.gaussians);
-  const tables = new Tables(stage, geometry, codesOf, whole, new Dictionary(list, table, language!.num_codes), loader);
+  const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
+  const dictionary = new Dictionary(list, table, language!.num_codes);
+  const tables = new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds);
   return new App(stage, geometry, manifest, tables, root);
 }
 

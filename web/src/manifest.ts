@@ -71,14 +71,20 @@ export interface Manifest {
   };
   /** Null where a server answers, as are the table of words and the list of objects. */
   server: ServerEntry | null;
-  language: { codes: string; segments: string | null; num_codes: number; method: string } | null;
+  language: { codes: string; segments: string | null; objects: string; num_codes: number; method: string } | null;
   words: { phrases: string; table: string | null; count: number };
   objects: ObjectEntry[] | null;
+  /** Places in the list of objects for each kind of things ("toy") that the scene holds. */
+  kinds: Record<string, number[]> | null;
   text: {
     weights: string;
     tokenizer: string;
     heads: number;
     activation: string;
+    /** Of the layer norms. */
+    epsilon: number;
+    /** Token that fills texts up, where all tokens see each other; null where they see those before them. */
+    padding: number | null;
     templates: string[];
     everyday: EverydayRule;
   } | null;
@@ -88,7 +94,51 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 2;
+const FORMAT_VERSION = 3;
+
+const isText = (value: unknown): boolean => typeof value === "string";
+const isRecord = (value: unknown): boolean => typeof value === "object" && value !== null && !Array.isArray(value);
+const areNumbers = (count: number) => (value: unknown): boolean =>
+  Array.isArray(value) && value.length === count && value.every(Number.isFinite);
+const orNull = (check: (value: unknown) => boolean) => (value: unknown): boolean => value === null || check(value);
+
+/** What the page cannot do without: where it is in the manifest, what it is, and how that is seen. */
+const FIELDS: [string, string, (value: unknown) => boolean][] = [
+  ["title", "a text", isText],
+  ["description", "a text", isText],
+  ["scene", "an object", isRecord],
+  ["scene.file", "a text", isText],
+  ["scene.gaussians", "a number", Number.isFinite],
+  ["scene.of", "a number", Number.isFinite],
+  ["scene.rotation", "4 numbers", areNumbers(4)],
+  ["scene.up", "3 numbers", areNumbers(3)],
+  ["scene.meters_per_unit", "a number or null", orNull(Number.isFinite)],
+  ["server", "an object or null", orNull(isRecord)],
+  ["language", "an object or null", orNull(isRecord)],
+  ["words", "an object", isRecord],
+  ["words.phrases", "a text", isText],
+  ["words.count", "a number", Number.isFinite],
+  ["text", "an object or null", orNull(isRecord)],
+  ["files", "an object", isRecord],
+  ["licenses", "an object", isRecord],
+  ["views", "a list of cameras", areViews],
+];
+
+function areViews(value: unknown): boolean {
+  const isView = (view: ViewEntry | null): boolean =>
+    isRecord(view) && isText(view!.name) && areNumbers(2)([view!.width, view!.height]) && areNumbers(2)(view!.focal) && areNumbers(16)(view!.viewmat);
+  return Array.isArray(value) && value.every(isView);
+}
+
+/** The first field that a manifest lacks, with what it should be; "" if it is whole. */
+function lacking(manifest: Manifest): string {
+  const at = (path: string): unknown =>
+    path.split(".").reduce<unknown>((owner, name) => (owner as Record<string, unknown> | null | undefined)?.[name], manifest);
+  const lack = FIELDS.find(([path, , check]) => !check(at(path)));
+  if (lack) return `${lack[1]} in ${lack[0]}`;
+  if (!manifest.server && !manifest.language) return "language or a server";
+  return manifest.files[manifest.scene.file] ? "" : `${manifest.scene.file} in files`;
+}
 
 /** Where the files are: beside the page, or inside it (`--single-file`). */
 export class Files {
@@ -113,12 +163,15 @@ export class Files {
       if (error instanceof PageError) throw error;
       throw new PageError("manifest.json: expected JSON, found something else; publish the scene again.");
     }
+    if (manifest === null || typeof manifest !== "object") manifest = {} as Manifest;
     if (manifest.format !== "lexsplat-page" || manifest.format_version !== FORMAT_VERSION) {
       throw new PageError(
         `manifest.json: expected version ${FORMAT_VERSION} of a lexsplat page, ` +
           `found ${manifest.format_version}; publish the scene again.`,
       );
     }
+    const lack = lacking(manifest);
+    if (lack) throw new PageError(`manifest.json: expected ${lack}, found something else; publish the scene again.`);
     return this.take(manifest);
   }
 

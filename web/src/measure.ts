@@ -44,11 +44,21 @@ export class Measure {
     return meters < 1 ? `${(meters * 100).toPrecision(3)} cm` : `${meters.toPrecision(3)} m`;
   }
 
-  /** The sides of a box, as short as a list needs it. */
+  /** The sides of a box with their unit. */
   sides(size: number[]): string {
-    const scale = this.manifest.scene.meters_per_unit;
-    if (scale === null) return `${size.map((side) => side.toPrecision(2)).join(" × ")} units`;
-    const small = Math.max(...size) * scale < 1;
-    return `${size.map((side) => (side * scale * (small ? 100 : 1)).toPrecision(2)).join(" × ")} ${small ? "cm" : "m"}`;
+    const { unit, sides } = this.sizes();
+    return `${sides(size)} ${unit}`;
   }
+
+  /** A unit for a list of boxes, and the sides of one in it. */
+  sizes(): { unit: string; sides: (size: number[]) => string } {
+    const scale = this.manifest.scene.meters_per_unit;
+    const sides = (size: number[]): string => size.map((side) => short(side * (scale ?? 1))).join(" × ");
+    return { unit: scale === null ? "units" : "m", sides };
+  }
+}
+
+/** Two digits, also of numbers above a hundred, and two decimals at most. */
+function short(value: number): string {
+  return value >= 9.95 ? value.toFixed(0) : value.toFixed(value >= 0.995 ? 1 : 2);
 }

@@ -208,7 +208,7 @@ function modifier(uniforms: Record<keyof typeof TYPES, unknown>, count: number) 
               if (score > best) {
                 best = score;
                 float strength = smoothstep(0.0, 1.0, score / max(0.05, prompt.w + 0.3));
-                marked = mix(rest * 0.6, lexsplatHeat(clamp(score, 0.0, 1.0)), 0.15 + 0.75 * strength);
+                marked = mix(rest * 0.6, lexsplatHeat(clamp(score, 0.0, 1.0)) * (0.55 + 0.7 * light), 0.15 + 0.75 * strength);
               }
               continue;
             }

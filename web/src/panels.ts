@@ -58,10 +58,13 @@ export function viewsPanel(views: ViewEntry[], jump: (view: ViewEntry) => void, 
 }
 
 /** The list of objects: name and size, found when it is first opened. */
-export function objectsPanel(find: () => Promise<ObjectEntry[]>, size: (object: ObjectEntry) => string, go: (object: ObjectEntry) => void) {
+export function objectsPanel(
+  find: () => Promise<ObjectEntry[]>, { unit, sides }: { unit: string; sides: (size: number[]) => string }, go: (object: ObjectEntry) => void,
+) {
   const list = h("ul", {});
   const head = h("strong", { text: "Objects" });
-  const element = h("aside", { class: "views objects", "aria-label": "Objects in this scene", hidden: true }, h("div", { class: "row" }, head), list);
+  const kind = h("span", { class: "fine", text: `sizes in ${unit}` });
+  const element = h("aside", { class: "views objects", "aria-label": "Objects in this scene", hidden: true }, h("div", { class: "row" }, head, kind), list);
   let found: Promise<void> | null = null;
   const fill = async (): Promise<void> => {
     head.textContent = "Looking for objects …";
@@ -69,7 +72,7 @@ export function objectsPanel(find: () => Promise<ObjectEntry[]>, size: (object: 
     head.textContent = objects.length === 1 ? "One object" : `${objects.length} objects`;
     list.replaceChildren(
       ...objects.map((object) =>
-        h("li", {}, h("button", { type: "button", onclick: () => go(object) }, h("span", { text: object.name }), h("span", { class: "fine", text: size(object) }))),
+        h("li", {}, h("button", { type: "button", onclick: () => go(object) }, h("span", { text: object.name }), h("span", { class: "fine", text: sides(object.size) }))),
       ),
     );
   };
@@ -87,6 +90,7 @@ const KEYS: [string, string][] = [
   ["/", "search"],
   ["Enter, Shift+Enter", "ask, add to the answers"],
   ["Escape", "remove all answers"],
+  ["Enter on the picture", "what is in its middle? While measuring: take that point"],
   ["arrows, + and -", "turn and approach (with Shift: move)"],
   ["[ and ]", "previous and next photo"],
   ["v, o, m, h", "photos, objects, measure, heat"],

@@ -9,8 +9,12 @@ import { type Manifest, PageError, type ViewEntry } from "./manifest";
 /** Scenes of more splats are stored with less precise centers, to fit into the memory of phones. */
 const MOST_PRECISE = 1_500_000;
 const FLIGHT_MS = 700;
+/** Pictures a second of a video, at most. */
+const MOST_RATE = 30;
+/** Seconds of the swing between two pictures of a video, at most. */
+const LONGEST_STEP = 0.2;
 
-const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY };
+const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY, sog: SplatFileType.PCSOGSZIP };
 
 export class Stage {
   readonly camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
@@ -131,6 +135,12 @@ export class Stage {
     return caster.ray;
   }
 
+  /** The middle of the part of the picture that nothing covers, on the page. */
+  get middle(): [number, number] {
+    const box = this.canvas.getBoundingClientRect();
+    return [box.left + box.width / 2, box.top + (box.height - this.#bottom) / 2];
+  }
+
   /** Where a point of the scene is on the page; null behind the camera. */
   pixel(point: THREE.Vector3): { x: number; y: number } | null {
     const seen = point.clone().project(this.camera);
@@ -157,24 +167,29 @@ export class Stage {
     const kinds = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
     const kind = globalThis.MediaRecorder && kinds.find((one) => MediaRecorder.isTypeSupported(one));
     if (!kind) return null;
-    const recorder = new MediaRecorder(this.canvas.captureStream(30), { mimeType: kind, videoBitsPerSecond: 8e6 });
+    const recorder = new MediaRecorder(this.canvas.captureStream(MOST_RATE), { mimeType: kind, videoBitsPerSecond: 8e6 });
     const parts: Blob[] = [];
     recorder.ondataavailable = ({ data }) => parts.push(data);
-    const stopped = new Promise((resolve) => (recorder.onstop = resolve));
+    const stopped = new Promise((resolve) => (recorder.onstop = recorder.onerror = resolve));
     const offset = this.camera.position.clone().sub(this.target);
     const flight = ++this.#flight;
     recorder.start();
-    const start = performance.now();
-    for (let share = 0; share < 1 && flight === this.#flight; ) {
-      share = Math.min(1, (performance.now() - start) / (1000 * seconds));
-      const angle = THREE.MathUtils.degToRad(degrees) * Math.sin(2 * Math.PI * share);
+    // Where pictures take long, the swing does too: a video of two pictures shows nothing.
+    let before = performance.now();
+    for (let time = 0; time < seconds && flight === this.#flight; ) {
+      const angle = THREE.MathUtils.degToRad(degrees) * Math.sin((2 * Math.PI * time) / seconds);
       this.camera.position.copy(this.target).add(offset.clone().applyAxisAngle(this.camera.up, angle));
       this.draw();
       await new Promise(requestAnimationFrame);
+      const now = performance.now();
+      time += Math.min(LONGEST_STEP, (now - before) / 1000);
+      before = now;
     }
-    recorder.stop();
+    if (recorder.state !== "inactive") recorder.stop();
     await stopped;
-    return { video: new Blob(parts, { type: kind }), suffix: kind.startsWith("video/mp4") ? ".mp4" : ".webm" };
+    const video = new Blob(parts, { type: kind });
+    if (video.size === 0) throw new PageError("The browser recorded no picture; keep this page in front and try again.");
+    return { video, suffix: kind.startsWith("video/mp4") ? ".mp4" : ".webm" };
   }
 
   /** Stand where a photo was taken. `depth` is how far away the scene is there. */

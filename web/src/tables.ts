@@ -1,10 +1,11 @@
 // Answers without a server: the dictionary, then the text tower, then whole segments.
 
 import { type Answer, type Clicked, type Source, answered, painted } from "./answers";
-import { Dictionary, normalize } from "./dictionary";
+import { Dictionary, normalize, singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
 import { type Language, shownSplats } from "./language";
 import { BORDER, type Presence, hasColor, isPart, peakOf, presenceOf } from "./rules";
+import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
 import type { Stage } from "./stage";
 import type { Description } from "./tower";
@@ -21,6 +22,7 @@ export class Tables implements Source {
     readonly segments: Segments | null,
     readonly dictionary: Dictionary,
     readonly loader: TowerLoader | null,
+    readonly kinds: Kinds,
   ) {
     this.#shown = shownSplats(geometry.opacities);
     dictionary.rank(language, this.#shown);
@@ -32,6 +34,13 @@ export class Tables implements Source {
   }
 
   async answer(prompt: string, color: string): Promise<Answer | null> {
+    const plain = await this.#plain(prompt, color);
+    const kind = singulars(normalize(prompt)).find((form) => this.kinds.has(form));
+    return kind && plain ? this.kinds.answer(kind, plain) : plain;
+  }
+
+  /** The answer to a phrase by its own relevancy. */
+  async #plain(prompt: string, color: string): Promise<Answer | null> {
     const known = this.dictionary.find(prompt);
     if (known >= 0) {
       const own = this.language.scores(this.dictionary.table(known));
@@ -70,6 +79,7 @@ export class Tables implements Source {
   }
 
   async refine(answer: Answer): Promise<void> {
+    answer.places ??= answer.members;
     if (answer.places) return;
     const hidden = this.segments?.hidden;
     const seen = (place: Place): Place => (hidden ? { ...place, splats: place.splats.filter((i) => !hidden[i]) } : place);

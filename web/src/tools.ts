@@ -52,6 +52,7 @@ function key(event: KeyboardEvent, app: App, buttons: Record<string, HTMLButtonE
   } else if (event.key === "Escape") app.clear();
   else if (buttons[event.key]) buttons[event.key].click();
   else if (event.key === "[" || event.key === "]") app.views.step(event.key === "]" ? 1 : -1);
+  else if (event.key === "Enter" && target === app.stage.canvas) app.pick(...app.stage.middle);
   else if ((target === app.stage.canvas || target === document.body) && app.stage.key(event.key, event.shiftKey)) {
     event.preventDefault();
   }

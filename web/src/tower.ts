@@ -1,9 +1,9 @@
-// The text tower of CLIP in plain TypeScript: a phrase to its relevancy for every code, without a server.
+// The text tower of a CLIP or SigLIP in plain TypeScript: a phrase to its relevancy for every code, without a server.
 
 import type { Table } from "./language";
 import type { EverydayRule, Manifest } from "./manifest";
 import { type Heights, hasColor, heightsOf, isPart, relevancyOf } from "./rules";
-import { Tokenizer } from "./tokenizer";
+import { PhraseTokenizer } from "./tokenizer";
 
 /** What a phrase means to the codes of the scene. */
 export interface Description {
@@ -48,6 +48,9 @@ export function readSafetensors(content: Uint8Array<ArrayBuffer>): Map<string, M
 const QUICK_GELU = (x: number): number => x / (1 + Math.exp(-1.702 * x));
 const GELU = (x: number): number => 0.5 * x * (1 + erf(x * Math.SQRT1_2));
 
+const TANH_GELU = (x: number): number => 0.5 * x * (1 + Math.tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+const ACTIVATIONS: Record<string, (x: number) => number> = { quick_gelu: QUICK_GELU, gelu: GELU, gelu_pytorch_tanh: TANH_GELU };
+
 /** Abramowitz and Stegun 7.1.26; the error is below 1.5e-7. */
 function erf(x: number): number {
   const t = 1 / (1 + 0.3275911 * Math.abs(x));
@@ -64,7 +67,7 @@ function unit(vectors: Float32Array[]): Float32Array {
 
 export class TextTower {
   readonly #tensors: Map<string, Matrix>;
-  readonly #tokenizer: Tokenizer;
+  readonly #tokenizer: PhraseTokenizer;
   readonly #text: NonNullable<Manifest["text"]>;
   readonly #heads: number;
   readonly #activation: (x: number) => number;
@@ -73,10 +76,11 @@ export class TextTower {
   constructor(weights: Uint8Array<ArrayBuffer>, tokenizer: Uint8Array, manifest: Manifest) {
     this.#tensors = readSafetensors(weights);
     const positions = this.#get("embeddings.position_embedding.weight").rows;
-    this.#tokenizer = new Tokenizer(JSON.parse(new TextDecoder().decode(tokenizer)), positions);
     this.#text = manifest.text!;
+    const file = JSON.parse(new TextDecoder().decode(tokenizer)) as object;
+    this.#tokenizer = new PhraseTokenizer(file, positions, this.#text.padding);
     this.#heads = this.#text.heads;
-    this.#activation = this.#text.activation === "quick_gelu" ? QUICK_GELU : GELU;
+    this.#activation = ACTIVATIONS[this.#text.activation];
     let layers = 0;
     while (this.#tensors.has(`encoder.layers.${layers}.layer_norm1.weight`)) layers++;
     this.#layers = layers;
@@ -105,7 +109,7 @@ export class TextTower {
       for (let d = 0; d < width; d++) x[t * width + d] = words.data[token * width + d] * a + positions.data[t * width + d] * b;
     });
     for (let layer = 0; layer < this.#layers; layer++) x = this.#block(x, tokens.length, `encoder.layers.${layer}.`);
-    const last = this.#norm(x.slice(-width), "final_layer_norm"); // the end token is the last one
+    const last = this.#norm(x.slice(-width), "final_layer_norm"); // the last token: the end, or for SigLIP the last place
     const out = this.#linear(last, 1, "text_projection");
     return unit([out]);
   }
@@ -118,9 +122,10 @@ export class TextTower {
     return middle.map((value, i) => value + out[i]);
   }
 
-  /** Causal self-attention of `count` tokens. */
+  /** Self-attention of `count` tokens: to those before each, or with padding to all. */
   #attend(x: Float32Array, count: number, name: string): Float32Array {
     const [q, k, v] = ["q_proj", "k_proj", "v_proj"].map((part) => this.#linear(x, count, name + part));
+    const all = this.#text.padding !== null;
     const width = x.length / count;
     const size = width / this.#heads;
     const blended = new Float32Array(x.length);
@@ -128,7 +133,7 @@ export class TextTower {
       for (let t = 0; t < count; t++) {
         const row = q.subarray(t * width + head, t * width + head + size);
         const weights: number[] = [];
-        for (let s = 0; s <= t; s++) {
+        for (let s = 0; s < (all ? count : t + 1); s++) {
           let sum = 0;
           for (let d = 0; d < size; d++) sum += row[d] * k[s * width + head + d];
           weights.push(sum / Math.sqrt(size));
@@ -170,7 +175,7 @@ export class TextTower {
       let square = 0;
       for (let d = 0; d < width; d++) mean += x[start + d] / width;
       for (let d = 0; d < width; d++) square += (x[start + d] - mean) ** 2 / width;
-      const scale = 1 / Math.sqrt(square + 1e-5);
+      const scale = 1 / Math.sqrt(square + this.#text.epsilon);
       for (let d = 0; d < width; d++) out[start + d] = (x[start + d] - mean) * scale * weight[d] + bias[d];
     }
     return out;

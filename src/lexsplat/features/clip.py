@@ -9,7 +9,6 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS
 from lexsplat.features.hub import local_folder
+from lexsplat.features.portable import TextWeights, tokenizer_content
 from lexsplat.features.pretrained import (
     PretrainedModel,
     check_images,
@@ -36,25 +36,10 @@ DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
+_ACTIVATIONS = ("quick_gelu", "gelu", "gelu_pytorch_tanh")
+"""Of text towers that other programs can compute."""
 _FEW_PATCHES = 64
 _PADDING = 128  # vocabularies are padded to a multiple of at most this
-
-
-@dataclass(frozen=True, eq=False)
-class TextWeights:
-    """The text half of a CLIP.
-
-    Args:
-        tensors: Weights by their names in transformers, without the prefix "text_model.".
-        heads: Attention heads of a layer.
-        activation: "quick_gelu" or "gelu".
-        tokenizer: The content of its ``tokenizer.json``.
-    """
-
-    tensors: dict[str, Tensor]
-    heads: int
-    activation: str
-    tokenizer: dict[str, Any]
 
 
 class ClipEncoder(PretrainedModel):
@@ -152,18 +137,27 @@ class ClipEncoder(PretrainedModel):
         return found
 
     def text_tower(self) -> TextWeights | None:
-        """The text tower for other programs; None if it is not of CLIP's own architecture."""
+        """The text tower for other programs; None if it is neither of CLIP's nor of SigLIP's architecture."""
         config = self._model.config.text_config
-        tokenizer = getattr(self._tokenizer, "backend_tokenizer", None)
-        if self._model.config.model_type != "clip" or tokenizer is None:
+        kind = self._model.config.model_type
+        tokenizer = tokenizer_content(self._tokenizer)
+        if kind not in ("clip", "siglip") or config.hidden_act not in _ACTIVATIONS or tokenizer is None:
             return None
         tensors = {
-            name: tensor.detach().cpu() for name, tensor in self._model.text_model.state_dict().items()
+            name.replace("head.", "text_projection."): tensor.detach().cpu()
+            for name, tensor in self._model.text_model.state_dict().items()
         }
-        tensors["text_projection.weight"] = self._model.text_projection.weight.detach().cpu()
+        if kind == "clip":
+            tensors["text_projection.weight"] = self._model.text_projection.weight.detach().cpu()
         tensors.pop("embeddings.position_ids", None)
-        content = json.loads(tokenizer.to_str())
-        return TextWeights(tensors, int(config.num_attention_heads), str(config.hidden_act), content)
+        return TextWeights(
+            tensors,
+            int(config.num_attention_heads),
+            str(config.hidden_act),
+            float(config.layer_norm_eps),
+            tokenizer,
+            int(self._tokenizer.pad_token_id) if self._siglip else None,
+        )
 
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask

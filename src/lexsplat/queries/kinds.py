@@ -22,6 +22,8 @@ _SAME = {
     "clothing": "clothes", "musical instrument": "instrument", "plaything": "toy",
 }  # fmt: skip
 KINDS = {kind: frozenset(words(members)) for kind, members in _MEMBERS.items()}
+KIND_PHRASES = (*_MEMBERS, *_SAME)
+"""Every text that names a kind."""
 
 
 def is_kind(text: str) -> bool:

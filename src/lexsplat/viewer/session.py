@@ -26,7 +26,7 @@ from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.editing import Editor, Motion, journal_of
 from lexsplat.scenes.exporting import export_gaussians
-from lexsplat.scenes.publishing.manifest import checksums, object_entries, scene_manifest
+from lexsplat.scenes.publishing.manifest import checksums, listed_objects, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
 from lexsplat.scenes.scene import Scene
@@ -140,7 +140,7 @@ class Session:
 
     def objects(self) -> list[dict[str, Any]]:
         """The objects of the scene for its list."""
-        return object_entries(self.scene)
+        return object_entries(listed_objects(self.scene))
 
     def colors(self, mode: str) -> bytes:
         """RGB of each drawn Gaussian; see `lexsplat.viewer.coloring`."""

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from lexsplat import __version__
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.kinds import KIND_PHRASES, is_of_kind
+from lexsplat.queries.selection import Selection
 from lexsplat.scenes.scene import Scene
 
-FORMAT, FORMAT_VERSION = "lexsplat-page", 2
+FORMAT, FORMAT_VERSION = "lexsplat-page", 3
 MOST_OBJECTS = 200
 """Entries of the list of objects, at most."""
 
@@ -56,6 +59,7 @@ def scene_manifest(
         "words": {"phrases": "words.txt", "table": None, "count": 0},
         "text": None,
         "objects": None,
+        "kinds": None,
         "views": view_entries(scene),
         "licenses": {"page.js": "Apache-2.0 and those of LICENSES.txt"},
         "provenance": {**scene.encoder_identity(), "built_with": built_with},
@@ -68,14 +72,19 @@ def _name(scene: Scene) -> str:
     return "demo" if scene.folder.is_bundled else scene.folder.root.resolve().name
 
 
-def object_entries(scene: Scene) -> list[dict[str, Any]]:
-    """Name, center and size of the objects of a scene, in world units, and in meters where the scale is known.
+def listed_objects(scene: Scene) -> tuple[Selection, ...]:
+    """The objects of the list.
 
     Raises:
         ModelError: If the text encoder cannot be loaded.
     """
+    return scene.objects[:MOST_OBJECTS]
+
+
+def object_entries(objects: Sequence[Selection]) -> list[dict[str, Any]]:
+    """Name, center and size of objects, in world units, and in meters where the scale is known."""
     entries = []
-    for found in scene.objects[:MOST_OBJECTS]:
+    for found in objects:
         meters = found.size_meters
         known = {} if meters is None else {"size_meters": meters.round(4).tolist()}
         size = found.size.round(4).tolist()
@@ -83,6 +92,15 @@ def object_entries(scene: Scene) -> list[dict[str, Any]]:
             {"name": found.phrase, "center": found.center.round(4).tolist(), "size": size, **known}
         )
     return entries
+
+
+def kind_entries(objects: Sequence[Selection]) -> dict[str, list[int]]:
+    """The places of a scene's objects that each kind holds, by every text that names the kind."""
+    found = {
+        text: [place for place, each in enumerate(objects) if is_of_kind(each.phrase, text)]
+        for text in KIND_PHRASES
+    }
+    return {text: places for text, places in found.items() if places}
 
 
 def one_line(text: str) -> str:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
 from lexsplat.language.segments import Segments
+from lexsplat.queries.selection import Selection
 from lexsplat.scenes.formats.language import StoredLanguage
+
+NO_OBJECT = 255
+"""Of a Gaussian that belongs to no object of the list."""
 
 
 def splat_codes(language: StoredLanguage) -> bytes:
@@ -36,3 +42,16 @@ def segments_file(segments: Segments, hidden: torch.Tensor) -> bytes:
     unseen = hidden.cpu().numpy().astype(np.uint8)
     head = np.array(levels.shape, "<u4")
     return b"".join(array.tobytes() for array in (head, levels, labels, masses, unseen))
+
+
+def objects_file(objects: Sequence[Selection], kept: torch.Tensor) -> bytes:
+    """The object of each splat: its place in the list, or `NO_OBJECT`, ``[M]`` uint8.
+
+    Args:
+        objects: At most 255 selections that share no Gaussian.
+        kept: Indices ``[M]`` of the Gaussians of the page.
+    """
+    found = np.full(len(kept), NO_OBJECT, np.uint8)
+    for place, each in enumerate(objects):
+        found[each.mask.cpu()[kept].numpy()] = place
+    return found.tobytes()

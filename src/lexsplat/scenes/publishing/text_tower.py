@@ -1,4 +1,4 @@
-"""The text tower of a CLIP for the browser: its weights as safetensors and its tokenizer as plain JSON."""
+"""The text tower of a CLIP or SigLIP for the browser: its weights as safetensors, and its ``tokenizer.json``."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
         scene: The scene, whose text encoder is taken.
         weights: Safetensors to write: the tower, the codewords of unit length ``[K, D]``, and the mean embedding
             ``[D]`` and the best height at each code ``[K]`` of everyday words.
-        tokenizer: JSON to write.
+        tokenizer: The ``tokenizer.json`` to write.
 
     Returns:
-        The entry "text" of the manifest; None if the encoder is not of CLIP's architecture.
+        The entry "text" of the manifest; None if the encoder is neither a CLIP nor a SigLIP.
     """
     encoder = load_clip(scene.clip)
     tower = encoder.text_tower() if isinstance(encoder, ClipEncoder) else None
@@ -43,12 +43,16 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
         weights,
         scene.encoder_identity(),
     )
-    tokenizer.write_text(json.dumps(_plain_tokenizer(tower.tokenizer), ensure_ascii=False), encoding="utf-8")
+    tokenizer.write_text(
+        json.dumps(tower.tokenizer, ensure_ascii=False, separators=(",", ":")), encoding="utf-8"
+    )
     return {
         "weights": weights.name,
         "tokenizer": tokenizer.name,
         "heads": tower.heads,
         "activation": tower.activation,
+        "epsilon": tower.epsilon,
+        "padding": tower.padding,
         "templates": list(scene.query.templates),
         "everyday": {
             "border": everyday.BORDER,
@@ -81,16 +85,3 @@ def _eight_bits(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         stored[name] = (tensor.float() / factor[:, None]).round().to(torch.int8)
         stored[f"{name}.factor"] = factor
     return stored
-
-
-def _plain_tokenizer(content: dict[str, Any]) -> dict[str, Any]:
-    """Vocabulary and merges of a ``tokenizer.json`` of CLIP, and the tokens of start and end."""
-    model = content["model"]
-    special = {token["content"]: token["id"] for token in content["added_tokens"]}
-    merges = [merge if isinstance(merge, str) else " ".join(merge) for merge in model["merges"]]
-    return {
-        "vocabulary": model["vocab"],
-        "merges": merges,
-        "start": special["<|startoftext|>"],
-        "end": special["<|endoftext|>"],
-    }

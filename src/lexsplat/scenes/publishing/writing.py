@@ -16,8 +16,16 @@ from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file, single_index
-from lexsplat.scenes.publishing.manifest import FORMAT, checksums, object_entries, one_line, scene_manifest
-from lexsplat.scenes.publishing.sidecar import segments_file, splat_codes
+from lexsplat.scenes.publishing.manifest import (
+    FORMAT,
+    checksums,
+    kind_entries,
+    listed_objects,
+    object_entries,
+    one_line,
+    scene_manifest,
+)
+from lexsplat.scenes.publishing.sidecar import objects_file, segments_file, splat_codes
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
 from lexsplat.scenes.publishing.vocabulary import (
@@ -184,13 +192,15 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     start = _start_view(scene, options.start_view)
     kept = most_visible(scene.gaussians, options.max_splats or len(scene.gaussians))
     gaussians = scene.gaussians.select(kept.to(scene.gaussians.device)).to("cpu")
-    splats, rotation = write_splats(gaussians, folder)
+    splats, rotation = write_splats(gaussians, folder, shrink=True)
     identity = scene.encoder_identity()
     language = stored_language(scene.field, identity).select(kept)
     (folder / "codes.bin").write_bytes(splat_codes(language))
     segments = scene.field.segments if form_used(scene.field, scene.query) == "segment" else None
     if segments is not None:
         (folder / "segments.bin").write_bytes(segments_file(segments.select(kept), scene.hidden.cpu()[kept]))
+    objects = listed_objects(scene)
+    (folder / "objects.bin").write_bytes(objects_file(objects, kept))
     phrases = page_phrases(asked_phrases(scene), bundled=scene.clip in ("bundled", "embedded"))
     tables, presences = phrase_answers(scene, list(phrases))
     (folder / "words.txt").write_bytes(words_file(phrases, presences))
@@ -207,12 +217,14 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
         "language": {
             "codes": "codes.bin",
             "segments": None if segments is None else "segments.bin",
+            "objects": "objects.bin",
             "num_codes": scene.field.codebook.num_codes,
             "method": scene.field.method,
         },
         "words": {"phrases": "words.txt", "table": "words.bin", "count": len(phrases)},
         "text": text,
-        "objects": object_entries(scene),
+        "objects": object_entries(objects),
+        "kinds": kind_entries(objects),
         "licenses": {
             "page.js": "Apache-2.0 and those of LICENSES.txt",
             "words.txt": "Apache-2.0",

@@ -1,0 +1,39 @@
+// What the page says under the answers: one line, and phrases to ask instead.
+
+import { h } from "./dom";
+
+export class Notes {
+  readonly element = h("div", { class: "status", role: "status", "aria-live": "polite" });
+  readonly #sheet: HTMLElement;
+  readonly #ask: (phrase: string, add: boolean) => void;
+
+  /** `sheet` holds the notes and gets the class "noted" while there is one. */
+  constructor(sheet: HTMLElement, ask: (phrase: string, add: boolean) => void) {
+    this.#sheet = sheet;
+    this.#ask = ask;
+  }
+
+  /** Show a line; an empty one removes it. */
+  tell(text: string): void {
+    this.element.replaceChildren(text ? h("p", { text }) : "");
+    this.#sheet.classList.toggle("noted", Boolean(text));
+  }
+
+  /** Only screen readers hear this, and only if nothing is shown. */
+  say(text: string): void {
+    if (this.element.childElementCount === 0 || this.element.firstElementChild?.className === "spoken") {
+      this.element.replaceChildren(h("p", { class: "spoken", text }));
+    }
+  }
+
+  /** Offer phrases after the line; `add` keeps the answers that are there. */
+  offer(phrases: { phrase: string; title?: string }[], add: boolean, before = ""): void {
+    if (phrases.length === 0) return;
+    const buttons = phrases.map(({ phrase, title }) => h("button", { type: "button", text: phrase, title, onclick: () => this.#ask(phrase, add) }));
+    this.element.append(h("p", { class: "examples" }, before, ...buttons));
+  }
+
+  append(element: HTMLElement): void {
+    this.element.append(element);
+  }
+}
