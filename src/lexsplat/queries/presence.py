@@ -155,7 +155,7 @@ class PresenceClassifier:
         """The segments that everyday words describe as wholes, as distributions ``[V, K]``, and those words."""
         codes, words = self.segment_codes, everyday_words()
         if codes is None:
-            return torch.zeros(0, self.language.codebook.num_codes), ()
+            return torch.zeros(0, len(self.language.codebook.clip)), ()
         texts = self._embed(words)
         whole = whole_segments(
             codes, lambda part: self.strengths(texts[part], codes.distributions), len(words)
