@@ -18,6 +18,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.pipeline.viewpoints import choosing
 from lexsplat.pipeline.viewpoints.choosing import choose_views, surface_share
+from lexsplat.pipeline.viewpoints.floaters import read_without_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.scenes.folder import SceneFolder
@@ -155,6 +156,32 @@ def test_floaters_in_front_of_a_surface_lower_its_share():
         before, after = (choosing._look(scene, camera)[1] for scene in (clean, both))
     assert before > 0.95
     assert after < 0.8 * before
+
+
+def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay(tmp_path, caplog):
+    clean = solid(on_table())
+    dust = np.random.default_rng(3).uniform([-3, -3, 0.1], [3, 3, 4], (700, 3))
+    floaters = solid(dust)
+    floaters.log_scales[:] = clean.log_scales[:700]
+    both = Gaussians(**{n: torch.cat([t, getattr(floaters, n)]) for n, t in clean.tensors().items()})
+    distances = np.linalg.norm(dust[:, None] - on_table()[None, ::10], axis=2).min(1)
+    splats = tmp_path / "dusty.ply"
+    write_ply(both, splats)
+    assert len(read_without_floaters(splats, keep=True)) == len(both)
+    with caplog.at_level(logging.WARNING, "lexsplat"):
+        kept = read_without_floaters(splats).means.numpy()
+    assert "dusty.ply" in caplog.text
+    assert "float free of all surfaces" in caplog.text
+    left = {tuple(row) for row in kept.tolist()}
+    assert all(tuple(row) in left for row in clean.means.tolist())
+    far = floaters.means[distances > 1].tolist()
+    assert len(far) > 300
+    assert sum(tuple(row) in left for row in far) < 0.05 * len(far)
+    caplog.clear()
+    for few in (both.select(torch.arange(len(clean) + 100)), clean):
+        write_ply(few, splats)
+        assert len(read_without_floaters(splats)) == len(few)
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("count", [0, 1, 60])

@@ -42,6 +42,7 @@ class Build:
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    unused: ClassVar[tuple[str, ...]] = ("keep_floaters",)
     until: ClassVar[Literal["reconstruct", "language"]] = "language"
 
     def run(self) -> None:
@@ -119,6 +120,7 @@ class Reconstruct(Build):
     )
     unused: ClassVar[tuple[str, ...]] = (
         "clip", "dino", "features_from", "method", "joint", "features", "codebook", "averaged", "trained",
+        "keep_floaters",
     )  # fmt: skip
     until: ClassVar[Literal["reconstruct", "language"]] = "reconstruct"
 
@@ -127,9 +129,9 @@ class Reconstruct(Build):
 class Language(Build):
     """Put language on the Gaussians of a scene: the stages after reconstruct, which runs first if it is missing.
 
-    With --splats, Gaussians made by another program are used unchanged. A CAPTURE must be the photos and poses that
-    they were made from, in the same axes and units. Without CAPTURE, views of the splats are chosen and rendered;
-    they are kept in OUTPUT/poses, with a contact sheet.
+    With --splats, Gaussians made by another program are used. A CAPTURE must be the photos and poses that they were
+    made from, in the same axes and units. Without CAPTURE, views of the splats are chosen and rendered; they are kept
+    in OUTPUT/poses, with a contact sheet. Where many Gaussians float free of all surfaces, they are then left out.
 
     Args:
         capture: Folder with photos and cameras, as in build; not needed with --splats.
@@ -138,6 +140,8 @@ class Language(Build):
 
     capture: OptionalCaptureArgument = dataclasses.field(default="", kw_only=True)
     splats: Path | None = None
+
+    unused: ClassVar[tuple[str, ...]] = ()
 
     def check(self) -> None:
         """Refuse invalid options."""

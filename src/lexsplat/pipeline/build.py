@@ -30,7 +30,7 @@ from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, f
 from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
 from lexsplat.pipeline.provenance import model_identity, model_place, write_provenance
 from lexsplat.pipeline.splats import check_agreement, existing_splats
-from lexsplat.pipeline.viewpoints import capture_of_splats
+from lexsplat.pipeline.viewpoints import capture_of_splats, read_without_floaters
 from lexsplat.pipeline.viewpoints.choosing import SIZE
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.reconstruction.blocks import BlockRun, number_of_blocks, reconstruct_blocks
@@ -45,7 +45,6 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.previous import drop_previous
 
 STAGES = ("reconstruct", "features", "codebook", "language")
@@ -300,7 +299,8 @@ class _Builder:
 
     def _take_splats(self) -> dict[str, Any]:
         splats = existing_splats(self.splats)
-        gaussians = read_splats(splats)
+        theirs = self.capture.root != self.folder.root / "poses"  # photos of the user show all Gaussians
+        gaussians = read_without_floaters(splats, keep=theirs or self.config.keep_floaters)
         check_agreement(gaussians, list(self._training_views.values()), splats)
         self.folder.write_gaussians(gaussians)
         return {"gaussians": len(gaussians), "splats": str(splats.resolve())}

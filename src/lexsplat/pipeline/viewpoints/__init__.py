@@ -1,6 +1,7 @@
 """Cameras for splats that come without a capture: chosen from the Gaussians alone."""
 
 from lexsplat.pipeline.viewpoints.choosing import ChosenViews, choose_views
+from lexsplat.pipeline.viewpoints.floaters import read_without_floaters
 from lexsplat.pipeline.viewpoints.stage import capture_of_splats
 
-__all__ = ["ChosenViews", "capture_of_splats", "choose_views"]
+__all__ = ["ChosenViews", "capture_of_splats", "choose_views", "read_without_floaters"]

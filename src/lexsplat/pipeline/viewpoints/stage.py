@@ -13,11 +13,11 @@ from lexsplat.geometry.world import parse_vector
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import existing_splats
 from lexsplat.pipeline.viewpoints.choosing import choose_views
+from lexsplat.pipeline.viewpoints.floaters import read_without_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.progress import NOTE, Listener
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.formats.reading import read_splats
 
 log = logging.getLogger("lexsplat")
 
@@ -44,11 +44,11 @@ def capture_of_splats(
         CaptureError: If no views can be chosen.
     """
     splats, poses = existing_splats(splats), folder.root / "poses"
-    key = fingerprint(file_hash(splats), config.up, config.seed)
+    key = fingerprint(file_hash(splats), config.up, config.seed, config.keep_floaters)
     if not (folder.is_finished("views", key) and (poses / "transforms.json").is_file()):
         start = time.perf_counter()
         folder.reopen("views")
-        gaussians = read_splats(splats).to(device)
+        gaussians = read_without_floaters(splats, keep=config.keep_floaters).to(device)
         up = None if config.up is None else np.array(parse_vector(config.up))
         chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
         write_chosen_capture(gaussians, chosen, poses)
