@@ -62,8 +62,8 @@ class BuildConfig:
         frames: Number of frames sampled from a video.
         test_every: Every n-th view is held out if the capture does not list held-out views; 0 holds out none.
         up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras.
-        keep_floaters: Keep Gaussians that float free of all surfaces. Splats without a capture lose them where they are
-            many.
+        keep_floaters: Keep Gaussians that float free of all surfaces; splats without a capture lose them where there
+            are many.
         method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in
             docs/results.md); "trained" is the optimization of the paper.
         joint: Train language together with geometry, as the authors' code does; needs method "trained".
