@@ -10,12 +10,17 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, share)))
 
+import hypothesis
 import pytest
 from filelock import FileLock
 from support.tiny_capture import QUICK_BUILD, write_capture
 
 import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
 from lexsplat.runtime import device as threads
+
+# A loaded machine may take any time for an example.
+hypothesis.settings.register_profile("lexsplat", deadline=None)
+hypothesis.settings.load_profile("lexsplat")
 
 TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

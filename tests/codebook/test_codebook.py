@@ -131,7 +131,7 @@ def test_load_balancing_gradient_disfavors_the_used_code() -> None:
     np.testing.assert_allclose(scores.grad[:, 1], -p * (1 - p) / 10, rtol=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10_000), st.integers(2, 9))
 def test_load_balancing_loss_is_at_most_one_and_lowest_when_balanced(seed: int, codes: int) -> None:
     scores = torch.randn(60, codes, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

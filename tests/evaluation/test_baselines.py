@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
 from support.language_scene import CENTERS, IGNORED, make_scene
@@ -164,7 +164,6 @@ def test_level_weights_by_hand():
     assert level_weights(wanted, [0.3]).tolist() == [[[1.0] * 5]]
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.floats(0.01, 1), min_size=1, max_size=5, unique_by=lambda x: round(x, 3)),
     st.floats(0.001, 10),
@@ -222,7 +221,6 @@ def test_lerf_finds_the_balls(balls, maps):
 # 3dovs
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-8, 8), min_size=4, max_size=4), st.lists(st.floats(-8, 8), min_size=4, max_size=4))
 def test_the_divergence_is_scipys_and_bounded(first, second):
     logs = [torch.tensor(values, dtype=torch.float64).log_softmax(-1) for values in (first, second)]

@@ -216,7 +216,7 @@ def test_every_level_counts_and_counts_once():
     torch.testing.assert_close(found, torch.full((8, 10, 7), 7**-0.5), atol=1e-6, rtol=0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     width=st.integers(1, 200),
     height=st.integers(1, 200),
@@ -239,7 +239,7 @@ def test_constant_features_stay_constant_at_any_size(width, height, cols, rows, 
     torch.testing.assert_close(found, vector.expand(rows, cols, 4), atol=1e-5, rtol=0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     width=st.integers(1, 400),
     height=st.integers(1, 400),
@@ -310,7 +310,7 @@ def test_equal_crops_are_encoded_once():
     torch.testing.assert_close(vectors[:9], vectors[9:18])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(chunks=st.lists(st.lists(st.integers(1, 7), max_size=4), max_size=6), batch=st.integers(1, 9))
 def test_batches_run_across_images_are_full_and_come_back_in_order(chunks, batch):
     class FirstPixel(CenterEncoder):

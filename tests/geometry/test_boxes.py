@@ -16,7 +16,7 @@ def turned(angle: float, center=(0.0, 0.0, 0.0), halves=(1.0, 0.5, 0.25)) -> Box
 
 
 @given(st.floats(0, 1.5), st.integers(0, 5))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_box_around_a_rotated_block_has_the_size_and_center_of_the_block(angle, seed):
     rng = np.random.default_rng(seed)
     block = turned(angle, center=(1.0, -2.0, 3.0))

@@ -151,7 +151,7 @@ def test_smoothing_gradient_is_finite_where_the_mlp_is_exact() -> None:
     assert torch.equal(copy.grad, torch.zeros(3, 8))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.floats(0, 1))
 def test_the_two_smoothing_weights_agree_at_the_ends_only(seed: int, u: float) -> None:
     generator = torch.Generator().manual_seed(seed)

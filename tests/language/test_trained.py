@@ -43,7 +43,7 @@ def train(balls, config, **options):
     return train_field(balls.gaussians, balls.cameras, balls.code_maps, balls.codebook, config, **options)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(1, 40), st.integers(1, 40))
 def test_a_pixel_takes_the_cell_its_center_lies_in(rows: int, columns: int, height: int, width: int) -> None:
     code_map = torch.arange(rows * columns).reshape(rows, columns)

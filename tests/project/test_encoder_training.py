@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -41,7 +41,6 @@ def labels():
     ]
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_phrase_made_for_a_label_is_true_of_it(seed):
     from words import TRUE, phrase_for
@@ -122,7 +121,6 @@ def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
         assert set(prompt.split()) <= single | qualities, prompt
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_training_phrase_names_a_held_out_pair(seed):
     # It could only be wrong, and would be learnt as the name of nothing.
@@ -260,7 +258,6 @@ def test_crops_of_parts_come_with_the_rest_of_the_thing_and_with_what_is_near():
     assert pairs[1::2].count(0) >= 20
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_phrase_about_any_part_is_true_of_that_part_alone(seed):
     from words import TRUE, any_part

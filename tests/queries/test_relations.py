@@ -100,7 +100,7 @@ def test_left_is_the_viewers_left(things):
 
 
 @given(st.floats(0.1, 3.0), st.floats(-3.0, 3.0))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_the_viewers_axes_are_level_and_right_angled(pitch, turn):
     eye = 4 * np.array([np.cos(turn) * np.cos(pitch), np.sin(turn) * np.cos(pitch), np.sin(pitch)])
     frame = frame_of(look_at(eye, np.zeros(3), [0.1, 0.2, 1.0], 64, 48, 0.8), UP)

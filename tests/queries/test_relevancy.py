@@ -66,7 +66,7 @@ def test_templates_are_averaged_as_directions_whatever_the_lengths():
 # Relevancy
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(1, 4), st.integers(1, 5), st.floats(0.5, 100), st.integers(0, 1000))
 def test_relevancy_is_the_least_favorable_pairwise_softmax(prompts, negatives, temperature, seed):
     rng = np.random.default_rng(seed)

@@ -87,7 +87,7 @@ def turned(angle: float, center=(0.0, 0.0, 0.0), halves=(1.0, 0.5, 0.25)) -> Box
 
 @pytest.mark.slow
 @given(st.integers(0, 50))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_the_overlap_of_boxes_is_the_share_of_random_points_in_both(seed):
     rng = np.random.default_rng(seed)
     first = turned(rng.uniform(0, 3), rng.uniform(-0.3, 0.3, 3), rng.uniform(0.4, 1.0, 3))

@@ -94,7 +94,7 @@ def test_default_control_equals_gsplats_strategy_up_to_its_missing_reset():
         assert_same(our_optimizers[name].state[ours[name]], optimizers[name].state[reference[name]])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(40, 120), st.sampled_from(["default", "mcmc"]), st.integers(0, 50))
 def test_the_cap_is_never_exceeded(cap, strategy, seed):
     parameters, optimizers = some_parameters(seed=seed)
@@ -292,7 +292,7 @@ def test_a_short_mcmc_training_has_steps_between_its_rounds():
     assert ReconstructionConfig(strategy="mcmc", iterations=400).density_schedule.every == 2
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(1, 100_000), st.integers(1, 200))
 def test_every_schedule_is_in_order(iterations, minimum):
     schedule = ReconstructionConfig(iterations=iterations, densify_min_every=minimum).density_schedule

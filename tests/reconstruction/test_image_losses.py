@@ -126,7 +126,7 @@ def test_l1_of_a_constant_difference_is_that_difference():
     assert float(photometric_loss(torch.full((8, 8, 3), 0.75), photo, 0.0)) == 0.5
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(6, 30), st.integers(6, 30), st.integers(0, 1000))
 def test_ssim_is_one_for_equal_images_and_at_most_one_otherwise(height, width, seed):
     image, photo = two_images(height, width, seed)
@@ -134,7 +134,7 @@ def test_ssim_is_one_for_equal_images_and_at_most_one_otherwise(height, width, s
     assert float(ssim(image, ssim_target(photo))) < 1.0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(6, 24), st.integers(6, 24), st.integers(0, 1000))
 def test_ssim_is_invariant_to_mirroring(height, width, seed):
     image, photo = two_images(height, width, seed)
@@ -143,7 +143,7 @@ def test_ssim_is_invariant_to_mirroring(height, width, seed):
     assert mirrored == pytest.approx(plain, abs=2e-6)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(6, 40))
 def test_transposed_taps_are_the_transpose_of_the_reflected_blur(length):
     from lexsplat.reconstruction.image_loss_kernels import RADIUS, TAPS, reflected_taps

@@ -287,7 +287,7 @@ def test_alpha_contributes_to_the_gradients_of_the_geometry_without_color():
 # --------------------------------------------------------------------------------------------------------- laws
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10_000), st.integers(1, 60), st.integers(1, 80), st.integers(1, 60))
 def test_the_order_of_the_gaussians_does_not_matter(seed, count, width, height):
     gaussians, camera = random_gaussians(count, seed), front_camera(width, height)
@@ -297,7 +297,7 @@ def test_the_order_of_the_gaussians_does_not_matter(seed, count, width, height):
     assert torch.equal(straight.radii[shuffle], shuffled.radii)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10_000), st.integers(1, 99), st.integers(1, 69))
 @example(50, 1, 24)
 def test_a_crop_of_the_image_is_the_image_of_a_cropped_camera(seed, x, y):

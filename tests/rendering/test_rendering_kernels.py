@@ -233,7 +233,7 @@ def test_no_uninitialized_memory_is_read(poisoned_memory):
         assert np.isfinite(rows).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(2**-20, 2**30, width=32), min_size=0, max_size=200), st.integers(0, 2**32 - 1))
 def test_the_radix_sort_equals_numpys_stable_sort(depths, seed):
     keys = np.array(depths, np.float32)
@@ -278,7 +278,7 @@ def _alpha_at(s, opacity):
     return lanes.total(row) / np.float32(16)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.floats(0, 5.6), st.floats(0.004, 1.0))
 def test_alpha_equals_the_exponential_within_3e_6(exponent, opacity):
     exact = min(opacity * math.exp(-exponent), 0.999)

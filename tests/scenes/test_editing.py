@@ -105,7 +105,7 @@ def test_recoloring_changes_hue_and_keeps_shading(base):
 
 
 @given(st.lists(st.sampled_from(["delete", "recolor", "move", "duplicate", "undo", "redo"]), max_size=9))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_replaying_a_journal_gives_the_same_scene(base, tmp_path_factory, actions):
     scene, _ = base
     journal = tmp_path_factory.mktemp("edit") / "edits.jsonl"

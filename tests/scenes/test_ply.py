@@ -13,7 +13,7 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.ply import read_ply, write_ply
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(count=st.integers(0, 20), degree=st.integers(0, 4), antialiased=st.booleans())
 def test_gaussians_survive_a_round_trip_exactly(tmp_path_factory, count, degree, antialiased):
     path = tmp_path_factory.mktemp("ply") / "g.ply"
@@ -91,7 +91,7 @@ def test_an_absurd_count_is_refused_without_allocating(tmp_path):
         read_ply(tmp_path / "t.ply")
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(data=st.data())
 def test_flipped_bytes_cause_only_typed_errors(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("flip")

@@ -41,7 +41,7 @@ def test_a_camera_transformed_with_the_scene_renders_the_same_image(degree):
 
 
 @given(st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_two_rotations_equal_their_product(seed):
     first, second = (Rotation.random(random_state=seed + k).as_matrix() for k in (0, 5000))
     shN = make(3, 3).shN
@@ -51,7 +51,7 @@ def test_two_rotations_equal_their_product(seed):
 
 
 @given(st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_quaternion_products_equal_scipys(seed):
     a, b = (Rotation.random(random_state=seed + k) for k in (0, 5000))
     product = multiply_quaternions(*(torch.from_numpy(quaternion_from_matrix(r.as_matrix())) for r in (a, b)))
