@@ -10,6 +10,7 @@ import pytest
 from lexsplat import cli
 
 
+@pytest.mark.slow
 def test_each_line_of_the_input_is_answered_with_a_line(monkeypatch, capsys):
     lines = 'where is the mug?\n\n{"ask": "unicorn", "id": 5}\n{"ask": 1}\n\xff\n'.encode("latin-1")
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines), encoding="latin-1"))

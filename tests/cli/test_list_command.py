@@ -59,6 +59,7 @@ def test_a_vocabulary_names_the_things(demo, tmp_path, capsys):
     assert objects_of(demo, ["unicorn", "swimming pool"]) == ()
 
 
+@pytest.mark.slow
 def test_thumbnails_show_the_objects(demo, tmp_path):
     document = list_document(demo, (), tmp_path / "new" / "sheet.png")
     with Image.open(document["picture"]) as sheet:
@@ -70,6 +71,7 @@ def test_thumbnails_show_the_objects(demo, tmp_path):
     assert middle[0] > 2 * middle[1:].max(), "red"
 
 
+@pytest.mark.slow
 def test_an_object_of_a_scene_without_segments_is_found_by_its_word_and_the_list_says_so(demo):
     field = demo.field.select(torch.arange(len(demo.gaussians)))
     field.segments = None

@@ -121,6 +121,7 @@ def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_captur
         build(tiny_capture, tmp_path / "other", joint, splats=tmp_path / "any.ply")
 
 
+@pytest.mark.slow
 def test_encoders_are_loaded_for_their_check_and_once_for_the_features(tiny_capture, tmp_path, monkeypatch):
     loaded = []
     for kind, encoder in (("clip", color_encoder.ColorClip), ("dino", color_encoder.ColorDino)):
@@ -138,6 +139,7 @@ def test_encoders_are_loaded_for_their_check_and_once_for_the_features(tiny_capt
     assert loaded == [], "the codes are there"
 
 
+@pytest.mark.slow
 def test_every_stage_receives_the_memory_budget(tiny_capture, tmp_path, monkeypatch):
     granted = {}
     for name in ("reconstruct", "fit_codebook"):

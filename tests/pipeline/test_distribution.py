@@ -37,6 +37,7 @@ def files(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("visible", [True, False], ids=["shared files", "object store"])
 def test_features_of_workers_are_those_of_one_process(visible, capture, tmp_path, monkeypatch):
     monkeypatch.setattr(SharedFolder, "is_visible", visible)

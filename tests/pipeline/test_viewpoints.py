@@ -192,6 +192,7 @@ def test_splats_without_surfaces_are_refused(count):
         choose_views(one.select(torch.zeros(count, dtype=torch.long)))
 
 
+@pytest.mark.slow
 def test_fog_in_which_no_place_shows_a_surface_is_refused():
     points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
     fog = gaussians_from_points(points, np.ones_like(points), opacity=0.35)

@@ -189,6 +189,7 @@ def test_the_gradient_of_the_pose_equals_the_float64_reference(turned, antialias
         assert relative_error(getattr(gaussians, name).grad, leaves[name].grad) < 1e-4, name
 
 
+@pytest.mark.slow
 def test_gradient_descent_recovers_a_perturbed_pose():
     gaussians, camera = random_gaussians(60, 4), front_camera()
     photo = render(gaussians, camera).image
