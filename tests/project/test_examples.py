@@ -91,7 +91,9 @@ def test_08_asks_from_a_shell():
     assert rows[1][1:] == ["no", "0", "-"]
 
 
-def test_09_asks_in_a_notebook(capsys):
+def test_09_asks_in_a_notebook(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
     cells = json.loads((EXAMPLES / "09_notebook.ipynb").read_text())["cells"]
     names: dict[str, object] = {}
     for cell in cells:
@@ -101,6 +103,9 @@ def test_09_asks_in_a_notebook(capsys):
     assert 'where is the mug? ("mug"): yes, mug' in printed
     assert "is there a dog?" in printed.splitlines()[3]
     assert printed.splitlines()[3].endswith("no, nothing")
+    table = [line for line in printed.splitlines() if line.startswith("│")]
+    cells = [[cell.strip() for cell in line.split("│")[1:5]] for line in table]
+    assert cells == [["red apple", "demo", "yes", "1"], ["mug", "demo", "yes", "1"]]
 
 
 def test_every_example_is_listed_and_tested():

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from support.library_scenes import OTHERS, THINGS, copied, install, write_scene
 
 import lexsplat
@@ -22,7 +23,7 @@ from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.bounds import phrase_bound, presence_bounds
-from lexsplat.scenes.library.entries import Codes
+from lexsplat.scenes.library.entries import Codes, map_codes
 from lexsplat.scenes.library.searching import spellings_of
 
 
@@ -330,6 +331,45 @@ def test_damaged_codes_are_refused_and_repaired_from_the_scene(copy, harm):
     assert library.verify(repair=True) == {}
     assert contents(library.stage).keys() == before.keys()
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
+
+
+def test_every_byte_of_the_codes_is_checked_before_it_answers(copy):
+    """Also where the byte makes no code larger: a scene that damage rules out would be missed without a word."""
+    (file,) = (copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    whole = file.read_bytes()
+    header = 8 + int.from_bytes(whole[:8], "little")
+    for place in np.random.default_rng(0).integers(header, len(whole), 40):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
+        library = Library(copy / "library")
+        assert library.codes(library.record("kitchen")) is None
+        assert "damaged" in str(library.damaged["kitchen"])
+
+
+def test_verify_finds_damage_that_keeps_the_checksum(copy):
+    """A checksum is no hash: whoever knows it can change codes and keep it. `verify` compares hashes."""
+    record = read_json(copy / "library" / "scenes" / "kitchen.json")
+    (file,) = (copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    damage(file)
+    known = Library(copy / "library").record("kitchen")
+    with pytest.raises(FileFormatError, match="the checksum differs"):
+        map_codes(file, known)
+    with safe_open(file, framework="pt") as changed:
+        codes = Codes(*(changed.get_tensor(field.name) for field in dataclasses.fields(Codes)))
+    write_json(copy / "library" / "scenes" / "kitchen.json", {**record, "checksum": codes.checksum()})
+    library = Library(copy / "library")
+    assert library.codes(library.record("kitchen")) is not None
+    assert "the hash differs" in library.verify()["kitchen"]
+    assert library.verify(repair=True) == {}
+
+
+def test_libraries_that_were_made_without_checksums_are_checked_by_hashes(copy):
+    path = copy / "library" / "scenes" / "kitchen.json"
+    record = read_json(path)
+    record.pop("checksum")
+    write_json(path, record)
+    assert sorted(hits(Library(copy / "library"), "mug")) == ["kitchen", "lab"]
+    damage(next((copy / "library" / "scenes").glob("kitchen.*.safetensors")))
+    assert "the hash differs" in Library(copy / "library").search("mug").skipped["kitchen"]
 
 
 @pytest.mark.parametrize(

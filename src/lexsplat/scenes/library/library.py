@@ -158,16 +158,17 @@ class Library:
         records = (self._record(each.name[:-5], each) for each in sorted(entries, key=lambda each: each.name))
         return [record for record in records if record is not None]
 
-    def codes(self, record: Record) -> Codes | None:
-        """The codes of a scene, checked when they are first read; None if they are damaged (`damaged`)."""
+    def codes(self, record: Record, by_hash: bool = False) -> Codes | None:
+        """The codes of a scene, checked when first read, with ``by_hash`` again; None if damaged (`damaged`)."""
         known = self._codes.get(record.name)
-        if known is None or known[0] != record.content:
+        if known is None or known[0] != record.content or by_hash:
+            self._codes.pop(record.name, None)
             try:
-                known = (record.content, map_codes(self.stage / record.codes_file, record))
+                known = (record.content, map_codes(self.stage / record.codes_file, record, by_hash))
             except FileFormatError as error:
                 now = self.record(record.name)
                 if now is None or now.content != record.content:  # replaced or removed in the meantime
-                    return None if now is None else self.codes(now)
+                    return None if now is None else self.codes(now, by_hash)
                 self.damaged[record.name] = error
                 return None
             self._codes[record.name] = known
@@ -408,9 +409,8 @@ class Library:
     def _problems(self) -> dict[str, str]:
         found: dict[str, str] = {}
         for name in self.names():
-            self._codes.pop(name, None)
             record = self.record(name)
-            if record is None or self.codes(record) is None:
+            if record is None or self.codes(record, by_hash=True) is None:
                 found[name] = str(self.damaged[name])
                 continue
             try:
