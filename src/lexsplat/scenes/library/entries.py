@@ -151,7 +151,7 @@ class Codes:
         """CRC-32 of all values, eight hex digits: it finds damage, which `content` does as well in more time."""
         found = 0
         for tensor in self.tensors().values():
-            found = zlib.crc32(tensor.contiguous().numpy(), found)
+            found = zlib.crc32(tensor.contiguous().numpy().data, found)
         return f"{found:08x}"
 
     @classmethod
