@@ -45,6 +45,7 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
 
 STAGES = ("reconstruct", "features", "codebook", "language")
@@ -191,6 +192,7 @@ class _Builder:
             self.folder.record.pop("building", None)
             self.folder.save()
             drop_previous(self.folder)
+            keep_for(self.folder, self.device, self.listener)
         return self.folder
 
     def _stages(self, capture_hash: str) -> dict[str, _Stage]:
