@@ -179,11 +179,8 @@ class _Builder:
         stages = self._stages(write_provenance(self.folder, self.capture, self.config))
         order = list(stages)
         wanted = order[: order.index(until if until in stages else "features") + 1]
-        if (
-            "features" in wanted
-            and not encoders_checked
-            and not self._is_finished("features", stages["features"])
-        ):
+        encodes = "features" in wanted and not encoders_checked
+        if encodes and not self._is_finished("features", stages["features"]):
             sizes = [view.capture_size for view in self._training_views.values()]
             check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
         for name in wanted:
