@@ -61,10 +61,14 @@ def keep(scene: Scene) -> None:
     if path is None:
         return
     try:
-        scene.embed([*everyday_words(), *scene.presence_classifier.colored])  # its cache of texts keeps them
         if scene.seen is not None and not scene.seen.complete:
             scene.seen.complete_all(scene.listener)
             write_tensors(path, scene.seen.tensors(), {"of": _key(scene)})
+        words = scene.embed(everyday_words())  # its cache of texts keeps them
+        if (
+            words.shape[1] == scene.field.codebook.clip.shape[1]
+        ):  # else no question can be asked with this encoder
+            scene.embed(scene.presence_classifier.colored or ["object"])
     except (OSError, LexsplatError) as error:  # the file is optional, and questions tell of a missing encoder
         log.warning("%s: not kept (%s)", path, str(error)[:200])
 
