@@ -7,6 +7,7 @@ import torch
 
 from lexsplat.rendering import render
 from lexsplat.scenes.answers import answer_queries, find_phrase
+from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.kept import keep
 from lexsplat.scenes.scene import open_scene
@@ -55,6 +56,14 @@ def test_what_is_kept_is_what_is_computed_without_it(copy, demo):
     assert again.seen.complete
     assert torch.equal(again.hidden, demo.hidden)
     assert again.select("mug").view_shares == demo.select("mug").view_shares
+
+
+@pytest.mark.slow
+def test_a_saved_edit_keeps_what_its_views_show(copy, tmp_path):
+    editor = Editor(open_scene(copy, device="cpu"))
+    editor.delete(editor.scene.find("mug"))
+    editor.save(tmp_path / "saved")
+    assert open_scene(tmp_path / "saved", device="cpu").seen.complete
 
 
 def test_a_damaged_file_or_one_of_another_scene_counts_as_none(copy):

@@ -49,8 +49,6 @@ class Build:
         """Build up to the last stage of this command."""
         from lexsplat.cli.progress import shown_progress
         from lexsplat.pipeline.build import build
-        from lexsplat.scenes.kept import keep
-        from lexsplat.scenes.scene import open_scene
 
         if self.more:
             self._build_scenes()
@@ -68,10 +66,6 @@ class Build:
                 splats=getattr(self, "splats", None),
                 listener=bars,
             )
-            if self.until == "language":
-                scene = open_scene(folder.root, device=self.settings.device)
-                scene.listener = bars
-                keep(scene)
         if self.progress == "json":
             return
         print(f"{folder.root}: finished {', '.join(folder.record['stages'])}")

@@ -12,7 +12,6 @@ from lexsplat.language.methods import MethodName
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.kept import keep
 from lexsplat.scenes.scene import open_scene
 
 SceneName = Literal["tabletop", "second"]
@@ -58,5 +57,4 @@ def run_demo(
     )
     build(demo_capture(scene), output, config, listener=listener)
     opened = open_scene(output, device=device)
-    keep(opened)
     return evaluate_scene(opened, title="lexsplat demo", listener=listener)

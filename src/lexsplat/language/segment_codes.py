@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from lexsplat.language.fields import CodeField, LanguageField
 from lexsplat.language.segments import Segments
 
 _ROWS = 1 << 15
@@ -45,14 +46,31 @@ def segment_codes(segments: Segments, probabilities: Callable[[Tensor], Tensor])
         probabilities: Distributions over the codes ``[n, K]`` of the Gaussians given by an index ``[n]``.
     """
     labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
-    levels = segments.levels.cpu().numpy()
-    lowest, sums = levels.shape[1], None
+    lowest, sums = segments.levels.shape[1], None
     for index in torch.arange(len(labels)).split(_ROWS):
         rows, place = probabilities(index).cpu().double().numpy(), index.numpy()
         spread = csr_array((weights[place], (labels[place], np.arange(len(place)))), (lowest, len(place)))
         sums = spread @ rows + (0.0 if sums is None else sums)
     if sums is None:
-        return SegmentCodes(np.zeros((len(levels), 0), np.int64), torch.zeros(0, 1), np.zeros(0))
+        return SegmentCodes(np.zeros((len(segments.levels), 0), np.int64), torch.zeros(0, 1), np.zeros(0))
+    return _from_sums(segments, sums)
+
+
+@torch.no_grad()
+def codes_of_field(field: LanguageField) -> SegmentCodes:
+    """`segment_codes` of a field that has segments; a field of codes needs no dense distributions."""
+    segments = field.segments
+    if segments is None:
+        raise ValueError("the field has no segments")
+    if isinstance(field, CodeField) and len(segments.labels):
+        return _from_sums(segments, field.sums(segments.labels, segments.masses, segments.levels.shape[1]))
+    return segment_codes(segments, lambda index: field.select(index).code_probabilities())
+
+
+def _from_sums(segments: Segments, sums: NDArray[np.float64]) -> SegmentCodes:
+    """The language of segments from the weighted sums over the lowest ones ``[S, K]``."""
+    labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
+    levels, lowest = segments.levels.cpu().numpy(), segments.levels.shape[1]
     masses = np.bincount(labels, weights, lowest).astype(np.float64)
     numbers = _numbered(levels)
     of_all = csr_array(

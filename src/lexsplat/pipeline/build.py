@@ -45,6 +45,7 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
 
 STAGES = ("reconstruct", "features", "codebook", "language")
@@ -178,11 +179,8 @@ class _Builder:
         stages = self._stages(write_provenance(self.folder, self.capture, self.config))
         order = list(stages)
         wanted = order[: order.index(until if until in stages else "features") + 1]
-        if (
-            "features" in wanted
-            and not encoders_checked
-            and not self._is_finished("features", stages["features"])
-        ):
+        encodes = "features" in wanted and not encoders_checked
+        if encodes and not self._is_finished("features", stages["features"]):
             sizes = [view.capture_size for view in self._training_views.values()]
             check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
         for name in wanted:
@@ -191,6 +189,7 @@ class _Builder:
             self.folder.record.pop("building", None)
             self.folder.save()
             drop_previous(self.folder)
+            keep_for(self.folder, self.device, self.listener)
         return self.folder
 
     def _stages(self, capture_hash: str) -> dict[str, _Stage]:

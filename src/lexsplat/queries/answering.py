@@ -33,7 +33,7 @@ from lexsplat.queries.relations import (
     related,
     same,
 )
-from lexsplat.queries.selection import PRESENCES, Presence, Selection
+from lexsplat.queries.selection import PRESENCES, Presence, Selection, union
 from lexsplat.queries.vocabulary import NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
@@ -97,10 +97,10 @@ def apart(selection: Selection, searched: Searched) -> Selection:
     if selection.present == "no" or not large or NAMES & set(selection.phrase.lower().split()):
         return selection
     objects = _things(searched)
-    inside = [each for each in objects if (each.mask & selection.mask).sum() >= _WHOLE * len(each)]
+    inside = [each for each in objects if selection.mask[each.indices].sum() >= _WHOLE * len(each)]
     if len(inside) < 2 or len(inside) <= selection.count:
         return selection
-    scores = [float(selection.scores[each.mask].median()) for each in objects]
+    scores = [float(selection.scores[each.indices].median()) for each in objects]
     limit = selection.convincing_limit(max(scores))
     kept = tuple(
         replace(each, scores=selection.scores) for each, score in zip(objects, scores) if score >= limit
@@ -168,7 +168,7 @@ def _except(phrase: Except, searched: Searched) -> Selection:
     others = _certain(second)
     kept = []
     for each in _certain(first):
-        shared = sum(int((each.mask & other.mask).sum()) for other in others)
+        shared = sum(int(other.mask[each.indices].sum()) for other in others)
         if shared <= _WHOLE * len(each) and not any(same(each, other) for other in others):
             kept.append(each - second if shared else each)
     return _joined(first, tuple(kept))
@@ -214,11 +214,12 @@ def _certain(selection: Selection) -> list[Selection]:
 
 def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | None = None) -> Selection:
     """The union of instances, which stay apart."""
-    mask, scores = torch.zeros_like(like.mask), like.scores
+    scores = like.scores.clone() if parts else like.scores
     for part in parts:
-        mask |= part.mask
-        scores = torch.where(part.mask, torch.maximum(scores, part.scores), scores)
-    return replace(like, mask=mask, scores=scores, parts=parts, present=present or like.present)
+        scores[part.indices] = torch.maximum(scores[part.indices], part.scores[part.indices])
+    return replace(
+        like, mask=union(like.mask, parts), scores=scores, parts=parts, present=present or like.present
+    )
 
 
 def _frame(searched: Searched, targets: Selection) -> Frame:

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
-from lexsplat.language.segment_codes import SegmentCodes, segment_codes
+from lexsplat.language.segment_codes import SegmentCodes, codes_of_field
 from lexsplat.queries.everyday import EverydayScale, everyday_words
 from lexsplat.queries.objects import FITS, whole_segments
 from lexsplat.queries.selection import Presence
@@ -99,7 +99,7 @@ class PresenceClassifier:
         segments = self.language.segments
         if segments is None or len(self._shown) == 0:
             return None
-        return segment_codes(segments, lambda index: self.language.select(index).code_probabilities())
+        return codes_of_field(self.language)
 
     @torch.no_grad()
     def best_heights(self, phrases: Sequence[str]) -> Tensor:

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from lexsplat.geometry.boxes import upright_frame
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.phrases import CornerName, RelationName
-from lexsplat.queries.selection import Selection
+from lexsplat.queries.selection import Selection, union
 
 _CONE = 0.5
 """Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
@@ -261,18 +260,18 @@ def _level(offset: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
 
 def _without(reference: Selection, target: Selection) -> Selection:
     """The reference without the Gaussians of the target: shared Gaussians support nothing."""
-    return reference - target if bool((reference.mask & target.mask).any()) else reference
+    return reference - target if bool(reference.mask[target.indices].any()) else reference
 
 
 def same(first: Selection, second: Selection) -> bool:
     """Whether two phrases name one object. A coin within the selection of its table is not the table."""
+    fewer, more = sorted((first, second), key=len)
+    if not int(more.mask[fewer.indices].sum()) > 0.5 * len(fewer):
+        return False
     small, large = sorted((first, second), key=lambda s: s.box.volume)
-    shared = int((first.mask & second.mask).sum())
-    return shared > 0.5 * min(len(first), len(second)) and small.box.volume > _SAME_SIZE * large.box.volume
+    return small.box.volume > _SAME_SIZE * large.box.volume
 
 
 def _union(whole: Selection, parts: list[Selection]) -> Selection:
-    mask = torch.zeros_like(whole.mask)
-    for part in parts:
-        mask |= part.mask
+    mask = union(whole.mask, parts)
     return replace(whole, mask=mask, parts=tuple(parts), present=whole.present if parts else "no")

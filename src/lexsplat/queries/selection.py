@@ -7,7 +7,7 @@ its *instances*: two mugs found by "mug" are one selection with two instances.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -107,7 +107,7 @@ class Selection:
     @cached_property
     def num_gaussians(self) -> int:
         """Number of Gaussians."""
-        return int(self.mask.sum())
+        return len(self.indices)
 
     @property
     def count(self) -> int:
@@ -122,12 +122,12 @@ class Selection:
     @property
     def selected(self) -> Gaussians:
         """The selected Gaussians."""
-        return self.gaussians.select(self.mask)
+        return self.gaussians.select(self.indices)
 
     @cached_property
     def score(self) -> float:
         """Mean score of its Gaussians, weighted by opacity; 0 for an empty selection."""
-        weights = self.gaussians.opacity_logits[self.indices].sigmoid()
+        weights = self.gaussians.opacity_logits.detach()[self.indices].sigmoid()
         return float((self.scores[self.indices] * weights).sum() / weights.sum().clamp_min(1e-12))
 
     @cached_property
@@ -185,8 +185,9 @@ class Selection:
             return [self]
         order = np.argsort(-weights, kind="stable")
         kept = [int(label) for label in order if weights[label] >= smallest * weights[order[0]]]
-        indices = self.indices.cpu().numpy()
-        return [self._with(indices[labels == label]) for label in kept]
+        members = self.indices[torch.from_numpy(np.argsort(labels, kind="stable")).to(self.indices.device)]
+        parts = members.split(np.bincount(labels).tolist())
+        return [self._with(parts[label]) for label in kept]
 
     @cached_property
     def best_view(self) -> str:
@@ -246,10 +247,7 @@ class Selection:
 
     def without_specks(self) -> Selection:
         """The Gaussians that belong to an instance."""
-        mask = torch.zeros_like(self.mask)
-        for instance in self.instances:
-            mask |= instance.mask
-        return replace(self, mask=mask, parts=tuple(self.instances))
+        return replace(self, mask=union(self.mask, self.instances), parts=tuple(self.instances))
 
     def convincing(self, scores: Tensor | None = None) -> Selection:
         """The instances whose peak is close to that of the best instance.
@@ -269,10 +267,7 @@ class Selection:
         ]
         limit = self.convincing_limit(max(peaks))
         kept = tuple(instance for peak, instance in zip(peaks, self.instances) if peak >= limit)
-        mask = torch.zeros_like(self.mask)
-        for instance in kept:
-            mask |= instance.mask
-        return replace(self, mask=mask, parts=kept)
+        return replace(self, mask=union(self.mask, kept), parts=kept)
 
     def convincing_limit(self, best: float) -> float:
         """The smallest score of an instance beside one that scores ``best``: `_CONVINCING`, in log-odds."""
@@ -283,7 +278,8 @@ class Selection:
 
     def within(self, mask: Tensor) -> Selection:
         """The intersection with a mask ``[N]``."""
-        return replace(self, mask=self.mask & mask.to(self.mask.device))
+        kept = self.indices[mask.to(self.mask.device)[self.indices]]
+        return self if len(kept) == len(self) else self._with(kept, self.parts)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: presence, threshold and the place of each instance, without the Gaussians.
@@ -352,10 +348,12 @@ class Selection:
             parts=() if word == "or" else self.parts,
         )
 
-    def _with(self, indices: NDArray) -> Selection:
+    def _with(self, indices: Tensor, parts: tuple[Selection, ...] = ()) -> Selection:
         mask = torch.zeros_like(self.mask)
-        mask[torch.from_numpy(np.ascontiguousarray(indices)).to(mask.device)] = True
-        return replace(self, mask=mask, parts=())
+        mask[indices] = True
+        made = replace(self, mask=mask, parts=parts)
+        made.__dict__["indices"] = indices  # not searched for again among all Gaussians
+        return made
 
     def _means(self) -> NDArray[np.float32]:
         return self.gaussians.means.detach().cpu().numpy()
@@ -402,11 +400,21 @@ class Selection:
         rows, columns = np.nonzero(np.isfinite(apart))
         edges = (np.ones(len(rows)), (rows, neighbors[rows, columns]))
         _, found = connected_components(coo_array(edges, shape=(len(firm), len(firm))), directed=False)
-        labels, faint = np.zeros(len(points), np.intp), np.setdiff1d(np.arange(len(points)), firm)
+        labels, is_faint = np.zeros(len(points), np.intp), np.ones(len(points), bool)
+        is_faint[firm] = False
+        faint = np.flatnonzero(is_faint)
         labels[firm] = found
         if len(faint):  # they join the cluster of the nearest firm one
             labels[faint] = found[tree.query(points[faint])[1]]
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
+
+
+def union(like: Tensor, parts: Iterable[Selection]) -> Tensor:
+    """The Gaussians ``[N]`` bool of any of some selections, on the device of ``like [N]``."""
+    mask = torch.zeros_like(like)
+    for part in parts:
+        mask[part.indices] = True
+    return mask
 
 
 def _promising_views(selection: Selection) -> list[str]:

@@ -75,7 +75,7 @@ def _alone(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
     """What can be seen of a selection. Hidden Gaussians still link what they connect, such as a lamp and its foot."""
-    if not bool((chosen.mask & hidden).any()):
+    if not bool(hidden[chosen.indices].any()):
         return chosen
     return replace(chosen, mask=chosen.mask & ~hidden, parts=tuple(chosen.instances))
 

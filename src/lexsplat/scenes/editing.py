@@ -32,6 +32,7 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.filling import Fill, fill_for, hidden_inside
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import transformed
 
@@ -314,6 +315,7 @@ class Editor:
             write_field(self.scene.field, {"reconstruction": str(reconstruction)}, temporary)
         folder.record["stages"] = stages
         folder.save()  # last: a folder without finished stages is not a scene
+        keep_for(folder, self.scene.gaussians.device.type, self.original.listener)
         return folder
 
     # -- inside

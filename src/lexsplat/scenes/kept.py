@@ -1,8 +1,8 @@
 """What a scene keeps on disk so that its first question is fast: what its views show, and the words it compares with.
 
-``checkpoints/seen.safetensors`` is written whole or not at all, after a build. It names the Gaussians, segments and
-cameras that it was computed from. A file of others, or a damaged one, counts as none: what it holds is then computed
-when it is asked for.
+``checkpoints/seen.safetensors`` is written whole or not at all, after a build and for a saved edit. It names the
+Gaussians, segments and cameras that it was computed from. A file of others, or a damaged one, counts as none: what it
+holds is then computed when it is asked for.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from lexsplat.queries.seen import MOST_VIEWS, Seen
 from lexsplat.runtime.errors import FileFormatError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
+from lexsplat.runtime.progress import Listener
+from lexsplat.scenes.folder import SceneFolder
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -59,12 +61,25 @@ def keep(scene: Scene) -> None:
     if path is None:
         return
     try:
-        scene.embed([*everyday_words(), *scene.presence_classifier.colored])  # its cache of texts keeps them
         if scene.seen is not None and not scene.seen.complete:
             scene.seen.complete_all(scene.listener)
             write_tensors(path, scene.seen.tensors(), {"of": _key(scene)})
+        words = scene.embed(everyday_words())  # its cache of texts keeps them
+        if (
+            words.shape[1] == scene.field.codebook.clip.shape[1]
+        ):  # else no question can be asked with this encoder
+            scene.embed(scene.presence_classifier.colored or ["object"])
     except (OSError, LexsplatError) as error:  # the file is optional, and questions tell of a missing encoder
         log.warning("%s: not kept (%s)", path, str(error)[:200])
+
+
+def keep_for(folder: SceneFolder, device: str, listener: Listener) -> None:
+    """`keep` for a finished scene folder, on a device; the listener hears of stages "words" and "views"."""
+    from lexsplat.scenes.scene import open_scene
+
+    scene = open_scene(folder.root, device=device)
+    scene.listener = listener
+    keep(scene)
 
 
 def _path(scene: Scene) -> Path | None:

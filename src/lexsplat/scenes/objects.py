@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from lexsplat.language.fields import CodeField
 from lexsplat.queries.colors import color_words
 from lexsplat.queries.objects import name_probabilities, whole_segments
 from lexsplat.queries.relations import same
@@ -97,21 +98,25 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     whole = whole_segments(codes, lambda part: judge.strengths(texts[part], codes.distributions), len(words))
     named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
     found: list[Selection] = []
+    scores, shown = (
+        torch.zeros_like(segments.masses),
+        ~scene.hidden,
+    )  # objects share no Gaussian, so they share scores
     for number in named[named >= 0].unique().tolist():
         mask, name = named[segments.labels] == number, words[number]
         both = Selection(
             scene.gaussians,
             scene.cameras,
             mask,
-            mask.float(),
+            scores,
             phrase=name,
             world=scene.world,
             seen=scene.seen,
         )
         for each in [both] if name in STUFF else both.instances:
-            each = each.within(~scene.hidden)
+            each = each.within(shown)
             found.append(_named(each, words, judge.strengths(texts, _mean_codes(scene, each)[None])[0]))
-    return tuple(sorted(found, key=lambda each: -float(segments.masses[each.mask].sum())))
+    return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
 def _shown(scene: Scene) -> torch.Tensor:
@@ -121,8 +126,12 @@ def _shown(scene: Scene) -> torch.Tensor:
 
 
 def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:
-    weights = _shown(scene)[thing.mask]
-    return (weights / weights.sum().clamp_min(1e-12)) @ scene.field.select(thing.indices).code_probabilities()
+    weights, field = _shown(scene)[thing.indices], scene.field.select(thing.indices)
+    shares = weights / weights.sum().clamp_min(1e-12)
+    if isinstance(field, CodeField):
+        summed = field.sums(torch.zeros_like(thing.indices), shares, 1)[0]
+        return torch.from_numpy(summed).to(shares)
+    return shares @ field.code_probabilities()
 
 
 def list_document(
@@ -152,7 +161,7 @@ def list_document(
 def _entry(scene: Scene, thing: Selection) -> dict[str, Any]:
     """One object of `list_document`."""
     colors = colors_of(thing.selected).astype(np.float64) / 255
-    weights = _shown(scene)[thing.mask].double().cpu().numpy()
+    weights = _shown(scene)[thing.indices].double().cpu().numpy()
     return {
         **thing.geometry(),
         "names": [{"name": name, "probability": round(share, 4)} for name, share in thing.names],
@@ -162,7 +171,7 @@ def _entry(scene: Scene, thing: Selection) -> dict[str, Any]:
 
 
 def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Selection:
-    """An object with its likeliest names, its own name first, and the strength of that name as its scores."""
+    """An object with its likeliest names, its own name first; the strength of that name becomes its scores."""
     shares = name_probabilities(strengths)
     order = np.argsort(-shares, kind="stable")[:_NAMES]
     names = [(words[place], float(shares[place])) for place in order if shares[place] >= _LEAST_PROBABILITY]
@@ -170,7 +179,8 @@ def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Sel
     if thing.phrase != (names or [("", 0.0)])[0][0]:
         names = [(thing.phrase, float(shares[own])), *(entry for entry in names if entry[0] != thing.phrase)]
     strength = min(max(float(strengths[own]), 0.0), 1.0)
-    return replace(thing, names=tuple(names[:_NAMES]), scores=thing.mask * strength)
+    thing.scores[thing.indices] = strength
+    return replace(thing, names=tuple(names[:_NAMES]))
 
 
 def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]:
@@ -191,7 +201,7 @@ def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]
 
 def _is_part(instance: Selection, other: Selection) -> bool:
     """Whether another name has most of it: a part of a thing is no object; a coin on a table is one."""
-    shared = int((instance.mask & other.mask).sum())
+    shared = int(other.mask[instance.indices].sum())
     return other.phrase not in SURFACES and shared > 0.5 * len(instance)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.codebook import Codebook
@@ -92,6 +94,22 @@ class CodeField:
         for column in range(self.codes.shape[1]):
             total.addcmul_(self.weights[:, column, None], table[self.codes[:, column].long()])
         return total
+
+    def sums(self, places: Tensor, shares: Tensor, count: int) -> NDArray[np.float64]:
+        """Weighted sums of the distributions at each of some places ``[count, K]``; ``[N, K]`` is never held.
+
+        Args:
+            places: Where each Gaussian counts ``[N]`` int64, in 0..count-1.
+            shares: Its weight ``[N]``.
+            count: Number of places.
+        """
+        codes = self.codebook.num_codes
+        first, weights = places.cpu().numpy() * codes, shares.cpu().double().numpy()
+        total = np.zeros(count * codes)
+        for column in range(self.codes.shape[1]):
+            values = weights * self.weights[:, column].cpu().numpy()
+            total += np.bincount(first + self.codes[:, column].cpu().numpy(), values, len(total))
+        return total.reshape(count, codes)
 
     @torch.no_grad()
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
