@@ -33,6 +33,7 @@ PROMPTS = (
     "the handle of that blue mug",  # in no dictionary
     "Café's über-mug, 42!",  # accents, marks and digits
     "blue tea mug",  # compared with other things with a color
+    "That shiny red apple",  # its widest gap lies between 0.3 and 0.6 of its best segment
     "zebra",  # not in the scene
     "qwzx blorp",
 )
@@ -454,6 +455,10 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
         (lambda m: m["scene"].update(gaussians="many"), "a number in scene.gaussians"),
         (lambda m: m["views"][0].update(viewmat=[1]), "a list of cameras in views"),
         (lambda m: m.update(language=None), "language or a server"),
+        (
+            lambda m: m["language"].update(segments="s", segment_rule=None),
+            "5 numbers in language.segment_rule",
+        ),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
         (lambda m: m.clear(), "version 3 of a lexsplat page"),
     ],
