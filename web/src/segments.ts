@@ -72,7 +72,9 @@ export class Segments {
   /** Scores by segments from those of single splats: at least the threshold exactly where a segment is taken. */
   scores(own: Float32Array): Float32Array {
     const lowest = new Float64Array(this.#sums.length);
-    this.#labels.forEach((label, i) => (lowest[label] += this.#masses[i] * own[i]));
+    const labels = this.#labels;
+    const masses = this.#masses;
+    for (let i = 0; i < own.length; i++) lowest[labels[i]] += masses[i] * own[i];
     let best: { cut: Cut; level: Uint32Array } | null = null;
     for (const level of [...this.#levels].reverse()) {
       const cut = cutOf(level, lowest, this.#sums, this.rule.lowest); // coarse levels first: of equal gaps the first one wins
@@ -81,12 +83,16 @@ export class Segments {
     const { cut, level } = best!;
     const { own_share: share, steepness, threshold } = this.rule;
     const spread = Math.max(cut.taken - cut.left, 1e-6);
-    return own.map((value, i) => {
-      const whole = cut.scores[level[this.#labels[i]]];
-      const blended = share * value + (1 - share) * whole;
-      const steep = 1 / (1 + Math.exp(-Math.min(60, Math.max(-60, ((blended - cut.limit) * steepness) / spread))));
-      return threshold * Number(whole >= cut.limit) + (1 - threshold) * steep;
-    });
+    // What all splats of a lowest segment share is computed once: a scene has millions of splats.
+    const slope = steepness / spread;
+    const shared = lowest.map((_, label) => ((1 - share) * cut.scores[level[label]] - cut.limit) * slope);
+    const floor = lowest.map((_, label) => threshold * Number(cut.scores[level[label]] >= cut.limit));
+    const scores = new Float32Array(own.length);
+    for (let i = 0; i < own.length; i++) {
+      const odds = Math.min(60, Math.max(-60, own[i] * share * slope + shared[labels[i]]));
+      scores[i] = floor[labels[i]] + (1 - threshold) / (1 + Math.exp(-odds));
+    }
+    return scores;
   }
 }
 
