@@ -139,6 +139,23 @@ def test_answers_are_those_of_python(page, demo):
     assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
 
 
+def test_a_phrase_takes_the_segments_that_python_takes(page, demo):
+    """Its widest gap lies between 0.3 and 0.6 of its best segment, below which Python cuts nothing."""
+    prompt = "that shiny red apple"
+    found = page.evaluate(
+        """async (prompt) => {
+            const { presence, scores } = await lexsplat.app.source.answer(prompt, "#fff");
+            return { presence, scores: [...scores] };
+        }""",
+        prompt,
+    )
+    asked = demo.ask([prompt])
+    scores, expected = np.array(found["scores"]), asked.scores[0].numpy()
+    assert found["presence"] == asked.presences[0]
+    assert np.array_equal(scores >= 0.5, expected >= 0.5)
+    assert np.abs(scores - expected).max() <= 3 / 255  # weights of the text tower have 8 bits
+
+
 KIND = """async (prompt) => {
     const answer = await lexsplat.app.source.answer(prompt, "#fff");
     await lexsplat.app.source.refine(answer);
@@ -454,6 +471,10 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
         (lambda m: m["scene"].update(gaussians="many"), "a number in scene.gaussians"),
         (lambda m: m["views"][0].update(viewmat=[1]), "a list of cameras in views"),
         (lambda m: m.update(language=None), "language or a server"),
+        (
+            lambda m: m["language"].update(segments="s", segment_rule=None),
+            "5 numbers in language.segment_rule",
+        ),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
         (lambda m: m.clear(), "version 3 of a lexsplat page"),
     ],

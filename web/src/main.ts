@@ -76,7 +76,7 @@ async function load(
   const geometry = new Geometry(stage.mesh, scene.gaussians);
   const codesOf = new Language(codes, language!.num_codes);
   const loader = manifest.text ? new TowerLoader(files, manifest) : null;
-  const whole = segments && new Segments(segments, scene.gaussians);
+  const whole = segments && new Segments(segments, scene.gaussians, language!.segment_rule!);
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
   const dictionary = new Dictionary(list, table, language!.num_codes);
   const tables = new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds);

@@ -34,6 +34,19 @@ export interface EverydayRule {
   colors: string[];
 }
 
+/** The constants of lexsplat.queries.segments. */
+export interface SegmentRule {
+  /** A cut is above this share of the best segment's score. */
+  lowest: number;
+  /** Levels whose taken segments lie below this do not compete. */
+  border: number;
+  /** Share of a splat's own relevancy in its score; the rest is its segment's. */
+  own_share: number;
+  steepness: number;
+  /** Smallest score of a splat in a taken segment. */
+  threshold: number;
+}
+
 /** What lexsplat view says of itself: the page asks its server instead of its tables. */
 export interface ServerEntry {
   /** Counts the edits; a page that shows an earlier version is told so. */
@@ -71,7 +84,15 @@ export interface Manifest {
   };
   /** Null where a server answers, as are the table of words and the list of objects. */
   server: ServerEntry | null;
-  language: { codes: string; segments: string | null; objects: string; num_codes: number; method: string } | null;
+  language: {
+    codes: string;
+    segments: string | null;
+    /** How segments are taken; null without segments. */
+    segment_rule: SegmentRule | null;
+    objects: string;
+    num_codes: number;
+    method: string;
+  } | null;
   words: { phrases: string; table: string | null; count: number };
   objects: ObjectEntry[] | null;
   /** Places in the list of objects for each kind of things ("toy") that the scene holds. */
@@ -124,6 +145,8 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
   ["views", "a list of cameras", areViews],
 ];
 
+const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "threshold"];
+
 function areViews(value: unknown): boolean {
   const isView = (view: ViewEntry | null): boolean =>
     isRecord(view) && isText(view!.name) && areNumbers(2)([view!.width, view!.height]) && areNumbers(2)(view!.focal) && areNumbers(16)(view!.viewmat);
@@ -137,6 +160,11 @@ function lacking(manifest: Manifest): string {
   const lack = FIELDS.find(([path, , check]) => !check(at(path)));
   if (lack) return `${lack[1]} in ${lack[0]}`;
   if (!manifest.server && !manifest.language) return "language or a server";
+  if (manifest.language?.segments) {
+    const isRule = areNumbers(SEGMENT_RULE.length);
+    const rule = manifest.language.segment_rule as unknown as Record<string, unknown> | null | undefined;
+    if (!isRule(SEGMENT_RULE.map((name) => rule?.[name]))) return `${SEGMENT_RULE.length} numbers in language.segment_rule`;
+  }
   return manifest.files[manifest.scene.file] ? "" : `${manifest.scene.file} in files`;
 }
 

@@ -3,14 +3,7 @@
 
 import { DataUtils } from "three";
 import type { Language } from "./language";
-import { PageError } from "./manifest";
-
-/** A cut is above this share of the best segment's score. */
-const LOWEST = 0.3;
-const BORDER = 0.5;
-/** Share of a splat's own relevancy in its score; the rest is its segment's. */
-const OWN_SHARE = 0.7;
-const STEEPNESS = 8;
+import { PageError, type SegmentRule } from "./manifest";
 
 interface Cut {
   scores: Float64Array;
@@ -31,7 +24,7 @@ export class Segments {
   readonly hidden: Uint8Array;
 
   /** `content` is L and S, the levels [L, S], the labels [N], the masses [N] and `hidden` [N] (lexsplat.scenes.publishing.sidecar). */
-  constructor(content: Uint8Array<ArrayBuffer>, count: number) {
+  constructor(content: Uint8Array<ArrayBuffer>, count: number, readonly rule: SegmentRule) {
     const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
     const levels = view.getUint32(0, true);
     const segments = view.getUint32(4, true);
@@ -76,34 +69,41 @@ export class Segments {
     return whole;
   }
 
-  /** Scores by segments from those of single splats: at least 0.5 exactly where a segment is taken. */
+  /** Scores by segments from those of single splats: at least the threshold exactly where a segment is taken. */
   scores(own: Float32Array): Float32Array {
     const lowest = new Float64Array(this.#sums.length);
-    this.#labels.forEach((label, i) => (lowest[label] += this.#masses[i] * own[i]));
+    const labels = this.#labels;
+    const masses = this.#masses;
+    for (let i = 0; i < own.length; i++) lowest[labels[i]] += masses[i] * own[i];
     let best: { cut: Cut; level: Uint32Array } | null = null;
     for (const level of [...this.#levels].reverse()) {
-      const cut = cutOf(level, lowest, this.#sums); // coarse levels first: of equal gaps the first one wins
-      if (best === null || before(best.cut, cut)) best = { cut, level };
+      const cut = cutOf(level, lowest, this.#sums, this.rule.lowest); // coarse levels first: of equal gaps the first one wins
+      if (best === null || before(best.cut, cut, this.rule.border)) best = { cut, level };
     }
     const { cut, level } = best!;
+    const { own_share: share, steepness, threshold } = this.rule;
     const spread = Math.max(cut.taken - cut.left, 1e-6);
-    return own.map((value, i) => {
-      const whole = cut.scores[level[this.#labels[i]]];
-      const blended = OWN_SHARE * value + (1 - OWN_SHARE) * whole;
-      const steep = 1 / (1 + Math.exp(-Math.min(60, Math.max(-60, ((blended - cut.limit) * STEEPNESS) / spread))));
-      return BORDER * Number(whole >= cut.limit) + (1 - BORDER) * steep;
-    });
+    // What all splats of a lowest segment share is computed once: a scene has millions of splats.
+    const slope = steepness / spread;
+    const shared = lowest.map((_, label) => ((1 - share) * cut.scores[level[label]] - cut.limit) * slope);
+    const floor = lowest.map((_, label) => threshold * Number(cut.scores[level[label]] >= cut.limit));
+    const scores = new Float32Array(own.length);
+    for (let i = 0; i < own.length; i++) {
+      const odds = Math.min(60, Math.max(-60, own[i] * share * slope + shared[labels[i]]));
+      scores[i] = floor[labels[i]] + (1 - threshold) / (1 + Math.exp(-odds));
+    }
+    return scores;
   }
 }
 
 /** Whether the second cut answers better: what it takes lies above the border, then by its gap. */
-function before(first: Cut, second: Cut): boolean {
-  const [a, b] = [first.taken >= BORDER, second.taken >= BORDER];
+function before(first: Cut, second: Cut, border: number): boolean {
+  const [a, b] = [first.taken >= border, second.taken >= border];
   return a === b ? second.gap > first.gap : b;
 }
 
 /** The widest gap between the sorted scores of the segments of a level. */
-function cutOf(level: Uint32Array, lowest: Float64Array, lowestMasses: Float64Array): Cut {
+function cutOf(level: Uint32Array, lowest: Float64Array, lowestMasses: Float64Array, share: number): Cut {
   const count = level.reduce((most, segment) => Math.max(most, segment), 0) + 1;
   const sums = new Float64Array(count);
   const masses = new Float64Array(count);
@@ -114,7 +114,7 @@ function cutOf(level: Uint32Array, lowest: Float64Array, lowestMasses: Float64Ar
   const scores = sums.map((sum, segment) => sum / Math.max(masses[segment], 1e-12));
   const ranked = scores.slice().sort().reverse();
   let place = 0;
-  const gapAt = (n: number): number => (ranked[n] >= LOWEST * ranked[0] ? ranked[n] - ranked[n + 1] : -1);
+  const gapAt = (n: number): number => (ranked[n] >= share * ranked[0] ? ranked[n] - ranked[n + 1] : -1);
   for (let n = 1; n + 1 < count; n++) if (gapAt(n) > gapAt(place)) place = n;
   const single = count === 1;
   const limit = single ? ranked[0] : (ranked[place] + ranked[place + 1]) / 2;

@@ -26,12 +26,13 @@ from lexsplat.language.segments import Segments
 SEGMENT_THRESHOLD = 0.5
 """Smallest score of a Gaussian in a taken segment."""
 
-_LOWEST = 0.6
+LOWEST = 0.6
 """A cut is above this share of the best segment's score."""
-_BORDER = 0.5
-_OWN_SHARE = 0.7
+BORDER = 0.5
+"""Levels whose taken segments lie below this do not compete."""
+OWN_SHARE = 0.7
 """Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
-_STEEPNESS = 8.0
+STEEPNESS = 8.0
 """Slope of the score at the cut, relative to the distance between what is taken and what is left."""
 
 FloatArray = NDArray[np.float64]
@@ -81,15 +82,15 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
     result = np.empty_like(own)
     for prompt in range(len(own)):
         # Coarse levels first: of equal gaps the first one wins.
-        keys = [(cut.taken[prompt] >= _BORDER, cut.gaps[prompt]) for cut in reversed(cuts)]
+        keys = [(cut.taken[prompt] >= BORDER, cut.gaps[prompt]) for cut in reversed(cuts)]
         place = len(cuts) - 1 - max(range(len(cuts)), key=lambda key: (keys[key], -key))
         cut = cuts[place]
         at_lowest = cut.scores[prompt][levels[place]]
         limit, spread = cut.limits[prompt], max(cut.taken[prompt] - cut.left[prompt], 1e-6)
         # Single precision, in place: this is all that is done for each Gaussian.
-        odds = ((1 - _OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
-        odds += np.float32(_OWN_SHARE) * own[prompt]
-        odds *= np.float32(-_STEEPNESS / spread)
+        odds = ((1 - OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
+        odds += np.float32(OWN_SHARE) * own[prompt]
+        odds *= np.float32(-STEEPNESS / spread)
         steep = np.exp(np.clip(odds, -60, 60, out=odds), out=odds)
         steep += 1
         np.divide(np.float32(1 - SEGMENT_THRESHOLD), steep, out=result[prompt])
@@ -107,7 +108,7 @@ def _cut(lowest: FloatArray, lowest_masses: FloatArray, level: NDArray[np.int64]
     ranked = np.take_along_axis(scores, order, 1)
     if count == 1:
         return _Cut(scores, masses, np.zeros(len(scores)), ranked[:, 0], ranked[:, 0], np.zeros(len(scores)))
-    gaps = np.where(ranked[:, :-1] >= _LOWEST * ranked[:, :1], ranked[:, :-1] - ranked[:, 1:], -1.0)
+    gaps = np.where(ranked[:, :-1] >= LOWEST * ranked[:, :1], ranked[:, :-1] - ranked[:, 1:], -1.0)
     best = gaps.argmax(1)[:, None]
     limits = (np.take_along_axis(ranked[:, :-1], best, 1) + np.take_along_axis(ranked[:, 1:], best, 1)) / 2
     taken = scores >= limits

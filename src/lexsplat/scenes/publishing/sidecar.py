@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lexsplat.language.segments import Segments
+from lexsplat.queries import segments as rule
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.formats.language import StoredLanguage
 
@@ -27,6 +28,17 @@ def splat_codes(language: StoredLanguage) -> bytes:
     shares = torch.cat([weights.sum(1, keepdim=True), weights[:, 1:]], dim=1) / largest
     quantized = (shares * 255).round().clamp(0, 255).to(torch.uint8)
     return language.codes.numpy().tobytes() + quantized.numpy().tobytes()
+
+
+def segment_rule() -> dict[str, float]:
+    """The constants by which the page takes or leaves segments: those of `lexsplat.queries.segments`."""
+    return {
+        "lowest": rule.LOWEST,
+        "border": rule.BORDER,
+        "own_share": rule.OWN_SHARE,
+        "steepness": rule.STEEPNESS,
+        "threshold": rule.SEGMENT_THRESHOLD,
+    }
 
 
 def segments_file(segments: Segments, hidden: torch.Tensor) -> bytes:
