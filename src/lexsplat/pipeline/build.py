@@ -29,7 +29,7 @@ from lexsplat.pipeline.distribution import extract_on_workers
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
 from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
 from lexsplat.pipeline.provenance import model_identity, model_place, write_provenance
-from lexsplat.pipeline.splats import check_agreement, existing_splats
+from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints import capture_of_splats, read_without_floaters
 from lexsplat.pipeline.viewpoints.choosing import SIZE
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
@@ -39,7 +39,7 @@ from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
-from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
@@ -221,8 +221,7 @@ class _Builder:
     def _geometry(self, capture_hash: str, config: BuildConfig) -> _Stage:
         outputs = [self.folder.gaussians_path]
         if self.splats is not None:
-            content = file_hash(existing_splats(self.splats))
-            return _Stage([capture_hash, content], self._take_splats, outputs)
+            return _Stage([capture_hash, splats_hash(self.splats)], self._take_splats, outputs)
         inputs = [capture_hash, config.reconstruction, config.seed, self.device]
         if self.blocks > 1:
             inputs += [f"{self.blocks} blocks", self.config.up]

@@ -13,8 +13,11 @@ from lexsplat.captures import View
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.formats.reading import splat_file
+from lexsplat.scenes.formats.sog import META
+from lexsplat.scenes.formats.sog_streamed import LOD_META
 
 CHECKED_VIEWS = 8
 """Number of views in which the Gaussians are looked for."""
@@ -35,6 +38,19 @@ def existing_splats(path: Path | None) -> Path:
     if path is None or not splat_file(path).is_file():
         raise FileFormatError(path, expected="a file of Gaussians", found="no such file")
     return splat_file(path)
+
+
+def splats_hash(path: Path | None) -> str:
+    """Hash of the content of the file; of the parts of a SOG in a folder, of all files that they may be.
+
+    Raises:
+        FileFormatError: If there is no such file.
+    """
+    file = existing_splats(path)
+    if file.name not in (META, LOD_META):
+        return file_hash(file)
+    parts = sorted(part for part in file.parent.rglob("*") if part.suffix in (".json", ".webp", ".sog"))
+    return fingerprint({part.relative_to(file.parent).as_posix(): file_hash(part) for part in parts})
 
 
 def check_agreement(gaussians: Gaussians, views: list[View], subject: Path) -> None:

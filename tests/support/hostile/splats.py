@@ -165,6 +165,34 @@ def sog_folder() -> Reader:
 
 
 @reader
+def sog_version_1() -> Reader:
+    from lexsplat.scenes.formats.reading import read_splats
+    from support.sog_files import write_version_1
+
+    parts = {
+        f"{name}.webp": lambda content, rng: mutate.binary(content, rng, 40, 30)
+        for name in ("means_u", "sh0", "shN_centroids", "shN_labels")
+    }
+    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 150, 800)
+    return Reader(write_version_1, read_splats, check_gaussians, parts)
+
+
+@reader
+def sog_streamed() -> Reader:
+    """The tree of levels is damaged, and the names of the files in it."""
+    from lexsplat.scenes.formats.reading import read_splats
+    from support.sog_files import write_streamed
+
+    fine, coarse = ({"file": number, "offset": 0, "count": count} for number, count in enumerate((10, 5)))
+    tree = {"children": [{"lods": {"0": fine, "1": coarse}}, {"lods": {"1": coarse}}]}
+    return Reader(
+        lambda folder: write_streamed(folder, {"0_0": 10, "1_0": 5}, tree),
+        read_splats, check_gaussians,
+        {"lod-meta.json": lambda content, rng: mutate.json_file(content, rng, 150, 1200)},
+    )  # fmt: skip
+
+
+@reader
 def glb() -> Reader:
     from lexsplat.scenes.formats.gltf import write_glb
     from lexsplat.scenes.formats.reading import read_splats

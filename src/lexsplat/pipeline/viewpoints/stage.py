@@ -11,11 +11,11 @@ import numpy as np
 from lexsplat.captures import Capture, load_capture
 from lexsplat.geometry.world import parse_vector
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.splats import existing_splats
+from lexsplat.pipeline.splats import existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints.choosing import choose_views
 from lexsplat.pipeline.viewpoints.floaters import read_without_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
-from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import NOTE, Listener
 from lexsplat.scenes.folder import SceneFolder
 
@@ -44,7 +44,7 @@ def capture_of_splats(
         CaptureError: If no views can be chosen.
     """
     splats, poses = existing_splats(splats), folder.root / "poses"
-    key = fingerprint(file_hash(splats), config.up, config.seed, config.keep_floaters)
+    key = fingerprint(splats_hash(splats), config.up, config.seed, config.keep_floaters)
     if not (folder.is_finished("views", key) and (poses / "transforms.json").is_file()):
         start = time.perf_counter()
         folder.reopen("views")

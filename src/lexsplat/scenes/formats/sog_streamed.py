@@ -39,7 +39,15 @@ def read_streamed_sog(path: Path) -> Gaussians:
         ranges = sorted(set(_finest(meta["tree"])))
         files = {file: _inside(path, names[file]) for file, _, _ in ranges}
         environment = [_inside(path, meta["environment"])] if meta.get("environment") else []
-    except (KeyError, TypeError, IndexError, ValueError, AttributeError, RecursionError) as error:
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        OSError,
+        RecursionError,
+    ) as error:
         found = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileFormatError(
             path, expected="a streamed SOG of version 1", found=f"damaged content: {found}"
