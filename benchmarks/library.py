@@ -40,7 +40,8 @@ from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.contents import Contents
-from lexsplat.scenes.library.entries import Codes, Record, write_entry
+from lexsplat.scenes.library.entries import Codes, write_entry
+from lexsplat.scenes.library.records import Record, stamp_of
 from lexsplat.scenes.library.searching import candidates
 from lexsplat.scenes.scene import open_scene
 
@@ -115,19 +116,19 @@ def mixed_library(root: Path, count: int, codes: int, dimensions: int, mixed: in
             entry = Codes.made(units, words, scale, shares)
             made.append(Record(
                 f"s{number}", str(folder), "", fingerprint(stages), "mixed", "mixed", entry.content(), codes, 0, 0,
-                "" if contents is None else contents.content(), entry.checksum(),
+                "" if contents is None else contents.content(), entry.checksum(), stamp_of(folder),
             ))  # fmt: skip
-            write_entry(root, made[-1], entry, contents, None)
+            write_entry(root, made[-1], entry, contents)
     return library
 
 
 def copy_entry(stage: Path, first: Record, name: str, folder: Path) -> None:
     """Enter a scene with the codes of another one; its codes are a file of its own, which a search has to read."""
-    record = dataclasses.replace(first, name=name, path=str(folder))
+    record = dataclasses.replace(first, name=name, path=str(folder), stamp=stamp_of(folder))
     shutil.copyfile(stage / first.codes_file, stage / record.codes_file)
     if record.contents:  # a link: only those of hits are read
         os.link(stage / first.contents_file, stage / record.contents_file)
-    write_json(stage / f"{name}.json", record)
+    write_json(stage / f"{name}.json", record.sealed())
 
 
 def with_codes(contents: Contents, numbers: torch.Tensor, scale: EverydayScale) -> Contents:
@@ -199,7 +200,7 @@ def measured(library: Library) -> dict[str, Any]:
         library.codes(record)
     opened, opened_cpu = time.perf_counter() - start, time.process_time() - spent
     hits = [answered(library, text) for text in TEXTS]  # embeds the texts, and reads what hits show
-    bounds = timed("bounds", lambda text: candidates(library, Thing(text, exact=True), {}))
+    bounds = timed("bounds", lambda text: candidates(library, Thing(text, exact=True)))
     answers = timed("answer", lambda text: answered(library, text))
     files = [path.stat().st_size for path in library.stage.iterdir()]
     return {
@@ -221,9 +222,9 @@ def compared(library: Library, served: Library) -> dict[str, Any]:
     seconds = time.perf_counter() - start
     wall, found = [], []
     for text in TEXTS:
-        exact = [name for name, _ in candidates(library, Thing(text), {})[:10]]
+        exact = [name for name, _ in candidates(library, Thing(text)).ranked[:10]]
         start = time.perf_counter()
-        proposed = [name for name, _ in candidates(served, Thing(text), {})[:10]]
+        proposed = [name for name, _ in candidates(served, Thing(text)).ranked[:10]]
         wall.append(time.perf_counter() - start)
         found += [name in proposed for name in exact]
     return {

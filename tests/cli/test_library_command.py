@@ -1,6 +1,8 @@
 """``lexsplat library``: many scenes from the command line."""
 
+import errno
 import json
+import os
 import shutil
 
 import pytest
@@ -93,9 +95,60 @@ def test_what_is_wrong_is_told_in_one_line_with_its_remedy(rooms, capsys):
     assert document(capsys, "search", rooms, "mug")["phrases"][0]["skipped"][0]["scene"] == "kitchen"
 
 
+def test_one_of_several_scenes_that_cannot_be_added_stops_no_other(rooms, capsys):
+    library = str(rooms / "library")
+    arguments = ["library", "add", library, str(rooms / "nowhere"), str(rooms / "office")]
+    assert cli.main(arguments) == 1
+    said = capsys.readouterr()
+    assert said.out.startswith(f"not added: {rooms / 'nowhere'}: expected a scene folder")
+    assert "office: added from" in said.out
+    assert "found 1 of 2 that cannot; see above" in said.err
+    assert cli.main([*arguments, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    validated("library", found)
+    assert [each["scene"] for each in found["failed"]] == [str(rooms / "nowhere")]
+
+
+def test_nothing_is_removed_unless_all_are_known(rooms, capsys):
+    fails_in_one_line(
+        capsys, ["library", "remove", str(rooms / "library"), "office", "attic"], "no such scene"
+    )
+    assert "2 scenes" in run(capsys, "list", rooms)
+    assert "removed: office, kitchen" in run(capsys, "remove", rooms, "office", "kitchen")
+
+
+def test_pictures_of_a_removed_scene_are_removed(rooms, capsys):
+    run(capsys, "search", rooms, "mug")
+    run(capsys, "remove", rooms, "kitchen")
+    assert not (rooms / "library" / "thumbnails" / "kitchen").exists()
+
+
+@pytest.mark.parametrize("code", [errno.EROFS, errno.ENOSPC])
+def test_an_answer_is_given_where_its_pictures_cannot_be_written(rooms, capsys, caplog, monkeypatch, code):
+    def refused(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("lexsplat.scenes.library.searching.atomic_path", refused)
+    assert cli.main(["library", "search", str(rooms / "library"), "mug"]) == 0
+    assert "1. kitchen: present: yes" in capsys.readouterr().out
+    assert f"no pictures, {os.strerror(code)}; give --thumbnails FOLDER or none" in caplog.text
+    (mug,) = document(capsys, "search", rooms, "mug")["phrases"]
+    assert "thumbnail" not in mug["hits"][0]
+
+
+@pytest.mark.parametrize("text", [None, "{"])
+def test_a_lost_library_file_is_mended_by_verify(rooms, capsys, text):
+    path = rooms / "library" / "library.json"
+    path.unlink() if text is None else path.write_text(text)
+    fails_in_one_line(capsys, ["library", "search", str(rooms / "library"), "mug"], "verify", "--repair")
+    assert "2 scenes are sound" in run(capsys, "verify", rooms, "--repair")
+    assert "in 1 of 2" in run(capsys, "search", rooms, "mug")
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
+        (["search", "LIB", "mug", " "], "PHRASE"),
         (["search", "LIB"], "PHRASE"),
         (["add", "LIB"], "SCENE"),
         (["remove", "LIB"], "SCENE"),

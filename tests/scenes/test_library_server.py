@@ -2,6 +2,7 @@
 
 import http.server
 import json
+import shutil
 import signal
 import threading
 
@@ -139,6 +140,58 @@ def test_what_was_added_and_removed_without_the_server_is_noticed_and_brought_to
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("action", ["add", "remove"])
+def test_a_change_brings_to_the_server_what_it_has_missed(rooms, chroma, tmp_path, action):
+    alone = Library.create(tmp_path / "library")
+    for name in NAMES[:2]:
+        alone.add(rooms / name)
+    library = Library(alone.root, index=chroma.url)
+    library.add(rooms / "lab") if action == "add" else library.remove("office")
+    for phrase in ("mug", "candle", "vase"):
+        assert hits(library, phrase) == hits(alone, phrase)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["a code", "a collection"])
+def test_a_server_that_has_lost_something_is_refused_until_it_is_mended(rooms, chroma, tmp_path, lost):
+    library = Library.create(tmp_path / "library", index=chroma.url)
+    for name in NAMES:
+        library.add(rooms / name)
+    (place, *_) = (each.place for each in library.server._collections())
+    if lost == "a code":
+        first = next(library.server._identifiers(place))
+        library.server._ask("POST", f"{place}/delete", {"ids": [first]})
+    else:
+        names = {
+            each["id"]: each["name"] for each in library.server._ask("GET", f"{served_by._PLACE}?limit=9999")
+        }
+        library.server._ask("DELETE", f"{served_by._PLACE}/{names[place.split('/')[-1]]}")
+    for ask in (lambda: library.search("mug"), library.verify):
+        with pytest.raises(LibraryError, match=f"verify {library.root} --repair --index"):
+            ask()
+    assert library.verify(repair=True) == {}
+    assert hits(library, "mug") == hits(Library(library.root), "mug")
+
+
+@pytest.mark.slow
+def test_scenes_beyond_the_proposals_are_counted_where_they_may_hold_the_thing(
+    rooms, chroma, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("lexsplat.scenes.library.searching.PROPOSED", 1)
+    library = Library.create(tmp_path / "library", index=chroma.url)
+    for name in NAMES:
+        library.add(rooms / name)
+    found = library.search("candle")  # in office and lab, of different encoders
+    assert len(found.hits) == 2
+    shutil.copytree(rooms / "office", tmp_path / "office")
+    library.add(tmp_path / "office")
+    found = library.search("candle")
+    assert (len(found.hits), found.unopened) == (2, 2)  # kitchen has the encoder of the two offices
+    found = library.search("griffin")
+    assert (found.hits, found.unopened) == ((), 0)
+
+
+@pytest.mark.slow
 def test_two_libraries_share_a_server_and_stay_apart(rooms, chroma, tmp_path):
     first, second = (Library.create(tmp_path / name, index=chroma.url) for name in ("first", "second"))
     first.add(rooms / "kitchen")
@@ -155,8 +208,8 @@ def test_the_server_recalls_the_ten_best_of_two_thousand_mixed_scenes(chroma, tm
     served.server.repair([(record, served.codes(record)) for record in served.records()], served.stage)
     found = []
     for word in default_vocabulary("bundled"):
-        exact = [name for name, _ in candidates(library, Thing(word), {})[:10]]
-        proposed = [name for name, _ in candidates(served, Thing(word), {})[:10]]
+        exact = [name for name, _ in candidates(library, Thing(word)).ranked[:10]]
+        proposed = [name for name, _ in candidates(served, Thing(word)).ranked[:10]]
         found += [name in proposed for name in exact]
     assert len(found) > 100
     assert np.mean(found) >= 0.99

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -72,6 +73,8 @@ def main() -> None:
     known: dict[str, dict[str, bytes]] = {}
     while report["kills"] < kills and not report["failed"]:
         place = places[rng.integers(len(places))]
+        if not inside:
+            shutil.rmtree(library, ignore_errors=True)  # so that making a library is killed too
         action = "remove" if place.name in inside else "add"
         result = attempt(library, action, place, float(rng.uniform(0, 1.1 * longest[action])))
         after = inside | {place.name} if action == "add" else inside - {place.name}

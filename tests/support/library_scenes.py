@@ -6,6 +6,7 @@ model is needed for everyday words, and what a scene holds is known from how it 
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import shutil
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from lexsplat.queries.everyday import everyday_words
 from lexsplat.runtime.files import write_tensors
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.library import COMPARED
+from lexsplat.scenes.library.records import read_record, write_record
 from support.language_scene import make_scene
 
 DIMENSIONS = 96
@@ -88,8 +90,10 @@ def write_scene(
 def copied(rooms: Path, target: Path) -> Path:
     """A copy of scenes and their library whose records do not name the originals."""
     shutil.copytree(rooms, target)
-    for record in (target / "library" / "scenes").glob("*.json"):
-        record.write_text(record.read_text().replace(str(rooms), str(target)))
+    for path in (target / "library" / "scenes").glob("*.json"):
+        record = read_record(path)
+        moved = record.path.replace(str(rooms), str(target))
+        write_record(dataclasses.replace(record, path=moved), path)
     return target
 
 

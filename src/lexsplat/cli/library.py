@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from lexsplat.cli.options import Device, check_phrases, print_json
-from lexsplat.runtime.errors import LibraryError
+from lexsplat.runtime.errors import FileFormatError, LibraryError, ModelError, SceneFolderError
 
 if TYPE_CHECKING:
-    from lexsplat.scenes.library import Library
+    from lexsplat.scenes.library import Found, Library
+
+log = logging.getLogger("lexsplat")
 
 _REQUIRED = "(required)"
 Action = tyro.conf.Positional[
@@ -38,8 +41,8 @@ class LibraryCommand:
         lexsplat library remove rooms office
         lexsplat library verify rooms --repair
 
-    The library is a folder of its own. It keeps the codes and a picture of each scene; the scenes stay where they
-    are. Add a scene again after it was rebuilt or moved (docs/library.md).
+    The library is a folder of its own. It keeps the codes, segments and pictures of each scene; the scenes stay where
+    they are. Add a scene again after it was rebuilt or moved (docs/library.md).
 
     Args:
         action: What to do.
@@ -82,7 +85,8 @@ class LibraryCommand:
         """Do it and print."""
         from lexsplat.scenes.library import Library
 
-        make = Library.create if self.action == "add" else Library
+        mends = self.repair and (self.library / "scenes").is_dir()
+        make = Library.create if self.action == "add" or mends else Library
         library = make(self.library, self.device, self.index)
         document = getattr(self, f"_{self.action}")(library)
         if self.json:
@@ -93,7 +97,14 @@ class LibraryCommand:
                 self.library,
                 expected="sound entries",
                 found=f"{count} of {len(library.names())} with a problem",
-                remedy="see above" if self.repair else "mend them with --repair",
+                remedy="see above" if self.repair else "see above; --repair mends damaged entries",
+            )
+        if document.get("failed"):
+            raise LibraryError(
+                self.library,
+                expected="scenes that can be added",
+                found=f"{len(document['failed'])} of {len(self.words)} that cannot",
+                remedy="see above",
             )
 
     def _say(self, text: str) -> None:
@@ -101,15 +112,23 @@ class LibraryCommand:
             print(text)
 
     def _add(self, library: Library) -> dict[str, Any]:
-        records = []
+        records, failed = [], []
         for path in self.words:
-            record = library.add(path)
+            try:
+                record = library.add(path)
+            except (SceneFolderError, FileFormatError, ModelError) as error:
+                if len(self.words) == 1:
+                    raise
+                failed.append({"scene": path, "problem": str(error)})
+                self._say(f"not added: {error}")
+                continue
             records.append(dataclasses.asdict(record))
             self._say(f"{record.name}: added from {record.path}, {record.codes} codes of {record.clip}")
-        return {"scenes": records}
+        return {"scenes": records, "failed": failed}
 
     def _remove(self, library: Library) -> dict[str, Any]:
-        removed = [library.remove(name) for name in self.words]
+        names = [library.name_of(scene) for scene in self.words]  # all are known before one is removed
+        removed = [library.remove(name) for name in dict.fromkeys(names)]
         self._say(f"removed: {', '.join(removed)}")
         return {"removed": removed}
 
@@ -132,20 +151,21 @@ class LibraryCommand:
         return {"problems": [{"scene": name, "problem": problem} for name, problem in problems.items()]}
 
     def _search(self, library: Library) -> dict[str, Any]:
-        folder = self.thumbnails or self.library / "thumbnails"
         answers = []
         for phrase in self.words:
             found = library.search(phrase, self.limit, confirm=self.confirm)
-            answer = found.to_dict()
-            if str(self.thumbnails) != "none":
-                for hit, entry in zip(found.hits, answer["hits"]):
-                    entry["thumbnail"] = str(hit.write_picture(folder))
+            answers.append(found.to_dict())
             self._say(repr(found))
-            self._say_pictures(answer)
-            answers.append(answer)
+            if str(self.thumbnails) != "none":
+                self._write_pictures(found, answers[-1]["hits"])
         return {"phrases": answers}
 
-    def _say_pictures(self, answer: dict[str, Any]) -> None:
-        for number, hit in enumerate(answer["hits"], start=1):
-            if "thumbnail" in hit:
-                self._say(f"  picture {number}: {hit['thumbnail']}")
+    def _write_pictures(self, found: Found, entries: list[dict[str, Any]]) -> None:
+        folder = self.thumbnails or self.library / "thumbnails"
+        for number, (hit, entry) in enumerate(zip(found.hits, entries), start=1):
+            try:
+                entry["thumbnail"] = str(hit.write_picture(folder))
+            except OSError as error:
+                log.warning("%s: no pictures, %s; give --thumbnails FOLDER or none", folder, error.strerror)
+                return
+            self._say(f"  picture {number}: {entry['thumbnail']}")

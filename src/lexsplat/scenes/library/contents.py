@@ -29,9 +29,9 @@ from lexsplat.language.segment_codes import segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.rendering import render
 from lexsplat.runtime.device import one_thread
-from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.library.records import damaged, mapped_tensors
 from lexsplat.scenes.scene import Scene
 
 _MOST = 2048
@@ -165,25 +165,16 @@ def map_contents(path: Path, content: str) -> Contents:
     Raises:
         FileFormatError: If it is missing, or its content is another one.
     """
-    from safetensors import SafetensorError, safe_open
-
+    expected = "the objects that were written"
+    tensors = mapped_tensors(path, expected)
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if _content(tensors) == content:
             facts = json.loads(tensors.pop("facts").numpy().tobytes())
             return Contents(**tensors, facts=facts)
         found = "damaged content (the hash differs)"
-    except OSError as error:
-        found = str(error.strerror)
-    except (SafetensorError, TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError, ValueError) as error:
         found = str(error)[:80]
-    raise FileFormatError(
-        path,
-        expected="the objects that were written",
-        found=found,
-        remedy=f"lexsplat library verify {path.parents[1]} --repair",
-    )
+    raise damaged(path, expected, found)
 
 
 def _content(tensors: Mapping[str, Tensor]) -> str:

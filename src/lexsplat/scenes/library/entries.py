@@ -6,7 +6,6 @@
     scenes/NAME.json                   the record: where the scene is, which version of it, its encoder
     scenes/NAME.CONTENT.safetensors    the codes, named after their hash, and the record again
     scenes/NAME.CONTENTS.objects.safetensors    segments, objects and pictures, of scenes with segments
-    scenes/NAME.jpg                    a picture of the scene
     texts/                             embeddings of the texts that were asked
 
 The record is written last and replaced as a whole: a scene is in the library when its record is. Codes that no record
@@ -20,7 +19,6 @@ import functools
 import json
 import math
 import os
-import re
 import zlib
 from pathlib import Path
 from typing import Any
@@ -28,91 +26,28 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from lexsplat.queries.everyday import OFFSET, EverydayScale, everyday_words
 from lexsplat.runtime.device import one_thread
-from lexsplat.runtime.errors import FileFormatError, SceneFolderError
-from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
-from lexsplat.runtime.fingerprints import digest, fingerprint
-from lexsplat.scenes.finding import middle_camera
-from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.files import write_tensors
+from lexsplat.runtime.fingerprints import digest
 from lexsplat.scenes.library.contents import Contents
+from lexsplat.scenes.library.records import (
+    BUNDLED,
+    Record,
+    damaged,
+    mapped_tensors,
+    stamp_of,
+    state_of,
+    write_record,
+)
 from lexsplat.scenes.scene import Scene
 
-BUNDLED = "demo"
-"""The path of the bundled scene, wherever it is installed."""
-_THUMBNAIL = 320
-"""Longer side of a picture in pixels."""
 _RIDGE = 0.1
 """Weight of the squared length of the estimate of the offset; the everyday words have about a thousand terms."""
 _GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
-
-
-@dataclasses.dataclass(frozen=True)
-class Record:
-    """A scene of a library.
-
-    Args:
-        name: Its name in the library.
-        path: Its folder; "demo" is the bundled scene.
-        beside: Its folder relative to the library, for scenes that were moved together with it.
-        state: Hash of its finished stages: another one after a build.
-        encoder: Hash of its text encoder; "" if the build did not record it.
-        clip: Name or folder of that encoder.
-        content: Hash of its codes.
-        codes: Number of codes K.
-        gaussians: Number of Gaussians.
-        views: Number of views.
-        contents: Hash of what is kept of its segments and objects; "" if it has no segments.
-        checksum: CRC-32 of its codes, eight times faster than the hash; "" in libraries that were made without.
-    """
-
-    name: str
-    path: str
-    beside: str
-    state: str
-    encoder: str
-    clip: str
-    content: str
-    codes: int
-    gaussians: int
-    views: int
-    contents: str = ""
-    checksum: str = ""
-
-    @property
-    def group(self) -> str:
-        """Scenes of one group have the same text embeddings."""
-        return self.encoder or f"name-{fingerprint(self.clip)}"
-
-    @property
-    def codes_file(self) -> str:
-        """Name of the file of its codes."""
-        return f"{self.name}.{self.content}.safetensors"
-
-    @property
-    def contents_file(self) -> str:
-        """Name of the file of its segments and objects; "" if there is none."""
-        return f"{self.name}.{self.contents}.objects.safetensors" if self.contents else ""
-
-    @property
-    def files(self) -> set[str]:
-        """Names of its files of tensors."""
-        return {self.codes_file, self.contents_file} - {""}
-
-    def folder(self, root: Path) -> Path:
-        """Where the scene is now: at its place relative to the library, as both may have moved, else at its path."""
-        if self.path == BUNDLED:
-            return BUNDLED_SCENE
-        together = (root / self.beside).resolve()
-        return together if (together / "scene.json").is_file() else Path(self.path)
-
-
-def state_of(folder: SceneFolder) -> str:
-    """A hash that changes with every build of a scene; its scale and its name do not matter."""
-    return fingerprint(folder.record["stages"])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -227,86 +162,21 @@ def record_of(
         views=len(scene.views),
         contents="" if contents is None else contents.content(),
         checksum=codes.checksum(),
+        stamp="" if path == BUNDLED else stamp_of(scene.folder.root),
     )
 
 
-def write_entry(
-    root: Path, record: Record, codes: Codes, contents: Contents | None, picture: Image.Image | None
-) -> None:
+def write_entry(root: Path, record: Record, codes: Codes, contents: Contents | None) -> None:
     """Write or replace the entry of a scene; the record comes last.
 
     Raises:
         OSError: If it cannot be written; the earlier entry stays.
     """
     stage = root / "scenes"
-    copy = json.dumps(dataclasses.asdict(record))
     if contents is not None:
         write_tensors(stage / record.contents_file, contents.tensors(), {})
-    write_tensors(stage / record.codes_file, codes.tensors(), {"record": copy})
-    if picture is not None:
-        with atomic_path(stage / f"{record.name}.jpg") as temporary:
-            picture.save(temporary, format="JPEG", quality=85)
-    write_json(stage / f"{record.name}.json", record)
-
-
-def picture_of(scene: Scene) -> Image.Image | None:
-    """A scene as the middle camera sees it; None without views."""
-    camera = middle_camera(scene)
-    if camera is None:
-        return None
-    small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _THUMBNAIL))
-    pixels = (scene.render(small).image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return Image.fromarray(pixels)
-
-
-def read_record(path: Path) -> Record:
-    """The record in a file.
-
-    Raises:
-        FileFormatError: If it is damaged.
-    """
-    found = read_json(path, remedy=f"lexsplat library verify {path.parents[1]} --repair")
-    return checked_record(found, path)
-
-
-def checked_record(content: Any, path: Path) -> Record:
-    """A record from plain data.
-
-    Raises:
-        FileFormatError: If an entry is missing or of a wrong type.
-    """
-    try:
-        values: dict[str, Any] = {
-            field.name: (int if field.type == "int" else str)(content[field.name])
-            for field in dataclasses.fields(Record)
-            if field.name in content or field.default is dataclasses.MISSING
-        }
-        hashes = values["content"], values.get("contents") or "0", values.get("checksum") or "0"
-        sound = values["name"] == path.name.split(".")[0] and all(
-            re.fullmatch("[0-9a-f]+", h) for h in hashes
-        )
-        if sound and re.fullmatch(r"[\w-]*", values["encoder"]) and values["codes"] > 0:
-            return Record(**values)
-        found = "other values"
-    except (KeyError, TypeError, ValueError) as error:
-        found = repr(error)[:80]
-    raise FileFormatError(
-        path,
-        expected="the record of a scene",
-        found=found,
-        remedy=f"lexsplat library verify {path.parents[1]} --repair",
-    )
-
-
-def recovered_record(stage: Path, name: str) -> Record | None:
-    """The record of a scene from the copy in the file of its codes; None if that is damaged as well."""
-    for path in stage.glob(f"{name}.*.safetensors"):
-        try:
-            _, metadata = read_tensors(path)
-            return checked_record(json.loads(metadata["record"]), path)
-        except (FileFormatError, KeyError, ValueError):
-            continue
-    return None
+    write_tensors(stage / record.codes_file, codes.tensors(), {"record": json.dumps(record.sealed())})
+    write_record(record, stage / f"{record.name}.json")
 
 
 def map_codes(path: Path, record: Record, by_hash: bool = False) -> Codes:
@@ -320,25 +190,15 @@ def map_codes(path: Path, record: Record, by_hash: bool = False) -> Codes:
     Raises:
         FileFormatError: If the file is missing, or its content is not that of the record.
     """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            codes = Codes(**{field.name: file.get_tensor(field.name) for field in dataclasses.fields(Codes)})
-        if by_hash or not record.checksum:
-            what, sound = "hash", codes.content() == record.content
-        else:
-            what, sound = "checksum", codes.checksum() == record.checksum
-        if sound and len(codes.units) == record.codes:
-            return codes
-        found = f"damaged content (the {what} differs)"
-    except OSError as error:
-        found = str(error.strerror)
-    except (SafetensorError, TypeError) as error:
-        found = str(error)[:80]
-    raise FileFormatError(
-        path,
-        expected="the codes that were written",
-        found=found,
-        remedy=f"lexsplat library verify {path.parents[1]} --repair",
-    )
+    expected, names = "the codes that were written", {field.name for field in dataclasses.fields(Codes)}
+    tensors = mapped_tensors(path, expected)
+    if tensors.keys() != names:
+        raise damaged(path, expected, f"{len(tensors)} other tensors")
+    codes = Codes(**tensors)
+    if by_hash or not record.checksum:
+        what, sound = "hash", codes.content() == record.content
+    else:
+        what, sound = "checksum", codes.checksum() == record.checksum
+    if not sound or len(codes.units) != record.codes:
+        raise damaged(path, expected, f"damaged content (the {what} differs)")
+    return codes

@@ -6,10 +6,9 @@ import contextlib
 import functools
 import os
 import re
-import uuid
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,28 +19,18 @@ from lexsplat.queries.relevancy import CANONICAL_PHRASES, embed_prompts
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, LibraryError
-from lexsplat.runtime.files import locked, read_json, write_json
+from lexsplat.runtime.files import locked
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.contents import Contents, map_contents
-from lexsplat.scenes.library.entries import (
-    BUNDLED,
-    Codes,
-    OwnTexts,
-    Record,
-    map_codes,
-    picture_of,
-    read_record,
-    record_of,
-    recovered_record,
-    state_of,
-    write_entry,
-)
+from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
+from lexsplat.scenes.library.identity import in_use, library_name, make_library
+from lexsplat.scenes.library.mending import mended, problems_of
+from lexsplat.scenes.library.records import BUNDLED, Record, read_record, stamp_of, state_of
 from lexsplat.scenes.library.searching import Found, search
 from lexsplat.scenes.library.server import Server
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.scene import Scene, open_scene
 
-FORMAT_VERSION = 1
 COMPARED = (*everyday_words(), *CANONICAL_PHRASES)
 """Texts that every question is compared with."""
 _OPEN_SCENES = 16
@@ -64,12 +53,14 @@ class Library:
 
     def __init__(self, root: str | Path, device: str = "auto", index: str | None = None) -> None:
         self.root, self._device = Path(root), device
-        facts = self._facts()
-        self.server = Server(index, facts["name"], self.root) if index else None
+        name = library_name(self.root)
+        self.server = Server(index, name, self.root) if index else None
+        self._home = self.root.resolve()
         self._texts = TextCache(self.root / "texts")
         self._towers: dict[str, TextTower] = {}
         self._records: dict[str, tuple[tuple[int, int], Record]] = {}
         self._codes: dict[str, tuple[str, Codes]] = {}
+        self._states: dict[str, tuple[str, str]] = {}
         self._scenes: Bounded[tuple[str, str, str], Scene] = Bounded(_OPEN_SCENES)
         self._contents: Bounded[str, Contents] = Bounded(_KEPT_CONTENTS)
         self.damaged: dict[str, FileFormatError] = {}
@@ -77,46 +68,17 @@ class Library:
 
     @classmethod
     def create(cls, root: str | Path, device: str = "auto", index: str | None = None) -> Library:
-        """Open a library; a new or empty folder becomes one.
+        """Open a library; a new or empty folder becomes one, and a lost ``library.json`` is written again.
 
         Raises:
             LibraryError: If the folder has files of another program.
         """
-        path = Path(root)
-        if path.exists() and (
-            not path.is_dir() or (any(path.iterdir()) and not (path / "library.json").exists())
-        ):
-            raise LibraryError(
-                path, expected="a library or a new folder", found="other files", remedy="give another folder"
-            )
-        if not (path / "library.json").exists():
-            write_json(path / "library.json", {"format_version": FORMAT_VERSION, "name": uuid.uuid4().hex})
+        with _told(Path(root)):
+            make_library(Path(root))
         return cls(root, device, index)
 
     def __repr__(self) -> str:
         return f"Library({str(self.root)!r}, scenes={len(self.names())})"
-
-    def _facts(self) -> dict[str, Any]:
-        path = self.root / "library.json"
-        if not path.is_file():
-            raise LibraryError(
-                self.root,
-                expected="a library of scenes",
-                found="no library.json in it" if self.root.exists() else "no such folder",
-                remedy=f"make one with: lexsplat library add {self.root} SCENE",
-            )
-        facts = read_json(
-            path, remedy=f'write {{"format_version": {FORMAT_VERSION}, "name": "rooms"}} into it'
-        )
-        version = facts.get("format_version") if isinstance(facts, dict) else None
-        if version != FORMAT_VERSION or not re.fullmatch(r"\w{1,40}", str(facts.get("name"))):
-            raise LibraryError(
-                path,
-                expected=f"format_version {FORMAT_VERSION} and a name",
-                found=repr(version)[:40],
-                remedy="add the scenes to a new library with this version of lexsplat",
-            )
-        return facts
 
     # -- what it holds
 
@@ -158,6 +120,10 @@ class Library:
         records = (self._record(each.name[:-5], each) for each in sorted(entries, key=lambda each: each.name))
         return [record for record in records if record is not None]
 
+    def groups(self) -> set[str]:
+        """The groups of the scenes, each with one encoder."""
+        return {record.group for record in self.records()}
+
     def codes(self, record: Record, by_hash: bool = False) -> Codes | None:
         """The codes of a scene, checked when first read, with ``by_hash`` again; None if damaged (`damaged`)."""
         known = self._codes.get(record.name)
@@ -183,6 +149,41 @@ class Library:
         path = self.stage / record.contents_file
         return self._contents.get_or_make(str(path), lambda: map_contents(path, record.contents))
 
+    def folder(self, record: Record) -> Path:
+        """Where a scene is now."""
+        return record.folder(self._home)
+
+    def is_rebuilt(self, record: Record) -> bool:
+        """Whether a scene was built again since it was added.
+
+        Raises:
+            LexsplatError: If its folder is gone, or its ``scene.json`` is damaged or of another version.
+        """
+        path = self.folder(record)
+        try:
+            stamp = stamp_of(path)
+        except OSError:
+            stamp = None
+        if stamp and stamp == record.stamp:
+            return False
+        key = f"{path} {stamp}"
+        known = self._states.get(record.name)
+        if stamp is None or known is None or known[0] != key:
+            try:
+                known = self._states[record.name] = (key, state_of(SceneFolder.open(path)))
+            except LexsplatError as error:
+                raise self._unusable(record, error) from error
+        return known[1] != record.state
+
+    def _unusable(self, record: Record, error: LexsplatError) -> LexsplatError:
+        """The error of a scene that cannot be read, with what can be done about its entry."""
+        remove = f"lexsplat library remove {self.root} {record.name}"
+        if (self.folder(record) / "scene.json").is_file():
+            remedy = f"{error.remedy or 'build it again'}, or: {remove}"
+        else:
+            remedy = f"if it was moved: lexsplat library add {self.root} NEW_PLACE; if it is gone: {remove}"
+        return type(error)(error.subject, expected=error.expected, found=error.found, remedy=remedy)
+
     def scene(self, name: str) -> Scene:
         """A scene, as it is now.
 
@@ -194,7 +195,7 @@ class Library:
         record = self.record(name)
         if record is None:
             raise self.damaged.get(name) or self._unknown(name)
-        path = record.folder(self.root)
+        path = self.folder(record)
         folder = SceneFolder.open(path)
         key = (name, str(path), state_of(folder))
         return self._scenes.get_or_make(key, lambda: self._open(path))
@@ -240,43 +241,24 @@ class Library:
     # -- changing it
 
     @contextlib.contextmanager
-    def _changing(self) -> Iterator[None]:
+    def changing(self) -> Iterator[None]:
         """Lock the library for a change, and remove what killed writers left.
 
         Raises:
             LibraryError: If another process changes it, or nothing can be written.
         """
-
-        def refusal(holder: str) -> LibraryError:
-            return LibraryError(
-                self.root,
-                expected="a library that no other process changes",
-                found=f"process {holder} at work",
-                remedy="run the command again when it is done",
-            )
-
-        try:
-            with locked(self.root, refusal):
-                self._sweep()
-                if self.server:
-                    self.server.check()  # before anything is changed
-                yield
-        except OSError as error:
-            raise LibraryError(
-                error.filename or self.root,
-                expected="to be written",
-                found=str(error.strerror or error),
-                remedy="run the command again when that is mended; the library is as it was before",
-            ) from error
+        with _told(self.root), locked(self.root, lambda holder: in_use(self.root, holder)):
+            self._sweep()
+            # Asked before anything is changed: whether the server holds what the library holds.
+            self._served = self.server is None or self.server.is_current(self.stage, self.groups())
+            yield
 
     def _sweep(self) -> None:
-        """Remove codes and pictures that no record names."""
-        names = set(self.names())
+        """Remove files that no record names; earlier versions also kept pictures."""
         kept = {file for record in self.records() for file in record.files}
-        for path in [*self.stage.glob("*.safetensors"), *self.stage.glob("*.jpg")]:
-            name = path.name.split(".")[0]
-            damaged = name in self.damaged  # its codes hold the only copy of the record
-            if name not in names or (path.suffix == ".safetensors" and path.name not in kept and not damaged):
+        for path in [*self.stage.glob("[!.]*.safetensors"), *self.stage.glob("*.jpg")]:
+            damaged = path.name.split(".")[0] in self.damaged  # its codes hold the only copy of the record
+            if path.name not in kept and not (damaged and path.suffix == ".safetensors"):
                 path.unlink(missing_ok=True)
 
     def add(self, path: str | Path) -> Record:
@@ -290,11 +272,12 @@ class Library:
             FileFormatError: If one of its files is damaged.
             LibraryError: If another process changes the library, the disk is full, or the server fails.
         """
-        with self._changing():
-            record = self._add(path)
+        with self.changing():
+            record = self.enter(path)
         return record
 
-    def _add(self, path: str | Path, name: str | None = None) -> Record:
+    def enter(self, path: str | Path, name: str | None = None) -> Record:
+        """`add` under a name, while the library is locked (`changing`)."""
         scene = open_scene(path, device=self._device)
         folder = scene.folder
         if folder is None:
@@ -306,24 +289,38 @@ class Library:
         known = scene.encoder_identity().get("encoder_hash")
         codes, contents = Codes.of(scene), Contents.of(scene)
         record = record_of(self.root, name, place, scene, codes, contents)
-        write_entry(self.root, record, codes, contents, picture_of(scene))
+        write_entry(self.root, record, codes, contents)
         if known:  # what the scene has in its cache, all of its scenes have
             self._texts.encode(known, COMPARED, lambda: OwnTexts(scene, known))
         for file in before.files - record.files if before is not None else ():
             (self.stage / file).unlink(missing_ok=True)
-        if self.server:
+        if self.server and self._served:
             self.server.put(record, codes, self.stage)
+        elif self.server:  # it has missed other changes
+            self.bring_to_server()
         return record
+
+    def bring_to_server(self) -> None:
+        """Bring the index server to the state of the library.
+
+        Raises:
+            LibraryError: If the server fails.
+        """
+        if self.server:
+            entries = ((record, codes) for record in self.records() if (codes := self.codes(record)))
+            self.server.repair(entries, self.stage)
+            self._served = True
 
     def _name_for(self, place: str, state: str) -> str:
         """The name of a known or moved scene, or a new one after the folder."""
         for record in self.records():
-            now = str(record.folder(self.root))
+            now = str(self.folder(record))
             if place in (record.path, now):
                 return record.name
             if record.state == state and not (Path(now) / "scene.json").is_file():
                 return record.name  # its folder is gone, and here is the same build
-        base = re.sub(r"[^\w-]+", "_", Path(place).name).strip("_")[:80] or "scene"
+        base = re.sub(r"[^\w-]+", "_", Path(place).name).strip("_").encode()[:80].decode(errors="ignore")
+        base = base or "scene"
         taken, name, number = {known.lower() for known in self.names()}, base, 2
         while name.lower() in taken:
             name, number = f"{base}-{number}", number + 1
@@ -335,21 +332,29 @@ class Library:
         Raises:
             LibraryError: If there is no such scene, another process changes the library, or the server fails.
         """
-        with self._changing():
-            name = self._known(scene)
+        with self.changing():
+            name = self.name_of(scene)
             record = self.record(name)
             (self.stage / f"{name}.json").unlink(missing_ok=True)
             self._sweep()
-            if self.server and record is not None:
+            if self.server and self._served and record is not None:
                 self.server.drop(record, self.stage)
+            else:
+                self.bring_to_server()
+            shutil.rmtree(self.root / "thumbnails" / name, ignore_errors=True)
         return name
 
-    def _known(self, scene: str) -> str:
+    def name_of(self, scene: str) -> str:
+        """The name of a scene, given its name or its folder.
+
+        Raises:
+            LibraryError: If there is no such scene.
+        """
         if scene in self.names():
             return scene
         place = BUNDLED if scene == BUNDLED else str(Path(scene).resolve())
         for record in self.records():
-            if place in (record.path, str(record.folder(self.root))):
+            if place in (record.path, str(self.folder(record))):
                 return record.name
         raise self._unknown(scene)
 
@@ -394,46 +399,21 @@ class Library:
         Raises:
             LibraryError: If another process changes the library, the disk is full, or the server fails.
         """
-        if not repair:
-            if self.server:
-                self.server.groups(self.stage)
-            return self._problems()
-        with self._changing():
-            for name in self._problems():
-                self._repair(name)
-            if self.server:
-                entries = [(record, codes) for record in self.records() if (codes := self.codes(record))]
-                self.server.repair(entries, self.stage)
-            return self._problems()
+        return mended(self) if repair else problems_of(self)
 
-    def _problems(self) -> dict[str, str]:
-        found: dict[str, str] = {}
-        for name in self.names():
-            record = self.record(name)
-            if record is None or self.codes(record, by_hash=True) is None:
-                found[name] = str(self.damaged[name])
-                continue
-            try:
-                if record.contents:
-                    map_contents(self.stage / record.contents_file, record.contents)
-            except FileFormatError as error:
-                found[name] = str(error)
-                continue
-            try:
-                if state_of(SceneFolder.open(record.folder(self.root))) != record.state:
-                    found[name] = (
-                        f"{record.path}: rebuilt since it was added; lexsplat library verify {self.root} --repair"
-                    )
-            except LexsplatError as error:
-                found[name] = f"{error}, or if it was moved: lexsplat library add {self.root} NEW_PLACE"
-        return found
 
-    def _repair(self, name: str) -> None:
-        """Recover the record of a scene from its codes, or read the scene again; a scene that is gone stays."""
-        record = self.record(name) or recovered_record(self.stage, name)
-        if record is not None and (record.folder(self.root) / "scene.json").is_file():
-            with contextlib.suppress(LexsplatError):  # `verify` tells what is still wrong
-                self._add(record.folder(self.root), name)
+@contextlib.contextmanager
+def _told(root: Path) -> Iterator[None]:
+    """Errors of the file system as one line with a remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise LibraryError(
+            error.filename or root,
+            expected="to be written",
+            found=str(error.strerror or error),
+            remedy="run the command again when that is mended; the library is as it was before",
+        ) from error
 
 
 def open_library(path: str | Path, *, device: str = "auto", index: str | None = None) -> Library:

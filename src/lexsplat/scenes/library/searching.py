@@ -25,8 +25,9 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import file_name, find_phrase
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.bounds import CERTAIN, SURELY_NOT, phrase_bound, presence_bounds
-from lexsplat.scenes.library.entries import Record, state_of
 from lexsplat.scenes.library.indexed import Indexed, answer_from, decidable, with_world
+from lexsplat.scenes.library.mending import rebuilt
+from lexsplat.scenes.library.records import Record
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.serving import sentence
 
@@ -39,6 +40,8 @@ PROPOSED = 1000
 """Codes that a server proposes for each text."""
 _ASKED = 4
 """Scenes that are looked at for each one that is wanted, at most."""
+_TOLD = 5
+"""Notes and skipped scenes that are told to people, at most."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,8 @@ class Found:
         opened: Number of scenes that were asked themselves.
         unopened: Number of scenes that may hold it as well and were not looked at.
         skipped: Scenes that could not be asked, and why.
+        rebuilt: Scenes that were built again since they were added, and what to do.
+        encoders: Names of the encoders of the scenes.
     """
 
     phrase: str
@@ -170,12 +175,17 @@ class Found:
     opened: int
     unopened: int
     skipped: dict[str, str]
+    rebuilt: dict[str, str] = field(default_factory=dict)
+    encoders: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         more = f"; {self.unopened} more may hold it" if self.unopened else ""
-        head = f"{self.phrase}: in {len(self.hits)} of {self.scenes} scenes{more}"
-        told = [f"  {number}. {hit}" for number, hit in enumerate(self.hits, start=1)]
-        return "\n".join([head, *told, *(f"  skipped: {problem}" for problem in self.skipped.values())])
+        several = f" of {len(self.encoders)} encoders" if len(self.encoders) > 1 else ""
+        head = f"{self.phrase}: in {len(self.hits)} of {self.scenes} scenes{several}{more}"
+        lines = [head]
+        for number, hit in enumerate(self.hits, start=1):
+            lines.append(f"  {number}. {hit}" + (f" (encoder {hit.clip})" if several else ""))
+        return "\n".join([*lines, *_told("note", self.rebuilt), *_told("skipped", self.skipped)])
 
     def rows(self) -> list[dict[str, Any]]:
         """One row for each thing, as for a table: `pandas.DataFrame(found.rows())`."""
@@ -203,7 +213,16 @@ class Found:
             "unopened": self.unopened,
             "hits": [hit.to_dict() for hit in self.hits],
             "skipped": [{"scene": name, "problem": problem} for name, problem in self.skipped.items()],
+            "rebuilt": [{"scene": name, "problem": problem} for name, problem in self.rebuilt.items()],
+            "encoders": list(self.encoders),
         }
+
+
+def _told(kind: str, problems: dict[str, str]) -> list[str]:
+    """Lines for people: the first few problems, and how many more there are."""
+    lines = [f"  {kind}: {problem}" for problem in list(problems.values())[:_TOLD]]
+    more = len(problems) - _TOLD
+    return [*lines, f"  {kind}: {more} more; lexsplat library verify names them"] if more > 0 else lines
 
 
 def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
@@ -212,11 +231,10 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
         raise QueryError("limit", expected="at least 1", found=str(limit))
     asking = _Asking(library, check_prompts(phrase)[0], confirm)
     understood = understand(asking.text).phrase
-    skipped: dict[str, str] = {}
-    ranked = candidates(library, understood, skipped)
+    possible = candidates(library, understood)
+    skipped, asked, opened = possible.skipped, 0, 0
     hits: list[Hit] = []
-    asked = opened = 0
-    for name, bound in ranked:
+    for name, bound in possible.ranked:
         if asked == _ASKED * limit or sum(hit.present == "yes" for hit in hits) == limit:
             break
         asked += 1
@@ -232,8 +250,17 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
     hits.sort(key=lambda hit: (-PRESENCES.index(hit.present), -hit.bound, hit.scene))
     names = library.names()
     skipped.update({name: str(error) for name, error in library.damaged.items() if name in names})
-    unopened = len(ranked) - asked
-    return Found(asking.text, str(understood), tuple(hits[:limit]), len(names), opened, unopened, skipped)
+    return Found(
+        phrase=asking.text,
+        understood=str(understood),
+        hits=tuple(hits[:limit]),
+        scenes=len(names),
+        opened=opened,
+        unopened=len(possible.ranked) - asked + possible.unproposed,
+        skipped=skipped,
+        rebuilt=possible.rebuilt,
+        encoders=possible.encoders,
+    )
 
 
 class _Asking:
@@ -258,8 +285,8 @@ class _Asking:
         """
         record = self.library.record(name)
         if record is not None and record.contents and not self.confirm:
-            folder = SceneFolder.open(record.folder(self.library.root))
-            found = self._indexed(record) if state_of(folder) == record.state else None
+            folder = SceneFolder.open(self.library.folder(record))
+            found = None if self.library.is_rebuilt(record) else self._indexed(record)
             if found is not None:
                 found, world = with_world(found, folder.record.get("world"))
                 path = str(folder.root)
@@ -280,38 +307,72 @@ class _Asking:
         return answer_from(contents, codes.units, thing, self.text, self._texts[record.group].cpu())
 
 
-def candidates(library: Library, phrase: Phrase, skipped: dict[str, str]) -> list[tuple[str, float]]:
-    """The scenes that may hold what a phrase names with their bounds, the highest first.
+@dataclass(frozen=True)
+class Candidates:
+    """The scenes that may hold what a phrase names.
 
     Args:
-        library: The library.
-        phrase: What to look for.
-        skipped: Receives the scenes that cannot be compared, and why.
+        ranked: Their names and bounds, the highest first.
+        unproposed: Number of scenes that a server did not propose, although they may hold it.
+        skipped: Scenes that cannot be compared, and why.
+        rebuilt: Scenes that were built again, and what to do: their old codes rule out nothing.
+        encoders: Names of the encoders of all scenes.
     """
-    found: list[tuple[str, float]] = []
-    for records in _groups(library, phrase):
+
+    ranked: list[tuple[str, float]]
+    unproposed: int
+    skipped: dict[str, str]
+    rebuilt: dict[str, str]
+    encoders: tuple[str, ...]
+
+
+def candidates(library: Library, phrase: Phrase) -> Candidates:
+    """The scenes of a library that may hold what a phrase names."""
+    current, skipped, again = [], {}, {}
+    records = library.records()
+    for record in records:
         try:
-            bounds = _bounds(library, records, phrase)
+            if library.is_rebuilt(record):
+                again[record.name] = rebuilt(library, record)
+            else:
+                current.append(record)
+        except LexsplatError as error:
+            skipped[record.name] = str(error)
+    found = [(name, CERTAIN) for name in again]
+    groups, unproposed = _groups(library, current, phrase)
+    for group in groups:
+        try:
+            bounds = _bounds(library, group, phrase)
         except LexsplatError as error:  # the encoder of these scenes is not here
-            skipped.update({record.name: str(error) for record in records})
+            skipped.update({record.name: str(error) for record in group})
             continue
-        found += [(record.name, bound) for record, bound in zip(records, bounds) if bound >= SURELY_NOT]
-    return sorted(found, key=lambda entry: (-entry[1], entry[0]))
+        found += [(record.name, bound) for record, bound in zip(group, bounds) if bound >= SURELY_NOT]
+    ranked = sorted(found, key=lambda entry: (-entry[1], entry[0]))
+    encoders = tuple(sorted({record.clip for record in records}))
+    return Candidates(ranked, unproposed, skipped, again, encoders)
 
 
-def _groups(library: Library, phrase: Phrase) -> list[list[Record]]:
-    """The records to compare, those of one encoder together; with a server, those that it proposes."""
-    groups: dict[str, list[Record]] = {}
+def _groups(library: Library, records: list[Record], phrase: Phrase) -> tuple[list[list[Record]], int]:
+    """The records to compare, those of one encoder together: all, or those that a server proposes.
+
+    Returns:
+        The groups, and the number of scenes that the server did not propose although they may hold the phrase.
+    """
+    groups: dict[str, dict[str, Record]] = {}
+    for record in records:
+        groups.setdefault(record.group, {})[record.name] = record
     if library.server is None or not things_of(phrase):
-        for record in library.records():
-            groups.setdefault(record.group, []).append(record)
-        return list(groups.values())
-    proposed = []
-    for place, encoder, clip in library.server.groups(library.stage):
-        texts = [text for both in spellings_of(phrase, clip).values() for text in both]
-        names = library.server.nearest(place, library.embed(encoder, clip, texts), PROPOSED)
-        proposed.append([known for name in names if (known := library.record(name)) is not None])
-    return [records for records in proposed if records]
+        return [list(group.values()) for group in groups.values()], 0
+    proposed, unproposed = [], 0
+    for collection in library.server.groups(library.stage, library.groups()):
+        there = groups.get(collection.group, {})
+        texts = [text for both in spellings_of(phrase, collection.clip).values() for text in both]
+        embedded = library.embed(collection.encoder, collection.clip, texts)
+        names, least = library.server.nearest(collection.place, embedded, PROPOSED)
+        known = [there[name] for name in names if name in there]
+        proposed.append(known)
+        unproposed += len(there) - len(known) if least >= SURELY_NOT else 0
+    return [group for group in proposed if group], unproposed
 
 
 def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[float]:

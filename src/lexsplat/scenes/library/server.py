@@ -9,13 +9,16 @@ where q is a quantile over the codes of the scene. With the linear estimate a.t 
 the vector ((u_k - a) / z_k, (a0 - c_k) / z_k) is stored, and (t, 1) is asked. A last coordinate makes all vectors
 equally long, and is 0 in a text: graphs of neighbors by inner product are poor where lengths differ.
 
-Each encoder has a collection. Its metadata hold the state of the library, "changing" while it is written: a search
-on a server that holds another state is refused, and `Server.repair` uploads what it lacks.
+Each encoder has a collection. Its metadata hold the state of the library, "changing" while it is written, and the
+number of its codes: a search on a server that holds another state or has lost codes is refused, and `Server.repair`
+uploads what it lacks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping, Set
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +29,8 @@ from torch import Tensor
 
 from lexsplat.runtime.errors import BackendError, LibraryError
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.scenes.library.entries import Codes, Record
+from lexsplat.scenes.library.entries import Codes
+from lexsplat.scenes.library.records import Record
 
 VERSION = "1."
 """First characters of the versions of the API that are understood."""
@@ -53,6 +57,27 @@ def code_vectors(codes: Codes) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
 def listing(stage: Path) -> str:
     """A hash of which version of which scene a library holds."""
     return fingerprint(sorted(path.name for path in stage.glob("[!.]*.safetensors")))
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The codes of the scenes with one encoder.
+
+    Args:
+        place: Its path on the server.
+        group: `Record.group` of the scenes.
+        encoder: Hash of their encoder.
+        clip: Name of their encoder.
+        state: `listing` of the library when it was written.
+        codes: Number of codes when it was written; -1 if that is unknown.
+    """
+
+    place: str
+    group: str
+    encoder: str
+    clip: str
+    state: str
+    codes: int
 
 
 class Server:
@@ -123,43 +148,67 @@ class Server:
             LibraryError: If the server fails.
         """
         self._mark(_CHANGING)
-        for place, _ in self._collections():
-            self._delete(place, {"where": {"scene": record.name}})
+        for each in self._collections():
+            self._delete(each.place, {"where": {"scene": record.name}})
         self._mark(listing(stage))
 
-    def groups(self, stage: Path) -> list[tuple[str, str, str]]:
-        """The collections: their places, and hash and name of the encoder of each.
+    def groups(self, stage: Path, groups: Set[str]) -> list[Collection]:
+        """The collections.
+
+        Args:
+            stage: The folder of the entries of the library.
+            groups: The groups of its scenes.
 
         Raises:
             LibraryError: If the server fails or holds another state of the library.
         """
         found = self._collections()
-        wanted = listing(stage)
-        states = {facts.get("state") for _, facts in found} or {listing(Path("/nowhere"))}
-        if states != {wanted}:
-            raise LibraryError(
-                self.url,
-                expected="the scenes of the library as they are now",
-                found="an interrupted change" if _CHANGING in states else "another state of it",
-                remedy=self._mending,
-            )
-        return [(place, facts["encoder"], facts["clip"]) for place, facts in found]
+        problem = self._problem(found, stage, groups)
+        if problem:
+            expected = "the scenes of the library as they are now"
+            raise LibraryError(self.url, expected=expected, found=problem, remedy=self._mending)
+        return found
 
-    def nearest(self, place: str, texts: Tensor, count: int) -> list[str]:
-        """Names of scenes with the codes that fit texts ``[P, D]`` best, each once.
+    def is_current(self, stage: Path, groups: Set[str]) -> bool:
+        """Whether the server holds what the library holds; arguments as of `groups`.
+
+        Raises:
+            LibraryError: If the server fails.
+        """
+        return not self._problem(self._collections(), stage, groups)
+
+    def _problem(self, found: list[Collection], stage: Path, groups: Set[str]) -> str:
+        states = {each.state for each in found}
+        if _CHANGING in states:
+            return "an interrupted change"
+        if states - {listing(stage)} or groups - {each.group for each in found}:
+            return "another state of it"
+        counts = [(each.codes, int(self._ask("GET", f"{each.place}/count"))) for each in found]
+        lost = [f"{there:,} of {written:,} codes" for written, there in counts if written != there]
+        return lost[0] if lost else ""
+
+    def nearest(self, place: str, texts: Tensor, count: int) -> tuple[list[str], float]:
+        """The scenes with the codes that fit texts ``[P, D]`` best.
 
         Args:
             place: The collection.
             texts: Unit embeddings.
             count: Number of codes for each text.
 
+        Returns:
+            Their names, each once, and what no bound of the others exceeds; minus infinity if there are no others.
+
         Raises:
             LibraryError: If the server fails.
         """
         asked = torch.cat([texts.cpu().float(), torch.tensor([[1.0, 0.0]]).expand(len(texts), 2)], dim=1)
-        body = {"query_embeddings": asked.tolist(), "n_results": count, "include": ["metadatas"]}
-        found = self._ask("POST", f"{place}/query", body)["metadatas"]
-        return list(dict.fromkeys(each["scene"] for row in found for each in row))
+        body = {
+            "query_embeddings": asked.tolist(), "n_results": count, "include": ["metadatas", "distances"],
+        }  # fmt: skip
+        found = self._ask("POST", f"{place}/query", body)
+        names = list(dict.fromkeys(each["scene"] for row in found["metadatas"] for each in row))
+        last = [1 - row[-1] for row in found["distances"] if len(row) == count]  # distance is 1 - product
+        return names, max(last, default=-math.inf)
 
     def repair(self, entries: Iterable[tuple[Record, Codes]], stage: Path) -> tuple[int, int]:
         """Upload the scenes that the server lacks, and delete codes of scenes that the library does not hold.
@@ -175,7 +224,7 @@ class Server:
             wanted.setdefault(self._collection(record), []).append((record, codes))
         self._mark(_CHANGING)
         uploaded = deleted = 0
-        for place, _ in self._collections():
+        for place in (each.place for each in self._collections()):
             there = set(self._identifiers(place))
             for record, codes in wanted.get(place, []):
                 own = {_identifier(record, int(code)) for code in code_vectors(codes)[0]}
@@ -194,28 +243,32 @@ class Server:
 
     def _collection(self, record: Record) -> str:
         """The place of the collection of the scene's encoder; made if there is none."""
-        name = f"{self._prefix}{record.group}"
-        known = [place for place, facts in self._collections() if facts["name"] == name]
+        known = [each.place for each in self._collections() if each.group == record.group]
         if known:
             return known[0]
-        facts = {"encoder": record.encoder, "clip": record.clip, "state": _CHANGING}
+        facts = {"encoder": record.encoder, "clip": record.clip, "state": _CHANGING, "codes": -1}
+        name = f"{self._prefix}{record.group}"
         body = {"name": name, "get_or_create": True, "metadata": facts, "configuration": {"hnsw": _HNSW}}
         return f"{_PLACE}/{self._ask('POST', _PLACE, body)['id']}"
 
-    def _collections(self) -> list[tuple[str, dict[str, str]]]:
-        """Place and metadata of each collection of the library."""
+    def _collections(self) -> list[Collection]:
+        """The collections of the library."""
         self.check()
-        listed = self._ask("GET", f"{_PLACE}?limit=10000")
-        return [
-            (f"{_PLACE}/{each['id']}", {**each["metadata"], "name": each["name"]})
-            for each in listed
-            if each["name"].startswith(self._prefix)
-        ]
+        found = []
+        for each in self._ask("GET", f"{_PLACE}?limit=10000"):
+            if each["name"].startswith(self._prefix):
+                group, facts = each["name"][len(self._prefix) :], each["metadata"]
+                found.append(Collection(
+                    f"{_PLACE}/{each['id']}", group, facts["encoder"], facts["clip"], facts["state"],
+                    int(facts.get("codes", -1)),
+                ))  # fmt: skip
+        return found
 
     def _mark(self, state: str) -> None:
-        for place, facts in self._collections():
-            metadata = {"encoder": facts["encoder"], "clip": facts["clip"], "state": state}
-            self._ask("PUT", place, {"new_metadata": metadata})
+        for each in self._collections():
+            codes = -1 if state == _CHANGING else int(self._ask("GET", f"{each.place}/count"))
+            metadata = {"encoder": each.encoder, "clip": each.clip, "state": state, "codes": codes}
+            self._ask("PUT", each.place, {"new_metadata": metadata})
 
     def _upsert(self, place: str, record: Record, codes: Codes) -> None:
         numbers, vectors = code_vectors(codes)

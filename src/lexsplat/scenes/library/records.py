@@ -1,0 +1,193 @@
+"""The record of a scene in a library: where the scene is, which version of it, and which files hold the rest.
+
+A record is kept twice: in a file of its own, and in the header of the file of its codes, from which a damaged one is
+recovered. Both carry a hash of its values.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import read_json, read_tensors, write_json
+from lexsplat.runtime.fingerprints import file_stamp, fingerprint
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+
+BUNDLED = "demo"
+"""The path of the bundled scene, wherever it is installed."""
+_HASH = "hash"
+"""Entry with the hash of the others; records of earlier libraries lack it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """A scene of a library.
+
+    Args:
+        name: Its name in the library.
+        path: Its folder; "demo" is the bundled scene.
+        beside: Its folder relative to the library, for scenes that were moved together with it.
+        state: Hash of its finished stages: another one after a build.
+        encoder: Hash of its text encoder; "" if the build did not record it.
+        clip: Name or folder of that encoder.
+        content: Hash of its codes.
+        codes: Number of codes K.
+        gaussians: Number of Gaussians.
+        views: Number of views.
+        contents: Hash of what is kept of its segments and objects; "" if it has no segments.
+        checksum: CRC-32 of its codes, eight times faster than the hash; "" in libraries that were made without.
+        stamp: Size and modification time of its ``scene.json`` when it was added: while they are the same, so is
+            its state. "" for the bundled scene and in libraries that were made without.
+    """
+
+    name: str
+    path: str
+    beside: str
+    state: str
+    encoder: str
+    clip: str
+    content: str
+    codes: int
+    gaussians: int
+    views: int
+    contents: str = ""
+    checksum: str = ""
+    stamp: str = ""
+
+    @property
+    def group(self) -> str:
+        """Scenes of one group have the same text embeddings."""
+        return self.encoder or f"name-{fingerprint(self.clip)}"
+
+    @property
+    def codes_file(self) -> str:
+        """Name of the file of its codes."""
+        return f"{self.name}.{self.content}.safetensors"
+
+    @property
+    def contents_file(self) -> str:
+        """Name of the file of its segments and objects; "" if there is none."""
+        return f"{self.name}.{self.contents}.objects.safetensors" if self.contents else ""
+
+    @property
+    def files(self) -> set[str]:
+        """Names of its files of tensors."""
+        return {self.codes_file, self.contents_file} - {""}
+
+    def folder(self, root: Path) -> Path:
+        """Where the scene is now: at its place relative to the library, as both may have moved, else at its path.
+
+        Args:
+            root: The library, without symbolic links.
+        """
+        if self.path == BUNDLED:
+            return BUNDLED_SCENE
+        together = os.path.normpath(os.path.join(root, self.beside))
+        return Path(together if os.path.isfile(os.path.join(together, "scene.json")) else self.path)
+
+    def sealed(self) -> dict[str, Any]:
+        """Plain data with a hash of all values."""
+        values = dataclasses.asdict(self)
+        return {**values, _HASH: fingerprint(values)}
+
+
+def state_of(folder: SceneFolder) -> str:
+    """A hash that changes with every build of a scene; its scale and its name do not matter."""
+    return fingerprint(folder.record["stages"])
+
+
+def stamp_of(folder: Path) -> str:
+    """Size and modification time of the ``scene.json`` of a scene; "" for the bundled one, which is installed.
+
+    Raises:
+        OSError: If there is none.
+    """
+    return "" if folder == BUNDLED_SCENE else "-".join(map(str, file_stamp(folder / "scene.json")))
+
+
+def write_record(record: Record, path: Path) -> None:
+    """Write or replace a record."""
+    write_json(path, record.sealed())
+
+
+def read_record(path: Path) -> Record:
+    """The record in a file.
+
+    Raises:
+        FileFormatError: If it is damaged.
+    """
+    try:
+        return checked_record(read_json(path), path)
+    except FileFormatError as error:
+        raise damaged(path, error.expected, error.found) from error
+
+
+def checked_record(content: Any, path: Path) -> Record:
+    """A record from plain data.
+
+    Raises:
+        FileFormatError: If an entry is missing, of a wrong type or altered.
+    """
+    try:
+        if _HASH in content and content[_HASH] != _hash(content):
+            raise ValueError("damaged content (the hash differs)")
+        values: dict[str, Any] = {
+            field.name: (int if field.type == "int" else str)(content[field.name])
+            for field in dataclasses.fields(Record)
+            if field.name in content or field.default is dataclasses.MISSING
+        }
+        hashes = values["content"], values.get("contents") or "0", values.get("checksum") or "0"
+        hexadecimal = all(re.fullmatch("[0-9a-f]+", each) for each in hashes)
+        named = values["name"] == path.name.split(".")[0] and re.fullmatch(r"[\w-]*", values["encoder"])
+        if not (named and hexadecimal and values["codes"] > 0):
+            raise ValueError("other values")
+        return Record(**values)
+    except (KeyError, TypeError, ValueError) as error:
+        found = str(error) if type(error) is ValueError else repr(error)
+        raise damaged(path, "the record of a scene", found[:80]) from error
+
+
+def recovered_record(stage: Path, name: str) -> Record | None:
+    """The record of a scene from the copy in the file of its codes; None if that is damaged as well."""
+    for path in stage.glob(f"{name}.*.safetensors"):
+        try:
+            _, metadata = read_tensors(path)
+            return checked_record(json.loads(metadata["record"]), path)
+        except (FileFormatError, KeyError, ValueError):
+            continue
+    return None
+
+
+def _hash(content: Mapping[str, Any]) -> str:
+    return fingerprint({name: value for name, value in content.items() if name != _HASH})
+
+
+def mapped_tensors(path: Path, expected: str) -> dict[str, Tensor]:
+    """The tensors of a file of the library, mapped; they have to be compared with their hash.
+
+    Raises:
+        FileFormatError: If it is missing or cannot be read.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError as error:
+        raise damaged(path, expected, "no such file") from error
+    except (OSError, SafetensorError, ValueError, TypeError) as error:
+        raise damaged(path, expected, str(error)[:80]) from error
+
+
+def damaged(path: Path, expected: str, found: str) -> FileFormatError:
+    """The error of a damaged file in the stage of a library, with what mends it."""
+    remedy = f"lexsplat library verify {path.parents[1]} --repair"
+    return FileFormatError(path, expected=expected, found=found, remedy=remedy)
