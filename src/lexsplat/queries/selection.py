@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -24,6 +22,7 @@ from lexsplat.geometry.boxes import Box, Up, fit_box
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
+from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
 
@@ -34,9 +33,6 @@ Presence = Literal["yes", "no", "unsure"]
 PRESENCES: tuple[Presence, ...] = ("no", "unsure", "yes")
 """Whether a scene holds something, the least certain first."""
 
-_NEIGHBORS = 8
-_LINK = 2.5
-"""Largest distance between linked Gaussians, in median distances to the sixth neighbor."""
 _SMALLEST_SHARE = 0.1
 """A cluster with less than this share of the largest cluster's opacity is not an instance."""
 _CONVINCING = 0.65
@@ -373,39 +369,19 @@ class Selection:
             if isinstance(distance, str) or not hasattr(distance, "__float__") or not float(distance) >= 0:
                 raise QueryError("distance", expected="a number from 0", found=repr(distance)[:40])
             return float(np.nextafter(float(distance), np.inf))
-        return self._spacing() * _LINK
+        return self._spacing() * LINK
 
     def _spacing(self) -> float:
         """Median distance from a selected Gaussian to its sixth neighbor."""
         points, _ = self._points()
-        sample = points[:: max(1, len(points) // 4096)]
-        neighbors = min(7, len(points))
-        if neighbors < 2:
+        if len(points) < 2:
             return float(self.gaussians.log_scales[self.indices].exp().max())
-        apart, _ = cKDTree(points).query(sample, k=neighbors)
-        return float(np.median(apart[:, -1]))
+        return spacing(points)
 
     def _clusters(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Cluster of each selected Gaussian ``[M]`` and the total opacity of each cluster ``[C]``."""
         points, opacities = self._points()
-        if len(points) < 2:
-            return np.zeros(len(points), np.intp), opacities[:1]
-        firm = np.flatnonzero(opacities >= _FAINT)
-        firm = firm if len(firm) else np.arange(len(points))
-        link = self._spacing() * _LINK
-        tree = cKDTree(points[firm])
-        k = min(_NEIGHBORS + 1, len(firm))
-        apart, neighbors = tree.query(points[firm], k=k, distance_upper_bound=link)
-        apart, neighbors = apart.reshape(len(firm), k), neighbors.reshape(len(firm), k)
-        rows, columns = np.nonzero(np.isfinite(apart))
-        edges = (np.ones(len(rows)), (rows, neighbors[rows, columns]))
-        _, found = connected_components(coo_array(edges, shape=(len(firm), len(firm))), directed=False)
-        labels, is_faint = np.zeros(len(points), np.intp), np.ones(len(points), bool)
-        is_faint[firm] = False
-        faint = np.flatnonzero(is_faint)
-        labels[firm] = found
-        if len(faint):  # they join the cluster of the nearest firm one
-            labels[faint] = found[tree.query(points[faint])[1]]
+        labels = clusters(points, opacities >= _FAINT)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

@@ -89,11 +89,12 @@ class CodeField:
     def scores(self, table: Tensor) -> Tensor:
         """Sum over codes of p_k table[k] for every Gaussian: ``[K, P]`` to ``[N, P]``."""
         check_table(table, self.codebook)
-        table = table.to(self.weights)
-        total = self.weights.new_zeros(len(self.codes), table.shape[1])
-        for column in range(self.codes.shape[1]):
-            total.addcmul_(self.weights[:, column, None], table[self.codes[:, column].long()])
-        return total
+        shares = self.weights
+        if not len(shares):
+            return shares.new_zeros(0, table.shape[1])
+        return torch.nn.functional.embedding_bag(
+            self.codes.int(), table.to(shares), per_sample_weights=shares, mode="sum"
+        )
 
     def sums(self, places: Tensor, shares: Tensor, count: int) -> NDArray[np.float64]:
         """Weighted sums of the distributions at each of some places ``[count, K]``; ``[N, K]`` is never held.
