@@ -54,9 +54,8 @@ def main() -> None:
             Path("checkpoints") / "texts"
         )  # embeddings of everyday words: a question needs no other encoding
         shutil.copytree(work / texts, BUNDLED_SCENE / texts, dirs_exist_ok=True)
-        shutil.copyfile(
-            work / "checkpoints" / "seen.safetensors", BUNDLED_SCENE / "checkpoints" / "seen.safetensors"
-        )
+        for name in ("checkpoints/seen.safetensors", "checkpoints/objects.safetensors"):
+            shutil.copyfile(work / name, BUNDLED_SCENE / name)
         for name in KEPT:
             shutil.copyfile(work / name, BUNDLED_SCENE / name)
         write_record(folder.record)

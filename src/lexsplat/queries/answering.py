@@ -103,7 +103,7 @@ def apart(selection: Selection, searched: Searched) -> Selection:
     scores = [float(selection.scores[each.indices].median()) for each in objects]
     limit = selection.convincing_limit(max(scores))
     kept = tuple(
-        replace(each, scores=selection.scores) for each, score in zip(objects, scores) if score >= limit
+        each.described(scores=selection.scores) for each, score in zip(objects, scores) if score >= limit
     )
     return _joined(selection, kept)
 

@@ -20,6 +20,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -73,6 +74,18 @@ class Evidence:
         return "yes" if self.strength >= self.yes else "no" if self.strength < NO else "unsure"
 
 
+class DescribedPlaces(NamedTuple):
+    """Where phrases are judged.
+
+    Args:
+        distributions: The scene's objects, and what no everyday word describes, as distributions ``[V, K]``.
+        words: The everyday words that describe the objects best.
+    """
+
+    distributions: Tensor
+    words: tuple[str, ...]
+
+
 class PresenceClassifier:
     """Compares phrases with everyday words in one scene.
 
@@ -81,6 +94,7 @@ class PresenceClassifier:
         language: Its language.
         scale: What everyday words reach in it.
         embed: Texts to embeddings ``[T, D]``.
+        places: `places` of an earlier classifier of the same scene; None computes them when they are needed.
     """
 
     def __init__(
@@ -89,9 +103,12 @@ class PresenceClassifier:
         language: LanguageField,
         scale: EverydayScale,
         embed: Callable[[Sequence[str]], Tensor],
+        places: DescribedPlaces | None = None,
     ) -> None:
         self.language, self.scale, self._embed = language, scale, embed
         self._shown = (gaussians.opacities >= _FAINT).detach().nonzero()[:, 0]
+        if places is not None:
+            self.places = places
 
     @cached_property
     def segment_codes(self) -> SegmentCodes | None:
@@ -121,16 +138,15 @@ class PresenceClassifier:
         if len(self._shown) == 0:
             return [Evidence(0.0, 0.0)] * len(texts)
         heights = self.scale.heights(self.language.codebook.clip, texts)
-        codes = self.segment_codes
         found = []
         for number, phrase in enumerate(phrases):
             yes = YES
-            if codes is None:
+            if self.language.segments is None:
                 places = self._peak(scores[number])[None]
-            elif is_part(phrase):
+            elif is_part(phrase) and (codes := self.segment_codes) is not None:
                 places = codes.distributions
             else:
-                places, yes = self._objects[0], YES_COLORED if has_color(phrase) else YES_OBJECT
+                places, yes = self.places.distributions, YES_COLORED if has_color(phrase) else YES_OBJECT
             ratios, reached = self._compared(heights[:, number : number + 1], places, self._best(phrase))
             place = _strength(ratios, reached)[:, 0].argmax()
             found.append(Evidence(float(ratios[place]), float(reached[place]), yes))
@@ -139,7 +155,7 @@ class PresenceClassifier:
     @property
     def tables(self) -> dict[str, Tensor]:
         """What published pages need: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
-        return {"places": self._objects[0], "best_colored": self._best_colored}
+        return {"places": self.places.distributions, "best_colored": self._best_colored}
 
     def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:
         """`Evidence.strength` of phrases ``[P, D]`` at places with distributions ``[V, K]``: ``[V, P]``."""
@@ -151,11 +167,11 @@ class PresenceClassifier:
         return tuple(evidence.presence for evidence in self.evidence(phrases, texts, scores))
 
     @cached_property
-    def _objects(self) -> tuple[Tensor, tuple[str, ...]]:
-        """The segments that everyday words describe as wholes, as distributions ``[V, K]``, and those words."""
+    def places(self) -> DescribedPlaces:
+        """The segments that everyday words describe as wholes, and those words."""
         codes, words = self.segment_codes, everyday_words()
         if codes is None:
-            return torch.zeros(0, len(self.language.codebook.clip)), ()
+            return DescribedPlaces(torch.zeros(0, len(self.language.codebook.clip)), ())
         texts = self._embed(words)
         whole = whole_segments(
             codes, lambda part: self.strengths(texts[part], codes.distributions), len(words)
@@ -163,14 +179,14 @@ class PresenceClassifier:
         # What no word describes is judged by its lowest segments.
         places = np.unique(np.where(whole.places < 0, codes.numbers[0], whole.places))
         named = whole.words[np.unique(whole.places[whole.places >= 0])]
-        return codes.distributions[torch.from_numpy(places)], tuple(
-            dict.fromkeys(words[word] for word in named)
+        return DescribedPlaces(
+            codes.distributions[torch.from_numpy(places)], tuple(dict.fromkeys(words[word] for word in named))
         )
 
     @property
     def colored(self) -> list[str]:
         """The scene's objects in any color, as phrases."""
-        return [f"{color} {name}" for color in sorted(COLORS) for name in self._objects[1]]
+        return [f"{color} {name}" for color in sorted(COLORS) for name in self.places.words]
 
     @cached_property
     def _best_colored(self) -> Tensor:

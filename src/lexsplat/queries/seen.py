@@ -40,6 +40,7 @@ class Seen:
         training: The names of those that the masses of the segments come from.
         segments: Its segments.
         kept: From `tensors` of an earlier one of the same scene; None computes what is asked for.
+        key: Hash of what it is computed from; "" where nobody needs it.
     """
 
     def __init__(
@@ -49,7 +50,9 @@ class Seen:
         training: Sequence[str],
         segments: Segments,
         kept: Mapping[str, Tensor] | None = None,
+        key: str = "",
     ) -> None:
+        self.key = key
         self._gaussians, self._segments = gaussians, segments
         self._training = [cameras[name] for name in training]
         self._cameras = {name: cameras[name] for name in evenly(list(cameras), MOST_VIEWS)}

@@ -39,6 +39,8 @@ _CONVINCING = 0.65
 """An instance is kept if its peak exceeds the threshold by at least this share of the best instance's excess, both in
 log-odds. On the second demo scene, 3 of the 4 wrong or partial instances of 20 prompts reach 0.47 to 0.50, and one
 reaches 0.32; the right ones reach 1."""
+_PLACE = ("indices", "num_gaussians", "box", "sample", "tree", "view_shares", "best_view")
+"""What follows from the Gaussians of a selection alone."""
 _SAMPLE = 4000
 _PEAK_COUNT = 20
 _FAINT = 0.1
@@ -183,7 +185,7 @@ class Selection:
         kept = [int(label) for label in order if weights[label] >= smallest * weights[order[0]]]
         members = self.indices[torch.from_numpy(np.argsort(labels, kind="stable")).to(self.indices.device)]
         parts = members.split(np.bincount(labels).tolist())
-        return [self._with(parts[label]) for label in kept]
+        return [self.part(parts[label]) for label in kept]
 
     @cached_property
     def best_view(self) -> str:
@@ -275,7 +277,7 @@ class Selection:
     def within(self, mask: Tensor) -> Selection:
         """The intersection with a mask ``[N]``."""
         kept = self.indices[mask.to(self.mask.device)[self.indices]]
-        return self if len(kept) == len(self) else self._with(kept, self.parts)
+        return self if len(kept) == len(self) else self.part(kept, self.parts)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: presence, threshold and the place of each instance, without the Gaussians.
@@ -344,7 +346,15 @@ class Selection:
             parts=() if word == "or" else self.parts,
         )
 
-    def _with(self, indices: Tensor, parts: tuple[Selection, ...] = ()) -> Selection:
+    def described(self, box: Box | None = None, **facts: Any) -> Selection:
+        """The same Gaussians with other facts, such as ``phrase`` or ``scores``; a known box stays known."""
+        made = replace(self, **facts)
+        known = {name: self.__dict__[name] for name in _PLACE if name in self.__dict__}
+        made.__dict__.update(known if box is None else {**known, "box": box})
+        return made
+
+    def part(self, indices: Tensor, parts: tuple[Selection, ...] = ()) -> Selection:
+        """Some of its Gaussians, by their indices ``[M]`` in the scene, with the instances among them if known."""
         mask = torch.zeros_like(self.mask)
         mask[indices] = True
         made = replace(self, mask=mask, parts=parts)

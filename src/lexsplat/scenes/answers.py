@@ -122,7 +122,7 @@ class Answers:
         members = self._members(index)
         if members:
             known = (each.within(selection.mask) for each in members)
-            return replace(selection, parts=tuple(replace(each, scores=scores) for each in known if each))
+            return replace(selection, parts=tuple(each.described(scores=scores) for each in known if each))
         selection = selection.without_specks()
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)

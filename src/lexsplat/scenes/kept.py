@@ -2,7 +2,7 @@
 
 ``checkpoints/seen.safetensors`` is written whole or not at all, after a build and for a saved edit. It names the
 Gaussians, segments and cameras that it was computed from. A file of others, or a damaged one, counts as none: what it
-holds is then computed when it is asked for.
+holds is then computed when it is asked for. The objects of the scene are kept beside it (`lexsplat.scenes.named`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.named import FILE, Named, read_named, write_named
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -37,18 +38,19 @@ def seen_of(scene: Scene) -> Seen | None:
     if segments is None:
         return None
     training = [name for name, view in scene.views.items() if view.split == "train"]
-    cameras, kept = scene.cameras, None
+    cameras, kept, key = scene.cameras, None, ""
     path = _path(scene)
     if path is not None and path.exists():
+        key = scene_key(scene)
         try:
             tensors, facts = read_tensors(path)
             views = min(len(cameras), MOST_VIEWS)
             fits = tensors["shares"].shape == (segments.levels.shape[1], views)
-            if fits and tensors["hidden"].shape == segments.labels.shape and facts.get("of") == _key(scene):
+            if fits and tensors["hidden"].shape == segments.labels.shape and facts.get("of") == key:
                 kept = tensors
         except (FileFormatError, KeyError) as error:
             log.warning("%s: computed again (%s)", path, str(error)[:100])
-    return Seen(scene.gaussians, cameras, training, segments, kept)
+    return Seen(scene.gaussians, cameras, training, segments, kept, key)
 
 
 def keep(scene: Scene) -> None:
@@ -63,12 +65,14 @@ def keep(scene: Scene) -> None:
     try:
         if scene.seen is not None and not scene.seen.complete:
             scene.seen.complete_all(scene.listener)
-            write_tensors(path, scene.seen.tensors(), {"of": _key(scene)})
+            write_tensors(path, scene.seen.tensors(), {"of": scene_key(scene)})
         words = scene.embed(everyday_words())  # its cache of texts keeps them
-        if (
-            words.shape[1] == scene.field.codebook.clip.shape[1]
-        ):  # else no question can be asked with this encoder
-            scene.embed(scene.presence_classifier.colored or ["object"])
+        if words.shape[1] != scene.field.codebook.clip.shape[1]:
+            return  # no question can be asked with this encoder
+        judge = scene.presence_classifier
+        scene.embed(judge.colored or ["object"])
+        if scene.named is None and scene.field.segments is not None:
+            write_named(scene, Named(scene.objects, judge.places), path.with_name(FILE))
     except (OSError, LexsplatError) as error:  # the file is optional, and questions tell of a missing encoder
         log.warning("%s: not kept (%s)", path, str(error)[:200])
 
@@ -86,8 +90,14 @@ def _path(scene: Scene) -> Path | None:
     return None if scene.folder is None else scene.folder.root / "checkpoints" / "seen.safetensors"
 
 
-def _key(scene: Scene) -> str:
-    """Hash of everything that the file depends on."""
+def named_of(scene: Scene) -> Named | None:
+    """The objects of a scene, where its folder keeps them."""
+    path = _path(scene)
+    return None if path is None else read_named(scene, path.with_name(FILE))
+
+
+def scene_key(scene: Scene) -> str:
+    """Hash of the Gaussians, segments and cameras of a scene."""
     return digest(_parts(scene))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,7 +179,7 @@ def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Sel
         names = [(thing.phrase, float(shares[own])), *(entry for entry in names if entry[0] != thing.phrase)]
     strength = min(max(float(strengths[own]), 0.0), 1.0)
     thing.scores[thing.indices] = strength
-    return replace(thing, names=tuple(names[:_NAMES]))
+    return thing.described(names=tuple(names[:_NAMES]))
 
 
 def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]:
@@ -195,7 +194,7 @@ def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]
     kept: list[Selection] = []
     for instance in sorted(found, key=lambda each: -each.score):
         if not any(same(instance, other) or _is_part(instance, other) for other in kept):
-            kept.append(replace(instance, names=((instance.phrase, instance.score),)))
+            kept.append(instance.described(names=((instance.phrase, instance.score),)))
     return tuple(kept)
 
 

@@ -48,7 +48,8 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView
-from lexsplat.scenes.kept import seen_of
+from lexsplat.scenes.kept import named_of, seen_of
+from lexsplat.scenes.named import Named
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 
@@ -116,6 +117,7 @@ class Scene:
         self._classifier: PresenceClassifier | None = None
         self._scale: EverydayScale | None = None
         self._objects: tuple[Selection, ...] | None = None
+        self.__dict__.pop("named", None)
         kept = max(32, min(1024, _KEPT_BYTES // (9 * max(1, len(self.gaussians)))))
         self._words: Bounded[str, Word] = Bounded(kept)
         self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
@@ -312,7 +314,7 @@ class Scene:
         """Its objects with everyday names (`lexsplat.scenes.objects.objects_of`), the largest first."""
         if self._objects is None:
             with self._working:
-                self._objects = self._objects or objects_of(self)
+                self._objects = self._objects or (self.named.objects if self.named else objects_of(self))
         return self._objects
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
@@ -327,20 +329,25 @@ class Scene:
             QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
         hit = surface_at(self.gaussians, self.camera(view), x, y)
-        found = select_hit(hit, self.gaussians, self.field, self.cameras, self.world)
-        return replace(found, seen=self.seen)
+        return replace(select_hit(hit, self.gaussians, self.field, self.cameras, self.world), seen=self.seen)
 
     @property
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            self._classifier = PresenceClassifier(self.gaussians, self.field, self.everyday_scale, self.embed)
+            known = (self.everyday_scale, self.embed, self.named.places if self.named else None)
+            self._classifier = PresenceClassifier(self.gaussians, self.field, *known)
         return self._classifier
 
     @cached_property
     def seen(self) -> Seen | None:
         """What its views show of its segments; None for a scene without segments."""
         return seen_of(self)
+
+    @cached_property
+    def named(self) -> Named | None:
+        """Its objects as its folder keeps them; None where it keeps none of this scene, encoder and query."""
+        return None if self._given_encode_text is not None else named_of(self)
 
     @property
     def hidden(self) -> Tensor:

@@ -30,7 +30,7 @@ from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.phrases import Thing
-from lexsplat.queries.presence import PresenceClassifier
+from lexsplat.queries.presence import DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.spelling import corrected
@@ -94,8 +94,8 @@ class _KeptPresence(PresenceClassifier):
         return _KeptCodes(self._contents)  # type: ignore[return-value]
 
     @property
-    def _objects(self) -> tuple[Tensor, tuple[str, ...]]:  # type: ignore[override]
-        return self._contents.places.float(), ()
+    def places(self) -> DescribedPlaces:  # type: ignore[override]
+        return DescribedPlaces(self._contents.places.float(), ())
 
     @property
     def _best_colored(self) -> Tensor:  # type: ignore[override]

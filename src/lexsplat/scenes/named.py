@@ -1,0 +1,133 @@
+"""The objects of a scene as its folder keeps them, so that the first question about things and places is fast.
+
+``checkpoints/objects.safetensors`` is written whole or not at all, with ``checkpoints/seen.safetensors``
+(`lexsplat.scenes.kept`). It names the scene, encoder, vocabularies and query that it was computed with. A file of
+others, or a damaged one, counts as none. Dimension letters: N Gaussians, O objects, V places, K codes.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lexsplat.geometry.boxes import Box
+from lexsplat.language.fields import CodeField
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.presence import DescribedPlaces
+from lexsplat.queries.selection import Selection
+from lexsplat.queries.vocabulary import default_vocabulary
+from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.files import read_tensors, write_tensors
+from lexsplat.runtime.fingerprints import digest
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
+
+log = logging.getLogger("lexsplat")
+
+FILE = "objects.safetensors"
+_VERSION = 1
+"""Raised when the content is computed in another way."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """What a file of objects holds.
+
+    Args:
+        objects: The objects, as `lexsplat.scenes.objects.objects_of` finds them.
+        places: What phrases are judged at (`lexsplat.queries.presence`).
+    """
+
+    objects: tuple[Selection, ...]
+    places: DescribedPlaces
+
+
+def read_named(scene: Scene, path: Path) -> Named | None:
+    """The objects of a scene from a file; None where it does not fit the scene."""
+    if not path.exists() or not isinstance(scene.field, CodeField):
+        return None
+    try:
+        tensors, facts = read_tensors(path)
+        if facts.get("of") != _key(scene, scene.field):
+            return None
+        places = DescribedPlaces(tensors["places"], tuple(json.loads(facts["words"])))
+        return Named(_selections(scene, tensors, json.loads(facts["objects"])), places)
+    except (FileFormatError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
+        log.warning("%s: computed again (%s)", path, str(error)[:100])
+        return None
+
+
+def write_named(scene: Scene, named: Named, path: Path) -> None:
+    """Write the objects of a scene; nothing is written of a scene without codes."""
+    if not isinstance(scene.field, CodeField):
+        return
+    numbers = torch.full((len(scene.gaussians),), -1, dtype=torch.int32)
+    for number, each in enumerate(named.objects):
+        numbers[each.indices.cpu()] = number
+    boxes = [np.concatenate([part.ravel() for part in each.box]) for each in named.objects]
+    tensors = {
+        "numbers": numbers.short() if len(named.objects) < 1 << 15 else numbers,
+        "boxes": torch.from_numpy(np.array(boxes).reshape(-1, 15)),
+        "strengths": torch.stack([each.scores[each.indices[0]].cpu() for each in named.objects])
+        if named.objects
+        else torch.zeros(0),
+        "places": named.places.distributions.cpu().contiguous(),
+    }
+    facts = {
+        "of": _key(scene, scene.field),
+        "objects": json.dumps([[each.phrase, each.names] for each in named.objects]),
+        "words": json.dumps(named.places.words),
+    }
+    write_tensors(path, tensors, facts)
+
+
+def _selections(scene: Scene, tensors: dict[str, Tensor], entries: list) -> tuple[Selection, ...]:
+    numbers, device = tensors["numbers"].long(), scene.gaussians.device
+    if numbers.shape != (len(scene.gaussians),) or tensors["boxes"].shape != (len(entries), 15):
+        raise ValueError("it does not fit the scene")
+    strengths = torch.cat([tensors["strengths"], torch.zeros(1)])  # the last one is that of no object
+    whole = Selection(
+        scene.gaussians,
+        scene.cameras,
+        (numbers >= 0).to(device),
+        strengths[numbers].to(device),
+        world=scene.world,
+        seen=scene.seen,
+    )
+    members = numbers.sort(stable=True).indices.to(device)
+    sizes = torch.bincount(numbers + 1, minlength=len(entries) + 1).tolist()
+    found = []
+    for (phrase, names), box, indices in zip(
+        entries, tensors["boxes"].numpy(), members.split(sizes)[1:], strict=True
+    ):
+        known = tuple((str(name), float(share)) for name, share in names)
+        found.append(
+            whole.part(indices).described(phrase=str(phrase), names=known, box=Box(box[:3], box[3:12].reshape(3, 3), box[12:]))
+        )
+    return tuple(found)
+
+
+def _key(scene: Scene, field: CodeField) -> str:
+    """Hash of everything that the file depends on."""
+    return digest(_parts(scene, field))
+
+
+def _parts(scene: Scene, field: CodeField) -> Iterator[bytes]:
+    from lexsplat.scenes.kept import scene_key
+
+    yield f"{_VERSION}".encode()
+    yield ((scene.seen.key if scene.seen else "") or scene_key(scene)).encode()
+    for tensor in (field.codes, field.weights, field.codebook.clip):
+        yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
+    encoder = scene.encoder_identity()
+    words = (everyday_words(), default_vocabulary(scene.clip), encoder.get("encoder_hash", encoder["encoder"]))
+    yield repr((words, scene.query, scene.world.up.direction.tolist())).encode()
