@@ -64,6 +64,16 @@ def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, vie
     assert all(url.startswith((viewer.url, "blob:", "data:")) for url in page.requested)
 
 
+def test_a_card_tells_how_a_question_was_understood_and_what_was_not(page):
+    ask(page, "where can I find the ball 4 next to the ball 0?")
+    assert page.locator(".card .understood").inner_text() == 'as “("ball 4" next to "ball 0")”'
+    ask(page, "why is ball 2 so round")
+    assert "not understood as a question" in page.locator(".card .fine").first.inner_text()
+    assert page.locator(".card .understood").count() == 0, "asked in these words"
+    ask(page, "ball 2")
+    assert page.locator(".card .understood").count() == 0
+
+
 def test_an_error_of_the_server_is_told_in_one_line(page):
     page.fill(".search input", "ball 1 on me")
     page.keyboard.press("Enter")
