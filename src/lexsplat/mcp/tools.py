@@ -119,10 +119,12 @@ class Tools:
     ) -> Annotated[Reply, answers.RelateAnswer]:
         """Tell whether things stand in a relation to others, and which do. Left and right are those of the view."""
         place = self._scene(scene)
-        both = (place.understand(first).phrase, place.understand(second).phrase)
-        asked = Related(relation, *both)
-        found = find_in(place, Understood(asked), place.camera(view) if view else None, None)
-        answer = {**found.to_dict(), "understood": str(asked), "note": ""}
+        both = place.understand(first), place.understand(second)
+        notes = "; ".join(filter(None, (each.note for each in both)))
+        related = Related(relation, both[0].phrase, both[1].phrase)
+        asked = Understood(related, notes, any(each.unknown for each in both))
+        found = find_in(place, asked, place.camera(view) if view else None, None)
+        answer = {**found.to_dict(), "understood": str(related), "note": notes}
         holds = "Yes" if found.present == "yes" else "Perhaps" if found.present == "unsure" else "No"
         return Reply(
             f"{holds}: {sentence(answer, place.world.meters_per_unit)}", {"holds": holds.lower(), **answer}

@@ -7,7 +7,7 @@ mug next to the duck on the table    right-associative: mug next to (duck on the
 mug between the apple and the duck   also "closest to", "farthest from", "in the back left corner"
 toy in front of me                   "me" stands where the view was taken
 apple and banana                     the union; also "or" and commas
-fruit but not the banana             the difference; also "without", "except", "other than"
+fruit but not the banana             the difference; also "without", "except", "other than"; "not the mug"
 largest book, leftmost mug           one of several
 two apples                           all of them, if there are as many
 mug that is blue; is the mug blue?   the same as "blue mug"; "made of metal" as well
@@ -100,6 +100,7 @@ _EXCEPT = re.compile(
     r"(?:(?:that|which) )?(?:is|are) not(?= (?:the|a|an|my) (?!left|right)))\s",
     re.IGNORECASE,
 )
+_NOT = re.compile(r"^(?:what is |things? that (?:is|are) )?not (?=(?:the|a|an|my) )", re.IGNORECASE)
 _BOTH = re.compile(r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with)\s|\s*,\s*", re.IGNORECASE)
 _PICKS: tuple[tuple[str, PickName], ...] = (
     (r"largest|biggest|greatest|hugest|bulkiest", "largest"),
@@ -196,6 +197,8 @@ class _Parser:
         words, deeper = words.strip(" ,"), depth + 1
         if _VIEWER.match(words):
             return Viewer()
+        if found := _NOT.match(words):
+            return Except(Anything(), self.phrase(words[found.end() :], deeper))
         words = re.sub(r"\s*,\s*(?=(?:that|which|who)\s)", " ", words)
         if found := _BETWEEN.match(f" {words}"):
             target, negated, first, second = found.groups()

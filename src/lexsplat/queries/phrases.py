@@ -135,10 +135,12 @@ class Understood:
     Args:
         phrase: What it asks for.
         note: What was not understood; "" if everything was.
+        unknown: Whether it holds words that the encoder does not know: then nothing is certainly here.
     """
 
     phrase: Phrase
     note: str = ""
+    unknown: bool = False
 
 
 def parts_of(phrase: Phrase) -> dict[str, Phrase]:

@@ -51,6 +51,21 @@ def is_word(word: str) -> bool:
     return bool(simplemma.is_known(word.lower(), lang="en"))
 
 
+def strange(phrase: str, vocabulary: Iterable[str]) -> list[str]:
+    """The words of a phrase that are neither English nor in a vocabulary, nor numbers."""
+    known = {word.lower() for entry in vocabulary for word in entry.split()}
+    return [
+        word
+        for word in phrase.split()
+        if not (word.isdecimal() or all(_is_known(part, known) for part in re.split(r"[-',.&/]", word) if part))
+    ]
+
+
+def _is_known(word: str, known: set[str]) -> bool:
+    small = word.lower()
+    return small in known or (small.isascii() and small.isalpha() and (len(small) < 4 or is_word(small)))
+
+
 def corrected(phrase: str, vocabulary: Iterable[str]) -> str:
     """A phrase with typing errors mended: words of the vocabulary for similar words that are in no dictionary.
 

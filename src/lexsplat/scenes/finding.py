@@ -10,14 +10,17 @@ import torch
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import understand
+from lexsplat.queries.grammar import MAX_LENGTH, understand
 from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.spelling import corrected
+from lexsplat.queries.spelling import corrected, strange
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
+
+_SHOWN = 40
+"""Letters of an unknown word that a note shows, at most."""
 
 
 def understood_in(scene: Scene, phrase: str) -> Understood:
@@ -28,9 +31,7 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     """
     understood = understand(phrase)
     if understood.note:
-        return understood
-    if scene.clip == "bundled" and not phrase.isascii():
-        return Understood(understood.phrase, "the bundled encoder knows English words alone")
+        return replace(understood, unknown=len(phrase) > MAX_LENGTH)
     vocabulary = [*default_vocabulary(scene.clip), *QUALITIES]
     mended: dict[str, str] = {}
 
@@ -43,6 +44,11 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
 
     found = with_things(understood.phrase, mend)
     notes = [f'"{typed}" is in no dictionary: asked for "{meant}"' for typed, meant in mended.items()]
+    unknown = [word for text in things_of(found) for word in strange(text, vocabulary)]
+    if scene.clip == "bundled" and unknown:
+        listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])
+        notes.append(f"the bundled encoder knows English words alone, not {listed}")
+        return Understood(found, "; ".join(notes), unknown=True)
     return Understood(found, "; ".join(notes))
 
 
@@ -72,6 +78,8 @@ def find_in(
         return scene.cameras.get(reference.best_view)
 
     found = answer(understood.phrase, Searched(select, viewer, lambda: scene.objects))
+    if understood.unknown and found.present == "yes":
+        found = found.described(present="unsure")
     if found.present == "no" and threshold is None:
         return replace(found, mask=torch.zeros_like(found.mask), parts=())
     return found

@@ -105,6 +105,8 @@ def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) ->
     understood = _shortened(answer["understood"], 200)
     if answer["present"] == "no":
         said = f"Not here: nothing fits {understood}."
+    elif not answer["instances"]:
+        said = f"Nothing reaches the threshold {answer['threshold']:g} for {understood}."
     else:
         unsure = "Perhaps " if answer["present"] == "unsure" else ""
         things = "; ".join(_place(thing, meters_per_unit) for thing in answer["instances"][:8])
