@@ -42,7 +42,9 @@ def test_the_transcript_of_the_page_is_what_a_client_gets_over_standard_input_an
 
 
 def test_the_set_up_of_each_client_is_json_and_starts_a_command_that_exists(capsys):
-    set_up = [json.loads(block) for block in re.findall(r"^    (\{\"\w*[sS]ervers\".*?\}\}\})$", PAGE, re.M | re.S)]
+    set_up = [
+        json.loads(block) for block in re.findall(r"^    (\{\"\w*[sS]ervers\".*?\}\}\})$", PAGE, re.M | re.S)
+    ]
     assert [list(each) for each in set_up] == [["mcpServers"], ["servers"]]
     for each in set_up:
         ((server,),) = [list(servers.values()) for servers in each.values()]

@@ -152,6 +152,8 @@ ANY, ME = Anything(), Viewer()
         ("what is in the far left corner of the table", InCorner(ANY, "back left")),
         ("mugs that are not the duck", Except(MUG, DUCK)),
         ("everything except the mug", Except(ANY, MUG)),
+        ("not the mug", Except(ANY, MUG)),
+        ("what is not the mug?", Except(ANY, MUG)),
         ("children", Thing("child")),
         ("glasses", Thing("glass")),
         ("mug with a handle", Thing("mug with a handle")),

@@ -5,6 +5,7 @@ import shutil
 import pytest
 import torch
 
+from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.editing import Editor
@@ -14,6 +15,7 @@ from lexsplat.scenes.scene import open_scene
 from lexsplat.scenes.serving import OpenScene, answer_line
 
 SEEN = "checkpoints/seen.safetensors"
+OBJECTS = "checkpoints/objects.safetensors"
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +60,59 @@ def test_what_is_kept_is_what_is_computed_without_it(copy, demo):
     assert again.select("mug").view_shares == demo.select("mug").view_shares
 
 
+def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(copy, demo):
+    assert demo.named is not None, (
+        "run tools/demo_scene/ship.py, or lexsplat.scenes.kept.keep on the bundled scene"
+    )
+    (copy / OBJECTS).unlink()
+    scene = open_scene(copy, device="cpu")
+    assert scene.named is None
+    assert len(scene.objects) == len(demo.objects) > 10
+    for found, kept in zip(scene.objects, demo.objects):
+        assert (kept.phrase, [name for name, _ in kept.names]) == (
+            found.phrase,
+            [name for name, _ in found.names],
+        )
+        assert [share for _, share in kept.names] == pytest.approx(
+            [share for _, share in found.names], rel=1e-4
+        )
+        assert torch.equal(kept.mask, found.mask)
+        assert torch.equal(kept.indices, found.indices)
+        assert kept.score == pytest.approx(found.score, rel=1e-4)
+        for one, other in zip(kept.box, found.box):
+            assert one == pytest.approx(other)
+    places = scene.presence_classifier.places
+    assert places.words == demo.named.places.words
+    assert torch.allclose(places.distributions, demo.named.places.distributions, atol=1e-6)
+
+
+def test_kept_objects_are_those_of_one_encoder_query_and_scene_or_none(copy, demo):
+    content = (copy / OBJECTS).read_bytes()
+    for damaged in (content[:1000], b"", content[:-1] + bytes([content[-1] ^ 1])):
+        (copy / OBJECTS).write_bytes(damaged)
+        assert open_scene(copy, device="cpu").named is None
+    (copy / OBJECTS).write_bytes(content)
+    scene = open_scene(copy, device="cpu")
+    assert scene.named is not None
+    scene.query = QueryConfig(temperature=5.0)
+    assert scene.named is None, "another query"
+    scene.query = QueryConfig()
+    scene.field.codes[0, 0] ^= 1
+    scene.__dict__.pop("named", None)
+    assert scene.named is None, "another language"
+    some = torch.arange(len(demo.gaussians)) % 2 == 0
+    assert demo.with_content(demo.gaussians.select(some), demo.field.select(some)).named is None
+
+
 @pytest.mark.slow
 def test_a_saved_edit_keeps_what_its_views_show(copy, tmp_path):
     editor = Editor(open_scene(copy, device="cpu"))
     editor.delete(editor.scene.find("mug"))
     editor.save(tmp_path / "saved")
-    assert open_scene(tmp_path / "saved", device="cpu").seen.complete
+    saved = open_scene(tmp_path / "saved", device="cpu")
+    assert saved.seen.complete
+    assert saved.named is not None
+    assert "mug" not in [each.phrase for each in saved.objects]
 
 
 def test_a_damaged_file_or_one_of_another_scene_counts_as_none(copy):

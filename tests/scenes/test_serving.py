@@ -76,6 +76,34 @@ def test_a_no_has_no_instances_and_says_so(demo):
     assert not demo.scene.find("is there a bicycle?")
 
 
+@pytest.mark.parametrize(
+    ("line", "unknown"),
+    [("🍎", "🍎"), ("das rote apfel", "apfel"), ("красное яблоко", "красное"), ("\x1b[31mmug", "\x1b[31mmug"),
+     ("mug left of the \ufffd", "\ufffd")],
+)  # fmt: skip
+def test_words_that_the_bundled_encoder_does_not_know_are_named_and_nothing_is_certainly_here(
+    demo, line, unknown
+):
+    answer = answer_line(demo, line)
+    assert f'the bundled encoder knows English words alone, not "{unknown}"' in answer["note"]
+    assert answer["present"] in ("no", "unsure")
+    assert answer["note"] in answer["sentence"]
+
+
+@pytest.mark.parametrize("line", ["x" * 100_000, "where is the " * 7000])
+def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(demo, line):
+    answer = answer_line(demo, line)
+    assert "too long for grammar" in answer["note"]
+    assert answer["present"] in ("no", "unsure")
+    assert len(answer["sentence"]) < 1000
+
+
+def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(demo):
+    answer = answer_line(demo, '{"ask": "mug", "threshold": 1}')
+    assert (answer["count"], answer["instances"]) == (0, [])
+    assert answer["sentence"] == 'Nothing reaches the threshold 1 for "mug".'
+
+
 @pytest.mark.slow
 def test_threads_get_the_answers_of_a_single_one(demo):
     phrases = ["red apple", "toys", "what is on the cloth?", "vase left of the bear", "pumpkin", "mugs"]

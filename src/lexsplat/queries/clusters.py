@@ -51,7 +51,9 @@ def clusters(points: FloatArray, firm: NDArray[np.bool_]) -> NDArray[np.intp]:
     order = np.cumsum(is_firm, axis=1)
     linked = is_firm & (apart < link) & (order <= _NEIGHBORS + 1)  # each is its own nearest
     # Where too few of them are firm, the search goes on among firm ones.
-    short = np.flatnonzero((order[:, -1] <= _NEIGHBORS * firm) & (apart[:, -1] < np.where(firm, link, np.inf)))
+    short = np.flatnonzero(
+        (order[:, -1] <= _NEIGHBORS * firm) & (apart[:, -1] < np.where(firm, link, np.inf))
+    )
     if len(short) and searched < count:
         others = np.flatnonzero(firm)
         wide = min(_NEIGHBORS + 1, len(others))

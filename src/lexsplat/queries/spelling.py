@@ -57,7 +57,9 @@ def strange(phrase: str, vocabulary: Iterable[str]) -> list[str]:
     return [
         word
         for word in phrase.split()
-        if not (word.isdecimal() or all(_is_known(part, known) for part in re.split(r"[-',.&/]", word) if part))
+        if not (
+            word.isdecimal() or all(_is_known(part, known) for part in re.split(r"[-',.&/]", word) if part)
+        )
     ]
 
 

@@ -111,7 +111,9 @@ def _selections(scene: Scene, tensors: dict[str, Tensor], entries: list) -> tupl
     ):
         known = tuple((str(name), float(share)) for name, share in names)
         found.append(
-            whole.part(indices).described(phrase=str(phrase), names=known, box=Box(box[:3], box[3:12].reshape(3, 3), box[12:]))
+            whole.part(indices).described(
+                phrase=str(phrase), names=known, box=Box(box[:3], box[3:12].reshape(3, 3), box[12:])
+            )
         )
     return tuple(found)
 
@@ -129,5 +131,9 @@ def _parts(scene: Scene, field: CodeField) -> Iterator[bytes]:
     for tensor in (field.codes, field.weights, field.codebook.clip):
         yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
     encoder = scene.encoder_identity()
-    words = (everyday_words(), default_vocabulary(scene.clip), encoder.get("encoder_hash", encoder["encoder"]))
+    words = (
+        everyday_words(),
+        default_vocabulary(scene.clip),
+        encoder.get("encoder_hash", encoder["encoder"]),
+    )
     yield repr((words, scene.query, scene.world.up.direction.tolist())).encode()
