@@ -46,7 +46,7 @@ SIZE = {"width": 960, "height": 600}
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 FIRST_BYTE = "(performance.timeOrigin + performance.getEntriesByType('navigation')[0].responseStart) / 1000"
 """When the page's first byte came, seconds since 1970."""
-_PACKED = {".js", ".css", ".html", ".json", ".txt", ".bin", ".ply", ".safetensors"}
+_PACKED = {".js", ".css", ".html", ".json", ".txt", ".bin", ".ply", ".safetensors", ".wasm"}
 """Endings that web servers compress; the others are compressed already."""
 
 

@@ -14,7 +14,7 @@ else:
 
 REPOSITORY = Path(__file__).parents[2]
 DATA = REPOSITORY / "src" / "lexsplat"
-PAGE = ("LICENSES.txt", "index.html", "page.css", "page.js", "words.txt")
+PAGE = ("LICENSES.txt", "index.html", "page.css", "page.js", "page.wasm", "words.txt")
 
 
 def patterns() -> list[str]:

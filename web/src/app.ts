@@ -27,16 +27,20 @@ export class App {
   readonly measure: Measure;
   readonly views: ReturnType<typeof viewsPanel>;
   readonly objects: ReturnType<typeof objectsPanel>;
-  readonly server: Server | null;
+  /** Who answers, once its files are there. */
+  source: Source | null = null;
+  readonly answering: Promise<Source>;
   readonly #painter: Painter;
   readonly #overlay: Overlay;
   readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
   readonly #sheet: HTMLElement;
+  readonly #tries = h("p", { class: "examples" });
   readonly #notes: Notes;
   readonly #bounds: { center: THREE.Vector3; radius: number };
   readonly #life = new AbortController();
   #mode: Mode = "marks";
   #preview: Preview | null = null;
+  #previewed = false;
   #colors = 0;
   #view = "";
   #written = "";
@@ -45,28 +49,24 @@ export class App {
     readonly stage: Stage,
     readonly geometry: Geometry,
     readonly manifest: Manifest,
-    readonly source: Source,
+    source: Promise<Source>,
+    readonly server: Server | null,
     root: HTMLElement,
   ) {
-    this.server = source instanceof Server ? source : null;
     this.#painter = new Painter(stage.mesh, geometry.count);
     this.#bounds = geometry.bounds();
-    const { examples } = source;
-    this.search = new SearchBar(
-      { complete: (text) => source.complete(text), ask: (text, add) => this.run(() => this.ask(text, add)) },
-      examples[0] ?? "",
-    );
+    this.search = new SearchBar({
+      complete: (text) => this.source?.complete(text) ?? [],
+      ask: (text, add) => this.run(() => this.ask(text, add)),
+    });
+    this.answering = source.then((found) => this.#begin(found));
     this.views = viewsPanel(manifest.views, (view) => this.jump(view), this.server !== null);
     this.#overlay = new Overlay(stage);
     this.measure = new Measure(stage, geometry, this.#overlay, manifest);
     const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
     this.objects = objectsPanel(list, this.measure.sizes(), (object) => this.#goTo(object));
     const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }));
-    const tries = h("p", { class: "examples" }, examples.length > 0 && "Try: ");
-    for (const phrase of examples) {
-      tries.append(h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, false)) }));
-    }
-    this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, tries, this.#list);
+    this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#list);
     this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
     this.#sheet.append(this.#notes.element);
     root.append(
@@ -82,6 +82,18 @@ export class App {
     stage.onDraw = () => this.#overlay.update();
     this.#listen();
     new ResizeObserver(() => this.#cover()).observe(this.#sheet);
+  }
+
+  /** From now on questions are answered. */
+  #begin(source: Source): Source {
+    this.source = source;
+    const { examples } = source;
+    this.search.suggest(examples[0] ?? "");
+    if (examples.length > 0) this.#tries.append("Try: ");
+    for (const phrase of examples) {
+      this.#tries.append(h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, false)) }));
+    }
+    return source;
   }
 
   /** End before another version of the scene is shown; the link keeps what was asked and the view. */
@@ -119,9 +131,11 @@ export class App {
     const prompts = text.split(",").map((part) => part.trim()).filter(Boolean);
     if (!add) this.answers.length = 0;
     this.#preview = null;
+    if (!this.source) this.note("One moment: the words are loading.");
+    const source = await this.answering;
     this.note("");
     for (const prompt of prompts) {
-      const answer = await this.source.answer(prompt, freeColor(this.answers));
+      const answer = await source.answer(prompt, freeColor(this.answers));
       if (answer) this.#add(answer);
       else this.#unknown(prompt);
     }
@@ -129,7 +143,7 @@ export class App {
       this.#paint(); // colors first, then places
       await new Promise((resolve) => setTimeout(resolve));
     }
-    for (const answer of this.answers) await this.source.refine(answer);
+    for (const answer of this.answers) await source.refine(answer);
     this.#paint();
     this.#refresh();
     const fresh = this.answers.slice(-prompts.length);
@@ -207,7 +221,8 @@ export class App {
       this.#mode,
       this.#preview,
     );
-    this.stage.draw();
+    this.stage.draw(this.#preview !== null || this.#previewed);
+    this.#previewed = this.#preview !== null;
     this.#write();
   }
 
@@ -247,7 +262,7 @@ export class App {
   }
 
   async #refine(answer: Answer): Promise<void> {
-    await this.source.refine(answer);
+    await (await this.answering).refine(answer);
     this.#paint();
     this.#refreshKeepingFocus();
   }
@@ -299,7 +314,7 @@ export class App {
 
   /** What is under a point of the page, told as buttons that ask for it. */
   async whatIs(x: number, y: number): Promise<Clicked | null> {
-    const clicked = await this.source.whatIs(x, y);
+    const clicked = await (await this.answering).whatIs(x, y);
     if (!clicked) {
       this.note("Nothing is there.");
       return null;

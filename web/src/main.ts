@@ -12,6 +12,7 @@ import { Server } from "./server";
 import { Stage } from "./stage";
 import { Tables } from "./tables";
 import { TowerLoader } from "./tower-loader";
+import { ownModule } from "./wasm";
 
 declare global {
   interface Window {
@@ -30,57 +31,56 @@ async function start(root: HTMLElement): Promise<App> {
   const manifest = await files.manifest();
   document.title = manifest.title;
   canvas.setAttribute("aria-label", `${manifest.title}. ${keys}`);
-  if (!document.createElement("canvas").getContext("webgl2")) {
-    throw new PageError("This page needs WebGL 2, which this browser does not offer; use a newer browser or allow hardware acceleration.");
-  }
+  const { gaussians, file } = manifest.scene;
+  progress.textContent = `Loading ${gaussians.toLocaleString("en")} Gaussians (${(manifest.files[file].bytes / 1e6).toFixed(1)} MB)`;
+  await ownModule;
   const stage = new Stage(canvas, manifest);
   stage.background = getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
-  const app = await load(files, manifest, stage, root, (text) => (progress.textContent = text));
-  await app.restore();
+  const app = await show(files, manifest, stage, root);
   progress.remove();
   root.classList.add("ready");
+  await Promise.all([app.restore(), app.answering]);
   return app;
 }
 
-async function load(
-  files: Files, manifest: Manifest, stage: Stage, root: HTMLElement, tell: (text: string) => void,
-): Promise<App> {
-  const { scene, words } = manifest;
-  const bytes = manifest.files[scene.file].bytes;
-  tell(`Loading ${scene.gaussians.toLocaleString("en")} Gaussians (${(bytes / 1e6).toFixed(1)} MB)`);
+/** The page of a scene: first its picture, then what answers. */
+async function show(files: Files, manifest: Manifest, stage: Stage, root: HTMLElement): Promise<App> {
   stage.manifest = manifest;
-  const [splats, phrases] = await Promise.all([files.read(scene.file), files.read(words.phrases)]);
-  const list = new TextDecoder().decode(phrases);
+  const { scene } = manifest;
+  await stage.load(await files.read(scene.file));
+  const geometry = new Geometry(stage.mesh, scene.gaussians);
   if (manifest.server) {
-    await stage.load(splats);
-    const geometry = new Geometry(stage.mesh, scene.gaussians);
-    const server = new Server(stage, geometry, new Dictionary(list, new Uint8Array(0), 0), manifest, async (next) => {
+    const phrases = new TextDecoder().decode(await files.read(manifest.words.phrases));
+    const server = new Server(stage, geometry, new Dictionary(phrases, new Uint8Array(0), 0), manifest, async (next) => {
       app.dispose();
       const shown = next ? files.take(next) : await files.manifest();
       root.replaceChildren(stage.canvas);
-      window.lexsplat.app = await load(files, shown, stage, root, () => undefined);
+      window.lexsplat.app = await show(files, shown, stage, root);
       await window.lexsplat.app.restore();
     });
-    const app = new App(stage, geometry, manifest, server, root);
+    const app = new App(stage, geometry, manifest, Promise.resolve(server), server, root);
     return app;
   }
-  const { language } = manifest;
-  const [codes, table, segments, members] = await Promise.all([
-    files.read(language!.codes), files.read(words.table!), language!.segments ? files.read(language!.segments) : null,
-    files.read(language!.objects),
+  return new App(stage, geometry, manifest, stage.shown.then(() => tables(files, manifest, stage, geometry)), null, root);
+}
+
+/** Everything that answers without a server. */
+async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: Geometry): Promise<Tables> {
+  const { scene, words } = manifest;
+  const language = manifest.language!;
+  const [phrases, codes, table, segments, members] = await Promise.all([
+    files.read(words.phrases), files.read(language.codes), files.read(words.table!),
+    language.segments ? files.read(language.segments) : null, files.read(language.objects),
   ]);
   if (codes.length !== 8 * scene.gaussians) {
-    throw new PageError(`${language!.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
+    throw new PageError(`${language.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
   }
-  await stage.load(splats);
-  const geometry = new Geometry(stage.mesh, scene.gaussians);
-  const codesOf = new Language(codes, language!.num_codes);
+  const codesOf = new Language(codes, language.num_codes);
   const loader = manifest.text ? new TowerLoader(files, manifest) : null;
-  const whole = segments && new Segments(segments, scene.gaussians, language!.segment_rule!);
+  const whole = segments && new Segments(segments, scene.gaussians, language.segment_rule!);
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
-  const dictionary = new Dictionary(list, table, language!.num_codes);
-  const tables = new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds);
-  return new App(stage, geometry, manifest, tables, root);
+  const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes);
+  return new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds);
 }
 
 /** Light or dark as chosen before, else as the system has it. */

@@ -173,20 +173,13 @@ export class Files {
   #manifest: Manifest | null = null;
 
   get inside(): boolean {
-    return document.getElementById("file:manifest.json") !== null;
+    return inside();
   }
 
   async manifest(): Promise<Manifest> {
-    if (location.protocol === "file:" && !this.inside) {
-      throw new PageError(
-        "This page needs a web server, because browsers do not let a file read its neighbors. " +
-          "In this folder run: python -m http.server, then open http://localhost:8000. " +
-          "Or publish with --single-file.",
-      );
-    }
     let manifest: Manifest;
     try {
-      manifest = JSON.parse(new TextDecoder().decode(await this.#raw("manifest.json"))) as Manifest;
+      manifest = JSON.parse(new TextDecoder().decode(await unchecked("manifest.json"))) as Manifest;
     } catch (error) {
       if (error instanceof PageError) throw error;
       throw new PageError("manifest.json: expected JSON, found something else; publish the scene again.");
@@ -213,7 +206,7 @@ export class Files {
   async read(name: string): Promise<Uint8Array<ArrayBuffer>> {
     const entry = this.#manifest?.files[name];
     if (!entry) throw new PageError(`${name}: the manifest does not list it; publish the scene again.`);
-    const content = await this.#raw(name);
+    const content = await unchecked(name);
     if (content.length !== entry.bytes || crc32(content) !== entry.crc32) {
       const found = content.length === entry.bytes ? "other content" : `${content.length} bytes`;
       throw new PageError(
@@ -222,22 +215,34 @@ export class Files {
     }
     return content;
   }
+}
 
-  async #raw(name: string): Promise<Uint8Array<ArrayBuffer>> {
-    if (this.inside) {
-      const element = document.getElementById(`file:${name}`);
-      if (!element) throw new PageError(`${name}: not inside this page; publish the scene again.`);
-      return decodeBase64(element.textContent ?? "");
-    }
-    let answer: Response;
-    try {
-      answer = await fetch(name, { credentials: "same-origin" });
-    } catch {
-      throw new PageError(`${name}: the server does not answer; reload the page.`);
-    }
-    if (!answer.ok) throw new PageError(`${name}: the server answered ${answer.status}; copy the folder again.`);
-    return new Uint8Array(await answer.arrayBuffer());
+function inside(): boolean {
+  return document.getElementById("file:manifest.json") !== null;
+}
+
+/** A file of the page as it is. */
+export async function unchecked(name: string): Promise<Uint8Array<ArrayBuffer>> {
+  if (inside()) {
+    const element = document.getElementById(`file:${name}`);
+    if (!element) throw new PageError(`${name}: not inside this page; publish the scene again.`);
+    return decodeBase64(element.textContent ?? "");
   }
+  if (location.protocol === "file:") {
+    throw new PageError(
+      "This page needs a web server, because browsers do not let a file read its neighbors. " +
+        "In this folder run: python -m http.server, then open http://localhost:8000. " +
+        "Or publish with --single-file.",
+    );
+  }
+  let answer: Response;
+  try {
+    answer = await fetch(name, { credentials: "same-origin" });
+  } catch {
+    throw new PageError(`${name}: the server does not answer; reload the page.`);
+  }
+  if (!answer.ok) throw new PageError(`${name}: the server answered ${answer.status}; copy the folder again.`);
+  return new Uint8Array(await answer.arrayBuffer());
 }
 
 function decodeBase64(text: string): Uint8Array<ArrayBuffer> {

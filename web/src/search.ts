@@ -15,7 +15,7 @@ export class SearchBar {
   readonly #host: SearchHost;
   #active = -1;
 
-  constructor(host: SearchHost, example: string) {
+  constructor(host: SearchHost) {
     this.#host = host;
     this.#list = h("ul", { id: "completions", role: "listbox", "aria-label": "Completions", hidden: true });
     this.input = h("input", {
@@ -26,7 +26,7 @@ export class SearchBar {
       "aria-controls": "completions",
       "aria-expanded": "false",
       "aria-autocomplete": "list",
-      placeholder: example ? `Search this place: ${example}, …` : "Search this place with words",
+      placeholder: "Search this place with words",
       autocomplete: "off",
       autocapitalize: "none",
       spellcheck: "false",
@@ -52,6 +52,12 @@ export class SearchBar {
       iconButton("add", "Add to the answers", () => this.#submit(true), "Shift+Enter"),
       this.#list,
     );
+  }
+
+  /** Completions are there, also for what was typed before; `example` is a phrase to begin with. */
+  suggest(example: string): void {
+    if (example) this.input.placeholder = `Search this place: ${example}, …`;
+    if (document.activeElement === this.input && this.input.value) this.#open();
   }
 
   close(): void {

@@ -23,7 +23,7 @@ from lexsplat.scenes.serving import error_document
 from lexsplat.viewer.requests import Asked, read_document
 from lexsplat.viewer.session import Session
 
-_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}
+_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "wasm": "application/wasm"}
 _PHOTO_SIDE = 1600
 """Longer side of photos in pixels, at most."""
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
-PAGE_FILES = ("page.js", "page.css", "LICENSES.txt")
+PAGE_FILES = ("page.js", "page.wasm", "page.css", "LICENSES.txt")
 _POLICY = (
     "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; style-src {style}; img-src {images} data: blob:; "
     "connect-src {connect}; worker-src blob:; base-uri 'none'; form-action 'none'"
@@ -25,8 +25,10 @@ def folder_index(manifest: Mapping[str, Any]) -> str:
     """``index.html`` of a page whose files lie beside it."""
     own = "'self'"
     policy = _POLICY.format(script=own, style=own, connect=own, images=own)
-    style, script = '<link rel="stylesheet" href="page.css">', '<script src="page.js" defer></script>'
-    return _index(manifest, policy, style, script)
+    needed = ("manifest.json", "page.wasm", html.escape(manifest["scene"]["file"]))
+    ahead = "\n".join(f'<link rel="preload" href="{name}" as="fetch" crossorigin>' for name in needed)
+    style = f'<link rel="stylesheet" href="page.css">\n{ahead}'
+    return _index(manifest, policy, style, '<script src="page.js" defer></script>')
 
 
 def single_index(manifest: Mapping[str, Any], style: str, script: str, blocks: str) -> str:
