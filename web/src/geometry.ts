@@ -2,6 +2,7 @@
 
 import type { SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
+import type { SelectionRule } from "./manifest";
 import { largest } from "./rules";
 
 /** A selection's cluster: where it is and how large. */
@@ -11,19 +12,8 @@ export interface Place {
   splats: number[];
 }
 
-/** A smaller cluster than this share of the largest one's opacity is a speck. */
-const SMALLEST_SHARE = 0.1;
-/** Smallest peak of a cluster above the threshold, as a share of the best one's (lexsplat.queries.selection). */
-const CONVINCING = 0.65;
-const PEAK_COUNT = 20;
-/** Largest distance between linked splats, in usual distances to the sixth neighbor. */
-const LINK = 2.5;
 /** Splats that are linked, at most; the others of a larger selection join them. */
 const MOST_LINKED = 20_000;
-/** Splats of lower opacity join clusters but do not link them. */
-const FAINT = 0.1;
-/** A splat belongs to the surface of a hit if its depth differs by at most this share. */
-const SAME_SURFACE = 0.05;
 
 export class Geometry {
   readonly centers: Float32Array;
@@ -33,7 +23,7 @@ export class Geometry {
   readonly #scales: Float32Array;
   readonly #quats: Float32Array;
 
-  constructor(mesh: SplatMesh, count: number) {
+  constructor(mesh: SplatMesh, count: number, readonly rule: SelectionRule) {
     this.centers = new Float32Array(3 * count);
     this.opacities = new Float32Array(count);
     this.lights = new Float32Array(count);
@@ -62,10 +52,9 @@ export class Geometry {
   /** The middle of most splats and the radius around it that holds them. */
   bounds(): { center: THREE.Vector3; radius: number } {
     const step = Math.max(1, Math.floor(this.count / 20000));
+    const firm = Array.from({ length: Math.ceil(this.count / step) }, (_, n) => n * step).filter((i) => this.opacities[i] >= this.rule.faint);
     const axis = (a: number): number[] => {
-      const values: number[] = [];
-      for (let i = 0; i < this.count; i += step) if (this.opacities[i] >= FAINT) values.push(this.centers[3 * i + a]);
-      values.sort((x, y) => x - y);
+      const values = Float32Array.from(firm, (i) => this.centers[3 * i + a]).sort();
       return [values[Math.floor(values.length * 0.1)] ?? 0, values[Math.floor(values.length * 0.9)] ?? 0];
     };
     const [x, y, z] = [axis(0), axis(1), axis(2)];
@@ -75,7 +64,7 @@ export class Geometry {
 
   /**
    * The surface that a ray meets: the depth behind which less than half of the light is left, and the splats there
-   * with their shares of it. Null if the ray meets less than 0.3 of a surface.
+   * with their shares of it. Null if the ray meets too little of a surface.
    */
   hit(ray: THREE.Ray): { point: THREE.Vector3; depth: number; splats: number[]; shares: number[] } | null {
     const { origin, direction } = ray;
@@ -111,10 +100,10 @@ export class Geometry {
       return share;
     });
     const total = 1 - light;
-    if (total < 0.3) return null;
+    if (total < this.rule.least_surface) return null;
     let sum = 0;
     const half = met[shares.findIndex((share) => (sum += share) >= total / 2)].depth;
-    const near = met.map((_, n) => n).filter((n) => Math.abs(met[n].depth - half) <= SAME_SURFACE * half);
+    const near = met.map((_, n) => n).filter((n) => Math.abs(met[n].depth - half) <= this.rule.same_surface * half);
     return {
       point: ray.at(half, new THREE.Vector3()),
       depth: half,
@@ -134,13 +123,14 @@ export class Geometry {
     const clusters = this.#clusters(chosen).map((splats) => ({
       splats,
       mass: splats.reduce((sum, i) => sum + this.opacities[i], 0),
-      peak: mean(largest(scores, splats, PEAK_COUNT).map((i) => scores[i])),
+      peak: mean(largest(scores, splats, this.rule.peak_count).map((i) => scores[i])),
     }));
     const most = Math.max(...clusters.map((cluster) => cluster.mass));
-    const firm = clusters.filter((cluster) => cluster.mass >= SMALLEST_SHARE * most);
-    const limit = threshold + CONVINCING * (Math.max(...firm.map((cluster) => cluster.peak)) - threshold);
+    const firm = clusters.filter((cluster) => cluster.mass >= this.rule.smallest_share * most);
+    const best = Math.max(...firm.map((cluster) => cluster.peak));
+    const limit = odds(threshold) + this.rule.convincing * (odds(best) - odds(threshold));
     return firm
-      .filter((cluster) => cluster.peak >= limit)
+      .filter((cluster) => odds(cluster.peak) >= limit)
       .sort((a, b) => b.peak * Math.sqrt(b.mass) - a.peak * Math.sqrt(a.mass))
       .map(({ splats }) => this.place(splats));
   }
@@ -150,11 +140,11 @@ export class Geometry {
    * selections those that are not in a sample, join the cluster of a linked one nearby.
    */
   #clusters(chosen: number[]): number[][] {
-    const firm = chosen.filter((i) => this.opacities[i] >= FAINT);
+    const firm = chosen.filter((i) => this.opacities[i] >= this.rule.faint);
     const all = firm.length ? firm : chosen;
     const step = Math.ceil(all.length / MOST_LINKED);
     const makers = step > 1 ? all.filter((_, n) => n % step === 0) : all;
-    const link = LINK * this.#spacing(makers);
+    const link = this.rule.link * this.#spacing(makers);
     const grid = new Grid(this.centers, makers, link);
     const parents = new Map<number, number>(makers.map((i) => [i, i]));
     const root = (i: number): number => {
@@ -222,6 +212,12 @@ export class Geometry {
     const apart = splats.map((i) => this.center(i, point).distanceTo(center)).sort((a, b) => a - b);
     return { center, radius: apart[Math.floor(apart.length * 0.95)] || 0.01, splats };
   }
+}
+
+/** Log-odds, finite for 0 and 1. */
+function odds(score: number): number {
+  const within = Math.min(1 - 1e-6, Math.max(1e-6, score));
+  return Math.log(within / (1 - within));
 }
 
 function squared(centers: Float32Array, i: number, j: number): number {

@@ -4,8 +4,6 @@
 const TOP = 4;
 /** Largest weight of the second, third and fourth code: weights are sorted and sum to at most 1. */
 const LARGEST = [1, 1 / 2, 1 / 3, 1 / 4];
-/** Splats of lower opacity do not count as evidence. */
-const FAINT = 0.1;
 
 /**
  * A relevancy for every code, 0..1. The score of a splat is the sum of weight times relevancy over its codes
@@ -73,11 +71,11 @@ export class Language {
   }
 }
 
-/** The indices of splats that are opaque enough to count. */
-export function shownSplats(opacities: Float32Array): Uint32Array {
+/** The indices of splats that are at least as opaque as `faint`. */
+export function shownSplats(opacities: Float32Array, faint: number): Uint32Array {
   const shown = new Uint32Array(opacities.length);
   let count = 0;
-  for (let i = 0; i < opacities.length; i++) if (opacities[i] >= FAINT) shown[count++] = i;
+  for (let i = 0; i < opacities.length; i++) if (opacities[i] >= faint) shown[count++] = i;
   return shown.subarray(0, count);
 }
 

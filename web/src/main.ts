@@ -48,7 +48,7 @@ async function show(files: Files, manifest: Manifest, stage: Stage, root: HTMLEl
   stage.manifest = manifest;
   const { scene } = manifest;
   await stage.load(await files.read(scene.file));
-  const geometry = new Geometry(stage.mesh, scene.gaussians);
+  const geometry = new Geometry(stage.mesh, scene.gaussians, manifest.selection_rule);
   if (manifest.server) {
     const phrases = new TextDecoder().decode(await files.read(manifest.words.phrases));
     const server = new Server(stage, geometry, new Dictionary(phrases, new Uint8Array(0), 0), manifest, async (next) => {

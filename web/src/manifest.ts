@@ -34,6 +34,31 @@ export interface EverydayRule {
   colors: string[];
 }
 
+/** The constants of lexsplat.queries by which surfaces, instances and evidence are found. */
+export interface SelectionRule {
+  /** Relevancy at the border: the automatic threshold of every prompt. */
+  threshold: number;
+  /** Largest distance between linked splats, in usual distances to the sixth neighbor. */
+  link: number;
+  /** A smaller cluster than this share of the largest one's opacity is a speck. */
+  smallest_share: number;
+  /** Smallest peak of a cluster above the threshold, as a share of the best one's, both in log-odds. */
+  convincing: number;
+  /** A peak is the mean of this many of the best scores. */
+  peak_count: number;
+  /** Splats of lower opacity join clusters but do not link them. */
+  faint: number;
+  /** A splat belongs to the surface of a hit if its depth differs by at most this share. */
+  same_surface: number;
+  /** A ray that meets less of a surface meets nothing. */
+  least_surface: number;
+  /** Evidence is the mean of this share of the splats that score best, and of at least this many. */
+  evidence_share: number;
+  evidence_count: number;
+  /** Splats of lower opacity are no evidence. */
+  evidence_faint: number;
+}
+
 /** The constants of lexsplat.queries.segments. */
 export interface SegmentRule {
   /** A cut is above this share of the best segment's score. */
@@ -82,6 +107,7 @@ export interface Manifest {
     meters_per_unit: number | null;
     start_view: string;
   };
+  selection_rule: SelectionRule;
   /** Null where a server answers, as are the table of words and the list of objects. */
   server: ServerEntry | null;
   language: {
@@ -115,7 +141,7 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 3;
+const FORMAT_VERSION = 4;
 
 const isText = (value: unknown): boolean => typeof value === "string";
 const isRecord = (value: unknown): boolean => typeof value === "object" && value !== null && !Array.isArray(value);
@@ -146,6 +172,15 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
 ];
 
 const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "threshold"];
+const SELECTION_RULE = [
+  "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",
+  "evidence_share", "evidence_count", "evidence_faint",
+];
+
+/** Whether a record has a number under each name. */
+function isRule(value: unknown, names: string[]): boolean {
+  return isRecord(value) && names.every((name) => Number.isFinite((value as Record<string, unknown>)[name]));
+}
 
 function areViews(value: unknown): boolean {
   const isView = (view: ViewEntry | null): boolean =>
@@ -161,10 +196,9 @@ function lacking(manifest: Manifest): string {
   if (lack) return `${lack[1]} in ${lack[0]}`;
   if (!manifest.server && !manifest.language) return "language or a server";
   if (manifest.language?.segments) {
-    const isRule = areNumbers(SEGMENT_RULE.length);
-    const rule = manifest.language.segment_rule as unknown as Record<string, unknown> | null | undefined;
-    if (!isRule(SEGMENT_RULE.map((name) => rule?.[name]))) return `${SEGMENT_RULE.length} numbers in language.segment_rule`;
+    if (!isRule(manifest.language.segment_rule, SEGMENT_RULE)) return `${SEGMENT_RULE.length} numbers in language.segment_rule`;
   }
+  if (!isRule(manifest.selection_rule, SELECTION_RULE)) return `${SELECTION_RULE.length} numbers in selection_rule`;
   return manifest.files[manifest.scene.file] ? "" : `${manifest.scene.file} in files`;
 }
 

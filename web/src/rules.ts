@@ -2,14 +2,11 @@
 // lexsplat.queries.everyday and lexsplat.queries.presence have it. tests/scenes/test_published_page.py compares them.
 
 import { type Language, type Table, dot } from "./language";
-import type { EverydayRule } from "./manifest";
+import type { EverydayRule, SelectionRule } from "./manifest";
 
 export type Presence = "yes" | "no" | "unsure";
 
-/** Relevancy at the border: the automatic threshold of every prompt. */
-export const BORDER = 0.5;
-const PEAK_SHARE = 5e-4;
-const PEAK_COUNT = 20;
+/** Keeps quotients finite. */
 const LEAST = 1e-6;
 
 /** How well a phrase describes each code, above its own offset. */
@@ -57,8 +54,8 @@ export function hasColor(phrase: string, rule: EverydayRule): boolean {
 }
 
 /** The mean distribution of the splats that score best. */
-export function peakOf(scores: Float32Array, language: Language, shown: Uint32Array): Float32Array {
-  const count = Math.min(shown.length, Math.max(PEAK_COUNT, Math.floor(PEAK_SHARE * shown.length)));
+export function peakOf(scores: Float32Array, language: Language, shown: Uint32Array, rule: SelectionRule): Float32Array {
+  const count = Math.min(shown.length, Math.max(rule.evidence_count, Math.floor(rule.evidence_share * shown.length)));
   return language.distribution(largest(scores, shown, count));
 }
 

@@ -125,7 +125,7 @@ export class Stage {
   /** Draw soon. Nothing is drawn while nothing changes. `moved` tells that splats moved or appeared. */
   draw(moved = false): void {
     if (moved) this.#order = "";
-    if (this.#wanted) return;
+    if (this.#wanted || !this.mesh?.isInitialized) return;
     this.#wanted = true;
     requestAnimationFrame(() => {
       this.#wanted = false;

@@ -4,7 +4,7 @@ import { type Answer, type Clicked, type Source, answered, painted } from "./ans
 import { Dictionary, normalize, singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
 import { type Language, shownSplats } from "./language";
-import { BORDER, type Presence, hasColor, isPart, peakOf, presenceOf } from "./rules";
+import { type Presence, hasColor, isPart, peakOf, presenceOf } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
 import type { Stage } from "./stage";
@@ -24,7 +24,7 @@ export class Tables implements Source {
     readonly loader: TowerLoader | null,
     readonly kinds: Kinds,
   ) {
-    this.#shown = shownSplats(geometry.opacities);
+    this.#shown = shownSplats(geometry.opacities, geometry.rule.evidence_faint);
     dictionary.rank(language, this.#shown);
     this.examples = dictionary.examples(4);
   }
@@ -60,7 +60,7 @@ export class Tables implements Source {
   #presence(phrase: string, own: Float32Array, { heights, best, rule, places, colored }: Description): Presence {
     if (this.#shown.length === 0) return "no";
     if (!this.segments || !places || !colored) {
-      return presenceOf(heights, peakOf(own, this.language, this.#shown), best, rule, rule.yes);
+      return presenceOf(heights, peakOf(own, this.language, this.#shown, this.geometry.rule), best, rule, rule.yes);
     }
     if (isPart(phrase, rule)) {
       this.#parts ??= this.segments.distributions(this.language);
@@ -75,7 +75,7 @@ export class Tables implements Source {
   /** By segments, something would always be taken: what is not here keeps the scores of single splats. */
   #whole(own: Float32Array, presence: Presence) {
     const scores = this.segments && presence !== "no" ? this.segments.scores(own) : own;
-    return { scores, presence, threshold: BORDER };
+    return { scores, presence, threshold: this.geometry.rule.threshold };
   }
 
   async refine(answer: Answer): Promise<void> {

@@ -17,27 +17,27 @@ export interface Description {
 }
 
 interface Matrix {
-  data: Float32Array | Int8Array;
-  /** Factor of each row of 8-bit weights. */
+  data: Float32Array | Int16Array | Int8Array;
+  /** Factor of each row of integer weights. */
   factors: Float32Array | null;
   rows: number;
   columns: number;
 }
 
-/** The tensors of a safetensors file: float32, or 8-bit weights with factors. */
+/** The tensors of a safetensors file: float32, or integer weights with factors. */
 export function readSafetensors(content: Uint8Array<ArrayBuffer>): Map<string, Matrix> {
   const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
   const length = Number(view.getBigUint64(0, true));
   const header = JSON.parse(new TextDecoder().decode(content.subarray(8, 8 + length))) as Record<
     string,
-    { dtype: string; shape: number[]; data_offsets: [number, number] }
+    { dtype: "I8" | "I16" | "F32"; shape: number[]; data_offsets: [number, number] }
   >;
   const tensors = new Map<string, Matrix>();
   for (const [name, entry] of Object.entries(header)) {
     if (name === "__metadata__") continue;
     const [start, end] = entry.data_offsets.map((offset) => offset + 8 + length);
     const bytes = content.slice(start, end).buffer;
-    const data = entry.dtype === "I8" ? new Int8Array(bytes) : new Float32Array(bytes);
+    const data = new { I8: Int8Array, I16: Int16Array, F32: Float32Array }[entry.dtype](bytes);
     const columns = entry.shape.at(-1) ?? 1;
     tensors.set(name, { data, factors: null, rows: data.length / columns, columns });
   }

@@ -19,8 +19,10 @@ from lexsplat.queries.thresholds import automatic_threshold
 from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import QueryError
 
-_SAME_SURFACE = 0.05
+SAME_SURFACE = 0.05
 """A Gaussian belongs to the clicked surface if its depth differs from the surface's by at most this share."""
+LEAST_SURFACE = 0.3
+"""A pixel whose weights sum to less shows nothing."""
 _SIMILAR = 0.8
 """Smallest similarity to the click, as a share of the surface's own. Chosen among 0.7 to 0.9 on the second demo scene
 (mean IoU of 63 clicks on objects in held-out views: 0.81, without it 0.56). On the bundled table top, where it was
@@ -66,14 +68,14 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
     weights = accumulate_weights(gaussians, Camera(1, 1, K, camera.viewmat))
     seen = (weights > 1e-4).nonzero()[:, 0]
     shares = weights[seen].double().cpu()
-    if float(shares.sum()) < 0.3:
+    if float(shares.sum()) < LEAST_SURFACE:
         raise QueryError(f"pixel ({x:g}, {y:g})", expected="a surface", found="nothing")
     means = gaussians.means[seen].double().cpu()
     depths = means @ torch.from_numpy(camera.viewmat[2, :3].copy()) + camera.viewmat[2, 3]
     order = depths.argsort()
     half = int((shares[order].cumsum(0) < shares.sum() / 2).sum())
     depth = float(depths[order[half]])
-    near = ((depths - depth).abs() <= _SAME_SURFACE * depth).to(seen.device)
+    near = ((depths - depth).abs() <= SAME_SURFACE * depth).to(seen.device)
     ray = np.linalg.inv(camera.K) @ np.array([x, y, 1.0]) * depth
     point = camera.viewmat[:3, :3].T @ (ray - camera.viewmat[:3, 3])
     return Hit(point, seen[near], weights[seen[near]])

@@ -41,10 +41,10 @@ YES_OBJECT, YES_COLORED = 0.62, 0.82
 """The former for names of whole objects, whose means are lower than peaks, and for phrases with a color, which share
 the color or the name with most of what they are confused with. Chosen on the second scene."""
 
-_PEAK_SHARE = 5e-4
-_PEAK_COUNT = 20
+PEAK_SHARE = 5e-4
+PEAK_COUNT = 20
 """A peak is the mean of the best 0.05 percent of the Gaussians, and of at least this many."""
-_FAINT = 0.1
+FAINT = 0.1
 """Gaussians of lower opacity do not count."""
 _LEAST = 1e-6
 
@@ -106,7 +106,7 @@ class PresenceClassifier:
         places: DescribedPlaces | None = None,
     ) -> None:
         self.language, self.scale, self._embed = language, scale, embed
-        self._shown = (gaussians.opacities >= _FAINT).detach().nonzero()[:, 0]
+        self._shown = (gaussians.opacities >= FAINT).detach().nonzero()[:, 0]
         if places is not None:
             self.places = places
 
@@ -209,7 +209,7 @@ class PresenceClassifier:
 
     def _peak(self, scores: Tensor) -> Tensor:
         """Mean distribution ``[K]`` over the codes of the Gaussians that score best."""
-        count = min(len(self._shown), max(_PEAK_COUNT, int(_PEAK_SHARE * len(self._shown))))
+        count = min(len(self._shown), max(PEAK_COUNT, int(PEAK_SHARE * len(self._shown))))
         best = self._shown[scores.to(self._shown.device)[self._shown].topk(count).indices]
         return self.language.select(best).code_probabilities().mean(0)
 

@@ -33,17 +33,17 @@ Presence = Literal["yes", "no", "unsure"]
 PRESENCES: tuple[Presence, ...] = ("no", "unsure", "yes")
 """Whether a scene holds something, the least certain first."""
 
-_SMALLEST_SHARE = 0.1
+SMALLEST_SHARE = 0.1
 """A cluster with less than this share of the largest cluster's opacity is not an instance."""
-_CONVINCING = 0.65
+CONVINCING = 0.65
 """An instance is kept if its peak exceeds the threshold by at least this share of the best instance's excess, both in
 log-odds. On the second demo scene, 3 of the 4 wrong or partial instances of 20 prompts reach 0.47 to 0.50, and one
 reaches 0.32; the right ones reach 1."""
 _PLACE = ("indices", "num_gaussians", "box", "sample", "tree", "view_shares", "best_view")
 """What follows from the Gaussians of a selection alone."""
 _SAMPLE = 4000
-_PEAK_COUNT = 20
-_FAINT = 0.1
+PEAK_COUNT = 20
+FAINT = 0.1
 """Gaussians of lower opacity join clusters but do not link them."""
 
 
@@ -174,7 +174,7 @@ class Selection:
         """Its parts within it, or else its connected clusters without specks, the largest first."""
         if self.parts:
             return [part for part in (known.within(self.mask) for known in self.parts) if part]
-        return self.clusters(_SMALLEST_SHARE)
+        return self.clusters(SMALLEST_SHARE)
 
     def clusters(self, smallest: float = 0.0) -> list[Selection]:
         """All connected clusters with at least ``smallest`` times the opacity of the largest, largest first."""
@@ -232,7 +232,7 @@ class Selection:
 
     def shrink(self, distance: float | None = None) -> Selection:
         """The Gaussians that are farther than ``distance`` from every Gaussian outside the selection."""
-        outside = (~self.mask & (self.gaussians.opacities >= _FAINT)).cpu().numpy()
+        outside = (~self.mask & (self.gaussians.opacities >= FAINT)).cpu().numpy()
         if not self or not outside.any():
             return self
         reach = self._reach(distance)
@@ -260,7 +260,7 @@ class Selection:
             return self
         compared = self.scores if scores is None else scores
         peaks = [
-            float(compared[one.indices].topk(min(_PEAK_COUNT, len(one))).values.mean())
+            float(compared[one.indices].topk(min(PEAK_COUNT, len(one))).values.mean())
             for one in self.instances
         ]
         limit = self.convincing_limit(max(peaks))
@@ -268,11 +268,11 @@ class Selection:
         return replace(self, mask=union(self.mask, kept), parts=kept)
 
     def convincing_limit(self, best: float) -> float:
-        """The smallest score of an instance beside one that scores ``best``: `_CONVINCING`, in log-odds."""
+        """The smallest score of an instance beside one that scores ``best``: `CONVINCING`, in log-odds."""
         low, high = (
             math.log(p / (1 - p)) for p in (min(max(p, 1e-6), 1 - 1e-6) for p in (self.threshold, best))
         )
-        return 1 / (1 + math.exp(-(low + _CONVINCING * (high - low))))
+        return 1 / (1 + math.exp(-(low + CONVINCING * (high - low))))
 
     def within(self, mask: Tensor) -> Selection:
         """The intersection with a mask ``[N]``."""
@@ -391,7 +391,7 @@ class Selection:
     def _clusters(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Cluster of each selected Gaussian ``[M]`` and the total opacity of each cluster ``[C]``."""
         points, opacities = self._points()
-        labels = clusters(points, opacities >= _FAINT)
+        labels = clusters(points, opacities >= FAINT)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

@@ -13,9 +13,10 @@ from lexsplat import __version__
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.kinds import KIND_PHRASES, is_of_kind
 from lexsplat.queries.selection import Selection
+from lexsplat.scenes.publishing.sidecar import selection_rule
 from lexsplat.scenes.scene import Scene
 
-FORMAT, FORMAT_VERSION = "lexsplat-page", 3
+FORMAT, FORMAT_VERSION = "lexsplat-page", 4
 MOST_OBJECTS = 200
 """Entries of the list of objects, at most."""
 
@@ -54,6 +55,7 @@ def scene_manifest(
             "meters_per_unit": scene.world.meters_per_unit,
             "start_view": min(scene.views, default=""),
         },
+        "selection_rule": selection_rule(),
         "server": None,
         "language": None,
         "words": {"phrases": "words.txt", "table": None, "count": 0},

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lexsplat.language.segments import Segments
+from lexsplat.queries import clusters, picking, presence, selection, thresholds
 from lexsplat.queries import segments as rule
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.formats.language import StoredLanguage
@@ -38,6 +39,23 @@ def segment_rule() -> dict[str, float]:
         "own_share": rule.OWN_SHARE,
         "steepness": rule.STEEPNESS,
         "threshold": rule.SEGMENT_THRESHOLD,
+    }
+
+
+def selection_rule() -> dict[str, float]:
+    """The constants by which the page finds surfaces, instances and evidence: those of `lexsplat.queries`."""
+    return {
+        "threshold": thresholds.BORDER,
+        "link": clusters.LINK,
+        "smallest_share": selection.SMALLEST_SHARE,
+        "convincing": selection.CONVINCING,
+        "peak_count": selection.PEAK_COUNT,
+        "faint": selection.FAINT,
+        "same_surface": picking.SAME_SURFACE,
+        "least_surface": picking.LEAST_SURFACE,
+        "evidence_share": presence.PEAK_SHARE,
+        "evidence_count": presence.PEAK_COUNT,
+        "evidence_faint": presence.FAINT,
     }
 
 
