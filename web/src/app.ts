@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
-import { h, icon, save } from "./dom";
+import { h, save } from "./dom";
 import type { Geometry, Place } from "./geometry";
 import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./manifest";
 import { Measure } from "./measure";
@@ -89,10 +89,8 @@ export class App {
     this.source = source;
     const { examples } = source;
     this.search.suggest(examples[0] ?? "");
-    if (examples.length > 0) this.#tries.append("Try: ");
-    for (const phrase of examples) {
-      this.#tries.append(h("button", { type: "button", text: phrase, onclick: () => this.run(() => this.ask(phrase, false)) }));
-    }
+    const tried = (text: string) => h("button", { type: "button", text, onclick: () => this.run(() => this.ask(text, false)) });
+    if (examples.length > 0) this.#tries.append("Try: ", ...examples.map(tried));
     return source;
   }
 
@@ -386,16 +384,6 @@ export class App {
     else this.run(async () => void (await this.whatIs(x, y)));
   }
 
-  theme(name: string): void {
-    document.documentElement.dataset.theme = name;
-    this.stage.background = getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
-    try {
-      localStorage.setItem("lexsplat-theme", name);
-    } catch {
-      // a page from a file may not store anything
-    }
-  }
-
   async savePicture(): Promise<void> {
     save(await this.stage.picture(), "picture.png");
   }
@@ -457,9 +445,4 @@ export class App {
     const phone = matchMedia("(max-width: 640px)").matches;
     this.stage.covered = phone ? this.#sheet.getBoundingClientRect().height : 0;
   }
-}
-
-/** The message of an error over the whole page. */
-export function failure(text: string): HTMLElement {
-  return h("div", { class: "failure", role: "alert" }, icon("close"), h("p", { text }));
 }

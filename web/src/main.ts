@@ -1,16 +1,18 @@
 // Starts the page: reads the manifest and its files, and says in one line why it cannot.
 
-import { App, failure } from "./app";
+import { App } from "./app";
 import { Dictionary } from "./dictionary";
 import { h } from "./dom";
 import { Geometry } from "./geometry";
 import { Kinds } from "./kinds";
 import { Language } from "./language";
 import { Files, type Manifest, PageError } from "./manifest";
+import { failure } from "./notes";
 import { Segments } from "./segments";
 import { Server } from "./server";
 import { Stage } from "./stage";
 import { Tables } from "./tables";
+import { firstTheme, ground } from "./theme";
 import { TowerLoader } from "./tower-loader";
 import { ownModule } from "./wasm";
 
@@ -22,7 +24,7 @@ declare global {
 }
 
 async function start(root: HTMLElement): Promise<App> {
-  theme();
+  firstTheme();
   const files = new Files();
   const progress = h("p", { class: "progress", role: "status", text: "Loading" });
   const keys = "Arrow keys turn it, plus and minus approach, Enter tells what is in its middle.";
@@ -35,7 +37,7 @@ async function start(root: HTMLElement): Promise<App> {
   progress.textContent = `Loading ${gaussians.toLocaleString("en")} Gaussians (${(manifest.files[file].bytes / 1e6).toFixed(1)} MB)`;
   await ownModule;
   const stage = new Stage(canvas, manifest);
-  stage.background = getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
+  stage.background = ground();
   const app = await show(files, manifest, stage, root);
   progress.remove();
   root.classList.add("ready");
@@ -81,18 +83,6 @@ async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: 
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
   const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes);
   return new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds);
-}
-
-/** Light or dark as chosen before, else as the system has it. */
-function theme(): void {
-  let stored: string | null = null;
-  try {
-    stored = localStorage.getItem("lexsplat-theme");
-  } catch {
-    // a page from a file may not store anything
-  }
-  const system = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
-  document.documentElement.dataset.theme = stored === "light" || stored === "dark" ? stored : system;
 }
 
 const root = document.getElementById("page")!;

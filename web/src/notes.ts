@@ -1,6 +1,6 @@
 // What the page says under the answers: one line, and phrases to ask instead.
 
-import { h } from "./dom";
+import { h, icon } from "./dom";
 
 export class Notes {
   readonly element = h("div", { class: "status", role: "status", "aria-live": "polite" });
@@ -36,4 +36,9 @@ export class Notes {
   append(element: HTMLElement): void {
     this.element.append(element);
   }
+}
+
+/** The message of an error over the whole page. */
+export function failure(text: string): HTMLElement {
+  return h("div", { class: "failure", role: "alert" }, icon("close"), h("p", { text }));
 }

@@ -3,6 +3,7 @@
 import type { App } from "./app";
 import { h, iconButton } from "./dom";
 import { helpDialog } from "./panels";
+import { changeTheme } from "./theme";
 
 /** The toolbar; its listeners end with `signal`. */
 export function toolbar(app: App, signal: AbortSignal): HTMLElement {
@@ -32,7 +33,7 @@ export function toolbar(app: App, signal: AbortSignal): HTMLElement {
     p: iconButton("picture", "Save the picture", () => app.run(() => app.savePicture()), "p"),
     r: iconButton("video", "Record a video", () => app.run(() => app.saveVideo()), "r"),
     l: iconButton("link", "Copy the link", () => app.run(() => app.copyLink()), "l"),
-    t: iconButton("theme", "Light or dark", () => app.theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"), "t"),
+    t: iconButton("theme", "Light or dark", () => (app.stage.background = changeTheme()), "t"),
     "?": iconButton("help", "Help and about", () => dialog.showModal(), "?"),
   });
   for (const button of [views, objects, measure, heat]) press(button, false);
