@@ -1,6 +1,6 @@
 """The published demo beside @playcanvas/supersplat-viewer, which shows the same scene without search, in one run.
 
-    python benchmarks/pages.py [--repeats 5] [--json FILE]
+    python benchmarks/pages.py [--repeats 5] [--copies N] [--json FILE]
 
 Headless Chromium with software WebGL opens both pages in turn, each in a fresh browser, from a server of the
 standard library on this machine. The first picture is the first presented frame that is closer to the finished one
@@ -8,6 +8,9 @@ than to an empty page. The first answer is the first frame after Enter that diff
 processor time of all processes of the browser, which depends less on other programs than wall time does. Bytes are
 those of the files, compressed as most web servers do (gzip). The viewer is fetched from npm into a temporary folder.
 Without npm or Chromium nothing is measured, and the reason is told.
+
+With ``--copies`` the scene is laid side by side that many times (25 copies of the demo have a million Gaussians), and
+only this page is opened: it says what a new prompt costs in software.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+from asking import copied
 from PIL import Image
 from records import argument_parser, write_record
 
@@ -219,28 +223,35 @@ def main() -> None:
     """Measure both pages in turn and print the medians."""
     parser = argument_parser(__doc__)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--copies", type=int, default=1)
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="save the last picture of each page there"
     )
     options = parser.parse_args()
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if program is None or shutil.which("npm") is None:
+    alone = options.copies > 1
+    if program is None or (shutil.which("npm") is None and not alone):
         print(f"skipped: no {'Chromium' if program is None else 'npm'} on the path")
         return
     from playwright.sync_api import sync_playwright
 
     scene = lexsplat.open_scene("demo")
-    rows: dict[str, list[dict[str, float]]] = {"lexsplat publish": [], VIEWER: []}
+    pages = [("lexsplat publish", ours, "page"), (VIEWER, theirs, "viewer")][: 1 if alone else 2]
+    rows: dict[str, list[dict[str, float]]] = {title: [] for title, _, _ in pages}
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         work = Path(name)
-        try:
-            write_viewer(scene, work / "viewer", work)
-        except (subprocess.SubprocessError, OSError) as error:
-            print(f"skipped: npm did not give {VIEWER}: {error}")
-            return
+        if alone:
+            copied(scene, options.copies, work / "scene")
+            scene = lexsplat.open_scene(work / "scene")
+        else:
+            try:
+                write_viewer(scene, work / "viewer", work)
+            except (subprocess.SubprocessError, OSError) as error:
+                print(f"skipped: npm did not give {VIEWER}: {error}")
+                return
         publish(scene, work / "page")
         for repeat in range(options.repeats + 1):
-            for title, measure, folder in (("lexsplat publish", ours, "page"), (VIEWER, theirs, "viewer")):
+            for title, measure, folder in pages:
                 browser = driver.chromium.launch(executable_path=program, args=FLAGS)
                 row = measure(browser, work / folder)
                 browser.close()

@@ -108,7 +108,8 @@ def main() -> None:
         "gaussians": len(scene.gaussians),
         "drawn": len(viewer.session.content.drawn),
         "start_s": round(start, 2),
-        "first_page_bytes": sum(map(len, files.values())) + sum(len(page_file(name)) for name in ("page.js", "page.wasm")),
+        "first_page_bytes": sum(map(len, files.values()))
+        + sum(len(page_file(name)) for name in ("page.js", "page.wasm")),
         "answer_median_ms": round(1e3 * statistics.median(answered), 1),
         "answer_max_ms": round(1e3 * max(answered), 1),
         "answer_cpu_median_ms": round(1e3 * statistics.median(spent), 1),

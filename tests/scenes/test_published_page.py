@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 from scipy.ndimage import binary_erosion
+from support.encoder_folders import write_clip
 from support.language_scene import CENTERS
 from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
 from support.siglip_folder import siglip_folder
@@ -140,10 +141,20 @@ def test_answers_are_those_of_python(page, demo):
 
 
 def test_free_phrases_have_the_scores_and_segments_of_python(page, demo):
-    """The widest gap of the first one lies between 0.3 and 0.6 of its best segment, below which Python cuts nothing."""
-    things = ("red apple", "green bowl", "rubber duck", "toy car", "cup of tea", "leaf of the plant", "violin case")
+    """The widest gap of the first lies between 0.3 and 0.6 of its best segment, below which Python cuts nothing."""
+    things = (
+        "red apple",
+        "green bowl",
+        "rubber duck",
+        "toy car",
+        "cup of tea",
+        "leaf of the plant",
+        "violin case",
+    )
     prompts = ["that shiny red apple", "the thing I drink coffee out of", "what keeps me warm"]
-    prompts += [f"{which} {thing}" for which in ("somebody's", "one very old", "this dusty") for thing in things]
+    prompts += [
+        f"{which} {thing}" for which in ("somebody's", "one very old", "this dusty") for thing in things
+    ]
     found = page.evaluate(
         """async (prompts) => {
             const answers = [];
@@ -314,15 +325,24 @@ def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_pag
     assert np.abs(opacities - scene.gaussians.opacities.numpy()).max() < 0.01
 
 
-def test_the_text_tower_of_siglip_answers_in_the_page_as_in_python(browser, ball_page, tmp_path):
-    pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
-    model = tmp_path / "siglip"
+@pytest.mark.parametrize("family", ["clip", "siglip"])
+def test_the_text_tower_of_another_encoder_answers_in_the_page_as_in_python(
+    browser, ball_page, tmp_path, family
+):
+    model = tmp_path / family
     model.mkdir()
-    siglip_folder(model, width=32)
+    if family == "siglip":
+        pytest.importorskip("sentencepiece", reason="needs the extra `siglip`")
+        siglip_folder(model, width=32)
+    else:
+        write_clip(model, width=32)
     ball_page.scene.clip = str(model)
     texts = ["A Car!", "the wooden table", "red mug, blue books and an apple on the table", "Ünknown 42"]
     with serving(ball_page(words_only=False)) as address:
         page = open_page(browser, address)
+        ask(page, "ball 3")
+        needed = [url for url in page.requested if url.endswith(("text.safetensors", "tokenizer.json"))]
+        assert not needed, "a phrase of the dictionary needs no text tower"
         found = page.evaluate(
             """async (texts) => {
                 const tower = await lexsplat.app.source.loader.load();
@@ -458,7 +478,7 @@ def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answe
     hold = """
         const own = window.fetch;
         window.fetch = (name, ...rest) =>
-            name === "words.bin" ? new Promise((go) => (window.go = go)).then(() => own(name, ...rest)) : own(name, ...rest);
+            (name === "words.bin" ? new Promise((go) => (window.go = go)) : Promise.resolve()).then(() => own(name, ...rest));
     """
     with serving(ball_page()) as address:
         page = browser.new_page(viewport={"width": 480, "height": 360}, reduced_motion="reduce")

@@ -260,5 +260,7 @@ def test_the_source_of_the_page_passes_the_type_checker_and_the_linter():
 
 
 def test_the_code_of_the_page_is_at_most_1_4_megabytes_compressed():
-    sizes = [len(zlib.compress((BUNDLE / name).read_bytes(), 9)) for name in ("page.js", "page.wasm", "page.css")]
+    sizes = [
+        len(zlib.compress((BUNDLE / name).read_bytes(), 9)) for name in ("page.js", "page.wasm", "page.css")
+    ]
     assert sum(sizes) < 1.4e6

@@ -29,8 +29,8 @@ def save_model(model, folder: Path) -> Path:
     return folder
 
 
-def write_clip(folder: Path) -> Path:
-    """A tiny CLIP with random weights and the bundled tokenizer."""
+def write_clip(folder: Path, width: int = 20) -> Path:
+    """A tiny CLIP with random weights, embeddings of a width and the bundled tokenizer."""
     from transformers import CLIPConfig, CLIPModel
 
     tokenizer = load_clip("bundled")._tokenizer
@@ -44,7 +44,7 @@ def write_clip(folder: Path) -> Path:
             "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
             "image_size": 40, "patch_size": 8,
         },
-        projection_dim=20,
+        projection_dim=width,
     )  # fmt: skip
     tokenizer.save_pretrained(folder)
     return save_model(seeded(lambda: CLIPModel(config)), folder)
