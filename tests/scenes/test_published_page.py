@@ -477,8 +477,8 @@ def test_a_single_file_opens_by_double_click_and_a_folder_says_what_to_do(browse
 def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answered(browser, ball_page):
     hold = """
         const own = window.fetch;
-        window.fetch = (name, ...rest) =>
-            (name === "words.bin" ? new Promise((go) => (window.go = go)) : Promise.resolve()).then(() => own(name, ...rest));
+        const held = (name) => name === "words.bin" ? new Promise((go) => (window.go = go)) : Promise.resolve();
+        window.fetch = (name, ...rest) => held(name).then(() => own(name, ...rest));
     """
     with serving(ball_page()) as address:
         page = browser.new_page(viewport={"width": 480, "height": 360}, reduced_motion="reduce")
