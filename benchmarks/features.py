@@ -1,6 +1,7 @@
 """Image encoders against matrix products of the same sizes: milliseconds and operations of an image and of a photo.
 
     python benchmarks/features.py [--threads 1] [--repeats 9] [--json FILE]
+    python benchmarks/features.py --precisions [--batches 8 64] [--repeats 3]
 
 Encoders: the bundled CLIP, and the image tower of a ViT-B/16 with random weights.
 
@@ -9,30 +10,44 @@ Encoders: the bundled CLIP, and the image tower of a ViT-B/16 with random weight
     share       products / forward: 1 would be an encoder that does nothing but matrix products at full speed
     crops       crops of a photo of the demo with its settings; "photo" is the time and operations of all of them
 
+``--precisions`` runs the ViT-B/16 in float32, in bfloat16 as lexsplat does (autocast) and with its weights in bfloat16,
+in 8-bit integers (torch's dynamic quantization), and in ONNX Runtime in float32 and in 8-bit integers where the
+packages ``onnx``, ``onnxscript`` and ``onnxruntime`` are installed. "cosine" is the lowest of its embeddings of bundled
+pictures with those in float32.
+
 Forward passes and products alternate; times are medians of processor time, which other programs hardly disturb.
 """
 
 from __future__ import annotations
 
+import copy
 import math
+import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from records import argument_parser, write_record
 from torch import Tensor
+from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from lexsplat.captures import load_capture
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features import FeatureConfig
+from lexsplat.features.checks import pictures
 from lexsplat.features.encoders import load_clip
 from lexsplat.features.extraction import encoded_size
 from lexsplat.features.pyramid import grid_levels, unique_boxes
 
 aten = torch.ops.aten
+SIDE = 224
+"""Pixels along a side of the ViT-B/16's input."""
+Encode = Callable[[Tensor], Tensor]
 
 
 class Products(TorchDispatchMode):
@@ -63,14 +78,13 @@ class Products(TorchDispatchMode):
         return result
 
 
-def vit_b16() -> Callable[[Tensor], Tensor]:
+def vit_b16() -> torch.nn.Module:
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
     config = CLIPVisionConfig(
         hidden_size=768, intermediate_size=3072, num_hidden_layers=12, num_attention_heads=12, patch_size=16
     )
-    model = CLIPVisionModelWithProjection(config).eval()
-    return lambda images: model(pixel_values=images).image_embeds
+    return CLIPVisionModelWithProjection(config).eval()
 
 
 def crops_of_a_photo() -> int:
@@ -87,7 +101,7 @@ def timed(function: Callable[[], object]) -> float:
 
 @torch.inference_mode()
 def run_case(
-    name: str, encode: Callable[[Tensor], Tensor], side: int, batch: int, repeats: int
+    name: str, encode: Encode, side: int, batch: int, repeats: int
 ) -> dict[str, float]:
     images = torch.rand(batch, 3, side, side)
     with Products() as products:
@@ -111,14 +125,89 @@ def run_case(
     }  # fmt: skip
 
 
+def precision_cases(model: torch.nn.Module, threads: int) -> Iterator[tuple[str, Encode]]:
+    """The ViT-B/16 in each precision that this machine has packages for."""
+
+    def plain(images: Tensor) -> Tensor:
+        return model(pixel_values=images).image_embeds
+
+    def autocast(images: Tensor) -> Tensor:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            return plain(images)
+
+    half = copy.deepcopy(model).bfloat16()
+    yield "float32", plain
+    yield "bfloat16, autocast", autocast
+    yield "bfloat16, weights", lambda images: half(pixel_values=images.bfloat16()).image_embeds
+    whole = torch.ao.quantization.quantize_dynamic(copy.deepcopy(model), {torch.nn.Linear}, torch.qint8)
+    yield "int8, torch", lambda images: whole(pixel_values=images).image_embeds
+    with tempfile.TemporaryDirectory() as folder:
+        yield from onnx_cases(model, Path(folder), threads)
+
+
+def onnx_cases(model: torch.nn.Module, folder: Path, threads: int) -> Iterator[tuple[str, Encode]]:
+    """The same in ONNX Runtime; nothing if it cannot be exported here."""
+    try:
+        import onnxruntime
+        from onnxruntime.quantization import quantize_dynamic
+
+        class Tower(torch.nn.Module):
+            def __init__(self) -> None:
+                super().__init__()
+                self.model = model
+
+            def forward(self, images: Tensor) -> Tensor:
+                return self.model(pixel_values=images).image_embeds
+
+        images = torch.rand(2, 3, SIDE, SIDE)
+        batch = {"images": {0: torch.export.Dim("batch")}}
+        path, small = folder / "float32.onnx", folder / "int8.onnx"
+        torch.onnx.export(Tower().eval(), (images,), path, dynamo=True, dynamic_shapes=batch, verbose=False)
+        quantize_dynamic(path, small)
+    except ImportError as error:
+        print(f"ONNX Runtime is not measured: {error}")
+        return
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    for name, file in (("float32, ONNX Runtime", path), ("int8, ONNX Runtime", small)):
+        session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
+        given = session.get_inputs()[0].name
+        yield name, lambda images, run=session.run, key=given: torch.from_numpy(
+            run(None, {key: images.numpy()})[0]
+        )
+
+
+@torch.inference_mode()
+def run_precisions(threads: int, batches: list[int], repeats: int) -> list[dict[str, Any]]:
+    """Median processor time of an image in each precision and batch size, and how far the embeddings agree."""
+    model, rows = vit_b16(), []
+    seen = pictures(SIDE)[:8]
+    exact = functional.normalize(model(pixel_values=seen).image_embeds, dim=-1)
+    print(f"{'precision':22} {'batch':>5} {'s/image':>8} {'cosine':>8}")
+    for name, encode in precision_cases(model, threads):
+        cosine = float((functional.normalize(encode(seen).float(), dim=-1) * exact).sum(-1).min())
+        for batch in batches:
+            images = torch.rand(batch, 3, SIDE, SIDE)
+            encode(images)
+            seconds = float(np.median([timed(lambda: encode(images)) for _ in range(repeats)])) / 1e3 / batch
+            rows.append({"precision": name, "batch": batch, "image_seconds": seconds, "cosine": cosine})
+            print(f"{name:22} {batch:5} {seconds:8.3f} {cosine:8.5f}", flush=True)
+    return rows
+
+
 def main() -> None:
     parser = argument_parser(__doc__)
+    parser.add_argument("--precisions", action="store_true")
+    parser.add_argument("--batches", type=int, nargs="+", default=[8])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=9)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    clip, crops = load_clip("bundled"), crops_of_a_photo()
-    cases = (("bundled", clip.encode_images, clip.image_size, 64), ("ViT-B/16", vit_b16(), 224, 8))
+    if options.precisions:
+        rows = run_precisions(options.threads, options.batches, options.repeats)
+        return write_record(options.json, rows, threads=options.threads)
+    clip, vision, crops = load_clip("bundled"), vit_b16(), crops_of_a_photo()
+    cases = (("bundled", clip.encode_images, clip.image_size, 64), ("ViT-B/16", lambda images: vision(pixel_values=images).image_embeds, SIDE, 8))
     print(f"{options.threads} threads, {crops} crops in a photo")
     print(
         f"{'encoder':10} {'ms/image':>9} {'GFLOP':>7} {'GFLOP/s':>8} {'products':>9} {'share':>6} {'s/photo':>8}"

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from support.encoder_folders import MEAN, STD, save_model, seeded, tiny_vit
 
-from lexsplat.features import hub
+from lexsplat.features import hub, pretrained
 from lexsplat.features.clip import _plain_attention, check_patches
 from lexsplat.features.dino import _ramp, _window_starts
 from lexsplat.features.encoders import ClipEncoder, DinoEncoder, load_clip, load_dino, resize_images
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def full_precision(request, monkeypatch):
     """Bfloat16 is tested separately; everything else is compared at full precision."""
     if "bfloat16" not in request.node.name:
-        monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda: False)
+        monkeypatch.setattr("lexsplat.features.pretrained.bfloat16_is_faster", lambda: False)
 
 
 def test_crops_in_bfloat16_agree_with_float32_and_texts_do_not_change(monkeypatch):
@@ -39,12 +39,20 @@ def test_crops_in_bfloat16_agree_with_float32_and_texts_do_not_change(monkeypatc
     crops = torch.rand(12, 3, 24, 24, generator=torch.Generator().manual_seed(0))
     found = []
     for on in (False, True):
-        monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda on=on: on)
+        monkeypatch.setattr("lexsplat.features.pretrained.bfloat16_is_faster", lambda on=on: on)
         found.append((clip.encode_images(crops), clip.encode_text(PROMPTS)))
     cosines = (found[0][0] * found[1][0]).sum(-1)
     assert cosines.min() > 0.999
     assert not torch.equal(found[0][0], found[1][0]), "bfloat16 was used"
     assert torch.equal(found[0][1], found[1][1])
+
+
+@pytest.mark.parametrize(("flag", "half", "chosen"), [(True, 0.3, True), (True, 0.9, False), (False, 0.3, False)])
+def test_bfloat16_is_chosen_by_its_time_where_the_processor_has_instructions(flag, half, chosen, monkeypatch):
+    clock = iter(np.cumsum([0.0, 1.0, 0.0, half] * 3))
+    monkeypatch.setattr(pretrained, "_has_bfloat16", lambda: flag)
+    monkeypatch.setattr(pretrained.time, "thread_time", lambda: next(clock))
+    assert pretrained.bfloat16_is_faster.__wrapped__() is chosen
 
 
 def test_only_image_towers_of_few_patches_use_eager_attention():

@@ -232,7 +232,7 @@ def test_weights_that_are_not_finite_are_refused(copy, vit_folder, tmp_path):
 def test_an_overflow_in_half_precision_is_computed_again_in_full(clip_folder, monkeypatch):
     from contextlib import contextmanager
 
-    monkeypatch.setattr("lexsplat.features.pretrained._computes_in_bfloat16", lambda: False)
+    monkeypatch.setattr("lexsplat.features.pretrained.bfloat16_is_faster", lambda: False)
     encoder, images = load_clip(str(clip_folder)), torch.rand(2, 3, 40, 40)
     expected = encoder.encode_images(images)
     halves = []

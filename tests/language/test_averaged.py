@@ -199,6 +199,7 @@ def test_a_gaussian_that_no_view_shows_has_no_language(balls) -> None:
     found = average_features(hidden, balls.cameras, maps, AveragedConfig())
     field = field_from_means(found, CODES, AveragedConfig())
     assert float(field.weights[-1].sum()) == 0
+    assert field.unseen == 1
     assert float(field.uncertainties[-1]) == 1
     torch.testing.assert_close(field.weights[:-1].sum(1), torch.ones(len(hidden) - 1))
     none = MeanFeatures(found.means[-1:], found.totals[-1:])  # a scene that no view shows

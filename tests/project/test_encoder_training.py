@@ -574,7 +574,7 @@ def test_training_and_encoder_compute_the_same_patch_embeddings(tmp_path, monkey
     from lexsplat.features import pretrained
     from lexsplat.features.clip import ClipEncoder
 
-    monkeypatch.setattr(pretrained, "_computes_in_bfloat16", lambda: False)
+    monkeypatch.setattr(pretrained, "bfloat16_is_faster", lambda: False)
     trainer = trainer_of(small_training(seed=3))
     save(trainer, tmp_path)
     images = torch.rand(4, 3, 48, 48, generator=torch.Generator().manual_seed(0))

@@ -365,6 +365,7 @@ class _Builder:
         facts: dict[str, Any] = {"method": field.method}
         if isinstance(field, CodeField):
             facts |= _code_facts([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
+            facts["unseen"] = field.unseen
         if field.segments is not None:
             facts["segments"] = field.segments.levels.shape[1]
         return facts

@@ -30,6 +30,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
         "segments": language.get("segments"),
+        "unseen": language.get("unseen"),
         "method": language.get("method"),
         "clip": config.get("clip"),
         "dino": config.get("dino")

@@ -77,6 +77,11 @@ class CodeField:
             f"CodeField({count:,} Gaussians, {kept} of {self.codebook.num_codes} codes each, {self.method!r})"
         )
 
+    @property
+    def unseen(self) -> int:
+        """Number of Gaussians that no training view shows; they have no code, and selections leave them out."""
+        return int((self.weights.sum(1) == 0).sum())
+
     def code_probabilities(self) -> Tensor:
         """The distributions as a dense array ``[N, K]``."""
         return self._dense(slice(0, self.codebook.num_codes))
