@@ -10,10 +10,10 @@ Encoders: the bundled CLIP, and the image tower of a ViT-B/16 with random weight
     share       products / forward: 1 would be an encoder that does nothing but matrix products at full speed
     crops       crops of a photo of the demo with its settings; "photo" is the time and operations of all of them
 
-``--precisions`` runs the ViT-B/16 in float32, in bfloat16 as lexsplat does (autocast) and with its weights in bfloat16,
-in 8-bit integers (torch's dynamic quantization), and in ONNX Runtime in float32 and in 8-bit integers where the
-packages ``onnx``, ``onnxscript`` and ``onnxruntime`` are installed. "cosine" is the lowest of its embeddings of bundled
-pictures with those in float32.
+``--precisions`` runs the ViT-B/16 in float32, in bfloat16 as lexsplat does (autocast) and with its weights in
+bfloat16, in 8-bit integers (torch's dynamic quantization), and in ONNX Runtime in float32 and in 8-bit integers where
+the packages ``onnx``, ``onnxscript`` and ``onnxruntime`` are installed. "cosine" is the lowest of its embeddings of
+bundled pictures with those in float32; weights are random, so it says nothing about published weights.
 
 Forward passes and products alternate; times are medians of processor time, which other programs hardly disturb.
 """
@@ -26,6 +26,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +101,7 @@ def timed(function: Callable[[], object]) -> float:
 
 
 @torch.inference_mode()
-def run_case(
-    name: str, encode: Encode, side: int, batch: int, repeats: int
-) -> dict[str, float]:
+def run_case(name: str, encode: Encode, side: int, batch: int, repeats: int) -> dict[str, float]:
     images = torch.rand(batch, 3, side, side)
     with Products() as products:
         encode(images)
@@ -172,8 +171,9 @@ def onnx_cases(model: torch.nn.Module, folder: Path, threads: int) -> Iterator[t
     for name, file in (("float32, ONNX Runtime", path), ("int8, ONNX Runtime", small)):
         session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
         given = session.get_inputs()[0].name
-        yield name, lambda images, run=session.run, key=given: torch.from_numpy(
-            run(None, {key: images.numpy()})[0]
+        yield (
+            name,
+            lambda images, run=session.run, key=given: torch.from_numpy(run(None, {key: images.numpy()})[0]),
         )
 
 
@@ -189,7 +189,7 @@ def run_precisions(threads: int, batches: list[int], repeats: int) -> list[dict[
         for batch in batches:
             images = torch.rand(batch, 3, SIDE, SIDE)
             encode(images)
-            seconds = float(np.median([timed(lambda: encode(images)) for _ in range(repeats)])) / 1e3 / batch
+            seconds = float(np.median([timed(partial(encode, images)) for _ in range(repeats)])) / 1e3 / batch
             rows.append({"precision": name, "batch": batch, "image_seconds": seconds, "cosine": cosine})
             print(f"{name:22} {batch:5} {seconds:8.3f} {cosine:8.5f}", flush=True)
     return rows
@@ -207,7 +207,10 @@ def main() -> None:
         rows = run_precisions(options.threads, options.batches, options.repeats)
         return write_record(options.json, rows, threads=options.threads)
     clip, vision, crops = load_clip("bundled"), vit_b16(), crops_of_a_photo()
-    cases = (("bundled", clip.encode_images, clip.image_size, 64), ("ViT-B/16", lambda images: vision(pixel_values=images).image_embeds, SIDE, 8))
+    cases = (
+        ("bundled", clip.encode_images, clip.image_size, 64),
+        ("ViT-B/16", lambda images: vision(pixel_values=images).image_embeds, SIDE, 8),
+    )
     print(f"{options.threads} threads, {crops} crops in a photo")
     print(
         f"{'encoder':10} {'ms/image':>9} {'GFLOP':>7} {'GFLOP/s':>8} {'products':>9} {'share':>6} {'s/photo':>8}"

@@ -47,7 +47,9 @@ def test_crops_in_bfloat16_agree_with_float32_and_texts_do_not_change(monkeypatc
     assert torch.equal(found[0][1], found[1][1])
 
 
-@pytest.mark.parametrize(("flag", "half", "chosen"), [(True, 0.3, True), (True, 0.9, False), (False, 0.3, False)])
+@pytest.mark.parametrize(
+    ("flag", "half", "chosen"), [(True, 0.3, True), (True, 0.9, False), (False, 0.3, False)]
+)
 def test_bfloat16_is_chosen_by_its_time_where_the_processor_has_instructions(flag, half, chosen, monkeypatch):
     clock = iter(np.cumsum([0.0, 1.0, 0.0, half] * 3))
     monkeypatch.setattr(pretrained, "_has_bfloat16", lambda: flag)

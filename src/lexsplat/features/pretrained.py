@@ -97,8 +97,8 @@ def _quiet_transformers() -> Iterator[None]:
 def precision(device: torch.device, *, crops: bool = False) -> AbstractContextManager:
     """Half precision where it is faster; angles between embeddings change by less than 1e-2.
 
-    Float16 on CUDA. Bfloat16 on processors where it is faster (`bfloat16_is_faster`), for many small crops only; dense
-    images gain nothing. Texts are always encoded in float32.
+    Float16 on CUDA. Bfloat16 on processors where it is faster (`bfloat16_is_faster`), for many small crops only:
+    dense images gain nothing. Texts are always encoded in float32.
     """
     if device.type == "cuda":
         return torch.autocast("cuda", dtype=torch.float16)
@@ -111,8 +111,8 @@ def precision(device: torch.device, *, crops: bool = False) -> AbstractContextMa
 def bfloat16_is_faster() -> bool:
     """Whether a layer of ViT-B/16 is faster in bfloat16 on this processor; measured once a process, in half a second.
 
-    Instructions for bfloat16 are needed, because emulation is slow, but they are not enough: ViT-B/16 takes 0.3 of the
-    time on an AMD EPYC with AVX-512 BF16, and 1.8 of it on an Intel Xeon with the same instructions.
+    Instructions for bfloat16 are needed, because emulation is slow, but they are not enough: ViT-B/16 takes 0.3 of
+    the time on an AMD EPYC with AVX-512 BF16, and 1.7 of it on an Intel Xeon with the same instructions.
     """
     if not _has_bfloat16():
         return False

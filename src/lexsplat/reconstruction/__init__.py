@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.reconstruction.few_photos import has_few_photos, points_between, warn_of_few_photos
 from lexsplat.reconstruction.forecasting import forecast
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
 from lexsplat.reconstruction.trainer import EVENT_EVERY, STAGE, Reconstructor
@@ -51,7 +52,7 @@ def reconstruct(
     """Train Gaussians on the training views of a capture.
 
     Args:
-        capture: Views, split, and initial points; missing points are triangulated.
+        capture: Views, split, and initial points; missing points are triangulated, and few photos get more points.
         config: Settings.
         device: Where to train.
         seed: Seed of the view order, of density control and of the points that replace missing ones.
@@ -70,12 +71,17 @@ def reconstruct(
 
     check_gaussians(config, device, memory)
     points = initial_points(capture, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
+    few = has_few_photos(capture)
+    if few and points.origin != "random":
+        points = points_between(capture, points, seed)
     if config.iterations >= _FORECAST_FROM:
         seconds = round(forecast(capture, config, points, device=device, memory=memory))
         length = f"{seconds // 60}:{seconds % 60:02} min"
         log.log(NOTE, "reconstruct: about %s for %s iterations", length, f"{config.iterations:,}")
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)
+    if few:
+        warn_of_few_photos(capture, trainer.gaussians())
     return trainer.gaussians()
 
 

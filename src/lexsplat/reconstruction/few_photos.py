@@ -1,0 +1,119 @@
+"""Few photos: more initial points than structure from motion finds, and how far new views can be trusted.
+
+Few photos give few points, and a short training cannot fill the places between them. Points at the depths of their
+neighbors in a photo start it close to the surfaces.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lexsplat.geometry.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from lexsplat.captures import Capture, View
+    from lexsplat.captures.sfm.triangulation import InitialPoints
+
+log = logging.getLogger("lexsplat")
+
+FEW_PHOTOS = 25
+"""Captures with at most this many training views are treated as few photos."""
+
+MOST_POINTS = 5_000
+PIXELS_A_POINT = 32
+"""Points are added for every so many pixels of the training views, at most `MOST_POINTS`. Chosen on validation views
+of three captures with 9 to 21 training views."""
+
+
+def has_few_photos(capture: Capture) -> bool:
+    """Whether a capture has so few training views that it is treated as few photos."""
+    return len(capture.train_views) <= FEW_PHOTOS
+
+
+def points_between(capture: Capture, known: InitialPoints, seed: int = 0) -> InitialPoints:
+    """The known points, and points at random pixels of the training views.
+
+    A pixel has the depth of the known point that projects nearest to it, and the color of the photo.
+
+    Args:
+        capture: The capture, at the size of the training.
+        known: Points of structure from motion.
+        seed: Seed of the pixels.
+
+    Raises:
+        CaptureError: If a photo cannot be read.
+    """
+    views, rng = capture.train_views, np.random.default_rng(seed)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    share = min(MOST_POINTS, pixels // PIXELS_A_POINT) / max(pixels, 1)
+    found = [_points_of(view, known.points, share, rng) for view in views]
+    points, colors = (
+        np.concatenate(parts).astype(np.float32) for parts in zip((known.points, known.colors), *found)
+    )
+    note = f"{known.note}, {len(points) - len(known.points):,} between them"
+    return replace(known, points=points, colors=colors, note=note)
+
+
+def _points_of(
+    view: View, known: NDArray[np.float32], share: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Points of a share of the pixels of a view ``[P, 3]``, world, and their colors ``[P, 3]``."""
+    camera = view.camera
+    size, focal = np.array([camera.width, camera.height]), np.diag(camera.K)[:2]
+    local = known @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    local = local[local[:, 2] > 1e-6]
+    places = local[:, :2] / local[:, 2:] * focal + camera.K[:2, 2]
+    inside = ((places >= 0) & (places < size)).all(1)
+    if not inside.any():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    chosen = rng.random((round(share * size.prod()), 2)) * size
+    columns, rows = chosen.astype(int).T
+    if (valid := view.load_valid()) is not None:
+        counted = valid[rows, columns]
+        chosen, columns, rows = chosen[counted], columns[counted], rows[counted]
+    depths = local[inside, 2][cKDTree(places[inside]).query(chosen)[1]]
+    rays = np.column_stack([(chosen - camera.K[:2, 2]) / focal, np.ones(len(chosen))])
+    points = (rays * depths[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return points, view.load_image()[rows, columns]
+
+
+def warn_of_few_photos(capture: Capture, gaussians: Gaussians) -> None:
+    """Log how far new views of few photos can be trusted: by the held-out photos, if there are any."""
+    told = ""
+    if capture.test_views:
+        trained, held_out = (
+            _psnr(capture, gaussians, views) for views in (capture.train_views, capture.test_views)
+        )
+        count = len(capture.test_views)
+        told = (
+            f": {count} held-out photos are rendered at {held_out:.1f} dB, trained ones at {trained:.1f} dB"
+        )
+    log.warning(
+        "%d training photos are few%s; views far from every photo are guessed, so take 30 photos or more that overlap"
+        " by 60 to 80 percent",
+        len(capture.train_views),
+        told,
+    )
+
+
+@torch.no_grad()
+def _psnr(capture: Capture, gaussians: Gaussians, views: Iterable[View]) -> float:
+    """Mean PSNR of views in dB, over the pixels that are not masked."""
+    from lexsplat.rendering import render
+
+    background = torch.tensor(capture.background, dtype=torch.float32, device=gaussians.device)
+    found = []
+    for view in views:
+        image = render(gaussians, view.camera, background=background).image.clamp(0, 1).cpu().numpy()
+        valid, errors = view.load_valid(), (image - view.load_image()) ** 2
+        found.append(-10 * np.log10(max(float((errors if valid is None else errors[valid]).mean()), 1e-10)))
+    return float(np.mean(found))

@@ -1,0 +1,101 @@
+"""Few photos: the points that are added to those of structure from motion, and the warning."""
+
+import dataclasses
+import logging
+
+import numpy as np
+import pytest
+
+from lexsplat.captures import load_capture
+from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.evaluation.metrics import psnr
+from lexsplat.reconstruction import ReconstructionConfig, few_photos, reconstruct
+from lexsplat.reconstruction.few_photos import points_between
+from lexsplat.rendering import render
+
+SHORT = ReconstructionConfig(iterations=3, sh_degree=1, max_gaussians=3_000)
+
+
+@pytest.fixture(scope="module")
+def capture(tiny_capture):
+    return load_capture(tiny_capture)
+
+
+@pytest.fixture(scope="module")
+def points(capture):
+    return initial_points(capture)
+
+
+def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_and_the_color_of_its_pixel(
+    capture, points
+):
+    name = capture.train_names[2]
+    camera, photo = capture.views[name].camera, capture.views[name].load_image()
+    found = points_between(dataclasses.replace(capture, train_names=(name,)), points)
+    known = len(points.points)
+    np.testing.assert_array_equal(found.points[:known], points.points)
+    assert len(found.points) - known == camera.width * camera.height // few_photos.PIXELS_A_POINT
+
+    def project(point):
+        x, y, depth = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+        u, v, _ = camera.K @ [x / depth, y / depth, 1]
+        return np.array([u, v]), depth
+
+    shown = [(place, depth) for place, depth in map(project, points.points.astype(np.float64)) if depth > 0]
+    shown = [
+        (place, depth)
+        for place, depth in shown
+        if 0 <= place[0] < camera.width and 0 <= place[1] < camera.height
+    ]
+    for point, color in zip(found.points[known:].astype(np.float64), found.colors[known:]):
+        place, depth = project(point)
+        distances = [np.linalg.norm(place - other) for other, _ in shown]
+        assert depth == pytest.approx(shown[int(np.argmin(distances))][1], rel=1e-4)
+        u, v = place
+        assert color == pytest.approx(photo[int(v), int(u)], abs=0.02) or min(u % 1, v % 1) < 1e-3
+
+
+def test_no_point_is_added_under_a_mask(capture, points, monkeypatch):
+    half = capture.views[capture.train_names[0]].camera.width // 2
+
+    def right_half(view, size=None):
+        valid = np.zeros((view.camera.height, view.camera.width), bool)
+        valid[:, half:] = True
+        return valid
+
+    monkeypatch.setattr(type(capture.train_views[0]), "load_valid", right_half)
+    one = dataclasses.replace(capture, train_names=capture.train_names[:1])
+    found, camera = points_between(one, points), one.train_views[0].camera
+    added = found.points[len(points.points) :]
+    local = added @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    columns = local[:, 0] / local[:, 2] * camera.K[0, 0] + camera.K[0, 2]
+    assert len(added) > 0
+    assert columns.min() > half - 1e-3
+
+
+def test_many_photos_start_from_the_known_points_alone(capture, monkeypatch, caplog):
+    def refuse(*_):
+        raise AssertionError("points were added")
+
+    monkeypatch.setattr("lexsplat.reconstruction.points_between", refuse)
+    monkeypatch.setattr(few_photos, "FEW_PHOTOS", len(capture.train_names) - 1)
+    reconstruct(capture, SHORT)
+    assert not caplog.records
+    monkeypatch.setattr(few_photos, "FEW_PHOTOS", len(capture.train_names))
+    with pytest.raises(AssertionError, match="points were added"):
+        reconstruct(capture, SHORT)
+
+
+def test_a_warning_states_how_well_held_out_photos_are_rendered(capture, caplog):
+    with caplog.at_level(logging.WARNING, logger="lexsplat"):
+        gaussians = reconstruct(capture, SHORT)
+    (record,) = caplog.records
+    found = [
+        psnr(render(gaussians, view.camera).image.clamp(0, 1).numpy(), view.load_image())
+        for view in capture.test_views
+    ]
+    assert f"{len(found)} held-out photos are rendered at {np.mean(found):.1f} dB" in record.getMessage()
+    caplog.clear()
+    reconstruct(dataclasses.replace(capture, test_names=()), SHORT)
+    assert "dB" not in caplog.text
+    assert "are few" in caplog.text
