@@ -27,14 +27,15 @@ def points(capture):
 
 
 def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_and_the_color_of_its_pixel(
-    capture, points
+    capture, points, monkeypatch
 ):
+    monkeypatch.setattr(few_photos, "PIXELS_A_POINT", 2)
     name = capture.train_names[2]
     camera, photo = capture.views[name].camera, capture.views[name].load_image()
     found = points_between(dataclasses.replace(capture, train_names=(name,)), points)
     known = len(points.points)
     np.testing.assert_array_equal(found.points[:known], points.points)
-    assert len(found.points) - known == camera.width * camera.height // few_photos.PIXELS_A_POINT
+    assert len(found.points) == camera.width * camera.height // 2
 
     def project(point):
         x, y, depth = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
@@ -56,6 +57,7 @@ def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_an
 
 
 def test_no_point_is_added_under_a_mask(capture, points, monkeypatch):
+    monkeypatch.setattr(few_photos, "PIXELS_A_POINT", 2)
     half = capture.views[capture.train_names[0]].camera.width // 2
 
     def right_half(view, size=None):
@@ -71,6 +73,11 @@ def test_no_point_is_added_under_a_mask(capture, points, monkeypatch):
     columns = local[:, 0] / local[:, 2] * camera.K[0, 0] + camera.K[0, 2]
     assert len(added) > 0
     assert columns.min() > half - 1e-3
+
+
+def test_no_point_is_added_where_there_are_enough(capture, points, monkeypatch):
+    monkeypatch.setattr(few_photos, "ENOUGH_POINTS", len(points.points))
+    np.testing.assert_array_equal(points_between(capture, points).points, points.points)
 
 
 def test_many_photos_start_from_the_known_points_alone(capture, monkeypatch, caplog):

@@ -28,10 +28,11 @@ log = logging.getLogger("lexsplat")
 FEW_PHOTOS = 25
 """Captures with at most this many training views are treated as few photos."""
 
-MOST_POINTS = 5_000
+ENOUGH_POINTS = 5_000
 PIXELS_A_POINT = 32
-"""Points are added for every so many pixels of the training views, at most `MOST_POINTS`. Chosen on validation views
-of three captures with 9 to 21 training views."""
+"""Points are added until there is one for so many pixels of the training views, and at most `ENOUGH_POINTS`. Chosen on
+validation views of three captures with 7 to 16 of them left for training: where structure from motion found 8,377
+points, 5,000 more did not help."""
 
 
 def has_few_photos(capture: Capture) -> bool:
@@ -54,7 +55,8 @@ def points_between(capture: Capture, known: InitialPoints, seed: int = 0) -> Ini
     """
     views, rng = capture.train_views, np.random.default_rng(seed)
     pixels = sum(view.camera.width * view.camera.height for view in views)
-    share = min(MOST_POINTS, pixels // PIXELS_A_POINT) / max(pixels, 1)
+    lacking = max(0, min(ENOUGH_POINTS, pixels // PIXELS_A_POINT) - len(known.points))
+    share = lacking / max(pixels, 1)
     found = [_points_of(view, known.points, share, rng) for view in views]
     points, colors = (
         np.concatenate(parts).astype(np.float32) for parts in zip((known.points, known.colors), *found)
