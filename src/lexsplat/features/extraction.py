@@ -45,7 +45,9 @@ from lexsplat.runtime.progress import Event, Listener, silent
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
 
-_CPU_BATCH = 64  # larger batches exceed the processor's cache: 256 is 10 to 15 % slower
+# Larger batches exceed the processor's cache: 256 crops of the bundled encoder take 10 to 15 % longer than 64, and 64 of
+# a ViT-B/16 take 16 % longer than 8.
+_CPU_BATCH, _CPU_PIXELS = 64, 8 * 224**2
 _LONGEST = 16  # in short sides: the maps of longer images get coarser, which bounds their memory
 _MAX_WORKERS = 4  # beyond this, more threads per operation are faster than more views at once
 
@@ -236,7 +238,9 @@ class _Extraction:
         batch_size: int,
     ) -> None:
         self.views, self.entries, self.clip, self.dino, self.config = views, entries, clip, dino, config
-        self.batch_size = min(batch_size, _CPU_BATCH) if clip.device.type == "cpu" else batch_size
+        self.batch_size = batch_size
+        if clip.device.type == "cpu":
+            self.batch_size = min(batch_size, _CPU_BATCH, max(1, _CPU_PIXELS // clip.image_size**2))
         self._todo: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._stop = threading.Event()
