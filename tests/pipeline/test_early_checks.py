@@ -55,6 +55,20 @@ def test_ground_truth_is_checked_before_structure_from_motion(photos, tmp_path):
     refused(photos, tmp_path / "out", "segmentations/9", "no view of that name")
 
 
+@pytest.mark.parametrize(
+    ("files", "told"),
+    [(None, "no such folder"), ([], "an empty folder"), (["0.png", "1.png"], "at least 3 photos")],
+)
+def test_a_missing_capture_is_told_before_an_encoder_is_fetched(files, told, tmp_path, monkeypatch):
+    source = tmp_path / "capture"
+    if files is not None:
+        source.mkdir()
+    for name in files or []:
+        save(source / name, np.zeros((60, 80, 3)))
+    monkeypatch.setattr(pipeline, "fetch_clip", lambda _: pytest.fail("fetched before"))
+    refused(source, tmp_path / "out", "capture", told)
+
+
 def test_held_out_names_are_checked_before_structure_from_motion(photos, tmp_path):
     refused(photos, tmp_path / "out", "'7'", "matches no view", test_names=["7"])
 

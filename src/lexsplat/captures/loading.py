@@ -161,6 +161,18 @@ def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:
     )
 
 
+def check_capture(path: Path) -> None:
+    """Refuse a path that holds neither cameras nor photos; cameras are not read.
+
+    Raises:
+        CaptureError: With what is there instead.
+    """
+    if path.is_file() or is_photo_folder(path):
+        return
+    if not path.is_dir() or (find_model(path) is None and find_transforms(path) is None):
+        _read_camera_files(path, None)
+
+
 def is_photo_folder(path: Path) -> bool:
     """Whether a folder holds photos but no cameras, so that cameras have to be estimated first.
 

@@ -45,8 +45,8 @@ from lexsplat.runtime.progress import Event, Listener, silent
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
 
-# Larger batches exceed the processor's cache: 256 crops of the bundled encoder take 10 to 15 % longer than 64, and 64 of
-# a ViT-B/16 take 16 % longer than 8.
+# Larger batches exceed the processor's cache: 256 crops of the bundled encoder take 10 to 15 % longer than 64, and 64
+# of a ViT-B/16 take 16 % longer than 8.
 _CPU_BATCH, _CPU_PIXELS = 64, 8 * 224**2
 _LONGEST = 16  # in short sides: the maps of longer images get coarser, which bounds their memory
 _MAX_WORKERS = 4  # beyond this, more threads per operation are faster than more views at once

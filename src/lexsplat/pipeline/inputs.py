@@ -25,8 +25,15 @@ from lexsplat.captures import (
     poses_from_photos,
 )
 from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
+from lexsplat.captures.loading import check_capture
 from lexsplat.captures.readers.video import is_video, sample_video
-from lexsplat.captures.sfm.preparation import find_photos, mask_places, photo_folder, upright_size
+from lexsplat.captures.sfm.preparation import (
+    checked_photos,
+    find_photos,
+    mask_places,
+    photo_folder,
+    upright_size,
+)
 from lexsplat.captures.splits import choose_test_names
 from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
@@ -119,7 +126,7 @@ def preview_capture(
     if not is_photo_folder(source):
         return load_capture(source, test_every=config.test_every, test_names=test_names)
     photos = photo_folder(source)
-    views = {name: _unposed_view(name, photos / name) for name in find_photos(photos, output)}
+    views = {name: _unposed_view(name, photos / name) for name in checked_photos(photos, output)}
     found = find_annotations(source)
     annotated = set() if found is None else annotated_names(*found, list(views), source / "images")
     chosen, _ = choose_test_names(
@@ -142,8 +149,10 @@ def survey_photos(
     Masks are checked by structure from motion before it searches features.
 
     Raises:
-        CaptureError: As `preview_capture`, or if ground truth belongs to no photo or does not fit it.
+        CaptureError: As `preview_capture`, if there is neither a camera nor a photo, or if ground truth belongs to no
+            photo or does not fit it.
     """
+    check_capture(source)
     if not is_photo_folder(source):
         return None
     capture = preview_capture(source, output, config, test_names)

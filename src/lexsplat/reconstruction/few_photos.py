@@ -30,8 +30,8 @@ FEW_PHOTOS = 25
 
 ENOUGH_POINTS = 5_000
 PIXELS_A_POINT = 32
-"""Points are added until there is one for so many pixels of the training views, and at most `ENOUGH_POINTS`. Chosen on
-validation views of three captures with 7 to 16 of them left for training: where structure from motion found 8,377
+"""Points are added until there is one for so many pixels of the training views, and at most `ENOUGH_POINTS`. Chosen
+on validation views of three captures with 7 to 16 of them left for training: where structure from motion found 8,377
 points, 5,000 more did not help."""
 
 

@@ -128,7 +128,7 @@ def prepare_photos(
             the output lies among the photos.
         MemoryBudgetError: If a photo is too large for ``memory``.
     """
-    names = _checked_names(folder, output)
+    names = checked_photos(folder, output)
     largest = max((image_size(folder / name) for name in names), key=lambda size: size[0] * size[1])
     budget.check_photo(largest, memory)
     photos = [_look_at(folder, name) for name in names]
@@ -158,7 +158,12 @@ def prepare_photos(
     return PreparedPhotos(images, tuple(sorted(renamed.values())), lenses, masks, largest, tuple(notes))
 
 
-def _checked_names(folder: Path, output: Path) -> list[str]:
+def checked_photos(folder: Path, output: Path) -> list[str]:
+    """The names of `find_photos`.
+
+    Raises:
+        CaptureError: If they are fewer than three, or camera files cannot hold one of them.
+    """
     if not folder.is_dir():
         raise CaptureError(
             folder, expected="a folder of photos", found="no such folder", remedy="check the path"
