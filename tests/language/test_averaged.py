@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch.nn.functional import normalize
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap
 from lexsplat.language.fields import CodeField
+from lexsplat.language.methods import METHODS
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
     MeanFeatures,
@@ -21,6 +23,9 @@ from lexsplat.language.methods.averaged import (
     features_of_codes,
     field_from_means,
 )
+from lexsplat.language.methods.method import FitRun, TrainingViews
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.runtime.errors import MemoryBudgetError
 from lexsplat.runtime.memory import parse_bytes
 
@@ -206,6 +211,24 @@ def test_a_gaussian_that_no_view_shows_has_no_language(balls) -> None:
     silent = field_from_means(none, CODES, AveragedConfig())
     assert silent.codebook.num_codes == 1
     assert float(silent.weights.sum()) == 0
+
+
+def test_what_counts_as_unseen_has_no_mass_in_its_segment_and_so_is_hidden(balls) -> None:
+    maps = features_of_codes(balls.code_maps, balls.codebook)
+    totals = average_features(balls.gaussians, balls.cameras, maps, AveragedConfig()).totals
+    limit = float(totals.quantile(0.2))
+    views = {
+        name: SimpleNamespace(camera=camera, load_valid=lambda size: None)
+        for name, camera in balls.cameras.items()
+    }
+    config = BuildConfig(codebook=CODES, averaged=AveragedConfig(min_visibility=limit))
+    field = METHODS["averaged"].fit(balls.gaussians, TrainingViews(views, features=maps), config, FitRun())
+    unseen = field.weights.sum(1) == 0
+    assert torch.equal(unseen, totals < limit)
+    assert torch.equal(field.segments.masses == 0, unseen)
+    assert hidden_gaussians(balls.gaussians, list(balls.cameras.values()), field.segments.masses)[
+        unseen
+    ].all()
 
 
 def _codes_of(centers: np.ndarray, own: np.ndarray, unit: np.ndarray, field: CodeField) -> bool:

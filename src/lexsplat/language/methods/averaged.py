@@ -167,7 +167,8 @@ class Averaged:
         )
         if config.averaged.segments:
             run.listener(Event("segments", 0, 1))
-            field.segments = make_segments(gaussians, found.rows, found.totals)
+            shown = found.totals * found.visible(config.averaged)  # selections leave out what has no mass
+            field.segments = make_segments(gaussians, found.rows, shown)
             run.listener(Event("segments", 1, 1))
         return field
 
