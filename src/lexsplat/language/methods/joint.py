@@ -1,7 +1,7 @@
-"""Language trained together with geometry from the first step, as in the authors' released code.
+"""Language trained together with geometry from the first step, as in the paper (Fig. 2, section 4) and its code.
 
-The paper trains language on finished geometry, which is the default here. In joint training every geometry step on a
-view is followed by a language step on the same view. The geometry is detached in both. When density control copies,
+By default language is trained on finished geometry. In joint training every geometry step on a view is followed by a
+language step on the same view. The geometry is detached in both. When density control copies,
 splits or removes a Gaussian, its language is copied or removed with it.
 """
 
