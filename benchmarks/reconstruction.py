@@ -28,7 +28,7 @@ from lexsplat.evaluation.demo import demo_capture
 from lexsplat.evaluation.metrics import psnr, ssim
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.reconstruction.few_photos import dropout_of, has_few_photos, points_between
+from lexsplat.reconstruction.few_photos import has_few_photos, points_between
 from lexsplat.rendering import render
 
 VALIDATION_EVERY = 6
@@ -107,7 +107,7 @@ def measured(
     scene: Capture, config: ReconstructionConfig, points: InitialPoints, seed: int, device: str
 ) -> dict[str, Any]:
     """Train once and measure the held-out views at the working size."""
-    trainer = Reconstructor(scene, config, points, device=device, seed=seed, dropout=dropout_of(scene))
+    trainer = Reconstructor(scene, config, points, device=device, seed=seed)
     start = time.process_time()
     trainer.run()
     seconds = time.process_time() - start

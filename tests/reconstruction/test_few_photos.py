@@ -5,12 +5,11 @@ import logging
 
 import numpy as np
 import pytest
-import torch
 
 from lexsplat.captures import load_capture
 from lexsplat.captures.sfm.triangulation import initial_points
 from lexsplat.evaluation.metrics import psnr
-from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, few_photos, reconstruct
+from lexsplat.reconstruction import ReconstructionConfig, few_photos, reconstruct
 from lexsplat.reconstruction.few_photos import points_between
 from lexsplat.rendering import render
 
@@ -79,38 +78,6 @@ def test_no_point_is_added_under_a_mask(capture, points, monkeypatch):
 def test_no_point_is_added_where_there_are_enough(capture, points, monkeypatch):
     monkeypatch.setattr(few_photos, "ENOUGH_POINTS", len(points.points))
     np.testing.assert_array_equal(points_between(capture, points).points, points.points)
-
-
-def test_dropout_leaves_a_rising_share_out_of_a_step_and_keeps_the_expected_opacity(capture, points):
-    trainer = Reconstructor(capture, dataclasses.replace(SHORT, iterations=4), points, dropout=0.4)
-    whole = trainer.gaussians().opacities
-    torch.testing.assert_close(trainer._some_gaussians().opacities, whole)
-    trainer.steps_done = 2
-    found = torch.stack([trainer._some_gaussians().opacities.detach() for _ in range(60)])
-    left_out = found < 1e-5
-    assert left_out.float().mean() == pytest.approx(0.2, abs=0.01)
-    torch.testing.assert_close(found[~left_out], (whole / 0.8).expand_as(found)[~left_out])
-    assert found.mean() == pytest.approx(float(whole.mean()), rel=0.02)
-
-
-def test_a_resumed_training_with_dropout_equals_an_uninterrupted_one(capture, points):
-    def trainer():
-        return Reconstructor(capture, SHORT, points, dropout=0.5)
-
-    whole, first, second = trainer(), trainer(), trainer()
-    whole.run()
-    first.step()
-    first.step()
-    second.load_state_dict(first.state_dict())
-    second.run()
-    for name, tensor in whole.gaussians().tensors().items():
-        assert torch.equal(tensor, second.gaussians().tensors()[name]), name
-
-
-@pytest.mark.parametrize(("views", "dropout"), [(0, 0.2), (1, 0.0)])
-def test_only_very_few_photos_are_trained_with_dropout(views, dropout, capture, monkeypatch):
-    monkeypatch.setattr(few_photos, "VERY_FEW_PHOTOS", len(capture.train_names) - views)
-    assert few_photos.dropout_of(capture) == dropout
 
 
 def test_many_photos_start_from_the_known_points_alone(capture, monkeypatch, caplog):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.reconstruction.few_photos import dropout_of, has_few_photos, points_between, warn_of_few_photos
+from lexsplat.reconstruction.few_photos import has_few_photos, points_between, warn_of_few_photos
 from lexsplat.reconstruction.forecasting import forecast
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
 from lexsplat.reconstruction.trainer import EVENT_EVERY, STAGE, Reconstructor
@@ -78,8 +78,7 @@ def reconstruct(
         seconds = round(forecast(capture, config, points, device=device, memory=memory))
         length = f"{seconds // 60}:{seconds % 60:02} min"
         log.log(NOTE, "reconstruct: about %s for %s iterations", length, f"{config.iterations:,}")
-    dropout = dropout_of(capture)
-    trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory, dropout=dropout)
+    trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)
     if few:
         warn_of_few_photos(capture, trainer.gaussians())

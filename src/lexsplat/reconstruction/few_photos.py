@@ -35,16 +35,6 @@ on validation views of three captures with 7 to 16 of them left for training: wh
 points, 5,000 more did not help."""
 
 
-VERY_FEW_PHOTOS, DROPOUT = 12, 0.2
-"""With at most so many training views, steps leave out a share of the Gaussians (as in DropGaussian, CVPR 2025). On
-validation views this helped with 7 and 9 training views, and not with 16."""
-
-
-def dropout_of(capture: Capture) -> float:
-    """The dropout with which a capture is trained (`Reconstructor`)."""
-    return DROPOUT if len(capture.train_views) <= VERY_FEW_PHOTOS else 0.0
-
-
 def has_few_photos(capture: Capture) -> bool:
     """Whether a capture has so few training views that it is treated as few photos."""
     return len(capture.train_views) <= FEW_PHOTOS

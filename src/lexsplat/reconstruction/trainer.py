@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -50,8 +49,6 @@ class Reconstructor:
         seed: Seed of the view order and of density control.
         memory: Total budget in bytes. Cached photos take a quarter of it, at most 1 GiB; the budget does not
             affect the result.
-        dropout: Share of the Gaussians that a step leaves out at random; it rises from 0 to this over the training.
-            The others become as much more opaque, so that the expected opacity stays.
 
     Raises:
         TrainingError: If there is no training view or no point.
@@ -68,14 +65,12 @@ class Reconstructor:
         device: torch.device | str = "cpu",
         seed: int = 0,
         memory: int = DEFAULT_MEMORY,
-        dropout: float = 0.0,
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
         self.config = config
         self.device = torch.device(device)
         self.steps_done = 0
-        self._dropout = dropout
         self._photo_bytes = min(PHOTO_BYTES_MAX, memory // 4)
         self._views = {view.name: view for view in capture.train_views}
         self._names = sorted(self._views)
@@ -168,7 +163,7 @@ class Reconstructor:
         camera = images.camera(self._names[index])
         target = images.target(self._names[index])
         rendering = render(
-            self._some_gaussians(), camera, sh_degree=self._active_sh_degree(), background=self._background
+            self._as_gaussians(), camera, sh_degree=self._active_sh_degree(), background=self._background
         )
         image = rendering.image
         if self._exposures is not None:
@@ -297,16 +292,6 @@ class Reconstructor:
 
     def _as_gaussians(self) -> Gaussians:
         return Gaussians(**self._parameters, antialiased=self.config.antialiased)
-
-    def _some_gaussians(self) -> Gaussians:
-        """The Gaussians of a step: all of them, or with dropout all but a random share."""
-        gaussians = self._as_gaussians()
-        share = self._dropout * self.steps_done / self.config.iterations
-        if share == 0:
-            return gaussians
-        kept = (torch.rand(len(gaussians), generator=self._generator) >= share).to(self.device)
-        opacities = gaussians.opacities * kept / (1 - share)
-        return replace(gaussians, opacity_logits=opacities.clamp(1e-6, 0.999).logit())
 
     def _active_sh_degree(self) -> int:
         every = self.config.sh_degree_every * self.config.iterations / REFERENCE_ITERATIONS
