@@ -1,6 +1,10 @@
-"""Reconstruct a capture in one piece or in blocks: PSNR of held-out views, Gaussians, peak memory, seconds.
+"""Reconstruct a capture in one piece or in blocks: PSNR of held-out views, Gaussians, memory, processor seconds.
 
-python benchmarks/blocks.py CAPTURE --blocks 4 --iterations 600 --max-gaussians 8000
+python tools/demo_scene/street.py output/street
+python benchmarks/blocks.py output/street --blocks 9 --iterations 2560 --max-gaussians 12000 --save output/nine.ply
+
+The memory is the peak of the process less what it has after a tiny reconstruction, that is, without libraries and
+compiled kernels. ``--pictures FOLDER`` writes photo and rendering, side by side, of held-out views that show a seam.
 """
 
 from __future__ import annotations
@@ -11,17 +15,29 @@ import resource
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
 
-from lexsplat.captures import load_capture
-from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.captures import Capture, View, load_capture
+from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
-from lexsplat.reconstruction import ReconstructionConfig, reconstruct
-from lexsplat.reconstruction.blocks import BlockRun, reconstruct_blocks
+from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
+from lexsplat.reconstruction.blocks import (
+    Block,
+    BlockRun,
+    cut_blocks,
+    ground_axes,
+    places_in_image,
+    reconstruct_blocks,
+)
 from lexsplat.rendering import render
+from lexsplat.scenes.formats.ply import write_ply
 
 
 def main() -> None:
@@ -31,34 +47,74 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=600)
     parser.add_argument("--max-gaussians", type=int, default=8000)
     parser.add_argument("--downscale", type=float, default=1.0)
+    parser.add_argument("--points", type=Path, help="folder that keeps triangulated points for the next call")
+    parser.add_argument("--save", type=Path, help="PLY file of the result")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of seams")
     given = parser.parse_args()
     capture = load_capture(given.capture, test_every=8).downscaled(given.downscale)
     config = ReconstructionConfig(iterations=given.iterations, max_gaussians=given.max_gaussians)
+    points = initial_points(capture, cache_dir=given.points)
+    Reconstructor(capture, replace(config, iterations=10, max_gaussians=100), points).run()
     before, start, cpu = _peak(), time.perf_counter(), time.process_time()
+    result: dict[str, object] = {"blocks": given.blocks, "points": len(points.points)}
     if given.blocks == 1:
-        gaussians = reconstruct(capture, config)
+        trainer = Reconstructor(capture, config, points)
+        trainer.run()
+        gaussians = trainer.gaussians()
     else:
         up = World.of_cameras(view.camera for view in capture.train_views).up
-        points = initial_points(capture)
+        blocks = cut_blocks(capture, points.points, ground_axes(up), given.blocks)
+        result |= _work_of(capture, blocks)
         with tempfile.TemporaryDirectory() as folder:
             run = BlockRun("cpu", 0, 4 << 30, Path(folder), "benchmark")
             gaussians = reconstruct_blocks(capture, config, points, up, given.blocks, run)
-    result = {
-        "blocks": given.blocks,
+    result |= {
         "gaussians": len(gaussians),
         "seconds": round(time.perf_counter() - start, 1),
         "cpu_seconds": round(time.process_time() - cpu, 1),
         "peak_mb": _peak() >> 20,
         "peak_above_start_mb": (_peak() - before) >> 20,
     }
-    errors = []
-    for view in capture.test_views:
-        with torch.no_grad():
-            image = render(gaussians, view.camera).image.clamp(0, 1).numpy()
-        errors.append(float(np.mean((image - view.load_image()) ** 2)))
-    result["psnr"] = round(float(np.mean([-10 * np.log10(error) for error in errors])), 2)
+    result["psnr"] = round(float(np.mean([_psnr(gaussians, view) for view in capture.test_views])), 2)
+    if given.save is not None:
+        given.save.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(gaussians, given.save)
+    if given.pictures is not None:
+        given.pictures.mkdir(parents=True, exist_ok=True)
+        for view in _views_of_seams(capture, points, max(9, given.blocks)):
+            pair = np.concatenate([view.load_image(), _image(gaussians, view)], 1)
+            Image.fromarray(np.round(255 * pair).astype(np.uint8)).save(given.pictures / f"{view.stem}.png")
     json.dump(result, sys.stdout)
     print()
+
+
+def _image(gaussians: Gaussians, view: View) -> NDArray[np.float32]:
+    with torch.no_grad():
+        return render(gaussians, view.camera).image.clamp(0, 1).numpy()
+
+
+def _psnr(gaussians: Gaussians, view: View) -> float:
+    return -10 * float(np.log10(np.mean((_image(gaussians, view) - view.load_image()) ** 2)))
+
+
+def _work_of(capture: Capture, blocks: list[Block]) -> dict[str, float]:
+    """Iterations and pixels of all blocks together, in those of one piece."""
+    areas = [(r - left) * (b - top) for block in blocks for left, top, r, b in block.windows.values()]
+    views = len(capture.train_names)
+    return {"iterations_share": round(len(areas) / views, 2), "pixels_share": round(sum(areas) / views, 2)}
+
+
+def _views_of_seams(capture: Capture, points: InitialPoints, count: int, views: int = 4) -> list[View]:
+    """The held-out views in which the points of two cells are most nearly equal in number."""
+    axes = ground_axes(World.of_cameras(view.camera for view in capture.train_views).up)
+    cells = cut_blocks(capture, points.points, axes, count)
+    cell = np.argmax([block.holds(points.points @ axes.T) for block in cells], 0)
+
+    def second(view: View) -> int:
+        shown, _ = places_in_image(view, points.points)
+        return int(np.sort(np.bincount(cell[shown], minlength=count))[-2])
+
+    return sorted(capture.test_views, key=second)[-views:]
 
 
 def _peak() -> int:

@@ -1,6 +1,9 @@
 """Blocks: cut on the ground plane with the views that see them, reconstructed apart, merged by their cells."""
 
 import dataclasses
+import json
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -75,9 +78,9 @@ def test_a_block_of_a_street_has_the_views_in_front_of_it_and_few_points_of_the_
     for block in cut_blocks(made, places, axes, 4):
         own = places[block.holds(places @ axes.T)][:, 0]
         near = {name for name in made.views if own.min() <= float(name) <= own.max()}
-        assert near <= set(block.names)
+        assert near <= set(block.windows)
         # A view shows three meters to either side; the margin is 1.5 m.
-        assert all(own.min() - 5 < float(name) < own.max() + 5 for name in block.names)
+        assert all(own.min() - 5 < float(name) < own.max() + 5 for name in block.windows)
         assert len(block.chosen) < 0.7 * len(places)
 
 
@@ -153,3 +156,32 @@ def test_build_with_blocks_makes_a_scene_and_repeats_nothing(tiny_capture, tmp_p
     before = folder.gaussians_path.stat().st_mtime_ns
     assert cli.main(arguments) == 0
     assert folder.gaussians_path.stat().st_mtime_ns == before
+
+
+def rolled(capture, folder):
+    """The photos with cameras that are turned about their viewing axes, so that no direction is up."""
+    turn = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    frames = []
+    for number, view in enumerate(capture.views.values()):
+        pose = np.linalg.inv(np.linalg.matrix_power(turn, number % 4) @ view.camera.viewmat)
+        matrix = (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+        frames.append({"file_path": f"images/{view.name}", "transform_matrix": matrix})
+    shutil.copytree(capture.root / "images", folder / "images")
+    (folder / "transforms.json").write_text(json.dumps({"w": 96, "h": 72, "fl_x": 105.6, "frames": frames}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        ("200", r"error: block \d+ of 200: expected points, .*; give a smaller --blocks"),
+        ("2", r"error: --blocks: expected a ground plane, .*; give --up X,Y,Z or --blocks none"),
+    ],
+)
+def test_a_command_tells_in_one_line_why_it_cannot_cut(count, message, capture, tmp_path, capsys):
+    source = capture.root if count == "200" else rolled(capture, tmp_path / "rolled")
+    arguments = ["reconstruct", str(source), "--output", str(tmp_path / "scene"), *QUICK_BUILD]
+    assert cli.main([*arguments, "--blocks", count]) == 1
+    errors = [line for line in capsys.readouterr().err.splitlines() if "error: " in line]
+    assert len(errors) == 1
+    assert re.fullmatch(message, errors[0])

@@ -94,6 +94,14 @@ def test_nodes_with_another_version_or_none_or_without_the_capture_are_refused()
             ray_workers._check_probe("a", *answer)
 
 
+def test_another_version_of_ray_is_told_with_the_remedy():
+    found = RuntimeError("Version mismatch: The cluster was started with:\n Ray: 2.9.0 Python: 3.11.7")
+    assert str(ray_workers._unreachable("head:6379", found)) == (
+        "Ray at head:6379: expected the same version, found Version mismatch: The cluster was started with: "
+        "Ray: 2.9.0 Python: 3.11.7; use the same versions of Ray and Python on every machine"
+    )
+
+
 @pytest.mark.slow
 def test_two_nodes_give_the_bits_of_this_process_in_order(on_ray):
     np.testing.assert_array_equal(total(on_ray), total(IN_PROCESS))

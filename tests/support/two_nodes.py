@@ -18,15 +18,19 @@ class TwoNodes:
 
     Args:
         nodes: Number of nodes beside the head.
+        client_port: Port for ``ray://``; 0 leaves it closed.
     """
 
-    def __init__(self, nodes: int = 2) -> None:
+    def __init__(self, nodes: int = 2, client_port: int = 0) -> None:
         from ray.cluster_utils import Cluster
 
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))  # workers read the tasks of this file
         head = {"num_cpus": 0, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+        if client_port:
+            head["ray_client_server_port"] = client_port
+        self.client_port = client_port
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes = [self.add() for _ in range(nodes)]
 

@@ -1,13 +1,14 @@
 """Reconstruction by blocks, for captures whose Gaussians do not fit into the memory of one reconstruction.
 
 As in VastGaussian and CityGaussian, the ground plane is cut into cells with equal numbers of points. A block is a
-cell with a margin, the views that see it, and a thinned rest of the points, which explains what these views show of
-other cells. Each block is reconstructed alone. Of each result only the Gaussians inside the cell are kept.
+cell with a margin, the parts of the views that show it, and a thinned rest of the points, which explains what these
+show of other cells. Each block is reconstructed alone. Of each result only the Gaussians inside the cell are kept.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,12 +32,17 @@ from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, r
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
     from lexsplat.captures.sfm.triangulation import InitialPoints
+    from lexsplat.reconstruction.photos import Window
 
 SHARE_OUTSIDE = 2.0
 """Gaussians that a block may have, in those that its cell keeps: the others explain what lies outside of the cell."""
 
 _MARGIN = 0.15
 _SEEN_SHARE = 0.15
+_WINDOW_MARGIN = 0.06
+"""What is added to the part of a view that shows the points of a block, as a share of its sides."""
+_STRAY = 0.005
+"""Share of the points at each side of that part that do not count."""
 _FEWEST_VIEWS = 3
 _MOST_BLOCKS = 1024
 
@@ -48,13 +54,13 @@ class Block:
     Args:
         low: Lower ends of the cell ``[2]`` on the ground plane; -inf at the border of the capture.
         high: Upper ends ``[2]``; inf at the border.
-        names: Training views that see it.
+        windows: The parts of the training views that show it, by name.
         chosen: Indices of its initial points ``[P']``.
     """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    names: tuple[str, ...]
+    windows: Mapping[str, Window]
     chosen: NDArray[np.int64]
 
     def holds(
@@ -146,29 +152,29 @@ def cut_blocks(
     ground = points @ axes.T
     cells: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     _cut(ground, np.full(2, -np.inf), np.full(2, np.inf), count, cells)
-    seen = {view.name: _points_in_image(view, points) for view in capture.train_views}
+    seen = {view.name: places_in_image(view, points) for view in capture.train_views}
     blocks = []
     for number, (low, high) in enumerate(cells, start=1):
-        cell = Block(low, high, (), np.zeros(0, np.int64))
+        cell = Block(low, high, {}, np.zeros(0, np.int64))
         own = ground[cell.holds(ground)]
-        margin = _MARGIN * (np.ptp(own, axis=0) if len(own) else np.zeros(2))
+        margin = _MARGIN * _sides(own)
         inside = cell.holds(ground, margin)
-        names = tuple(
-            name
-            for name, shown in seen.items()
-            if (shown & inside).sum() >= _SEEN_SHARE * max(1, shown.sum())
-        )
-        if len(names) < _FEWEST_VIEWS or not len(own):
+        windows = {
+            name: _window(places[inside[shown]])
+            for name, (shown, places) in seen.items()
+            if inside[shown].sum() >= _SEEN_SHARE * max(1, len(shown))
+        }
+        if len(windows) < _FEWEST_VIEWS or not len(own):
             raise CaptureError(
                 f"block {number} of {count}",
                 expected=f"points, and at least {_FEWEST_VIEWS} views that show them",
-                found=f"{len(own):,} points and {len(names)} views",
+                found=f"{len(own):,} points and {len(windows)} views",
                 remedy="give a smaller --blocks",
             )
         outside = np.flatnonzero(~inside)
         thinned = outside[:: max(1, len(outside) // max(1, int(inside.sum())))]
         chosen = np.sort(np.concatenate([np.flatnonzero(inside), thinned]))
-        blocks.append(Block(low, high, names, chosen))
+        blocks.append(Block(low, high, windows, chosen))
     return blocks
 
 
@@ -183,11 +189,7 @@ def _cut(
     if count == 1:
         cells.append((low, high))
         return
-    if len(ground) < 2:
-        sides = np.zeros(2)
-    else:  # stray points far away do not decide which side is longer
-        sides = np.diff(np.quantile(ground, [0.02, 0.98], axis=0), axis=0)[0]
-    axis, first = int(sides.argmax()), count // 2
+    axis, first = int(_sides(ground).argmax()), count // 2
     at = float(np.quantile(ground[:, axis], first / count)) if len(ground) else 0.0
     middle_high, middle_low = high.copy(), low.copy()
     middle_high[axis] = middle_low[axis] = at
@@ -196,13 +198,30 @@ def _cut(
     _cut(ground[~below], middle_low, high, count - first, cells)
 
 
-def _points_in_image(view: View, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which points ``[P]`` fall into the image of a view."""
+def _sides(ground: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Extent ``[2]`` of places ``[N, 2]`` without the stray ones far away."""
+    if len(ground) < 2:
+        return np.zeros(2)
+    return np.ptp(np.quantile(ground, [0.02, 0.98], axis=0), axis=0)
+
+
+def places_in_image(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Indices ``[S]`` of the points in the image of a view, and where they are ``[S, 2]``, in shares of its sides."""
     camera = view.camera
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     depth = np.maximum(local[:, 2:], 1e-9)
-    x, y = (local[:, :2] / depth * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]).T
-    return (local[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    places = local[:, :2] / depth * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]
+    places /= camera.width, camera.height
+    shown = np.flatnonzero((local[:, 2] > 0) & ((places >= 0) & (places < 1)).all(1))
+    return shown, places[shown]
+
+
+def _window(places: NDArray[np.float64]) -> Window:
+    """The part of an image that shows points at ``places`` ``[S, 2]``, with a margin."""
+    low, high = np.quantile(places, [_STRAY, 1 - _STRAY], axis=0)
+    left, top = np.maximum(0.0, low - _WINDOW_MARGIN)
+    right, bottom = np.minimum(1.0, high + _WINDOW_MARGIN)
+    return float(left), float(top), float(right), float(bottom)
 
 
 @dataclass(frozen=True)
@@ -284,13 +303,13 @@ def _reconstruct_block(shared: _Shared, block: Block) -> Gaussians:
 def _train_block(shared: _Shared, block: Block, path: Path) -> Gaussians:
     """Train a block on its views, as often a view as in the whole, and keep what lies in its cell."""
     run, views, points = shared.run, shared.capture.views, shared.points
-    part = replace(
-        shared.capture, views={n: views[n] for n in block.names}, train_names=block.names, test_names=()
-    )
-    share = len(block.names) / len(shared.capture.train_names)
+    names = tuple(block.windows)
+    part = replace(shared.capture, views={n: views[n] for n in names}, train_names=names, test_names=())
+    share = len(names) / len(shared.capture.train_names)
     config = replace(shared.config, iterations=max(1, round(share * shared.config.iterations)))
     start = replace(points, points=points.points[block.chosen], colors=points.colors[block.chosen])
-    trainer = Reconstructor(part, config, start, device=run.device, seed=run.seed, memory=run.memory)
+    options = {"device": run.device, "seed": run.seed, "memory": run.memory}
+    trainer = Reconstructor(part, config, start, windows=block.windows, **options)
     checkpoint = None
     if shared.folder.is_visible:
         checkpoint = Checkpoint(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,7 +28,7 @@ from lexsplat.runtime.training import run_training
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
-    from lexsplat.reconstruction.photos import TrainingImages
+    from lexsplat.reconstruction.photos import TrainingImages, Window
     from lexsplat.runtime.training import Checkpoint
 
 STAGE = "reconstruct"
@@ -49,6 +50,8 @@ class Reconstructor:
         seed: Seed of the view order and of density control.
         memory: Total budget in bytes. Cached photos take a quarter of it, at most 1 GiB; the budget does not
             affect the result.
+        windows: Parts of views that are trained on, as if the other pixels were masked; views that are not named
+            are trained on as a whole.
 
     Raises:
         TrainingError: If there is no training view or no point.
@@ -65,8 +68,10 @@ class Reconstructor:
         device: torch.device | str = "cpu",
         seed: int = 0,
         memory: int = DEFAULT_MEMORY,
+        windows: Mapping[str, Window] | None = None,
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
+        from lexsplat.reconstruction.photos import cropped
 
         self.config = config
         self.device = torch.device(device)
@@ -74,7 +79,11 @@ class Reconstructor:
         self._photo_bytes = min(PHOTO_BYTES_MAX, memory // 4)
         self._views = {view.name: view for view in capture.train_views}
         self._names = sorted(self._views)
+        self._windows = windows or {}
         halves = [view.camera.downscaled(2.0) for view in self._views.values()]
+        halves += [
+            cropped(self._views[name].camera.downscaled(2.0), self._windows[name]) for name in self._windows
+        ]
         self._can_shrink = all(min(half.width, half.height) >= SMALLEST_SIDE for half in halves)
         if not self._names:
             raise TrainingError(
@@ -160,18 +169,19 @@ class Reconstructor:
 
         index = self._next_view()
         images = self._training_images()
-        camera = images.camera(self._names[index])
-        target = images.target(self._names[index])
+        name = self._names[index]
+        camera, target = images.camera(name), images.target(name)
         rendering = render(
             self._as_gaussians(), camera, sh_degree=self._active_sh_degree(), background=self._background
         )
         image = rendering.image
         if self._exposures is not None:
             image = self._exposures.apply(image, index)
-        valid = images.valid(self._names[index])
+        valid = images.valid(name)
         if valid is not None:
             image = torch.where(valid[..., None], image, target.image)
-        loss = photometric_loss(image, target, self.config.ssim_weight) + self._regularization()
+        loss = photometric_loss(image, target, self.config.ssim_weight)
+        loss = images.share(name) * loss + self._regularization()
         loss.backward()
         value = loss.item() if self.reads_loss(self.steps_done + 1) else 0.0
         if not math.isfinite(value):
@@ -183,8 +193,8 @@ class Reconstructor:
             )
         self._update_errors(image, target.image)
         self._optimize()
-        self._control_density(rendering.means2d, rendering.radii, (camera.width, camera.height))
-        self.last_view = self._names[index]
+        self._control_density(rendering.means2d, rendering.radii, images.whole_size(name))
+        self.last_view = name
         if len(self._parameters["means"]) == 0:
             raise TrainingError(
                 "reconstruction",
@@ -316,7 +326,11 @@ class Reconstructor:
         shrink = 2.0 if self.steps_done < self.config.warm_up_iterations and self._can_shrink else 1.0
         if self._images is None or shrink != self._images_shrink:
             self._images = TrainingImages(
-                self._views.values(), memory=self._photo_bytes, shrink=shrink, device=self.device
+                self._views.values(),
+                memory=self._photo_bytes,
+                shrink=shrink,
+                device=self.device,
+                windows=self._windows,
             )
             self._images_shrink = shrink
         return self._images

@@ -284,6 +284,9 @@ def _unreachable(place: str, error: Exception) -> WorkersError:
     if "ersion mismatch" in reason:
         remedy = "use the same versions of Ray and Python on every machine"
         return WorkersError(f"Ray at {place}", expected="the same version", found=reason, remedy=remedy)
+    if "ray[client]" in reason:
+        remedy = "pip install 'lexsplat[cluster]'"
+        return WorkersError(place, expected="the client of Ray", found="no package grpcio", remedy=remedy)
     return WorkersError(
         f"Ray at {place}",
         expected="a running cluster",
