@@ -99,8 +99,8 @@ class DensityControl:
             parameters: The parameters by the names of `Gaussians`, and any other of the same length.
             optimizers: One optimizer per parameter, each with one group.
             step: Number of steps before this one.
-            means2d: Projected centers ``[N, 2]`` in pixels with their ``grad``.
-            radii: Size on screen ``[N]`` in pixels; 0 where not drawn.
+            means2d: Projected centers ``[N, 2]`` or, of C views, ``[C, N, 2]`` in pixels with their ``grad``.
+            radii: Size on screen ``[N]`` or ``[C, N]`` in pixels; 0 where not drawn.
             image_size: Width and height of the rendered image.
             means_learning_rate: Present learning rate of the means; scales the noise of "mcmc".
 
@@ -121,8 +121,9 @@ class DensityControl:
                 self._accumulate(means2d, radii, image_size)
                 if changed:
                     # gsplat accumulates and refines in one call; shown no visible Gaussian, it only refines.
-                    self._strategy.grow_grad2d = self._threshold_within_cap(len(means2d))
-                    nothing = _nothing_visible(len(means2d), self._device)
+                    count = radii.shape[-1]
+                    self._strategy.grow_grad2d = self._threshold_within_cap(count)
+                    nothing = _nothing_visible(count, self._device)
                     self._strategy.step_post_backward(*subjects, self._state, step, nothing)
                 if self.config.resets_opacities and step > 0 and step % self.schedule.reset_every == 0:
                     from gsplat.strategy import ops
@@ -136,12 +137,14 @@ class DensityControl:
         if means2d.grad is None:
             raise ValueError("means2d must have a gradient: run density control after the backward pass")
         if self._state["grad2d"] is None:
-            self._state["grad2d"] = torch.zeros(len(radii), device=self._device)
-            self._state["count"] = torch.zeros(len(radii), device=self._device)
-        visible = radii > 0
-        x, y = (means2d.grad[:, axis] * (image_size[axis] / 2) for axis in (0, 1))
-        self._state["grad2d"] += (x * x + y * y).sqrt_() * visible
-        self._state["count"] += visible
+            self._state["grad2d"] = torch.zeros(radii.shape[-1], device=self._device)
+            self._state["count"] = torch.zeros(radii.shape[-1], device=self._device)
+        for gradients, visible in zip(
+            means2d.grad.view(-1, *means2d.shape[-2:]), radii.view(-1, radii.shape[-1]) > 0
+        ):
+            x, y = (gradients[:, axis] * (image_size[axis] / 2) for axis in (0, 1))
+            self._state["grad2d"] += (x * x + y * y).sqrt_() * visible
+            self._state["count"] += visible
 
     def refines_at(self, step: int) -> bool:
         """Whether `step` changes the set of Gaussians after ``step`` finished steps."""

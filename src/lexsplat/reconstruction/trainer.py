@@ -28,7 +28,9 @@ from lexsplat.runtime.training import run_training
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
+    from lexsplat.geometry.cameras import Camera
     from lexsplat.reconstruction.photos import TrainingImages, Window
+    from lexsplat.rendering import Rendering
     from lexsplat.runtime.training import Checkpoint
 
 STAGE = "reconstruct"
@@ -165,15 +167,12 @@ class Reconstructor:
             TrainingError: If the loss is not finite, the images diverge, or no Gaussian is left.
         """
         from lexsplat.reconstruction.image_losses import photometric_loss
-        from lexsplat.rendering import render
 
         index = self._next_view()
         images = self._training_images()
         name = self._names[index]
         camera, target = images.camera(name), images.target(name)
-        rendering = render(
-            self._as_gaussians(), camera, sh_degree=self._active_sh_degree(), background=self._background
-        )
+        rendering = self._render(self._as_gaussians(), camera)
         image = rendering.image
         if self._exposures is not None:
             image = self._exposures.apply(image, index)
@@ -204,6 +203,11 @@ class Reconstructor:
             )
         self.steps_done += 1
         return value
+
+    def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
+        from lexsplat.rendering import render
+
+        return render(gaussians, camera, sh_degree=self._active_sh_degree(), background=self._background)
 
     def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
         """Run density control and record the origins of the Gaussians if they are tracked.

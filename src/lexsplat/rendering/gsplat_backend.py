@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering.results import Projection
+from lexsplat.rendering.results import Projection, Rendering
 from lexsplat.runtime.errors import BackendError
 
 TILE = 16
@@ -189,3 +189,34 @@ def blend(
     if not images:
         return alpha.new_empty(pairs.height, pairs.width, 0), alpha
     return (images[0] if len(images) == 1 else torch.cat(images, -1)), alpha
+
+
+def render_distributed(gaussians: Gaussians, camera: Camera, degree: int, background: Tensor) -> Rendering:
+    """Render the view of this process with the Gaussians of all processes of the group (`torch.distributed`).
+
+    All processes call it at once, with their own Gaussians and views of one size.
+
+    Args:
+        gaussians: Those of this process.
+        camera: The view of this process.
+        degree: Highest degree of spherical harmonics.
+        background: RGB ``[3]`` behind the Gaussians.
+
+    Returns:
+        The rendering; its centers ``[C, N, 2]`` and radii ``[C, N]`` are those of the N Gaussians of this process in
+        the views of all C processes.
+    """
+    require_gsplat()
+    from gsplat.rendering import rasterization
+
+    g = gaussians
+    image, alpha, found = rasterization(
+        g.means, g.quats, g.scales, g.opacities, torch.cat([g.sh0, g.shN], 1),
+        _matrix(camera.viewmat, g.device), _matrix(camera.K, g.device), camera.width, camera.height,
+        sh_degree=degree, tile_size=TILE, backgrounds=background[None], packed=False, distributed=True,
+        rasterize_mode="antialiased" if g.antialiased else "classic",
+    )  # fmt: skip
+    means2d = found["means2d"]
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    return Rendering(image[0], alpha[0, ..., 0], means2d, found["radii"].amax(-1), 3)
