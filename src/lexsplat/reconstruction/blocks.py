@@ -1,8 +1,9 @@
 """Reconstruction by blocks, for captures whose Gaussians do not fit into the memory of one reconstruction.
 
 As in VastGaussian and CityGaussian, the ground plane is cut into cells with equal numbers of points. A block is a
-cell with a margin, the parts of the views that show it, and a thinned rest of the points, which explains what these
-show of other cells. Each block is reconstructed alone. Of each result only the Gaussians inside the cell are kept.
+cell with a margin, and the parts of the views that show it. First a coarse model of the whole is trained at half
+resolution, with few Gaussians. Each block starts from it, so that what its views show of other cells is explained,
+and adds Gaussians in its cell and margin only. Of each result only the Gaussians inside the cell are kept.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.gaussians import TENSORS, Gaussians
@@ -34,8 +36,12 @@ if TYPE_CHECKING:
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.reconstruction.photos import Window
 
-SHARE_OUTSIDE = 2.0
+SHARE_OUTSIDE = 3.0
 """Gaussians that a block may have, in those that its cell keeps: the others explain what lies outside of the cell."""
+COARSE_SHARE = 1.5
+"""Gaussians of the coarse model, in those that a cell keeps."""
+COARSE_ITERATIONS = 0.3
+"""Share of the iterations that train the coarse model; the others train the blocks."""
 
 _MARGIN = 0.15
 _SEEN_SHARE = 0.15
@@ -55,19 +61,21 @@ class Block:
         low: Lower ends of the cell ``[2]`` on the ground plane; -inf at the border of the capture.
         high: Upper ends ``[2]``; inf at the border.
         windows: The parts of the training views that show it, by name.
-        chosen: Indices of its initial points ``[P']``.
+        margin: Width of the margin on all sides ``[2]``.
+        inside: Indices of the initial points in the cell and its margin ``[P']``.
+        own: Number of points in the cell.
     """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     windows: Mapping[str, Window]
-    chosen: NDArray[np.int64]
+    margin: NDArray[np.float64]
+    inside: NDArray[np.int64]
+    own: int
 
-    def holds(
-        self, ground: NDArray[np.float64], margin: float | NDArray[np.float64] = 0.0
-    ) -> NDArray[np.bool_]:
-        """Which places ``[N, 2]`` on the ground plane lie in the cell with a margin on all sides ``[N]``."""
-        return np.all((ground >= self.low - margin) & (ground < self.high + margin), axis=1)
+    def holds(self, ground: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which places ``[N, 2]`` on the ground plane lie in the cell ``[N]``."""
+        return _within(ground, self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -155,10 +163,9 @@ def cut_blocks(
     seen = {view.name: places_in_image(view, points) for view in capture.train_views}
     blocks = []
     for number, (low, high) in enumerate(cells, start=1):
-        cell = Block(low, high, {}, np.zeros(0, np.int64))
-        own = ground[cell.holds(ground)]
+        own = ground[_within(ground, low, high)]
         margin = _MARGIN * _sides(own)
-        inside = cell.holds(ground, margin)
+        inside = _within(ground, low - margin, high + margin)
         windows = {
             name: _window(places[inside[shown]])
             for name, (shown, places) in seen.items()
@@ -171,11 +178,14 @@ def cut_blocks(
                 found=f"{len(own):,} points and {len(windows)} views",
                 remedy="give a smaller --blocks",
             )
-        outside = np.flatnonzero(~inside)
-        thinned = outside[:: max(1, len(outside) // max(1, int(inside.sum())))]
-        chosen = np.sort(np.concatenate([np.flatnonzero(inside), thinned]))
-        blocks.append(Block(low, high, windows, chosen))
+        blocks.append(Block(low, high, windows, margin, np.flatnonzero(inside), len(own)))
     return blocks
+
+
+def _within(
+    ground: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    return np.all((ground >= low) & (ground < high), axis=1)
 
 
 def _cut(
@@ -196,6 +206,11 @@ def _cut(
     below = ground[:, axis] < at
     _cut(ground[below], low, middle_high, first, cells)
     _cut(ground[~below], middle_low, high, count - first, cells)
+
+
+def _on_ground(gaussians: Gaussians, axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Centers on the ground plane ``[N, 2]``."""
+    return gaussians.means.numpy().astype(np.float64) @ axes.T
 
 
 def _sides(ground: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,6 +239,50 @@ def _window(places: NDArray[np.float64]) -> Window:
     return float(left), float(top), float(right), float(bottom)
 
 
+class BlockReconstructor(Reconstructor):
+    """The reconstruction of a block: it starts from the coarse model and adds Gaussians in cell and margin only.
+
+    Args:
+        capture: The capture with the views of the block.
+        config: Settings of the block.
+        points: Its initial points, which are added to the coarse model.
+        coarse: The coarse model of the whole.
+        block: The block.
+        axes: From `ground_axes`.
+        options: Device, seed and memory, as in `Reconstructor`.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        config: ReconstructionConfig,
+        points: InitialPoints,
+        coarse: Gaussians,
+        block: Block,
+        axes: NDArray[np.float64],
+        **options: Any,
+    ) -> None:
+        self._coarse = coarse
+        super().__init__(capture, config, points, windows=block.windows, **options)
+        ends = axes, block.low - block.margin, block.high + block.margin
+        self._axes, self._low, self._high = (
+            torch.tensor(a, dtype=torch.float32).to(self.device) for a in ends
+        )
+
+    def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
+        own = super()._initial_parameters(start)
+        coarse = self._coarse.to(self.device).tensors()
+        return {name: torch.nn.Parameter(torch.cat([coarse[name], own[name].detach()])) for name in own}
+
+    def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
+        """Density control for which Gaussians outside of the margin have no gradient; "mcmc" does not ask for one."""
+        if means2d.grad is not None:
+            ground = self._parameters["means"].detach() @ self._axes.T
+            inside = ((ground >= self._low) & (ground < self._high)).all(1)
+            means2d.grad.mul_(inside[:, None])
+        super()._control_density(means2d, radii, image_size)
+
+
 @dataclass(frozen=True)
 class _Shared:
     """What the tasks of all blocks read."""
@@ -234,6 +293,9 @@ class _Shared:
     axes: NDArray[np.float64]
     folder: SharedFolder
     run: BlockRun
+    kept: float
+    """Gaussians that each cell keeps."""
+    coarse: Gaussians
 
 
 def reconstruct_blocks(
@@ -267,7 +329,10 @@ def reconstruct_blocks(
         if workers.distributed:  # listeners stay here
             run = replace(run, listener=silent)
         own = replace(run, workers=IN_PROCESS)
-        shared = _Shared(capture, points, replace(config, max_gaussians=cap), axes, folder, own)
+        kept = cap / SHARE_OUTSIDE
+        coarse = _coarse_model(capture, config, points, kept, replace(own, listener=listener))
+        config = replace(config, max_gaussians=cap)
+        shared = _Shared(capture, points, config, axes, folder, own, kept, coarse)
         needs = Needs(memory=run.memory, gpu=run.device == "cuda")
         listener(Event("blocks", 0, count))
         for part in results(workers.map(_reconstruct_block, shared, items, needs)):
@@ -277,16 +342,48 @@ def reconstruct_blocks(
     return Gaussians(**tensors, antialiased=config.antialiased)
 
 
+def _coarse_model(
+    capture: Capture, config: ReconstructionConfig, points: InitialPoints, kept: float, run: BlockRun
+) -> Gaussians:
+    """The coarse model, from its file if an earlier run has finished it; on the CPU."""
+    path = run.folder / f"{fingerprint(run.key, 'coarse')}.safetensors"
+    if (found := _read_gaussians(path, config)) is not None:
+        return found
+    config = replace(
+        config,
+        iterations=max(1, round(COARSE_ITERATIONS * config.iterations)),
+        warm_up=1.0,
+        max_gaussians=math.ceil(COARSE_SHARE * kept),
+    )
+    trainer = Reconstructor(capture, config, points, device=run.device, seed=run.seed, memory=run.memory)
+    checkpoint = Checkpoint(
+        path.with_suffix(".training.safetensors"), path.stem, every=run.checkpoint_seconds
+    )
+    trainer.run(run.listener, checkpoint)
+    found = trainer.gaussians().to("cpu").map(lambda tensor: tensor.clone())
+    write_tensors(path, found.tensors(), {})
+    checkpoint.remove()
+    return found
+
+
+def _read_gaussians(path: Path, config: ReconstructionConfig) -> Gaussians | None:
+    """Gaussians that an earlier run has written; None if there are none, or if they are damaged."""
+    if not path.exists():
+        return None
+    try:
+        return Gaussians(**read_tensors(path)[0], antialiased=config.antialiased)
+    except (FileFormatError, TypeError, ValueError):
+        path.unlink()
+        return None
+
+
 def _reconstruct_block(shared: _Shared, block: Block) -> Gaussians:
     """The Gaussians of a block's cell, from its file if an earlier run has finished it; on the CPU."""
     run, folder = shared.run, shared.folder
     key = fingerprint(run.key, [block.low.tolist(), block.high.tolist()])
     path = folder.path / f"{key}.safetensors"
-    if folder.is_visible and path.exists():
-        try:
-            return Gaussians(**read_tensors(path)[0], antialiased=shared.config.antialiased)
-        except (FileFormatError, TypeError, ValueError):
-            path.unlink()
+    if folder.is_visible and (kept := _read_gaussians(path, shared.config)) is not None:
+        return kept
     found = _train_block(shared, block, path)
     if len(found) == 0:
         raise TrainingError(
@@ -301,15 +398,35 @@ def _reconstruct_block(shared: _Shared, block: Block) -> Gaussians:
 
 
 def _train_block(shared: _Shared, block: Block, path: Path) -> Gaussians:
-    """Train a block on its views, as often a view as in the whole, and keep what lies in its cell."""
-    run, views, points = shared.run, shared.capture.views, shared.points
+    """Train a block on its views, as often a view as in the whole, and keep what lies in its cell.
+
+    The Gaussians may become as many as the cell keeps, those of its margin in proportion, and the coarse ones
+    outside.
+    A round of density control has as many views a Gaussian as in the whole. Adam divides by the root of a mean of
+    squared gradients, in which a Gaussian counts as 0 in each step that does not show it. In a block most steps show
+    it, so the rates are larger by the root of the share of the views.
+    """
+    run, views, points, coarse = shared.run, shared.capture.views, shared.points, shared.coarse
     names = tuple(block.windows)
     part = replace(shared.capture, views={n: views[n] for n in names}, train_names=names, test_names=())
     share = len(names) / len(shared.capture.train_names)
-    config = replace(shared.config, iterations=max(1, round(share * shared.config.iterations)))
-    start = replace(points, points=points.points[block.chosen], colors=points.colors[block.chosen])
+    config, cap = shared.config, shared.config.cap(torch.device(run.device))
+    grown = math.ceil(shared.kept * len(block.inside) / block.own)
+    near = _within(_on_ground(coarse, shared.axes), block.low - block.margin, block.high + block.margin).sum()
+    room = max(1, min(cap - len(coarse), grown - int(near)))
+    config = replace(
+        config,
+        iterations=max(1, round(share * (1 - COARSE_ITERATIONS) * config.iterations)),
+        warm_up=0.0,
+        rate_scale=config.scale_of_rates / math.sqrt(share),
+        opacities_rate=config.opacities_rate / math.sqrt(share),
+        densify_min_every=max(1, round(share * config.densify_min_every)),
+        max_gaussians=len(coarse) + room,
+    )
+    chosen = block.inside[:: -(-len(block.inside) // room)]
+    start = replace(points, points=points.points[chosen], colors=points.colors[chosen])
     options = {"device": run.device, "seed": run.seed, "memory": run.memory}
-    trainer = Reconstructor(part, config, start, windows=block.windows, **options)
+    trainer = BlockReconstructor(part, config, start, coarse, block, shared.axes, **options)
     checkpoint = None
     if shared.folder.is_visible:
         checkpoint = Checkpoint(
@@ -317,7 +434,7 @@ def _train_block(shared: _Shared, block: Block, path: Path) -> Gaussians:
         )
     trainer.run(run.listener, checkpoint)
     gaussians = trainer.gaussians().to("cpu")
-    inside = block.holds(gaussians.means.numpy().astype(np.float64) @ shared.axes.T)
+    inside = block.holds(_on_ground(gaussians, shared.axes))
     if checkpoint is not None:
         checkpoint.remove()
     return gaussians.select(torch.from_numpy(inside)).map(lambda tensor: tensor.clone())

@@ -162,11 +162,16 @@ class ReconstructionConfig:
         given = (self.opacity_weight, self.scale_weight)
         return tuple(default if weight is None else weight for weight in given)  # type: ignore[return-value]
 
+    @property
+    def scale_of_rates(self) -> float:
+        """`rate_scale`, with its default."""
+        if self.rate_scale is not None:
+            return self.rate_scale
+        return min(3.0, max(1.0, (REFERENCE_ITERATIONS / self.iterations) ** (1 / 3)))
+
     def rates(self, extent: float) -> dict[str, float]:
         """Initial learning rates by parameter (our names)."""
-        scale = self.rate_scale
-        if scale is None:
-            scale = min(3.0, max(1.0, (REFERENCE_ITERATIONS / self.iterations) ** (1 / 3)))
+        scale = self.scale_of_rates
         return {
             "means": scale * self.means_rate * extent,
             "quats": scale * self.quats_rate,
