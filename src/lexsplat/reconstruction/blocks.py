@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.gaussians import TENSORS, Gaussians
+from lexsplat.reconstruction.photos import WHOLE
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.trainer import Reconstructor
 from lexsplat.runtime import memory as budget
@@ -158,9 +159,10 @@ def cut_blocks(
         CaptureError: If a block has too few points, or too few views see it.
     """
     ground = points @ axes.T
+    seen = {view.name: places_in_image(view, points) for view in capture.train_views}
+    stands = {view.name: view.camera.position @ axes.T for view in capture.train_views}
     cells: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     _cut(ground, np.full(2, -np.inf), np.full(2, np.inf), count, cells)
-    seen = {view.name: places_in_image(view, points) for view in capture.train_views}
     blocks = []
     for number, (low, high) in enumerate(cells, start=1):
         own = ground[_within(ground, low, high)]
@@ -178,6 +180,8 @@ def cut_blocks(
                 found=f"{len(own):,} points and {len(windows)} views",
                 remedy="give a smaller --blocks",
             )
+        # A view from within the cell looks through it, at whatever it shows: without it, fog would be left there.
+        windows |= {name: WHOLE for name, place in stands.items() if _within(place[None], low, high)[0]}
         blocks.append(Block(low, high, windows, margin, np.flatnonzero(inside), len(own)))
     return blocks
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Window = tuple[float, float, float, float]
 """Part of an image: left, top, right and lower end, as shares of its width and height in 0..1."""
-_WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
+WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
 
 class TrainingImages:
@@ -53,7 +53,7 @@ class TrainingImages:
             name: view.camera if shrink == 1.0 else view.camera.downscaled(shrink)
             for name, view in self._views.items()
         }
-        self._windows = {name: (windows or {}).get(name, _WHOLE) for name in self._views}
+        self._windows = {name: (windows or {}).get(name, WHOLE) for name in self._views}
         self._cameras = {name: cropped(self._whole[name], part) for name, part in self._windows.items()}
         pixels = sum(camera.width * camera.height for camera in self._cameras.values())
         self._photo_room = memory
