@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import multiprocessing
+import os
 import shutil
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from lexsplat.queries.grammar import understand
 from lexsplat.queries.presence import NO
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.runtime.errors import FileFormatError, LibraryError, QueryError, SceneFolderError
-from lexsplat.runtime.files import read_json, write_json
+from lexsplat.runtime.files import read_json, read_tensors, write_json, write_tensors
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.library import Library
@@ -439,17 +440,116 @@ def test_a_record_is_recovered_without_its_scene(copy):
     assert path.read_bytes() == before
 
 
-def test_codes_without_a_record_are_told_before_they_are_removed(copy, caplog):
+def test_a_lost_record_is_told_and_written_again(copy):
     library = Library(copy / "library")
-    library.add(copy / "kitchen")
+    before = (library.stage / "kitchen.json").read_bytes()
     (library.stage / "kitchen.json").unlink()
-    told = library.verify()["kitchen"]
-    assert "codes without a record" in told
-    assert told.endswith(f"lexsplat library add {library.root} {copy / 'kitchen'}")
-    with caplog.at_level("INFO", "lexsplat"):
-        assert library.verify(repair=True) == {}
-    assert told in caplog.text
+    library.remove("office")  # other changes keep its codes
+    for told in (library.search("mug").skipped["kitchen"], library.verify()["kitchen"]):
+        assert "found codes without one" in told
+        assert told.endswith(f"lexsplat library verify {library.root} --repair")
+    assert library.verify(repair=True) == {}
+    assert (library.stage / "kitchen.json").read_bytes() == before
+    assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
+
+
+def test_a_removal_that_was_killed_is_finished_and_not_undone(copy, monkeypatch):
+    library = Library(copy / "library")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            library.remove("kitchen")
+    assert list(library.stage.glob("kitchen.*.safetensors"))
+    assert library.search("vase").skipped == library.verify() == library.verify(repair=True) == {}
     assert not list(library.stage.glob("kitchen*"))
+
+
+def test_a_scene_with_a_damaged_record_is_removed_with_all_its_files(copy):
+    (copy / "library" / "scenes" / "kitchen.json").write_text("[]")
+    library = Library(copy / "library")
+    library.search("mug")
+    assert library.remove("kitchen") == "kitchen"
+    assert not list(library.stage.glob("kitchen*"))
+    assert library.verify() == {}
+
+
+def test_a_record_whose_copy_is_damaged_as_well_is_told_with_another_remedy(copy):
+    library = Library(copy / "library")
+    codes = library.stage / library.record("kitchen").codes_file
+    write_tensors(codes, read_tensors(codes)[0], {"record": "{}"})
+    assert "expected the copy of the record" in library.verify()["kitchen"]
+    (library.stage / "kitchen.json").write_text("{}")
+    told = library.verify(repair=True)["kitchen"]
+    assert told.endswith(f"; lexsplat library remove {library.root} kitchen, and add the scene again")
+
+
+def test_a_damaged_copy_of_a_record_is_written_again(copy):
+    library = Library(copy / "library")
+    codes = library.stage / library.record("kitchen").codes_file
+    whole = codes.read_bytes()
+    codes.write_bytes(whole.replace(b"kitchen", b"kitchem", 1))
+    assert library.verify().keys() == {"kitchen"}
+    assert library.verify(repair=True) == {}
+
+
+def test_verify_finds_a_rebuilt_scene_whose_file_has_kept_size_and_time(copy):
+    library, path = Library(copy / "library"), copy / "kitchen" / "scene.json"
+    times = path.stat()
+    path.write_text(path.read_text().replace('"l1"', '"l2"'))
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert "rebuilt" in library.verify()["kitchen"]
+
+
+def test_files_of_others_are_never_deleted(copy):
+    """A folder named ``scenes`` of a project is no library, and what a library did not write stays."""
+    project = copy / "project"
+    shutil.copytree(copy / "kitchen", project / "scenes")
+    (project / "scenes" / "photo.jpg").write_bytes(b"mine")
+    before = contents(project / "scenes")
+    with pytest.raises(LibraryError, match="other files"):
+        Library.create(project)
+    with pytest.raises(LibraryError, match="make one with"):
+        Library(project)
+    assert contents(project / "scenes") == before
+    library = Library(copy / "library")
+    for name in ("photo.jpg", "features.safetensors", "notes.json.txt"):
+        (library.stage / name).write_bytes(b"mine")
+    library.remove("office")
+    library.add(copy / "office")
+    assert library.verify(repair=True) == {}
+    assert {"photo.jpg", "features.safetensors", "notes.json.txt"} <= contents(library.stage).keys()
+    (copy / "songs").mkdir()
+    (copy / "songs" / "library.json").write_text('{"songs": []}')
+    with pytest.raises(LibraryError, match="expected format_version 1"):
+        Library.create(copy / "songs")
+    assert (copy / "songs" / "library.json").read_text() == '{"songs": []}'
+
+
+def test_every_changed_byte_of_the_library_file_is_harmless_or_mended(copy):
+    path = copy / "library" / "library.json"
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        for bit in (1, 4, 64):
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ bit]) + whole[place + 1 :])
+            told = ""
+            try:
+                Library(copy / "library")
+            except LibraryError as error:
+                told = str(error)
+            assert not told or "--repair" in told
+            assert len(Library.create(copy / "library").names()) == 3
+
+
+def test_many_rebuilt_scenes_leave_room_for_the_others(copy):
+    for number in range(5):
+        write_scene(copy / f"room{number}", OTHERS)
+    library = Library(copy / "library")
+    for number in range(5):
+        library.add(copy / f"room{number}")
+        write_scene(copy / f"room{number}", OTHERS, build=2)
+    found = library.search("vase", limit=1)  # four scenes are looked at, two of them rebuilt ones
+    assert [hit.scene for hit in found.hits] == ["kitchen"]
+    assert len(found.rebuilt) == 5
 
 
 @pytest.mark.parametrize("text", [None, "", "{"])
@@ -491,7 +591,7 @@ def test_people_read_a_few_problems_and_their_number(copy):
     found = library.search("griffin")
     assert len(found.skipped) == 8
     assert repr(found).count("\n  skipped: ") == 6
-    assert repr(found).endswith("3 more; lexsplat library verify names them")
+    assert repr(found).endswith("3 more; lexsplat library verify LIB names them")
     assert found.encoders == ("models/abc", "models/def")
     assert "scenes of 2 encoders" in repr(found)
 
@@ -512,7 +612,13 @@ def test_a_folder_that_is_no_library_is_refused(tmp_path, copy):
         lexsplat.open_library(tmp_path / "nowhere")
     with pytest.raises(LibraryError, match="other files"):
         Library.create(copy / "kitchen")
-    for facts in ({"format_version": 2, "name": "x"}, {"format_version": 1, "name": "../x"}, [], {}):
+    for facts in (
+        {"format_version": 2, "name": "x"},
+        {"format_version": 1, "name": "../x"},
+        [],
+        {},
+        {"a": 1},
+    ):
         (copy / "library" / "library.json").write_text(json.dumps(facts))
         with pytest.raises(LibraryError, match="expected format_version 1"):
             Library(copy / "library")

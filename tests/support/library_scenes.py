@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from lexsplat.features.text import TextCache, TextTower, load_text
 from lexsplat.language.fields import CodeField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.everyday import everyday_words
-from lexsplat.runtime.files import write_tensors
+from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.library import COMPARED
 from lexsplat.scenes.library.records import read_record, write_record
@@ -92,8 +93,10 @@ def copied(rooms: Path, target: Path) -> Path:
     shutil.copytree(rooms, target)
     for path in (target / "library" / "scenes").glob("*.json"):
         record = read_record(path)
-        moved = record.path.replace(str(rooms), str(target))
-        write_record(dataclasses.replace(record, path=moved), path)
+        record = dataclasses.replace(record, path=record.path.replace(str(rooms), str(target)))
+        write_record(record, path)
+        tensors, _ = read_tensors(path.with_name(record.codes_file))
+        write_tensors(path.with_name(record.codes_file), tensors, {"record": json.dumps(record.sealed())})
     return target
 
 

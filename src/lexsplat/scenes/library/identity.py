@@ -8,8 +8,15 @@ from pathlib import Path
 
 from lexsplat.runtime.errors import FileFormatError, LibraryError
 from lexsplat.runtime.files import locked, read_json, write_json
+from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.scenes.library.records import has_entries
 
 FORMAT_VERSION = 1
+_OWN = {"library.json", "scenes", "texts", "thumbnails"}
+
+
+class _DamagedError(LibraryError):
+    """``library.json`` is not what was written."""
 
 
 def library_name(root: Path) -> str:
@@ -19,50 +26,65 @@ def library_name(root: Path) -> str:
         LibraryError: If there is no library, a damaged one, or one of another format version.
     """
     path = root / "library.json"
+    mending = (
+        f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
+    )
     if not path.is_file():
-        whole = not _has_entries(root)
         raise LibraryError(
             root,
             expected="a library of scenes",
             found="no library.json in it" if root.exists() else "no such folder",
-            remedy=f"make one with: lexsplat library add {root} SCENE" if whole else _mending(root),
+            remedy=mending if has_entries(root) else f"make one with: lexsplat library add {root} SCENE",
         )
+    expected = f"format_version {FORMAT_VERSION} and a name"
     try:
         facts = read_json(path)
     except FileFormatError as error:
-        raise LibraryError(path, expected=error.expected, found=error.found, remedy=_mending(root)) from error
-    version = facts.get("format_version") if isinstance(facts, dict) else None
-    if version != FORMAT_VERSION or not re.fullmatch(r"\w{1,40}", str(facts.get("name"))):
-        raise LibraryError(
-            path,
-            expected=f"format_version {FORMAT_VERSION} and a name",
-            found=repr(version)[:40],
-            remedy="add the scenes to a new library with this version of lexsplat",
+        raise _DamagedError(path, expected=error.expected, found=error.found, remedy=mending) from error
+    if not isinstance(facts, dict) or facts.get("hash", _hash(facts)) != _hash(facts):
+        raise _DamagedError(path, expected=expected, found="damaged content", remedy=mending)
+    version, name = facts.get("format_version"), facts.get("name")
+    if type(version) is int and version > FORMAT_VERSION:
+        remedy = "add the scenes to a new library with this version of lexsplat"
+        raise LibraryError(path, expected=expected, found=f"version {version}", remedy=remedy)
+    if version != FORMAT_VERSION or not isinstance(name, str) or not re.fullmatch(r"\w{1,40}", name):
+        raise _DamagedError(
+            path, expected=expected, found=f"{version!r:.20} and {name!r:.40}", remedy=mending
         )
-    return str(facts["name"])
+    return name
 
 
 def make_library(root: Path) -> None:
-    """Make a library of a new or empty folder; a lost or unreadable ``library.json`` is written again.
+    """Make a library of a new or empty folder; a lost or damaged ``library.json`` beside entries is written again.
 
     Files with a name that starts with a dot, such as those of killed commands, do not matter.
 
     Raises:
-        LibraryError: If the folder has files of another program, or another process changes the library.
+        LibraryError: If the folder has files of another program, the library is of another format version, or another
+            process changes it.
     """
-    path = root / "library.json"
-    foreign = root.exists() and (
-        not root.is_dir()
-        or (not _has_entries(root) and any(each.name[0] != "." for each in root.iterdir() if each != path))
-    )
-    if foreign and not path.is_file():
-        raise LibraryError(
-            root, expected="a library or a new folder", found="other files", remedy="give another folder"
+    path, entries = root / "library.json", has_entries(root)
+    if path.is_file():
+        try:
+            library_name(root)
+            return
+        except _DamagedError:
+            if not entries:  # it may be a file of another program
+                raise
+    elif root.exists() and not entries:
+        other = not root.is_dir() or any(
+            each.name[0] != "." for each in root.iterdir() if each.name not in _OWN
         )
-    if not _is_readable(path):
-        with locked(root, lambda holder: in_use(root, holder)):
-            if not _is_readable(path):  # another process may have made it in the meantime
-                write_json(path, {"format_version": FORMAT_VERSION, "name": uuid.uuid4().hex})
+        if other or any((root / "scenes").glob("[!.]*")):
+            raise LibraryError(
+                root, expected="a library or a new folder", found="other files", remedy="give another folder"
+            )
+    with locked(root, lambda holder: in_use(root, holder)):
+        try:
+            library_name(root)  # another process may have made it in the meantime
+        except LibraryError:
+            facts = {"format_version": FORMAT_VERSION, "name": uuid.uuid4().hex}
+            write_json(path, {**facts, "hash": _hash(facts)})
 
 
 def in_use(root: Path, holder: str) -> LibraryError:
@@ -75,17 +97,5 @@ def in_use(root: Path, holder: str) -> LibraryError:
     )
 
 
-def _has_entries(root: Path) -> bool:
-    return any((root / "scenes").glob("[!.]*.safetensors"))
-
-
-def _is_readable(path: Path) -> bool:
-    try:
-        read_json(path)
-    except FileFormatError:
-        return False
-    return True
-
-
-def _mending(root: Path) -> str:
-    return f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
+def _hash(facts: dict) -> str:
+    return fingerprint({name: value for name, value in facts.items() if name != "hash"})

@@ -25,7 +25,15 @@ from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
 from lexsplat.scenes.library.identity import in_use, library_name, make_library
 from lexsplat.scenes.library.mending import mended, problems_of
-from lexsplat.scenes.library.records import BUNDLED, Record, read_record, stamp_of, state_of
+from lexsplat.scenes.library.records import (
+    BUNDLED,
+    OWN_FILE,
+    REMOVED,
+    Record,
+    read_record,
+    stamp_of,
+    state_of,
+)
 from lexsplat.scenes.library.searching import Found, search
 from lexsplat.scenes.library.server import Server
 from lexsplat.scenes.reading import read_scene
@@ -106,6 +114,7 @@ class Library:
             self.damaged.pop(name, None)
             return known[1]
         except FileNotFoundError:  # removed in the meantime
+            self.damaged.pop(name, None)
             return None
         except FileFormatError as error:
             self.damaged[name] = error
@@ -153,8 +162,12 @@ class Library:
         """Where a scene is now."""
         return record.folder(self._home)
 
-    def is_rebuilt(self, record: Record) -> bool:
+    def is_rebuilt(self, record: Record, thoroughly: bool = False) -> bool:
         """Whether a scene was built again since it was added.
+
+        Args:
+            record: Its record.
+            thoroughly: Read its ``scene.json`` also where size and time of the file are as they were.
 
         Raises:
             LexsplatError: If its folder is gone, or its ``scene.json`` is damaged or of another version.
@@ -164,11 +177,11 @@ class Library:
             stamp = stamp_of(path)
         except OSError:
             stamp = None
-        if stamp and stamp == record.stamp:
+        if stamp and stamp == record.stamp and not thoroughly:
             return False
         key = f"{path} {stamp}"
         known = self._states.get(record.name)
-        if stamp is None or known is None or known[0] != key:
+        if stamp is None or thoroughly or known is None or known[0] != key:
             try:
                 known = self._states[record.name] = (key, state_of(SceneFolder.open(path)))
             except LexsplatError as error:
@@ -254,12 +267,16 @@ class Library:
             yield
 
     def _sweep(self) -> None:
-        """Remove files that no record names; earlier versions also kept pictures."""
-        kept = {file for record in self.records() for file in record.files}
-        for path in [*self.stage.glob("[!.]*.safetensors"), *self.stage.glob("*.jpg")]:
-            damaged = path.name.split(".")[0] in self.damaged  # its codes hold the only copy of the record
-            if path.name not in kept and not (damaged and path.suffix == ".safetensors"):
+        """Finish removals, and delete files of earlier versions of scenes; files without a record stay."""
+        marks = list(self.stage.glob(f"[!.]*{REMOVED}"))
+        leaving = {path.stem for path in marks if not path.with_suffix(".json").exists()}
+        kept = {record.name: record.files for record in self.records()}
+        for path in self.stage.glob("[!.]*.safetensors"):
+            own = OWN_FILE.fullmatch(path.name)
+            if own and (own[1] in leaving or path.name not in kept.get(own[1], {path.name})):
                 path.unlink(missing_ok=True)
+        for path in marks:
+            path.unlink(missing_ok=True)
 
     def add(self, path: str | Path) -> Record:
         """Add a scene, or bring its entry up to date after a build or a move.
@@ -335,7 +352,8 @@ class Library:
         with self.changing():
             name = self.name_of(scene)
             record = self.record(name)
-            (self.stage / f"{name}.json").unlink(missing_ok=True)
+            path = self.stage / f"{name}.json"
+            path.replace(path.with_suffix(REMOVED))  # a removal that is killed from here on is finished later
             self._sweep()
             if self.server and self._served and record is not None:
                 self.server.drop(record, self.stage)
@@ -408,9 +426,10 @@ def _told(root: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        temporary = str(error.filename or "").endswith(".tmp")
         raise LibraryError(
-            error.filename or root,
-            expected="to be written",
+            root if temporary else error.filename or root,
+            expected="files that can be written",
             found=str(error.strerror or error),
             remedy="run the command again when that is mended; the library is as it was before",
         ) from error

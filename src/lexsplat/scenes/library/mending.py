@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from typing import TYPE_CHECKING
 
-from lexsplat.runtime.errors import LexsplatError
-from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.errors import LexsplatError, LibraryError
 from lexsplat.scenes.library.contents import map_contents
-from lexsplat.scenes.library.records import Record, recovered_record, write_record
+from lexsplat.scenes.library.records import (
+    Record,
+    copy_of_record,
+    damaged,
+    recovered_record,
+    scenes_without_record,
+    write_record,
+)
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
-
-log = logging.getLogger("lexsplat")
 
 
 def problems_of(library: Library) -> dict[str, str]:
     """What is wrong with the entry of each scene or with its folder, by name, each with its remedy.
 
     Raises:
-        LibraryError: If the server fails or holds another state of the library.
+        LibraryError: If nothing else is wrong, and the server fails or holds another state of the library.
     """
-    if library.server:
-        library.server.groups(library.stage, library.groups())
-    return {**_orphans(library), **_entries(library)}
+    found = {**orphans(library), **_entries(library)}
+    try:
+        if library.server:
+            library.server.groups(library.stage, library.groups())
+    except LibraryError as error:
+        if not found:
+            raise
+        found[library.server.url if library.server else ""] = str(error)
+    return found
 
 
 def mended(library: Library) -> dict[str, str]:
@@ -34,28 +43,20 @@ def mended(library: Library) -> dict[str, str]:
     Raises:
         LibraryError: If another process changes the library, the disk is full, or the server fails.
     """
-    orphans = _orphans(library)
     with library.changing():
-        for name, problem in orphans.items():  # removed with the lock
-            log.log(NOTE, "%s: %s", name, problem)
-        for name in _entries(library):
+        for name in {**orphans(library), **_entries(library)}:
             _repair(library, name)
         library.bring_to_server()
-    return _entries(library)
+    return {**orphans(library), **_entries(library)}
 
 
-def _orphans(library: Library) -> dict[str, str]:
-    """Scenes whose codes are there without a record."""
-    files = library.stage.glob("[!.]*.safetensors") if library.stage.is_dir() else ()
-    found = {}
-    for name in sorted({file.name.split(".")[0] for file in files} - set(library.names())):
-        record = recovered_record(library.stage, name)
-        place = library.folder(record) if record else "SCENE"
-        found[name] = (
-            f"{library.stage / name}.json: codes without a record, left by a killed command or of a lost record;"
-            f" --repair removes them; if the scene is wanted: lexsplat library add {library.root} {place}"
-        )
-    return found
+def orphans(library: Library) -> dict[str, str]:
+    """Scenes whose codes are there without a record, and what to do."""
+    return {
+        name: f"{library.stage / name}.json: expected the record of a scene, found codes without one, of an addition"
+        f" that was killed or is under way, or of a lost record; lexsplat library verify {library.root} --repair"
+        for name in sorted(scenes_without_record(library.stage))
+    }
 
 
 def _entries(library: Library) -> dict[str, str]:
@@ -66,12 +67,20 @@ def _entries(library: Library) -> dict[str, str]:
 def _problem(library: Library, name: str) -> str:
     """What is wrong with a scene; "" if nothing is."""
     record = library.record(name)
+    if record is None and name in library.damaged and recovered_record(library.stage, name) is None:
+        problem = (
+            f"{library.stage / name}.json: expected the record of a scene, found it and its copy damaged"
+        )
+        return f"{problem}; lexsplat library remove {library.root} {name}, and add the scene again"
     if record is None or library.codes(record, by_hash=True) is None:
         return str(library.damaged.get(name, ""))  # "" if it was removed in the meantime
+    path = library.stage / record.codes_file
     try:
+        if copy_of_record(path) != record:
+            raise damaged(path, "the copy of the record", "another one")
         if record.contents:
             map_contents(library.stage / record.contents_file, record.contents)
-        return rebuilt(library, record) if library.is_rebuilt(record) else ""
+        return rebuilt(library, record) if library.is_rebuilt(record, thoroughly=True) else ""
     except LexsplatError as error:
         return str(error)
 

@@ -23,6 +23,10 @@ from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 
 BUNDLED = "demo"
 """The path of the bundled scene, wherever it is installed."""
+OWN_FILE = re.compile(r"([\w-]+)\.[0-9a-f]{24}(\.objects)?\.safetensors")
+"""Names of files of tensors: the scene, and the hash of the content."""
+REMOVED = ".removed"
+"""Ending of the record of a scene that is being removed."""
 _HASH = "hash"
 """Entry with the hash of the others; records of earlier libraries lack it."""
 
@@ -137,6 +141,8 @@ def checked_record(content: Any, path: Path) -> Record:
         FileFormatError: If an entry is missing, of a wrong type or altered.
     """
     try:
+        if not isinstance(content, dict):
+            raise ValueError("other values")
         if _HASH in content and content[_HASH] != _hash(content):
             raise ValueError("damaged content (the hash differs)")
         values: dict[str, Any] = {
@@ -155,15 +161,47 @@ def checked_record(content: Any, path: Path) -> Record:
         raise damaged(path, "the record of a scene", found[:80]) from error
 
 
+def copy_of_record(path: Path) -> Record | None:
+    """The copy of a record in the file of the codes; None if it is damaged."""
+    try:
+        _, metadata = read_tensors(path)
+        return checked_record(json.loads(metadata["record"]), path)
+    except (FileFormatError, KeyError, ValueError, RecursionError):
+        return None
+
+
 def recovered_record(stage: Path, name: str) -> Record | None:
     """The record of a scene from the copy in the file of its codes; None if that is damaged as well."""
-    for path in stage.glob(f"{name}.*.safetensors"):
-        try:
-            _, metadata = read_tensors(path)
-            return checked_record(json.loads(metadata["record"]), path)
-        except (FileFormatError, KeyError, ValueError):
-            continue
-    return None
+    copies = (copy_of_record(stage / file) for file, scene in _own_files(stage) if scene == name)
+    return next((copy for copy in copies if copy is not None), None)
+
+
+def scenes_without_record(stage: Path) -> set[str]:
+    """Names of scenes whose codes are there without a record, and which are not being removed."""
+    known = {path.stem for path in stage.glob("[!.]*") if path.suffix in (".json", REMOVED)}
+    return {scene for _, scene in _own_files(stage)} - known
+
+
+def has_entries(root: Path) -> bool:
+    """Whether a folder holds the entry of a scene, so that it is a library also without ``library.json``."""
+    stage = root / "scenes"
+    return any(recovered_record(stage, scene) for _, scene in _own_files(stage)) or any(
+        _is_record(path) for path in stage.glob("[!.]*.json")
+    )
+
+
+def _is_record(path: Path) -> bool:
+    try:
+        read_record(path)
+    except FileFormatError:
+        return False
+    return True
+
+
+def _own_files(stage: Path) -> list[tuple[str, str]]:
+    """The files of tensors of a library, and the names of their scenes."""
+    listed = sorted(os.listdir(stage)) if stage.is_dir() else []
+    return [(file, found[1]) for file in listed if (found := OWN_FILE.fullmatch(file))]
 
 
 def _hash(content: Mapping[str, Any]) -> str:

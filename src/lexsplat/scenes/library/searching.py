@@ -20,13 +20,13 @@ from lexsplat.queries.selection import PRESENCES, Presence
 from lexsplat.queries.spelling import corrected
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.rendering import render
-from lexsplat.runtime.errors import LexsplatError, QueryError
+from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import file_name, find_phrase
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.bounds import CERTAIN, SURELY_NOT, phrase_bound, presence_bounds
 from lexsplat.scenes.library.indexed import Indexed, answer_from, decidable, with_world
-from lexsplat.scenes.library.mending import rebuilt
+from lexsplat.scenes.library.mending import orphans, rebuilt
 from lexsplat.scenes.library.records import Record
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.serving import sentence
@@ -40,6 +40,8 @@ PROPOSED = 1000
 """Codes that a server proposes for each text."""
 _ASKED = 4
 """Scenes that are looked at for each one that is wanted, at most."""
+_REBUILT = 2
+"""Rebuilt scenes that are looked at before the others, for each scene that is wanted."""
 _TOLD = 5
 """Notes and skipped scenes that are told to people, at most."""
 
@@ -222,7 +224,7 @@ def _told(kind: str, problems: dict[str, str]) -> list[str]:
     """Lines for people: the first few problems, and how many more there are."""
     lines = [f"  {kind}: {problem}" for problem in list(problems.values())[:_TOLD]]
     more = len(problems) - _TOLD
-    return [*lines, f"  {kind}: {more} more; lexsplat library verify names them"] if more > 0 else lines
+    return [*lines, f"  {kind}: {more} more; lexsplat library verify LIB names them"] if more > 0 else lines
 
 
 def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
@@ -234,7 +236,7 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
     possible = candidates(library, understood)
     skipped, asked, opened = possible.skipped, 0, 0
     hits: list[Hit] = []
-    for name, bound in possible.ranked:
+    for name, bound in _in_turn(possible, limit):
         if asked == _ASKED * limit or sum(hit.present == "yes" for hit in hits) == limit:
             break
         asked += 1
@@ -263,6 +265,16 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
     )
 
 
+def _in_turn(possible: Candidates, limit: int) -> list[tuple[str, float]]:
+    """The candidates in the order in which they are looked at.
+
+    Nothing is known of rebuilt scenes. They come first, but many of them would leave no room for the others.
+    """
+    again = [entry for entry in possible.ranked if entry[0] in possible.rebuilt]
+    late = {name for name, _ in again[_REBUILT * limit :]}
+    return sorted(possible.ranked, key=lambda entry: entry[0] in late)
+
+
 class _Asking:
     """One question to many scenes: what is the same for all of them is worked out once.
 
@@ -284,6 +296,14 @@ class _Asking:
             LexsplatError: If it cannot be asked.
         """
         record = self.library.record(name)
+        try:
+            return self._hit(name, bound, record)
+        except FileFormatError:
+            if self.library.record(name) == record:
+                raise
+            return self.hit(name, bound)  # replaced in the meantime
+
+    def _hit(self, name: str, bound: float, record: Record | None) -> Hit:
         if record is not None and record.contents and not self.confirm:
             folder = SceneFolder.open(self.library.folder(record))
             found = None if self.library.is_rebuilt(record) else self._indexed(record)
@@ -328,7 +348,7 @@ class Candidates:
 
 def candidates(library: Library, phrase: Phrase) -> Candidates:
     """The scenes of a library that may hold what a phrase names."""
-    current, skipped, again = [], {}, {}
+    current, skipped, again = [], orphans(library), {}
     records = library.records()
     for record in records:
         try:
@@ -366,8 +386,11 @@ def _groups(library: Library, records: list[Record], phrase: Phrase) -> tuple[li
     proposed, unproposed = [], 0
     for collection in library.server.groups(library.stage, library.groups()):
         there = groups.get(collection.group, {})
-        texts = [text for both in spellings_of(phrase, collection.clip).values() for text in both]
-        embedded = library.embed(collection.encoder, collection.clip, texts)
+        if not there:
+            continue
+        one = next(iter(there.values()))
+        texts = [text for both in spellings_of(phrase, one.clip).values() for text in both]
+        embedded = library.embed(one.encoder, one.clip, texts)
         names, least = library.server.nearest(collection.place, embedded, PROPOSED)
         known = [there[name] for name in names if name in there]
         proposed.append(known)

@@ -66,16 +66,12 @@ class Collection:
     Args:
         place: Its path on the server.
         group: `Record.group` of the scenes.
-        encoder: Hash of their encoder.
-        clip: Name of their encoder.
         state: `listing` of the library when it was written.
         codes: Number of codes when it was written; -1 if that is unknown.
     """
 
     place: str
     group: str
-    encoder: str
-    clip: str
     state: str
     codes: int
 
@@ -246,7 +242,7 @@ class Server:
         known = [each.place for each in self._collections() if each.group == record.group]
         if known:
             return known[0]
-        facts = {"encoder": record.encoder, "clip": record.clip, "state": _CHANGING, "codes": -1}
+        facts = {"clip": record.clip, "state": _CHANGING, "codes": -1}
         name = f"{self._prefix}{record.group}"
         body = {"name": name, "get_or_create": True, "metadata": facts, "configuration": {"hnsw": _HNSW}}
         return f"{_PLACE}/{self._ask('POST', _PLACE, body)['id']}"
@@ -257,18 +253,16 @@ class Server:
         found = []
         for each in self._ask("GET", f"{_PLACE}?limit=10000"):
             if each["name"].startswith(self._prefix):
-                group, facts = each["name"][len(self._prefix) :], each["metadata"]
-                found.append(Collection(
-                    f"{_PLACE}/{each['id']}", group, facts["encoder"], facts["clip"], facts["state"],
-                    int(facts.get("codes", -1)),
-                ))  # fmt: skip
+                group, facts = each["name"][len(self._prefix) :], each.get("metadata") or {}
+                state, codes = str(facts.get("state")), facts.get("codes")
+                codes = codes if isinstance(codes, int) else -1
+                found.append(Collection(f"{_PLACE}/{each['id']}", group, state, codes))
         return found
 
     def _mark(self, state: str) -> None:
         for each in self._collections():
             codes = -1 if state == _CHANGING else int(self._ask("GET", f"{each.place}/count"))
-            metadata = {"encoder": each.encoder, "clip": each.clip, "state": state, "codes": codes}
-            self._ask("PUT", each.place, {"new_metadata": metadata})
+            self._ask("PUT", each.place, {"new_metadata": {"state": state, "codes": codes}})
 
     def _upsert(self, place: str, record: Record, codes: Codes) -> None:
         numbers, vectors = code_vectors(codes)
