@@ -1,4 +1,4 @@
-"""What a question costs in an open scene: the first one, a new word, a known word, an inventory.
+"""What a question costs in an open scene: the first one, new words, a known word, an inventory.
 
     python benchmarks/asking.py [SCENE] [--copies 25] [--folder FOLDER] [--json FILE]
 
@@ -37,6 +37,9 @@ from lexsplat.scenes.scene import Scene
 APART = 8.0
 """Distance of the copies, in scene units: the table of the bundled scene is 4 long."""
 WORDS = ("vase", "teddy bear", "pumpkin", "is there a bottle?", "where is the toy car?", "unicorn")
+"""What `Scene.find` is asked: with places, boxes and best views."""
+ASKED = ("duck", "banana", "lamp", "blue mug", "book", "griffin")
+"""What `Scene.ask` is asked: scores, threshold and presence."""
 
 
 def copied(scene: Scene, copies: int, root: Path) -> None:
@@ -95,12 +98,17 @@ def measure(path: str, kept: str) -> dict[str, Any]:
     scene = timed("open", lambda: lexsplat.open_scene(path))
     row["gaussians"] = len(scene.gaussians)
     timed("first", lambda: scene.find("where is the red apple?").to_dict())
-    new = []
-    for word in WORDS:
-        timed("new", lambda word=word: scene.find(word).to_dict())
-        new.append((row["new"], row["new_wall"]))
-    row["new"], row["new_wall"] = (sorted(values)[len(values) // 2] for values in zip(*new))
-    row["new_worst"] = max(cpu for cpu, _ in new)
+
+    def median(name: str, words: tuple[str, ...], what: Callable[[str], Any]) -> None:
+        spent = []
+        for word in words:
+            timed(name, lambda word=word: what(word))
+            spent.append((row[name], row[f"{name}_wall"]))
+        row[name], row[f"{name}_wall"] = (sorted(values)[len(values) // 2] for values in zip(*spent))
+        row[f"{name}_worst"] = max(cpu for cpu, _ in spent)
+
+    median("asked", ASKED, scene.ask)
+    median("new", WORDS, lambda word: scene.find(word).to_dict())
     timed("known", lambda: [scene.find(word).to_dict() for word in WORDS])
     row["known"] = round(row["known"] / len(WORDS), 5)
     timed("objects", lambda: scene.objects)
