@@ -73,7 +73,7 @@ class LibraryCommand:
     def check(self) -> None:
         """Refuse invalid options."""
         if self.action == "search":
-            check_phrases(self.words)
+            check_phrases(() if any(not word.strip() for word in self.words) else self.words)
         if self.action in ("add", "remove") and not self.words:
             raise ValueError("at least one SCENE is needed")
         if self.action in ("list", "verify") and self.words:

@@ -107,12 +107,12 @@ def check_threshold(threshold: float | None) -> None:
 
 
 def check_phrases(phrases: tuple[str, ...]) -> None:
-    """Refuse a command without phrases, or with an empty one.
+    """Refuse a command without phrases.
 
     Raises:
         ValueError: There is none.
     """
-    if not all(phrase.strip() for phrase in phrases) or not phrases:
+    if not phrases:
         raise ValueError('at least one PHRASE is needed, such as "red apple"')
 
 
