@@ -117,12 +117,6 @@ def test_nothing_is_removed_unless_all_are_known(rooms, capsys):
     assert "removed: office, kitchen" in run(capsys, "remove", rooms, "office", "kitchen")
 
 
-def test_pictures_of_a_removed_scene_are_removed(rooms, capsys):
-    run(capsys, "search", rooms, "mug")
-    run(capsys, "remove", rooms, "kitchen")
-    assert not (rooms / "library" / "thumbnails" / "kitchen").exists()
-
-
 @pytest.mark.parametrize("code", [errno.EROFS, errno.ENOSPC])
 def test_an_answer_is_given_where_its_pictures_cannot_be_written(rooms, capsys, caplog, monkeypatch, code):
     def refused(*_):

@@ -21,6 +21,7 @@ from lexsplat.queries.presence import NO
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.runtime.errors import FileFormatError, LibraryError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.library import Library
@@ -446,11 +447,51 @@ def test_a_lost_record_is_told_and_written_again(copy):
     (library.stage / "kitchen.json").unlink()
     library.remove("office")  # other changes keep its codes
     for told in (library.search("mug").skipped["kitchen"], library.verify()["kitchen"]):
-        assert "found codes without one" in told
+        assert "found files without one" in told
         assert told.endswith(f"lexsplat library verify {library.root} --repair")
     assert library.verify(repair=True) == {}
     assert (library.stage / "kitchen.json").read_bytes() == before
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
+
+
+def test_files_that_nothing_can_be_recovered_from_are_told_with_another_remedy(copy):
+    library = Library(copy / "library")
+    damage(library.stage / library.record("kitchen").codes_file)
+    (library.stage / "kitchen.json").unlink()
+    told = library.verify(repair=True)["kitchen"]
+    assert told.endswith(f"; add the scene again, or: lexsplat library remove {library.root} kitchen")
+    assert library.remove("kitchen") == "kitchen"
+    assert not list(library.stage.glob("kitchen*"))
+    assert library.verify() == {}
+
+
+@pytest.mark.parametrize("text", [None, "{}"])
+def test_a_scene_whose_record_is_lost_keeps_its_name_from_others(copy, text):
+    library = Library(copy / "library")
+    path = library.stage / "kitchen.json"
+    path.unlink() if text is None else path.write_text(text)
+    shutil.copytree(copy / "office", copy / "other" / "kitchen")
+    assert library.add(copy / "other" / "kitchen").name == "kitchen-2"
+    assert library.add(copy / "kitchen").name == "kitchen"
+    assert library.verify(repair=True) == {}
+    assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
+
+
+def test_codes_that_a_damaged_record_of_an_early_library_does_not_name_stay(copy):
+    path = copy / "library" / "scenes" / "kitchen.json"
+    record = read_json(path)
+    record.pop("hash")
+    write_json(path, {**record, "content": "0" * 24})
+    library = Library(copy / "library")
+    shutil.rmtree(copy / "kitchen")
+    library.remove("office")
+    assert list(library.stage.glob("kitchen.*.safetensors"))
+
+
+def test_a_record_with_a_path_that_no_file_can_have_is_told(copy):
+    path = copy / "library" / "scenes" / "kitchen.json"
+    write_record(dataclasses.replace(read_record(path), path="/a\0b", beside="../nowhere"), path)
+    assert "no such folder" in Library(copy / "library").search("griffin").skipped["kitchen"]
 
 
 def test_a_removal_that_was_killed_is_finished_and_not_undone(copy, monkeypatch):
@@ -518,11 +559,29 @@ def test_files_of_others_are_never_deleted(copy):
     library.add(copy / "office")
     assert library.verify(repair=True) == {}
     assert {"photo.jpg", "features.safetensors", "notes.json.txt"} <= contents(library.stage).keys()
+    (copy / "photos" / "thumbnails" / "kitchen").mkdir(parents=True)
+    (copy / "photos" / "thumbnails" / "kitchen" / "mine.jpg").write_bytes(b"mine")
+    photos = Library.create(copy / "photos")
+    photos.add(copy / "kitchen")
+    (photos.stage / "notes.removed").write_bytes(b"mine")
+    (photos.stage / "old.removed").mkdir()
+    photos.remove("kitchen")
+    photos.add(copy / "office")
+    assert (copy / "photos" / "thumbnails" / "kitchen" / "mine.jpg").read_bytes() == b"mine"
+    assert (photos.stage / "notes.removed").read_bytes() == b"mine"
+    assert (photos.stage / "old.removed").is_dir()
     (copy / "songs").mkdir()
     (copy / "songs" / "library.json").write_text('{"songs": []}')
-    with pytest.raises(LibraryError, match="expected format_version 1"):
-        Library.create(copy / "songs")
-    assert (copy / "songs" / "library.json").read_text() == '{"songs": []}'
+    for text in (
+        '{"songs": []}',
+        '{"format_version": 1, "name": "abc"}',
+        '["\\ud800"]',
+        "[" * 600 + "]" * 600,
+    ):
+        (copy / "songs" / "library.json").write_text(text)
+        with pytest.raises(LibraryError, match=r"library\.json: expected .* give another folder"):
+            Library.create(copy / "songs")
+        assert (copy / "songs" / "library.json").read_text() == text
 
 
 def test_every_changed_byte_of_the_library_file_is_harmless_or_mended(copy):
@@ -612,16 +671,15 @@ def test_a_folder_that_is_no_library_is_refused(tmp_path, copy):
         lexsplat.open_library(tmp_path / "nowhere")
     with pytest.raises(LibraryError, match="other files"):
         Library.create(copy / "kitchen")
-    for facts in (
-        {"format_version": 2, "name": "x"},
-        {"format_version": 1, "name": "../x"},
-        [],
-        {},
-        {"a": 1},
-    ):
+    for facts in ({"format_version": 1, "name": "../x"}, [], {}, {"a": "\ud800"}):
         (copy / "library" / "library.json").write_text(json.dumps(facts))
-        with pytest.raises(LibraryError, match="expected format_version 1"):
+        with pytest.raises(LibraryError, match=r"expected format_version 1 .* --repair"):
             Library(copy / "library")
+    later = {"format_version": 2, "name": "x"}
+    write_json(copy / "library" / "library.json", {**later, "hash": fingerprint(later)})
+    for make in (Library, Library.create):
+        with pytest.raises(LibraryError, match="found version 2; add the scenes to a new library"):
+            make(copy / "library")
 
 
 def test_a_scene_that_is_not_finished_is_refused_and_nothing_changes(copy):

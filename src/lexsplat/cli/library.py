@@ -133,13 +133,16 @@ class LibraryCommand:
         return {"removed": removed}
 
     def _list(self, library: Library) -> dict[str, Any]:
+        from lexsplat.scenes.library.mending import orphans
+
         records = library.records()
         for record in records:
             self._say(f"{record.name}: {record.path}, {record.gaussians:,} Gaussians, encoder {record.clip}")
-        for error in library.damaged.values():
-            self._say(f"damaged: {error}")
+        problems = {**orphans(library), **{name: str(error) for name, error in library.damaged.items()}}
+        for problem in problems.values():
+            self._say(f"damaged: {problem}")
         self._say(f"{len(records)} scenes, {len({record.group for record in records})} encoders")
-        damaged = [{"scene": name, "problem": str(error)} for name, error in library.damaged.items()]
+        damaged = [{"scene": name, "problem": problem} for name, problem in problems.items()]
         return {"scenes": [dataclasses.asdict(record) for record in records], "skipped": damaged}
 
     def _verify(self, library: Library) -> dict[str, Any]:

@@ -8,8 +8,9 @@
     scenes/NAME.CONTENTS.objects.safetensors    segments, objects and pictures, of scenes with segments
     texts/                             embeddings of the texts that were asked
 
-The record is written last and replaced as a whole: a scene is in the library when its record is. Codes that no record
-names were left by a killed writer; the next one removes them.
+The record is written last and replaced as a whole: a scene is in the library when its record is. Codes of earlier
+versions of a scene were left by a killed writer; the next one removes them. Codes without any record stay
+(`lexsplat.scenes.library.mending`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
 from lexsplat.runtime.errors import FileFormatError, LibraryError
@@ -25,10 +27,14 @@ def library_name(root: Path) -> str:
     Raises:
         LibraryError: If there is no library, a damaged one, or one of another format version.
     """
-    path = root / "library.json"
-    mending = (
-        f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
+    path, mending = (
+        root / "library.json",
+        "delete it if it is that of an empty library, or give another folder",
     )
+    if has_entries(root):
+        mending = (
+            f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
+        )
     if not path.is_file():
         raise LibraryError(
             root,
@@ -41,8 +47,8 @@ def library_name(root: Path) -> str:
         facts = read_json(path)
     except FileFormatError as error:
         raise _DamagedError(path, expected=error.expected, found=error.found, remedy=mending) from error
-    if not isinstance(facts, dict) or facts.get("hash", _hash(facts)) != _hash(facts):
-        raise _DamagedError(path, expected=expected, found="damaged content", remedy=mending)
+    if not isinstance(facts, dict) or not _is_intact(facts):
+        raise _DamagedError(path, expected=expected, found="another content than was written", remedy=mending)
     version, name = facts.get("format_version"), facts.get("name")
     if type(version) is int and version > FORMAT_VERSION:
         remedy = "add the scenes to a new library with this version of lexsplat"
@@ -95,6 +101,28 @@ def in_use(root: Path, holder: str) -> LibraryError:
         found=f"process {holder} at work",
         remedy="run the command again when it is done",
     )
+
+
+@contextlib.contextmanager
+def telling_errors(root: Path) -> Iterator[None]:
+    """Errors of the file system as one line with a remedy."""
+    try:
+        yield
+    except OSError as error:
+        temporary = str(error.filename or "").endswith(".tmp")
+        raise LibraryError(
+            root if temporary else error.filename or root,
+            expected="files that can be written",
+            found=str(error.strerror or error),
+            remedy="run the command again when that is mended; the library is as it was before",
+        ) from error
+
+
+def _is_intact(facts: dict) -> bool:
+    try:
+        return bool(facts.get("hash") == _hash(facts))
+    except (ValueError, RecursionError):  # text that no file can hold, or brackets nested too deeply
+        return False
 
 
 def _hash(facts: dict) -> str:

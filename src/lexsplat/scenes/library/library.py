@@ -6,7 +6,6 @@ import contextlib
 import functools
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from lexsplat.runtime.files import locked
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
-from lexsplat.scenes.library.identity import in_use, library_name, make_library
+from lexsplat.scenes.library.identity import in_use, library_name, make_library, telling_errors
 from lexsplat.scenes.library.mending import mended, problems_of
 from lexsplat.scenes.library.records import (
     BUNDLED,
@@ -31,6 +30,9 @@ from lexsplat.scenes.library.records import (
     REMOVED,
     Record,
     read_record,
+    recovered_record,
+    removals,
+    scenes_without_record,
     stamp_of,
     state_of,
 )
@@ -81,7 +83,7 @@ class Library:
         Raises:
             LibraryError: If the folder has files of another program.
         """
-        with _told(Path(root)):
+        with telling_errors(Path(root)):
             make_library(Path(root))
         return cls(root, device, index)
 
@@ -175,7 +177,7 @@ class Library:
         path = self.folder(record)
         try:
             stamp = stamp_of(path)
-        except OSError:
+        except (OSError, ValueError):  # a path that no file can have
             stamp = None
         if stamp and stamp == record.stamp and not thoroughly:
             return False
@@ -260,7 +262,7 @@ class Library:
         Raises:
             LibraryError: If another process changes it, or nothing can be written.
         """
-        with _told(self.root), locked(self.root, lambda holder: in_use(self.root, holder)):
+        with telling_errors(self.root), locked(self.root, lambda holder: in_use(self.root, holder)):
             self._sweep()
             # Asked before anything is changed: whether the server holds what the library holds.
             self._served = self.server is None or self.server.is_current(self.stage, self.groups())
@@ -268,14 +270,15 @@ class Library:
 
     def _sweep(self) -> None:
         """Finish removals, and delete files of earlier versions of scenes; files without a record stay."""
-        marks = list(self.stage.glob(f"[!.]*{REMOVED}"))
-        leaving = {path.stem for path in marks if not path.with_suffix(".json").exists()}
-        kept = {record.name: record.files for record in self.records()}
+        marks = removals(self.stage)
+        leaving = {name for name, path in marks.items() if not path.with_suffix(".json").exists()}
+        whole = (each for each in self.records() if all((self.stage / file).exists() for file in each.files))
+        kept = {record.name: record.files for record in whole}
         for path in self.stage.glob("[!.]*.safetensors"):
             own = OWN_FILE.fullmatch(path.name)
             if own and (own[1] in leaving or path.name not in kept.get(own[1], {path.name})):
                 path.unlink(missing_ok=True)
-        for path in marks:
+        for path in marks.values():
             path.unlink(missing_ok=True)
 
     def add(self, path: str | Path) -> Record:
@@ -330,7 +333,9 @@ class Library:
 
     def _name_for(self, place: str, state: str) -> str:
         """The name of a known or moved scene, or a new one after the folder."""
-        for record in self.records():
+        lost = scenes_without_record(self.stage) | self.damaged.keys()
+        copies = (recovered_record(self.stage, name) for name in sorted(lost))
+        for record in filter(None, (*self.records(), *copies)):
             now = str(self.folder(record))
             if place in (record.path, now):
                 return record.name
@@ -338,7 +343,7 @@ class Library:
                 return record.name  # its folder is gone, and here is the same build
         base = re.sub(r"[^\w-]+", "_", Path(place).name).strip("_").encode()[:80].decode(errors="ignore")
         base = base or "scene"
-        taken, name, number = {known.lower() for known in self.names()}, base, 2
+        taken, name, number = {known.lower() for known in (*self.names(), *lost)}, base, 2
         while name.lower() in taken:
             name, number = f"{base}-{number}", number + 1
         return name
@@ -352,14 +357,15 @@ class Library:
         with self.changing():
             name = self.name_of(scene)
             record = self.record(name)
-            path = self.stage / f"{name}.json"
-            path.replace(path.with_suffix(REMOVED))  # a removal that is killed from here on is finished later
+            path, mark = self.stage / f"{name}.json", self.stage / f"{name}{REMOVED}"
+            # A removal that is killed from here on is finished later.
+            path.replace(mark) if path.exists() else mark.touch()
             self._sweep()
+            mark.unlink(missing_ok=True)
             if self.server and self._served and record is not None:
                 self.server.drop(record, self.stage)
             else:
                 self.bring_to_server()
-            shutil.rmtree(self.root / "thumbnails" / name, ignore_errors=True)
         return name
 
     def name_of(self, scene: str) -> str:
@@ -368,7 +374,7 @@ class Library:
         Raises:
             LibraryError: If there is no such scene.
         """
-        if scene in self.names():
+        if scene in self.names() or scene in scenes_without_record(self.stage):
             return scene
         place = BUNDLED if scene == BUNDLED else str(Path(scene).resolve())
         for record in self.records():
@@ -418,21 +424,6 @@ class Library:
             LibraryError: If another process changes the library, the disk is full, or the server fails.
         """
         return mended(self) if repair else problems_of(self)
-
-
-@contextlib.contextmanager
-def _told(root: Path) -> Iterator[None]:
-    """Errors of the file system as one line with a remedy."""
-    try:
-        yield
-    except OSError as error:
-        temporary = str(error.filename or "").endswith(".tmp")
-        raise LibraryError(
-            root if temporary else error.filename or root,
-            expected="files that can be written",
-            found=str(error.strerror or error),
-            remedy="run the command again when that is mended; the library is as it was before",
-        ) from error
 
 
 def open_library(path: str | Path, *, device: str = "auto", index: str | None = None) -> Library:

@@ -52,11 +52,15 @@ def mended(library: Library) -> dict[str, str]:
 
 def orphans(library: Library) -> dict[str, str]:
     """Scenes whose codes are there without a record, and what to do."""
-    return {
-        name: f"{library.stage / name}.json: expected the record of a scene, found codes without one, of an addition"
-        f" that was killed or is under way, or of a lost record; lexsplat library verify {library.root} --repair"
-        for name in sorted(scenes_without_record(library.stage))
-    }
+    found = {}
+    for name in sorted(scenes_without_record(library.stage)):
+        problem = f"{library.stage / name}.json: expected the record of a scene, found files without one"
+        if recovered_record(library.stage, name) is None:
+            found[name] = f"{problem}; add the scene again, or: lexsplat library remove {library.root} {name}"
+        else:
+            why = "of an addition that was killed or is under way, or of a lost record"
+            found[name] = f"{problem}, {why}; lexsplat library verify {library.root} --repair"
+    return found
 
 
 def _entries(library: Library) -> dict[str, str]:

@@ -156,7 +156,7 @@ def checked_record(content: Any, path: Path) -> Record:
         if not (named and hexadecimal and values["codes"] > 0):
             raise ValueError("other values")
         return Record(**values)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         found = str(error) if type(error) is ValueError else repr(error)
         raise damaged(path, "the record of a scene", found[:80]) from error
 
@@ -178,8 +178,15 @@ def recovered_record(stage: Path, name: str) -> Record | None:
 
 def scenes_without_record(stage: Path) -> set[str]:
     """Names of scenes whose codes are there without a record, and which are not being removed."""
-    known = {path.stem for path in stage.glob("[!.]*") if path.suffix in (".json", REMOVED)}
+    known = {path.stem for path in stage.glob("[!.]*.json")} | removals(stage).keys()
     return {scene for _, scene in _own_files(stage)} - known
+
+
+def removals(stage: Path) -> dict[str, Path]:
+    """The marks of scenes that are being removed, by name; other files with this ending are none."""
+    there = {scene for _, scene in _own_files(stage)}
+    marks = (path for path in stage.glob(f"[!.]*{REMOVED}") if path.is_file())
+    return {path.stem: path for path in marks if path.stem in there or _is_record(path)}
 
 
 def has_entries(root: Path) -> bool:
