@@ -3,6 +3,8 @@
 import importlib.util
 import io
 import json
+import os
+import subprocess
 import sys
 
 import pytest
@@ -19,6 +21,22 @@ def test_each_line_of_the_input_is_answered_with_a_line(monkeypatch, capsys):
     assert [answer.get("present", "error") for answer in answers[:3]] == ["yes", "no", "error"]
     assert "error" not in answers[3], "bytes that are not UTF-8 are replaced"
     assert answers[1]["id"] == 5
+
+
+@pytest.mark.slow
+def test_an_output_that_is_not_utf_8_gets_every_answer(tmp_path):
+    lines = '{"ask": "mug", "id": "\\ud800"}\n{"ask": "mug", "threshold": [1]}\n🍎\nduck\n'
+    done = subprocess.run(
+        [sys.executable, "-m", "lexsplat", "ask", "demo", "--stdin", "--device", "cpu"],
+        input=lines.encode(),
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "cp1252"},
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    answers = [json.loads(line) for line in done.stdout.decode().splitlines()]
+    assert [answer.get("present", "error") for answer in answers] == ["yes", "error", "unsure", "yes"]
+    assert (answers[0]["id"], answers[2]["phrase"]) == ("\ud800", "🍎")
 
 
 def test_a_question_on_the_command_line_is_answered_with_a_sentence(capsys):

@@ -10,6 +10,7 @@ import torch
 from jsonschema import Draft202012Validator
 
 from lexsplat.runtime.bounded import Bounded
+from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
 from lexsplat.scenes.serving import OpenScene, answer_line
@@ -49,6 +50,11 @@ def test_what_was_used_least_recently_is_forgotten():
         ('{"ask": "mug", "view": 5}', "view"),
         ('{"ask": "mug", "threshold": NaN}', "0..1"),
         ('{"ask": "mug", "threshold": "high"}', "0..1"),
+        ('{"ask": "mug", "threshold": [1]}', "0..1"),
+        ('{"ask": "mug", "threshold": {}}', "0..1"),
+        ('{"ask": "mug", "threshold": 1' + "0" * 400 + "}", "0..1"),
+        ('{"ask": "mug", "id": NaN}', "a value of JSON"),
+        ('{"ask": "mug", "id": [1e999]}', "a value of JSON"),
         ('{"ask": ""}', "word or phrase"),
         ('{"ask": "\\ud800"}', "UTF-8"),
         ("x" * (2 << 20), "at most"),
@@ -58,9 +64,21 @@ def test_each_line_is_answered_in_the_schema_and_errors_tell_what_was_expected(d
     answer = answer_line(demo, line)
     errors = [error.message for error in Draft202012Validator(SCHEMA).iter_errors(answer)]
     assert not errors, errors
-    assert json.loads(json.dumps(answer)) == answer
+    assert json.loads(json.dumps(answer, allow_nan=False)) == answer
     assert told in answer.get("error", {}).get("message", "")
     assert bool(told) == ("error" in answer)
+
+
+def test_a_line_that_meets_an_unforeseen_error_is_answered_as_well(demo, monkeypatch):
+    monkeypatch.setattr("lexsplat.scenes.serving.find_phrase", lambda *_: 1 / 0)
+    answer = answer_line(demo, '{"ask": "mug", "id": 3}')
+    assert (answer["id"], "division" in answer["error"]["message"]) == (3, True)
+
+
+@pytest.mark.parametrize("threshold", [[1], {}, "1", 10**400, float("nan"), True])
+def test_a_threshold_that_is_no_number_in_its_range_is_refused_by_the_scene(demo, threshold):
+    with pytest.raises(QueryError, match=r"0\.\.1"):
+        demo.scene.find("mug", threshold=threshold)
 
 
 def test_an_answer_has_the_id_of_its_question_also_if_it_is_an_error(demo):

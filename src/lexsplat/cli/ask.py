@@ -49,6 +49,8 @@ class Ask:
         from lexsplat.scenes.serving import OpenScene, answer_line, sentence
 
         note_hidden("demo", self.scene)
+        # Where a terminal has other letters, "\\u1f34e" stands for an apple; lone surrogates stay valid JSON.
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         served = OpenScene(self.scene, self.device, self.clip)
         for phrase in self.phrases:
             print(sentence(find_phrase(served.scene, phrase), served.scene.world.meters_per_unit))
@@ -57,6 +59,7 @@ class Ask:
         served.warm()
         print(f"{self.scene}: ready, one question a line", file=sys.stderr, flush=True)
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
+        sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # type: ignore[union-attr]
         for line in sys.stdin:
             if line.strip():
                 print(json.dumps(answer_line(served, line), ensure_ascii=False), flush=True)

@@ -8,6 +8,7 @@ the scene does not hold (`lexsplat.queries.presence`). Dimension letters are tho
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -34,9 +35,13 @@ def check_threshold(threshold: float) -> float:
     Raises:
         QueryError: If it is not a number in 0..1.
     """
-    if isinstance(threshold, bool) or not hasattr(threshold, "__float__") or not 0 <= float(threshold) <= 1:
+    try:
+        number = float(threshold) if hasattr(threshold, "__float__") else math.nan  # a text is no number
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # an array of several, 1 with 400 zeros
+        number = math.nan
+    if isinstance(threshold, bool) or not 0 <= number <= 1:
         raise QueryError("threshold", expected="a number in 0..1", found=repr(threshold)[:40])
-    return float(threshold)
+    return number
 
 
 def masks(relevancy: Tensor, thresholds: float | Tensor) -> Tensor:

@@ -293,6 +293,7 @@ class Scene:
             QueryError: If a part of the phrase is empty, the view is unknown, or the threshold is not in 0..1.
         """
         understood = self.understand(phrase)
+        threshold = None if threshold is None else check_threshold(threshold)
         camera = None if view is None else self.camera(view)
         if isinstance(view, Camera):
             return find_in(self, understood, camera, threshold)

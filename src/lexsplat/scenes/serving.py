@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.scene import Scene, open_scene
+
+log = logging.getLogger("lexsplat")
 
 MAX_LINE = 1 << 20
 """Characters of a line of `answer_line`, at most."""
@@ -129,7 +132,7 @@ def answer_line(served: OpenScene, line: str) -> dict[str, Any]:
     """The answer to a line of ``lexsplat ask --stdin`` (docs/schemas/ask.json).
 
     A line is a phrase, or a JSON object with "ask" and optionally "view", "threshold" and "id". Errors are answers
-    as well: one line with "error".
+    as well: one line with "error". No line raises.
     """
     request: dict[str, Any] = {}
     try:
@@ -141,6 +144,12 @@ def answer_line(served: OpenScene, line: str) -> dict[str, Any]:
         return {**_id(request), **answer, "sentence": sentence(answer, scene.world.meters_per_unit)}
     except LexsplatError as error:
         return {**_id(request), **error_document(error)}
+    except Exception as error:  # the next line is answered, whatever this one meets
+        log.exception("a line was not answered")
+        unforeseen = QueryError(
+            "line", expected="an answer", found=repr(error)[:80], remedy="please report it with the line"
+        )
+        return {**_id(request), **error_document(unforeseen)}
 
 
 def _id(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -163,4 +172,8 @@ def _request(line: str) -> dict[str, Any]:
     unknown = set(found) - {"ask", "view", "threshold", "id"}
     if unknown:
         raise QueryError("line", expected="known keys", found=", ".join(sorted(unknown))[:60], remedy=remedy)
+    try:
+        json.dumps(found.get("id"), allow_nan=False)
+    except (ValueError, RecursionError) as error:
+        raise QueryError("id", expected="a value of JSON", found=str(error)[:80], remedy=remedy) from error
     return found
