@@ -156,11 +156,46 @@ ANY, ME = Anything(), Viewer()
         ("what is not the mug?", Except(ANY, MUG)),
         ("children", Thing("child")),
         ("glasses", Thing("glass")),
+        ("which toys can you see?", Thing("toy")),
+        ("which red toys can you see?", Thing("red toy")),
+        ("what toys are on the table?", Related("on", Thing("toy"), Thing("table"))),
+        ("what objects are visible?", ANY),
+        ("what do you see next to the mug?", Related("next to", ANY, MUG)),
+        ("what can I find behind the mug?", Related("behind", ANY, MUG)),
+        ("what else do you have on the mug?", Related("on", ANY, MUG)),
+        ("what is there to see on the mug?", Related("on", ANY, MUG)),
+        ("what can I see through?", Thing("something to see through")),
+        ("what is the thing next to the mug?", Related("next to", ANY, MUG)),
+        ("what's the thing between the mug and the duck?", Between(ANY, MUG, DUCK)),
+        ("what is the name of the object on the mug?", Related("on", ANY, MUG)),
+        ("what's that blue thing?", Thing("something blue")),
+        ("what is that on the mug?", Related("on", ANY, MUG)),
+        ("what are those red things on the mug?", Related("on", Thing("something red"), MUG)),
+        ("which one can I eat?", Thing("something to eat")),
+        ("have I left my mug on the duck?", Related("on", MUG, DUCK)),
+        ("has anyone seen my mug?", MUG),
+        ("has the mug been left on the duck?", Related("on", MUG, DUCK)),
         ("mug with a handle", Thing("mug with a handle")),
     ],
 )
 def test_questions_as_people_ask_them_are_understood(text, expected):
     assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        ("what is the color of the mug?", "that is the"),
+        ("something that is the mug", "that is the"),
+        ("something to see", "to see"),
+        ("something thing with a handle", "thing with a handle"),
+        ("what can hold water?", "can"),
+    ],
+)
+def test_words_around_the_thing_that_are_left_over_are_told_and_the_whole_is_one_thing(text, left):
+    understood = understand(text)
+    assert f'not understood as a question ("{left}")' in understood.note
+    assert understood.phrase == Thing(text.rstrip("?"))
 
 
 def test_words_in_quotation_marks_keep_their_form():

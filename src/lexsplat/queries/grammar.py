@@ -42,7 +42,7 @@ from lexsplat.queries.phrases import (
     things_of,
     with_things,
 )
-from lexsplat.queries.questions import as_phrase, is_question
+from lexsplat.queries.questions import as_phrase, not_understood
 from lexsplat.queries.spelling import singular
 from lexsplat.queries.vocabulary import QUALITIES
 from lexsplat.runtime.errors import QueryError
@@ -166,8 +166,9 @@ def understand(text: str) -> Understood:
     words = as_phrase(plain[:1].lower() + plain[1:])
     parsed = _Parser(text).phrase(words)
     note = ""
-    if any(is_question(thing) for thing in things_of(parsed)):
-        parsed, note = Thing(plain), "not understood as a question: asked for as one thing, in these words"
+    if left := next(filter(None, map(not_understood, things_of(parsed))), ""):
+        parsed = Thing(plain)
+        note = f'not understood as a question ("{left}"): asked for as one thing, in these words'
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note)
 
 
@@ -307,7 +308,7 @@ class _Parser:
                 found="an empty part",
                 remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
             )
-        return Thing(words if " to " in words or is_question(words) else singular(words))
+        return Thing(words if " to " in words or not_understood(words) else singular(words))
 
 
 def _undetermined(words: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-_I = r"(?:i|we|you|one|someone|somebody|they|he|she|it)"
+_I = r"(?:i|we|you|one|someone|somebody|anyone|anybody|they|he|she|it)"
 _CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
 _ROOM = r"(?:the|this|that|your|my) (?:\w+ )?(?:room|scene|place|picture|photos?|image|view|house|kitchen|office|space|area|environment)"
 _FIND = (
@@ -19,6 +19,18 @@ _REQUEST = (
     r"(?: in on| in to| on to| over to| out| up| at| to| for| on| towards?| about)?"
 )
 _HERE = rf"(?:right |over |up |anywhere |somewhere )*(?:here|there|around|anywhere|somewhere|around here|in here|out there|(?:in|inside|of|within) {_ROOM})"
+
+_PLACE = (
+    r"(?:(?:not )?(?:on|upon|in|inside|within|at|by|near|under|underneath|beneath|below|above|over|behind|before|"
+    r"between|beside|besides|around|alongside|next to|close to|(?:left|right|top|front) of|to the|"
+    r"(?:the )?(?:nearest|closest|farthest|furthest)) (?=\S))"
+)
+_SEE = r"(?:see|find|spot|detect|have|notice|recognize)"
+_LEAVE = (
+    r"(?:leave|left|put|place|placed|keep|kept|store|stored|drop|dropped|lose|lost|forget|forgot|forgotten|"
+    r"misplace|misplaced)"
+)
+_ANY = r"(?:things?|objects?|items?|stuff|ones?)"
 
 _CONTRACTIONS = (
     (r"[\u2018\u2019\u02bc]", "'"),
@@ -56,11 +68,11 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     # Where
     (r"where (?:is it|are they)[\s,]+", ""),
     (rf"where(?: else| exactly)? {_CAN} {_I} (?:find|see|get|spot|look for|buy|locate)\s+", ""),
-    (rf"where (?:do|did|have|has|had|would) {_I} (?:ever |last )?(?:leave|left|put|place|placed|keep|kept|store|stored|drop|dropped|lose|lost|have)\s+", ""),
+    (rf"where (?:do|did|have|has|had|would) {_I} (?:ever |last )?(?:{_LEAVE}|have)\s+", ""),
     (rf"where (?:{_CAN}) {_I} (\w+)(?: (.+))?$", "something to @ in"),
     (r"where (?:is|are|was|were|has|have) (?:located |the whereabouts of )?(?=\S)", ""),
     (r"where (.+?) (?:is|are|was|were)(?: located| standing| lying)?$", r"\1"),
-    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|whereabouts|coordinates|place) of ", ""),
+    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|place) of ", ""),
     (r"in which (?:place|corner|spot) (?:is|are) ", ""),
     # How many
     (r"how (?:many|much)(?: of)?(?: the)? (?:different )?", ""),
@@ -70,16 +82,23 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:(?:is|are|was|were) there|there (?:is|are)) ", ""),
     (rf"{_CAN} (?:{_I}|{_ROOM}) (?:\w+ )?(?:see|have|find|spot|contain|hold|show|own|know|include|notice|recognize)(?: of)? ", ""),
     (rf"(?:have|has) (?:{_I}|{_ROOM}) (?:got|seen|found|noticed) ", ""),
+    (rf"(?:have|has|had|did|do|does) {_I} (?:ever |just |already )?{_LEAVE} ", ""),
+    (rf"(?:has|have) (.+?) been (?:seen|found|{_LEAVE})(?= |$)", r"\1"),
     (rf"have {_I} ", ""),
     (r"(?:got|seen|anyone seen) ", ""),
     (r"(?:does|do|did) (?=\S+ \S)", ""),
     # What and which
-    (rf"(?:what|which(?: \w+)?) {_CAN} {_I} (?:see|find|spot|detect|have)$", "thing"),
-    (rf"(?:what|which) ([\w ]+?) {_CAN} {_I} (?:see|find|spot|detect|have)$", r"\1"),
-    (rf"(?:what|which things?|which objects?) {_CAN} {_I} (?:be used to |use to )?(.+)$", r"something to \1"),
+    (r"(what|which) else ", r"\1 "),
+    (rf"(?:what|which) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", "thing"),
+    (rf"(?:what|which) ([\w ]+?) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", r"\1"),
+    (rf"(?:what|which)(?: {_ANY})? {_CAN} {_I} (?:be used to |use to )?(.+)$", r"something to \1"),
     (rf"(?:which|what) (\w+) {_CAN} {_I} (.+)$", r"\1 to \2"),
     (r"(?:what|which)(?: else)? (?:is|are)(?: (?:there|here|this|that|it|these|those|visible|present))?$", "thing"),
+    (rf"what (?:is|are) there to {_SEE}(?=$| {_PLACE})", "thing"),
     (r"what (?:is|are) there (?=\S)", "thing "),
+    (rf"(?:what|which|who) (?:is|are) (?:all )?(?:the|that|this|these|those|a|an) ((?:(?!of\b)\w+ ){{0,3}}?{_ANY})\b", r"\1"),
+    (rf"(?:what|which|who) (?:is|are) (?:that|this|these|those)(?: there| here)? (?={_PLACE})", "thing "),
+    (r"(?:what|which|who) (?:is|are) (?:that|this|these|those) (?=\w+)", ""),
     (r"(?:which|what) (?:one|ones)(?: of (?:the|these|those))? (?=(?:is|are)\b)", "which "),
     (r"(?:which|what) (?:one|ones)? ?of (?:the|these|those|my) ", "which "),
     (r"(?:which|what) (?:color(?:ed)?|colour(?:ed)?|kind of|sort of|type of|kinds of|sorts of|types of) (?=\w)", "which "),
@@ -88,8 +107,8 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what|which) (?:is|are) (?:the )?(?=(?:\w+st|leftmost|rightmost)\b(?! (?:to|from|away)\b))", ""),
     (r"(?:what|which|who) (?:is|are) ", "thing that is "),
     (r"what (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
-    (r"what (\w+s) (.+)$", r"something that \1 \2"),
-    (r"(?:which|what) (.+?) (?:is|are) there$", r"\1"),
+    (r"what (\w+s) (?!(?:is|are|was|were)\b)(.+)$", r"something that \1 \2"),
+    (r"(?:which|what) (.+?) (?:is|are) (?:there|visible|present|shown)$", r"\1"),
     (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
     (r"(?:which|what) (?=\w+ )", ""),
 )  # fmt: skip
@@ -108,6 +127,13 @@ _QUESTION = re.compile(
     r"have|if|whether|please)\b|\b(?:what|where|why|when|i|you|we|they|he|she|is|are|was|were|does|did|me|than)\b",
     re.IGNORECASE,
 )
+
+_LEFT_OVER = re.compile(
+    rf"\b(?:(?:that|which|who) (?:is|are|was|were)(?: (?:the|that|this|these|those|not))?\b|to {_SEE}$"
+    rf"|(?<=something ){_ANY}\b.*|(?:what|where|when|why|does|did)\b)",
+    re.IGNORECASE,
+)
+"""Words around the thing that stay in "something ..." when no frame takes them off."""
 
 
 def as_phrase(words: str) -> str:
@@ -142,9 +168,11 @@ def as_phrase(words: str) -> str:
     return words or whole
 
 
-def is_question(words: str) -> bool:
-    """Whether words that should name a thing still hold a question or a sentence."""
-    return bool(_QUESTION.search(words)) and not words.lower().startswith("something ")
+def not_understood(words: str) -> str:
+    """What of a question or a sentence is left in words that should name a thing; "" if nothing."""
+    something = words.lower().startswith("something ")
+    found = (_LEFT_OVER if something else _QUESTION).search(words)
+    return found[0] if found else ""
 
 
 def _is_count(frame: str) -> bool:
