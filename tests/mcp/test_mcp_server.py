@@ -164,6 +164,58 @@ def test_a_dialogue_of_more_than_twenty_questions_is_answered_rightly(server):
     assert not wrong
 
 
+@pytest.mark.parametrize(
+    ("tool", "arguments"),
+    [
+        ("count", {"phrase": "🍎"}),
+        ("nearest", {"target": "🍎", "to": "mug"}),
+        ("nearest", {"target": "mug", "to": "🍎"}),
+        ("measure", {"first": "mug", "second": "🍎"}),
+        ("render", {"look_at": "🍎"}),
+        ("export", {"phrase": "🍎", "file": "apple.ply"}),
+        ("edit", {"action": "keep", "phrase": "🍎", "folder": "apple", "confirm": True}),
+    ],
+)
+def test_every_answer_tells_what_is_unsure_and_why(scenes, tmp_path, tool, arguments):
+    reply, text = ask(make_server(scenes, tmp_path), tool, **arguments)
+    asked = reply.structured_content["look_at"] if tool == "render" else reply.structured_content
+    assert asked["present"] == "unsure"
+    assert '"🍎"' in asked["understood"]
+    assert 'not "🍎"' in asked["note"]
+    assert asked["note"] in text
+    assert "Perhaps" in text or tool == "edit"
+    assert asked["understood"] in text or tool == "nearest"
+
+
+def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_mended_word_tells_it(scenes, tmp_path):
+    server = make_server(scenes, tmp_path)
+    for phrase, told in (("🍎", "confirm=true"), ("unicorn", "not here")):
+        reply, text = ask(server, "edit", action="delete", phrase=phrase, folder="without")
+        assert reply.is_error
+        assert told in text
+        assert reply.structured_content["error"]["remedy"] or phrase == "unicorn"
+    assert not (tmp_path / "without").exists()
+    reply, text = ask(server, "edit", action="keep", phrase="bananna", folder="banana")
+    assert not reply.is_error
+    assert 'asked for "banana"' in text
+
+
+def test_a_count_of_nothing_says_that_it_is_not_here(server):
+    assert ask(server, "count", phrase="unicorns")[1] == 'Not here: nothing fits "unicorn".'
+
+
+def test_heat_is_drawn_for_what_a_question_asks_and_for_what_a_relation_finds(server):
+    reply, text = ask(
+        server, "render", view="view_033", phrases=["where is the mug?", "mug", "what is on the cloth?"]
+    )
+    question, word, relation = reply.structured_content["legend"]
+    assert (question["understood"], question["present"]) == ('"mug"', "yes")
+    assert {**question, "phrase": ""} == {**word, "phrase": ""}
+    assert relation["understood"] == '(any object on "cloth")'
+    assert (relation["present"], relation["peak"] > 0.5) == ("yes", True)
+    assert 'Heat for "mug": present yes' in text
+
+
 HOSTILE = [
     ("find", {"phrase": "mug", "scene": "../../etc/passwd"}, "no such name"),
     ("find", {"phrase": "mug", "view": "../view"}, "view"),

@@ -11,6 +11,7 @@ from jsonschema import Draft202012Validator
 
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.answers import answer_queries
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
 from lexsplat.scenes.serving import OpenScene, answer_line
@@ -114,6 +115,20 @@ def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(demo, line):
     assert "too long for grammar" in answer["note"]
     assert answer["present"] in ("no", "unsure")
     assert len(answer["sentence"]) < 1000
+
+
+@pytest.mark.parametrize(
+    ("prompt", "understood"),
+    [
+        ("where is the mug?", '"mug"'),
+        ("mug on the cloth", '("mug" on "cloth")'),
+        ("the red mugs", ""),
+        ("mug", ""),
+    ],
+)
+def test_a_query_that_is_a_question_tells_how_find_understands_it(demo, prompt, understood):
+    (answer,) = answer_queries(demo.scene, prompt, ["view_033"], None, None)["prompts"]
+    assert answer["note"] == (understood and f"asked in these words; lexsplat find understands {understood}")
 
 
 def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(demo):

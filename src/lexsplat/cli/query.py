@@ -112,6 +112,8 @@ class Query:
                 f"threshold {answer['threshold']:.2f}, {answer['gaussians']} Gaussians"
                 f"{PRESENCE[answer['present']]}"
             )
+            if answer["note"]:
+                print(f"  note: {answer['note']}")
         print(f"relative to {answers['rests_on']}")
         if folder:
             print(f"images in {folder}")

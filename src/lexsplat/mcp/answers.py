@@ -44,13 +44,18 @@ class Instance(TypedDict):
     best_view: View
 
 
-class Counted(TypedDict):
-    """How many, and how the phrase was understood."""
+class Asked(TypedDict):
+    """How phrases were understood, and whether the scene holds what they name."""
 
-    phrase: str
     understood: str
     note: Annotated[str, Field(description="What was not understood or mended; empty if nothing.")]
     present: Present
+
+
+class Counted(Asked):
+    """How many."""
+
+    phrase: str
     count: Count
 
 
@@ -149,7 +154,7 @@ class Length(TypedDict):
     meters: float | None
 
 
-class NearestAnswer(TypedDict):
+class NearestAnswer(World, Asked):
     """The nearest thing."""
 
     distance: Length
@@ -157,7 +162,7 @@ class NearestAnswer(TypedDict):
     among: Annotated[int, Field(description="Number of things compared.")]
 
 
-class MeasureAnswer(World):
+class MeasureAnswer(World, Asked):
     """Lengths between two things."""
 
     first: Instance
@@ -178,11 +183,10 @@ class PixelAnswer(TypedDict):
     thing: Instance | None
 
 
-class Heat(TypedDict):
+class Heat(Asked):
     """A phrase that is drawn as heat."""
 
     phrase: str
-    present: Present
     peak: float
     threshold: float
 
@@ -191,6 +195,7 @@ class RenderAnswer(TypedDict):
     """What the picture shows."""
 
     view: str
+    look_at: Annotated[Asked | None, Field(description="null where the view was given.")]
     legend: list[Heat]
 
 
@@ -222,14 +227,14 @@ class LibraryAnswer(TypedDict):
     skipped: list[dict[str, str]]
 
 
-class ExportAnswer(TypedDict):
+class ExportAnswer(Asked):
     """The files that were written."""
 
     files: list[str]
     gaussians: Count
 
 
-class EditAnswer(TypedDict):
+class EditAnswer(Asked):
     """The scene that was written."""
 
     scene: str

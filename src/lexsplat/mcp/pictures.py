@@ -7,9 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image, ImageDraw
 
+from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.heatmaps import overlay_heatmap
+from lexsplat.queries.phrases import Thing
+from lexsplat.queries.scoring import render_gaussian_scores
 from lexsplat.scenes.scene import Scene
 
 _WIDTH = 640
@@ -23,7 +27,7 @@ def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[
     Args:
         scene: The scene.
         view: Name of a view.
-        phrases: What the heat is about.
+        phrases: What the heat is about, understood as by `Scene.find`.
 
     Raises:
         QueryError: If the view is unknown or a phrase is empty.
@@ -34,24 +38,32 @@ def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[
     image = scene.render(camera).image.clamp(0, 1).cpu().numpy()
     if not phrases:
         return [], _png([((image * 255).round().astype(np.uint8), view)])
-    answers = scene.ask(phrases)
-    maps = scene.relevancy(phrases, camera).cpu().numpy()
-    legend = [
-        {
-            "phrase": phrase,
-            "present": presence,
-            "peak": round(float(heat.max()), 3),
-            "threshold": round(limit, 4),
-        }
-        for phrase, presence, heat, limit in zip(
-            answers.prompts, answers.presences, maps, answers.thresholds.tolist()
-        )
-    ]
+    drawn = [_heat(scene, camera, phrase) for phrase in phrases]
     tiles = [
         (overlay_heatmap(image, heat), f"{entry['phrase'][:60]}: {entry['present']}, peak {entry['peak']}")
-        for heat, entry in zip(maps, legend)
+        for entry, heat in drawn
     ]
-    return legend, _png(tiles)
+    return [entry for entry, _ in drawn], _png(tiles)
+
+
+def _heat(scene: Scene, camera: Camera, phrase: str) -> tuple[dict[str, Any], np.ndarray]:
+    """What the heat of a phrase shows, and the heat ``[H, W]`` in 0..1: its relevancy, or that of what it finds."""
+    understood, found = scene.understand(phrase), scene.find(phrase)
+    if isinstance(understood.phrase, Thing):
+        heat = scene.relevancy(understood.phrase.text, camera)[0]
+    else:  # a text with relations has no relevancy of its own
+        heat = render_gaussian_scores(
+            scene.gaussians, camera, torch.where(found.mask, found.scores, 0)[None]
+        )[0]
+    entry = {
+        "phrase": phrase,
+        "understood": str(understood.phrase),
+        "note": understood.note,
+        "present": found.present,
+        "peak": round(float(heat.max()), 3),
+        "threshold": round(float(found.threshold), 4),
+    }
+    return entry, heat.cpu().numpy()
 
 
 def _png(tiles: Sequence[tuple[np.ndarray, str]]) -> bytes:

@@ -15,14 +15,14 @@ from lexsplat.mcp import answers
 from lexsplat.mcp.pictures import picture
 from lexsplat.queries.phrases import Related, RelationName, Understood
 from lexsplat.queries.relations import distance, same
-from lexsplat.queries.selection import Selection
+from lexsplat.queries.selection import PRESENCES, Selection
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import find_phrases
 from lexsplat.scenes.finding import find_in
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.serving import OpenScene, sentence
+from lexsplat.scenes.serving import OpenScene, qualified, sentence, shortened
 
 SceneName = Annotated[str, Field(description="Name from list_scenes; may be left out if there is one scene.")]
 PhraseText = Annotated[
@@ -107,7 +107,11 @@ class Tools:
         """Count things by words, such as "apples" or "toys on the table"."""
         answer = self.find(phrase, scene).document["phrases"][0]
         document = {key: answer[key] for key in ("phrase", "understood", "note", "present", "count")}
-        return Reply(f"{answer['count']} found for {answer['understood']}.", document)
+        if not answer["count"]:
+            return Reply(sentence(answer), document)
+        return Reply(
+            qualified(f"{answer['count']} found for {shortened(answer['understood'])}.", document), document
+        )
 
     def relate(
         self,
@@ -141,30 +145,44 @@ class Tools:
     ) -> Annotated[Reply, answers.NearestAnswer]:
         """Find which of several things is nearest to another thing or to a point, and how far away it is."""
         place = self._scene(scene)
+        things, asked = _found(place, target)
+        understood = shortened(asked["understood"])
         if point:
             goal = np.array(point, dtype=float)
             if goal.shape != (3,) or not np.isfinite(goal).all():
                 raise QueryError("point", expected="three finite numbers", found=repr(point)[:60])
-            gaps = [(float(np.linalg.norm(one.center - goal)), one) for one in _instances(place, target)]
+            gaps = [(float(np.linalg.norm(one.center - goal)), one) for one in things]
+            where = f"({', '.join(f'{value:.2f}' for value in point)})"
         else:
-            others = _instances(place, to)
+            others, reference = _found(place, to)
+            asked, where = _both(asked, reference, "nearest to"), shortened(reference["understood"])
             gaps = [
                 (min(distance(one, other) for other in others), one)
-                for one in _instances(place, target)
+                for one in things
                 if not any(same(one, other) for other in others)
             ]
         if not gaps:
             raise QueryError(target, expected="something else than what it is nearest to", found="nothing")
         gap, best = min(gaps, key=lambda entry: entry[0])
-        document = {"distance": _lengths(place, gap), "nearest": best.geometry(), "among": len(gaps)}
-        return Reply(f"{best.phrase} is nearest: {_length(place, gap)} away.", document)
+        document = {
+            **place.world.to_json(),
+            **asked,
+            "distance": _lengths(place, gap),
+            "nearest": best.geometry(),
+            "among": len(gaps),
+        }
+        among = f"the only {understood}" if len(gaps) == 1 else f"of {len(gaps)} for {understood}"
+        said = f"{best.phrase} is nearest to {where}, {among}: {_length(place, gap)} away."
+        return Reply(qualified(said, asked), document)
 
     def measure(
         self, first: PhraseText, second: PhraseText, scene: SceneName = ""
     ) -> Annotated[Reply, answers.MeasureAnswer]:
         """Measure between two things: center to center, the gap between their surfaces, the difference in height."""
         place = self._scene(scene)
-        one, other = (_instances(place, phrase)[0] for phrase in (first, second))
+        (one, *_), asked = _found(place, first)
+        (other, *_), also = _found(place, second)
+        asked = _both(asked, also, "and")
         offset = other.center - one.center
         rise = float(offset @ np.asarray(one.up.direction))
         lengths = {
@@ -174,16 +192,17 @@ class Tools:
         }
         document = {
             **place.world.to_json(),
+            **asked,
             "first": one.geometry(),
             "second": other.geometry(),
             **{name: _lengths(place, value) for name, value in lengths.items()},
         }
         said = (
-            f"{one.phrase} and {other.phrase}: {_length(place, lengths['centers'])} between their centers, "
+            f"{shortened(asked['understood'])}: {_length(place, lengths['centers'])} between their centers, "
             f"{_length(place, lengths['gap'])} between their surfaces; the second is {_length(place, abs(rise))} "
             f"{'higher' if rise >= 0 else 'lower'}."
         )
-        return Reply(said, document)
+        return Reply(qualified(said, asked), document)
 
     def what_is_at(
         self,
@@ -223,15 +242,21 @@ class Tools:
         """Show a picture of a place: a view, or the view that shows a thing best; with a heatmap for each phrase."""
         place = self._scene(scene)
         name = place.view(view).name if view else ""
+        looked_at = None
         if look_at and not name:
-            name = _instances(place, look_at)[0].best_view
+            (best, *_), looked_at = _found(place, look_at)
+            name = best.best_view
         name = name or next(iter(place.views))
         legend, png = picture(place, name, phrases)
-        document = {"view": name, "legend": legend}
-        listed = "; ".join(
-            f"{entry['phrase']}: present {entry['present']}, peak {entry['peak']}" for entry in legend
+        document = {"view": name, "look_at": looked_at, "legend": legend}
+        shown = f"{name} shows {shortened(looked_at['understood'])} best." if looked_at else f"{name}."
+        heat = (
+            f"Heat for {each['understood']}: present {each['present']}, peak {each['peak']}."
+            + (f" Note: {each['note']}." if each["note"] else "")
+            for each in legend
         )
-        return Reply(f"{name}{' with heat for ' + listed if listed else ''}.", document, png)
+        said = qualified(shown, looked_at) if looked_at else shown
+        return Reply(" ".join((said, *heat)), document, png)
 
     def _scene(self, name: str) -> Scene:
         if not name and len(self.scenes) == 1:
@@ -253,16 +278,41 @@ def _facts(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _instances(scene: Scene, phrase: str) -> list[Selection]:
-    """The instances of a phrase, the best first.
+def _found(scene: Scene, phrase: str) -> tuple[list[Selection], dict[str, Any]]:
+    """The instances of a phrase, the best first, and how it was understood (`answers.Asked`).
 
     Raises:
         QueryError: If the scene does not hold it.
     """
-    found = scene.find(phrase)
+    found, asked = asked_of(scene, phrase)
+    return sorted(found.instances, key=lambda one: -one.score), asked
+
+
+def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
+    """What the scene holds of a phrase, and how it was understood (`answers.Asked`).
+
+    Raises:
+        QueryError: If the scene does not hold it.
+    """
+    understood, found = scene.understand(phrase), scene.find(phrase)
     if found.present == "no" or not found:
-        raise QueryError(phrase[:60], expected="something that the scene holds", found="not here")
-    return sorted(found.instances, key=lambda one: -one.score)
+        note = f" ({understood.note})" if understood.note else ""
+        raise QueryError(
+            phrase[:60],
+            expected="something that the scene holds",
+            found=f"not here: nothing fits {shortened(str(understood.phrase))}{note}",
+        )
+    present = {"understood": str(understood.phrase), "note": understood.note, "present": found.present}
+    return found, present
+
+
+def _both(first: dict[str, Any], second: dict[str, Any], link: str) -> dict[str, Any]:
+    """How two phrases were understood; together they are as present as the less certain one."""
+    return {
+        "understood": f"{first['understood']} {link} {second['understood']}",
+        "note": "; ".join(dict.fromkeys(filter(None, (first["note"], second["note"])))),
+        "present": min(first["present"], second["present"], key=PRESENCES.index),
+    }
 
 
 def _lengths(scene: Scene, value: float) -> dict[str, float | None]:

@@ -10,12 +10,12 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from lexsplat.mcp import answers
-from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools
+from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools, asked_of
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene
 from lexsplat.scenes.library import Library
-from lexsplat.scenes.serving import OpenScene
+from lexsplat.scenes.serving import OpenScene, qualified, sentence, shortened
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
 
@@ -39,15 +39,12 @@ class WritingTools(Tools):
         """Write the Gaussians of a thing to a new file for other programs; the ending selects the format."""
         place, path = self._scene(scene), self._new(file)
         ending_of(path)
-        found = place.find(phrase)
-        if not found:
-            raise QueryError(phrase[:60], expected="something that the scene holds", found="not here")
+        found, asked = asked_of(place, phrase)
         path.parent.mkdir(parents=True, exist_ok=True)
         files = export_scene(place, path, found=[replace(found, phrase=phrase)])
         written = [str(each) for each in files]
-        return Reply(
-            f"{len(found)} Gaussians written to {written[0]}.", {"files": written, "gaussians": len(found)}
-        )
+        said = f"{len(found)} Gaussians of {shortened(asked['understood'])} written to {written[0]}."
+        return Reply(qualified(said, asked), {**asked, "files": written, "gaussians": len(found)})
 
     def edit(
         self,
@@ -56,12 +53,20 @@ class WritingTools(Tools):
         folder: Annotated[str, Field(description="Name of a new scene folder for the result.")],
         color: Annotated[list[float], Field(description="Red, green, blue in 0..1, for recolor.")] = [],  # noqa: B006
         scene: SceneName = "",
+        confirm: Annotated[
+            bool, Field(description='True edits also where the scene is "unsure" that it is the thing.')
+        ] = False,
     ) -> Annotated[Reply, answers.EditAnswer]:
         """Make a new scene without a thing, with a thing alone, or with a thing in another color; the scene stays."""
         place, path = self._scene(scene), self._new(folder)
-        found = place.find(phrase)
-        if not found:
-            raise QueryError(phrase[:60], expected="something that the scene holds", found="not here")
+        found, asked = asked_of(place, phrase)
+        if found.present != "yes" and not confirm:
+            raise QueryError(
+                phrase[:60],
+                expected="something that the scene holds for certain",
+                found=sentence({**found.to_dict(), **asked}, place.world.meters_per_unit),
+                remedy="look at it with render, then edit with confirm=true, or name it in other words",
+            )
         path.parent.mkdir(parents=True, exist_ok=True)
         editor = Editor(place)
         if action == "recolor":
@@ -69,8 +74,10 @@ class WritingTools(Tools):
         else:
             getattr(editor, action)(found)
         saved = editor.save(path)
-        document = {"scene": str(saved.root), "action": action, "gaussians": len(found)}
-        return Reply(f"{action}: {len(found)} Gaussians; the result is the scene {saved.root}.", document)
+        document = {**asked, "scene": str(saved.root), "action": action, "gaussians": len(found)}
+        what = f"{shortened(asked['understood'])}{' (unsure)' if asked['present'] == 'unsure' else ''}"
+        said = f"{action} {what}: {len(found)} Gaussians; the result is the scene {saved.root}."
+        return Reply(said + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
     def _new(self, name: str) -> Path:
         path = self.output / name

@@ -207,14 +207,14 @@ class _Parser:
             middle = Between(things, self.phrase(first, deeper), self.phrase(second, deeper))
             return Except(things, middle) if negated else middle
         if found := _QUALITY.search(f" {words}"):
-            noun, rest = _undetermined(f" {words}"[: found.start()].strip()), found[2]
+            noun, rest = undetermined(f" {words}"[: found.start()].strip()), found[2]
             if not found[1] and not _RELATION.search(f" {words} "[found.start() :]) and _is_quality(rest):
                 return self.phrase(f"{rest} {noun}", deeper)
         for splitter, kind in ((_EXCEPT, Except), (_BOTH, Both)):
             parts = splitter.split(f" {words} ", maxsplit=1)
             if len(parts) == 2:
                 if kind is Both and "," in words and _all_qualities(parts[1]):  # vase, white
-                    return self.phrase(f"{parts[1].strip()} {_undetermined(parts[0].strip())}", deeper)
+                    return self.phrase(f"{parts[1].strip()} {undetermined(parts[0].strip())}", deeper)
                 return kind(self.phrase(parts[0], deeper), self.phrase(parts[1], deeper))
         return self.one(words, deeper)
 
@@ -311,7 +311,8 @@ class _Parser:
         return Thing(words if " to " in words or not_understood(words) else singular(words))
 
 
-def _undetermined(words: str) -> str:
+def undetermined(words: str) -> str:
+    """Words without articles and the like in front."""
     while (shorter := _DETERMINER.sub("", words)) != words:
         words = shorter
     return words

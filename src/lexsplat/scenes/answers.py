@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +14,13 @@ import torch
 from torch import Tensor
 
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.spelling import singular
 from lexsplat.queries.thresholds import BORDER, scene_thresholds
 from lexsplat.queries.visibility import without_hidden
 from lexsplat.queries.vocabulary import STUFF
@@ -188,7 +191,7 @@ def answer_queries(
     Returns:
         ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak",
         "peak_view" (the view with the highest relevancy), "gaussians", "present" (whether the scene holds it: "yes",
-        "no" or "unsure") and "views".
+        "no" or "unsure"), "note" (how `Scene.find` understands it, if as something else) and "views".
 
     Raises:
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
@@ -204,6 +207,7 @@ def answer_queries(
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
             "present": present,
+            "note": _heard_by_find(prompt),
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
@@ -223,6 +227,15 @@ def answer_queries(
         "rests_on": rests_on(scene),
         "prompts": answers,
     }
+
+
+def _heard_by_find(prompt: str) -> str:
+    """What to ask in place of a question or a phrase with grammar, which is asked here in its own words."""
+    with contextlib.suppress(QueryError):
+        understood = understand(prompt).phrase
+        if str(understood).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
+            return f"asked in these words; lexsplat find understands {understood}"
+    return ""
 
 
 def rests_on(scene: Scene) -> str:

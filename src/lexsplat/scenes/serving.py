@@ -105,26 +105,33 @@ def error_document(error: LexsplatError) -> dict[str, Any]:
 
 def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) -> str:
     """An answer of `find_phrase` in one plain sentence."""
-    understood = _shortened(answer["understood"], 200)
+    understood = shortened(answer["understood"])
     if answer["present"] == "no":
         said = f"Not here: nothing fits {understood}."
     elif not answer["instances"]:
         said = f"Nothing reaches the threshold {answer['threshold']:g} for {understood}."
     else:
-        unsure = "Perhaps " if answer["present"] == "unsure" else ""
         things = "; ".join(_place(thing, meters_per_unit) for thing in answer["instances"][:8])
         more = f"; and {answer['count'] - 8} more" if answer["count"] > 8 else ""
-        said = f"{unsure}{answer['count']} found for {understood}: {things}{more}."
+        said = f"{answer['count']} found for {understood}: {things}{more}."
+        return qualified(said, answer)
+    return qualified(said, {**answer, "present": "yes"})
+
+
+def qualified(said: str, answer: Mapping[str, Any]) -> str:
+    """A sentence with "Perhaps" where the "present" of an answer is "unsure", and with its "note"."""
+    said = f"Perhaps {said}" if answer["present"] == "unsure" else said
     return f"{said} Note: {answer['note']}." if answer.get("note") else said
 
 
 def _place(thing: Mapping[str, Any], meters_per_unit: float | None) -> str:
     scale, unit = (meters_per_unit, "m") if meters_per_unit else (1.0, "scene units")
     center = ", ".join(f"{value * scale:.2f}" for value in thing["center"])
-    return f"{_shortened(thing['name'], 60)} at ({center}) {unit}, best seen in {thing['best_view']}"
+    return f"{shortened(thing['name'], 60)} at ({center}) {unit}, best seen in {thing['best_view']}"
 
 
-def _shortened(text: str, length: int) -> str:
+def shortened(text: str, length: int = 200) -> str:
+    """A text for a sentence."""
     return text if len(text) <= length else f"{text[:length]}..."
 
 
