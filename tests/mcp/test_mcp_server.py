@@ -200,6 +200,16 @@ def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_mended_wo
     assert 'asked for "banana"' in text
 
 
+@pytest.mark.parametrize("color", [[], [1, 0], [1e308, 0, 1], [-1, 0, 0]])
+def test_a_color_that_is_none_is_refused_with_what_was_expected(scenes, tmp_path, color):
+    server = make_server(scenes, tmp_path)
+    reply, text = ask(server, "edit", action="recolor", phrase="mug", folder="new", color=color)
+    assert reply.is_error
+    assert reply.structured_content["error"]["subject"] == "color"
+    assert "in 0..1" in text
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_count_of_nothing_says_that_it_is_not_here(server):
     assert ask(server, "count", phrase="unicorns")[1] == 'Not here: nothing fits "unicorn".'
 
@@ -227,6 +237,7 @@ HOSTILE = [
     ("what_is_at", {"view": "view_000", "x": 1e300, "y": -1e300}, "outside"),
     ("what_is_at", {"view": "view_000", "x": float("nan"), "y": 0}, "number"),
     ("nearest", {"target": "mug", "point": [1, 2]}, "three finite numbers"),
+    ("nearest", {"target": "mug", "point": [1e200, 0, 0]}, "three finite numbers"),
     ("nearest", {"target": "mug", "point": [1e400, 0, 0]}, "number"),
     ("measure", {"first": "unicorn", "second": "mug"}, "not here"),
     ("relate", {"first": "mug", "relation": "eats", "second": "mug"}, "relation"),

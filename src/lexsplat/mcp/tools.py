@@ -32,6 +32,8 @@ PhraseText = Annotated[
 ViewName = Annotated[
     str, Field(description="Name of a view (a photo): what left, right and me refer to; may be empty.")
 ]
+_FARTHEST = 1e9
+"""Largest coordinate of a point, in scene units."""
 _LISTED = 100
 """Scenes of a library that are listed, at most."""
 
@@ -149,8 +151,9 @@ class Tools:
         understood = shortened(asked["understood"])
         if point:
             goal = np.array(point, dtype=float)
-            if goal.shape != (3,) or not np.isfinite(goal).all():
-                raise QueryError("point", expected="three finite numbers", found=repr(point)[:60])
+            if goal.shape != (3,) or not (np.abs(goal) <= _FARTHEST).all():
+                expected = f"three finite numbers, none beyond {_FARTHEST:g}"
+                raise QueryError("point", expected=expected, found=repr(point)[:60])
             gaps = [(float(np.linalg.norm(one.center - goal)), one) for one in things]
             where = f"({', '.join(f'{value:.2f}' for value in point)})"
         else:

@@ -59,6 +59,13 @@ class WritingTools(Tools):
     ) -> Annotated[Reply, answers.EditAnswer]:
         """Make a new scene without a thing, with a thing alone, or with a thing in another color; the scene stays."""
         place, path = self._scene(scene), self._new(folder)
+        if action == "recolor" and not (len(color) == 3 and all(0 <= value <= 1 for value in color)):
+            raise QueryError(
+                "color",
+                expected="red, green and blue in 0..1",
+                found=repr(color)[:60],
+                remedy="such as [1, 0, 0]",
+            )
         found, asked = asked_of(place, phrase)
         if found.present != "yes" and not confirm:
             raise QueryError(
