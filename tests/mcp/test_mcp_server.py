@@ -3,6 +3,7 @@
 
 import asyncio
 import contextlib
+import shutil
 import socket
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from support.schemas import validated
 
 from lexsplat.mcp.server import http_app, make_server
 from lexsplat.runtime.files import read_json
+from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import open_scenes
 
@@ -208,6 +210,21 @@ def test_a_color_that_is_none_is_refused_with_what_was_expected(scenes, tmp_path
     assert reply.structured_content["error"]["subject"] == "color"
     assert "in 0..1" in text
     assert not (tmp_path / "new").exists()
+
+
+def test_a_scene_that_is_deleted_is_listed_with_its_problem_beside_the_others(tmp_path):
+    shutil.copytree(BUNDLED_SCENE, tmp_path / "gone")
+    server = make_server(open_scenes(["demo", str(tmp_path / "gone")]))
+    shutil.rmtree(tmp_path / "gone")
+    reply, text = ask(server, "list_scenes")
+    assert not reply.is_error
+    demo, gone = reply.structured_content["scenes"]
+    assert (demo["name"], demo["views"]) == ("demo", 72)
+    assert gone["name"] == "gone"
+    assert "moved or deleted" in gone["problem"]
+    assert "moved or deleted" in text
+    resource = talk(server, lambda client: client.read_resource("lexsplat://scenes"))
+    assert '"problem"' in resource.contents[0].text
 
 
 def test_a_count_of_nothing_says_that_it_is_not_here(server):

@@ -117,10 +117,15 @@ class Facts(TypedDict):
     method: str
 
 
-class SceneFacts(Facts):
-    """Facts of a named scene."""
+class SceneFacts(TypedDict):
+    """Facts of a named scene, or why there are none."""
 
     name: str
+    gaussians: NotRequired[Count]
+    views: NotRequired[Count]
+    meters_per_unit: NotRequired[float | None]
+    method: NotRequired[str]
+    problem: NotRequired[Annotated[str, Field(description="Why it cannot be asked.")]]
 
 
 class LibraryFacts(TypedDict):

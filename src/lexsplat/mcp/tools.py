@@ -16,7 +16,7 @@ from lexsplat.mcp.pictures import picture
 from lexsplat.queries.phrases import Related, RelationName, Understood
 from lexsplat.queries.relations import distance, same
 from lexsplat.queries.selection import PRESENCES, Selection
-from lexsplat.runtime.errors import QueryError
+from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.scenes.answers import find_phrases
 from lexsplat.scenes.finding import find_in
 from lexsplat.scenes.library import Library
@@ -59,9 +59,12 @@ class Tools:
 
     def list_scenes(self) -> Annotated[Reply, answers.ScenesAnswer]:
         """List the places that can be searched."""
-        listed = [{"name": name, **_facts(served.scene)} for name, served in self.scenes.items()]
+        listed = [{"name": name, **_facts_or_problem(served)} for name, served in self.scenes.items()]
         document: dict[str, Any] = {"scenes": listed}
-        said = f"{len(listed)} scenes: {', '.join(self.scenes)}." if listed or not self.library else ""
+        names = [
+            f"{each['name']} ({each['problem']})" if "problem" in each else each["name"] for each in listed
+        ]
+        said = f"{len(listed)} scenes: {', '.join(names)}." if listed or not self.library else ""
         if self.library is not None:
             names = self.library.names()
             document["library"] = {"scenes": len(names), "names": names[:_LISTED]}
@@ -279,6 +282,13 @@ def _facts(scene: Scene) -> dict[str, Any]:
         "meters_per_unit": scene.world.meters_per_unit,
         "method": scene.field.method,
     }
+
+
+def _facts_or_problem(served: OpenScene) -> dict[str, Any]:
+    try:
+        return _facts(served.scene)
+    except LexsplatError as error:  # the other scenes are listed all the same
+        return {"problem": str(error)}
 
 
 def _found(scene: Scene, phrase: str) -> tuple[list[Selection], dict[str, Any]]:
