@@ -178,6 +178,23 @@ def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(demo, monkeypa
     assert not torch.equal(scene.ask("mug").scores, first.scores)
 
 
+def test_a_scene_that_changes_while_it_is_opened_is_read_again_at_the_first_question(tmp_path, monkeypatch):
+    folder = tmp_path / "scene"
+    shutil.copytree(BUNDLED_SCENE, folder)
+
+    def open_and_change(*arguments, **options):
+        scene = open_scene(*arguments, **options)
+        record = json.loads((folder / "scene.json").read_text())
+        record["world"] = {**record.get("world", {}), "meters_per_unit": 0.1}
+        (folder / "scene.json").write_text(json.dumps(record))
+        return scene
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lexsplat.scenes.serving.open_scene", open_and_change)
+        served = OpenScene(folder, "cpu")
+    assert served.scene.world.meters_per_unit == 0.1
+
+
 @pytest.mark.slow
 def test_a_scene_that_is_rebuilt_moved_or_deleted_while_it_is_asked(tmp_path):
     folder = tmp_path / "scene"

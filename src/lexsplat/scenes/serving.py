@@ -13,6 +13,7 @@ from typing import Any
 from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import find_phrase
+from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import Scene, open_scene
 
 log = logging.getLogger("lexsplat")
@@ -36,8 +37,9 @@ class OpenScene:
     def __init__(self, path: str | Path, device: str = "auto", clip: str | None = None) -> None:
         self.path, self._device, self._clip = path, device, clip
         self._lock = threading.Lock()
+        self._root = SceneFolder.open(Path(path)).root
+        self._state = self._stamp()  # before it is read: what changes meanwhile is read again
         self._scene = open_scene(path, device=device, clip=clip)
-        self._state = self._stamp()
 
     def warm(self) -> None:
         """Load and compute what the first questions would wait for: the encoder, the dictionary, the objects."""
@@ -63,14 +65,11 @@ class OpenScene:
         return self._scene
 
     def _stamp(self) -> tuple[int, int]:
-        folder = self._scene.folder
-        if folder is None:
-            return (0, 0)
         try:
-            facts = (folder.root / "scene.json").stat()
+            facts = (self._root / "scene.json").stat()
         except OSError as error:
             raise SceneFolderError(
-                folder.root,
+                self._root,
                 expected="the scene that was opened",
                 found="no scene.json: it was moved or deleted",
                 remedy="put it back, or start again with its new place",
