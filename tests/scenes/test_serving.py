@@ -131,6 +131,26 @@ def test_a_query_that_is_a_question_tells_how_find_understands_it(demo, prompt, 
     assert answer["note"] == (understood and f"asked in these words; lexsplat find understands {understood}")
 
 
+@pytest.mark.parametrize(
+    ("phrase", "understood", "names"),
+    [
+        ("red thing", "(red any object)", {"apple", "toy car"}),
+        ("the yellow object", "(yellow any object)", {"rubber duck", "banana", "stack of books"}),
+        ("show me the green things", "(green any object)", {"bottle", "potted plant"}),
+        ("red toy", '(red "toy")', {"toy car"}),
+        ("which fruit is yellow?", '(yellow "fruit")', {"banana"}),
+        ("blue thing on the cloth", '((blue any object) on "cloth")', {"mug"}),
+        ("pink object", "(pink any object)", set()),
+    ],
+)
+def test_a_thing_or_kind_in_a_color_is_the_objects_that_the_list_has_in_this_color(
+    demo, phrase, understood, names
+):
+    answer = answer_line(demo, phrase)
+    assert answer["understood"] == understood
+    assert {thing["name"] for thing in answer["instances"]} == names
+
+
 def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(demo):
     answer = answer_line(demo, '{"ask": "mug", "threshold": 1}')
     assert (answer["count"], answer["instances"]) == (0, [])

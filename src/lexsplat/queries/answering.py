@@ -15,6 +15,7 @@ from lexsplat.queries.phrases import (
     AtLeast,
     Between,
     Both,
+    Colored,
     Except,
     InCorner,
     Phrase,
@@ -51,11 +52,13 @@ class Searched:
         select: The selection of a thing, by its text.
         viewer: The camera of whoever asks, given the reference of a direction; None asks for that of "me".
         objects: The objects of the scene with their names in ``phrase``: what "thing" can be.
+        colors: The color words of an instance, the most frequent first (`lexsplat.queries.colors`).
     """
 
     select: Callable[[str], Selection]
     viewer: Callable[[Selection | None], Camera | None]
     objects: Callable[[], Sequence[Selection]] = tuple
+    colors: Callable[[Selection], Sequence[str]] = lambda _: ()
 
 
 def answer(phrase: Phrase, searched: Searched) -> Selection:
@@ -115,6 +118,14 @@ def _anything(phrase: Anything, searched: Searched) -> Selection:
 
 def _things(searched: Searched) -> tuple[Selection, ...]:
     return tuple(each for each in searched.objects() if each.phrase not in SURFACES)
+
+
+def _colored(phrase: Colored, searched: Searched) -> Selection:
+    """The instances whose main color it is; where there are none, those that have it as well."""
+    targets = answer(phrase.target, searched)
+    colors = [(searched.colors(each), each) for each in _certain(targets)]
+    main = tuple(each for words, each in colors if phrase.color in words[:1])
+    return _joined(targets, main or tuple(each for words, each in colors if phrase.color in words))
 
 
 def _related(phrase: Related, searched: Searched) -> Selection:
@@ -202,8 +213,8 @@ def _viewer(phrase: Viewer, searched: Searched) -> Selection:
 
 
 _ANSWERS: dict[type, Callable[..., Selection]] = {
-    Anything: _anything, Related: _related, Between: _between, InCorner: _corner, Both: _both, Except: _except,
-    Pick: _pick, AtLeast: _at_least, Viewer: _viewer,
+    Anything: _anything, Colored: _colored, Related: _related, Between: _between, InCorner: _corner, Both: _both,
+    Except: _except, Pick: _pick, AtLeast: _at_least, Viewer: _viewer,
 }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ _EXAMPLES = (
     ("pink", (225, 130, 165)), ("brown", (115, 75, 45)),
 )  # fmt: skip
 """sRGB of words, in 0..255, in light and in shade."""
-_WORDS = tuple(dict.fromkeys(word for word, _ in _EXAMPLES))
+COLOR_WORDS = tuple(dict.fromkeys(word for word, _ in _EXAMPLES))
+"""Every color that `color_words` can tell."""
 _LIGHTNESS = 0.5
 """Weight of the difference of lightness; that of hue and chroma is 1. Shading changes lightness most."""
 _LEAST = 0.2
@@ -30,8 +31,12 @@ def color_words(colors: NDArray[np.float64], weights: NDArray[np.float64]) -> li
 
     scale = np.array([_LIGHTNESS, 1.0, 1.0])
     known = rgb2lab(np.array([example for _, example in _EXAMPLES], float) / 255) * scale
-    places = np.array([_WORDS.index(word) for word, _ in _EXAMPLES])
+    places = np.array([COLOR_WORDS.index(word) for word, _ in _EXAMPLES])
     apart = np.linalg.norm((rgb2lab(np.clip(colors, 0, 1)) * scale)[:, None] - known, axis=-1)
-    shares = np.bincount(places[apart.argmin(1)], weights, len(_WORDS)) / max(float(weights.sum()), 1e-12)
+    shares = np.bincount(places[apart.argmin(1)], weights, len(COLOR_WORDS)) / max(
+        float(weights.sum()), 1e-12
+    )
     order = np.argsort(-shares, kind="stable")[:2]
-    return [_WORDS[place] for number, place in enumerate(order) if number == 0 or shares[place] >= _LEAST]
+    return [
+        COLOR_WORDS[place] for number, place in enumerate(order) if number == 0 or shares[place] >= _LEAST
+    ]

@@ -12,6 +12,7 @@ largest book, leftmost mug           one of several
 two apples                           all of them, if there are as many
 mug that is blue; is the mug blue?   the same as "blue mug"; "made of metal" as well
 what is on the cloth?                any object; also "thing", "object", "everything"
+red thing, yellow toys               the objects, or those of a kind, in a color
 what can I drink from?               the same as "something to drink from"
 how many apples are there?           the same as "apple"; plurals are asked for in the singular
 where is the mug? show me the mug    the same as "mug" (`_FRAMES`)
@@ -24,11 +25,14 @@ from __future__ import annotations
 
 import re
 
+from lexsplat.queries.colors import COLOR_WORDS
+from lexsplat.queries.kinds import is_kind
 from lexsplat.queries.phrases import (
     Anything,
     AtLeast,
     Between,
     Both,
+    Colored,
     Except,
     InCorner,
     Phrase,
@@ -298,9 +302,9 @@ class _Parser:
                 return Thing(f"something made of {material}")
             return self.thing(f"{_MATERIAL.get(material, material)} {noun}")
         if found := _THING_WORD.match(words):
-            return Thing(f"something {found[1]}") if found[1] else Anything()
+            return thing_of(f"something {found[1]}") if found[1] else Anything()
         if found := _SOMETHING.match(words):
-            return Thing(f"something {found[1]}")
+            return thing_of(f"something {found[1]}")
         if not words:
             raise QueryError(
                 f"phrase {self.whole!r}",
@@ -308,7 +312,17 @@ class _Parser:
                 found="an empty part",
                 remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
             )
-        return Thing(words if " to " in words or not_understood(words) else singular(words))
+        return thing_of(words if " to " in words or not_understood(words) else singular(words))
+
+
+def thing_of(text: str) -> Phrase:
+    """A thing by its words; "something red" and "red toy" are objects of the scene in a color."""
+    words = text.lower().split()
+    color, target = words.pop() if words[:1] == ["something"] else words.pop(0), " ".join(words)
+    color = "gray" if color == "grey" else color
+    if color in COLOR_WORDS and (target == "something" or is_kind(target)):
+        return Colored(color, Anything() if target == "something" else Thing(target))
+    return Thing(text)
 
 
 def undetermined(words: str) -> str:

@@ -36,6 +36,17 @@ class Anything:
 
 
 @dataclass(frozen=True)
+class Colored:
+    """The instances of ``target`` in a color (`lexsplat.queries.colors`): "red thing", "red toy"."""
+
+    color: str
+    target: Phrase
+
+    def __str__(self) -> str:
+        return f"({self.color} {self.target})"
+
+
+@dataclass(frozen=True)
 class Viewer:
     """Whoever asks: "closest to me". Stands where the view was taken."""
 
@@ -123,7 +134,7 @@ class AtLeast:
 
 
 Phrase = Union[  # noqa: UP007  (forward references)
-    Thing, Anything, Viewer, Related, Between, InCorner, Both, Except, Pick, AtLeast
+    Thing, Anything, Colored, Viewer, Related, Between, InCorner, Both, Except, Pick, AtLeast
 ]
 _PARTS = ("target", "reference", "first", "second")
 

@@ -15,6 +15,7 @@ from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import corrected, strange
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
+from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -77,7 +78,8 @@ def find_in(
             return camera or middle_camera(scene)
         return scene.cameras.get(reference.best_view)
 
-    found = answer(understood.phrase, Searched(select, viewer, lambda: scene.objects))
+    searched = Searched(select, viewer, lambda: scene.objects, lambda thing: object_colors(scene, thing))
+    found = answer(understood.phrase, searched)
     if understood.unknown and found.present == "yes":
         found = found.described(present="unsure")
     if found.present == "no" and threshold is None:

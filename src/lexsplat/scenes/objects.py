@@ -157,14 +157,18 @@ def list_document(
     }
 
 
+def object_colors(scene: Scene, thing: Selection) -> list[str]:
+    """The color words of an object, the most frequent first (`lexsplat.queries.colors`)."""
+    colors = colors_of(thing.selected).astype(np.float64) / 255
+    return color_words(colors, _shown(scene)[thing.indices].double().cpu().numpy())
+
+
 def _entry(scene: Scene, thing: Selection) -> dict[str, Any]:
     """One object of `list_document`."""
-    colors = colors_of(thing.selected).astype(np.float64) / 255
-    weights = _shown(scene)[thing.indices].double().cpu().numpy()
     return {
         **thing.geometry(),
         "names": [{"name": name, "probability": round(share, 4)} for name, share in thing.names],
-        "colors": color_words(colors, weights),
+        "colors": object_colors(scene, thing),
         "surface": thing.phrase in SURFACES,
     }
 
