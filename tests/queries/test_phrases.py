@@ -17,7 +17,7 @@ from lexsplat.queries.phrases import (
     Understood,
     Viewer,
 )
-from lexsplat.queries.spelling import corrected
+from lexsplat.queries.spelling import corrected, spellings
 from lexsplat.runtime.errors import QueryError
 
 MUG, CLOTH, DUCK = Thing("mug"), Thing("cloth"), Thing("duck")
@@ -214,11 +214,48 @@ def test_words_in_quotation_marks_keep_their_form():
     ("typed", "meant"),
     [
         ("rubber dukc", "rubber duck"), ("bananna", "banana"), ("stripped ball", "striped ball"),
+        ("mgu", "mug"), ("canlde", "candle"), ("hosue", "house"), ("candl", "candle"), ("rubber duk", "rubber duck"),
+        ("LCD", "LCD"), ("lego", "lego"), ("rubber", "rubber"), ("bug", "bug"), ("mouse", "mouse"),
+        ("cadle", "candle"),
         ("horse", "horse"), ("theremin", "theremin"), ("mugs", "mugs"), ("日本", "日本"),
     ],
 )  # fmt: skip
 def test_typing_errors_are_mended_and_other_words_are_not(typed, meant):
     assert corrected(typed, ["rubber duck", "banana", "house", "mug", "striped ball", "candle"]) == meant
+
+
+def test_a_word_with_several_possible_meanings_has_them_all_the_likeliest_first():
+    assert spellings("gren mug", ["grey", "green", "mug"]) == ("green mug", "grey mug")
+    assert spellings("appel", ["apple"]) == ("apple",), "a rare word with two letters in the other order"
+    assert spellings("orang", ["orange"]) == ("orange",)
+    assert spellings("range", ["orange"]) == ("range",)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected", "mended"),
+    [
+        ("teh mug", MUG, "the"),
+        ("whre is the mug?", MUG, "where"),
+        ("hwo mnay mugs are there?", MUG, "many"),
+        ("waht is on teh mug", Related("on", ANY, MUG), "what"),
+        ("whcih toys can you see?", Thing("toy"), "which"),
+        ("mug nxet to the duck", Related("next to", MUG, DUCK), "next"),
+        ("blu thing", Colored("blue", ANY), "blue"),
+        ("yelow mug", Thing("yellow mug"), "yellow"),
+    ],
+)
+def test_typing_errors_in_the_words_of_a_question_are_mended_and_told(text, expected, mended):
+    understood = understand(text)
+    assert understood.phrase == expected
+    assert f'asked for "{mended}"' in understood.note
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["led lamp", "lego", "TV", "mat", "tan shoes", "bred", '"teh mug"', "don't I have a mug", "bow", "whale"],
+)
+def test_other_words_are_not_taken_for_those_of_a_question(text):
+    assert "typing error" not in understand(text).note
 
 
 def test_what_was_understood_can_be_read():

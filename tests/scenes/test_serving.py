@@ -97,7 +97,7 @@ def test_a_no_has_no_instances_and_says_so(demo):
 
 @pytest.mark.parametrize(
     ("line", "unknown"),
-    [("🍎", "🍎"), ("das rote apfel", "apfel"), ("красное яблоко", "красное"), ("\x1b[31mmug", "\x1b[31mmug"),
+    [("🍎", "🍎"), ("das rote apfel", 'das", "apfel'), ("красное яблоко", "красное"), ("\x1b[31mmug", "\x1b[31mmug"),
      ("mug left of the \ufffd", "\ufffd")],
 )  # fmt: skip
 def test_words_that_the_bundled_encoder_does_not_know_are_named_and_nothing_is_certainly_here(
@@ -149,6 +149,27 @@ def test_a_thing_or_kind_in_a_color_is_the_objects_that_the_list_has_in_this_col
     answer = answer_line(demo, phrase)
     assert answer["understood"] == understood
     assert {thing["name"] for thing in answer["instances"]} == names
+
+
+@pytest.mark.parametrize(
+    ("typed", "understood"),
+    [("blu mug", "blue mug"), ("duk", "duck"), ("mgu", "mug"), ("appel", "apple"),
+     ("teh mug", "mug"), ("whre is the bannana", "banana"), ("orang cone", "orange cone")],
+)  # fmt: skip
+def test_typing_errors_find_what_is_meant_and_are_told(demo, typed, understood):
+    answer = answer_line(demo, typed)
+    (thing,) = answer["instances"]
+    (meant,) = answer_line(demo, understood)["instances"]
+    assert (answer["present"], answer["understood"]) == ("yes", f'"{understood}"')
+    assert thing["center"] == meant["center"]
+    assert "may be a typing error" in answer["note"]
+
+
+@pytest.mark.parametrize("typed", ["qzx", "kup", "tape duk"])
+def test_a_word_that_is_none_and_resembles_nothing_here_is_told(demo, typed):
+    answer = answer_line(demo, typed)
+    assert f'"{typed.split()[-1]}"' in answer["note"]
+    assert answer["present"] != "yes"
 
 
 def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(demo):

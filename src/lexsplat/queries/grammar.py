@@ -43,10 +43,11 @@ from lexsplat.queries.phrases import (
     Thing,
     Understood,
     Viewer,
+    mended_note,
     things_of,
     with_things,
 )
-from lexsplat.queries.questions import as_phrase, not_understood
+from lexsplat.queries.questions import as_phrase, not_understood, with_asking_words
 from lexsplat.queries.spelling import singular
 from lexsplat.queries.vocabulary import QUALITIES
 from lexsplat.runtime.errors import QueryError
@@ -159,7 +160,7 @@ def understand(text: str) -> Understood:
         QueryError: If a part is empty, a quotation mark is missing, or there are too many parts.
     """
     if len(text) > MAX_LENGTH:
-        return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing")
+        return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", unknown=True)
     if text.count('"') % 2:
         raise QueryError(f"phrase {text!r}", expected="quotation marks in pairs", found="an odd number")
     # Quoted parts are replaced by a character that no pattern contains.
@@ -167,13 +168,13 @@ def understand(text: str) -> Understood:
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text.replace("\x00", ""))
     plain = " ".join(hidden.split()).rstrip("?.!").strip()
-    words = as_phrase(plain[:1].lower() + plain[1:])
-    parsed = _Parser(text).phrase(words)
-    note = ""
+    asked, mended = with_asking_words(plain[:1].lower() + plain[1:])
+    parsed = _Parser(text).phrase(as_phrase(asked))
+    note, unknown = mended_note(mended), False
     if left := next(filter(None, map(not_understood, things_of(parsed))), ""):
-        parsed = Thing(plain)
+        parsed, unknown = Thing(plain), True
         note = f'not understood as a question ("{left}"): asked for as one thing, in these words'
-    return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note)
+    return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
 
 
 def _unhidden(thing: Thing, quoted: list[str]) -> Thing:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Union
 
@@ -146,12 +146,19 @@ class Understood:
     Args:
         phrase: What it asks for.
         note: What was not understood; "" if everything was.
-        unknown: Whether it holds words that the encoder does not know: then nothing is certainly here.
+        unknown: Whether nothing is certainly here: it holds words that the encoder does not know, or has no grammar.
     """
 
     phrase: Phrase
     note: str = ""
     unknown: bool = False
+
+
+def mended_note(meant: Mapping[str, str]) -> str:
+    """A note on typing errors; "" if there are none."""
+    return "; ".join(
+        f'"{typed}" may be a typing error: asked for "{right}"' for typed, right in meant.items()
+    )
 
 
 def parts_of(phrase: Phrase) -> dict[str, Phrase]:

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
+
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.spelling import frame_errors
+from lexsplat.queries.vocabulary import COLORS, QUALITIES, default_vocabulary
 
 _I = r"(?:i|we|you|one|someone|somebody|anyone|anybody|they|he|she|it)"
 _CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
@@ -82,7 +87,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:(?:is|are|was|were) there|there (?:is|are)) ", ""),
     (rf"{_CAN} (?:{_I}|{_ROOM}) (?:\w+ )?(?:see|have|find|spot|contain|hold|show|own|know|include|notice|recognize)(?: of)? ", ""),
     (rf"(?:have|has) (?:{_I}|{_ROOM}) (?:got|seen|found|noticed) ", ""),
-    (rf"(?:have|has|had|did|do|does) {_I} (?:ever |just |already )?{_LEAVE} ", ""),
+    (rf"(?:have|has|had|did|do|does)(?: not)? {_I} (?:ever |just |already )?{_LEAVE} ", ""),
     (rf"(?:has|have) (.+?) been (?:seen|found|{_LEAVE})(?= |$)", r"\1"),
     (rf"have {_I} ", ""),
     (r"(?:got|seen|anyone seen) ", ""),
@@ -136,6 +141,27 @@ _LEFT_OVER = re.compile(
 """Words around the thing that stay in "something ..." when no frame takes them off."""
 
 
+_ASKING = """
+    what where which who how many much there this that these those and the are show find between behind under above
+    below inside next left right front with without except not near closest nearest farthest largest smallest thing
+    things object objects everything anything something
+"""
+_FRAME = frozenset(_ASKING.split()) | COLORS
+_NO_ERRORS = frozenset(re.findall(r"[a-z]+", " ".join(pattern for pattern, _ in _FRAMES)))
+
+
+def with_asking_words(text: str) -> tuple[str, dict[str, str]]:
+    """A question with the typing errors in its question words and colors mended, and what was mended."""
+    wrong = frame_errors(text, _FRAME, _vocabulary(), _NO_ERRORS)
+    return re.sub(r"[^\W\d_]+", lambda word: wrong.get(word[0], word[0]), text), wrong
+
+
+@lru_cache(1)
+def _vocabulary() -> frozenset[str]:
+    names = [*default_vocabulary(), *default_vocabulary("bundled"), *QUALITIES, *everyday_words()]
+    return frozenset(word for name in names for word in name.lower().split())
+
+
 def as_phrase(words: str) -> str:
     """A question or request without the words around the thing: "where can I find the mug" is "the mug".
 
@@ -187,8 +213,6 @@ def _without_tail(words: str) -> str:
 
 def _with_quality_first(words: str) -> str:
     """The statement "the mug red" as a phrase: "red mug"; a statement with a place stays as it is."""
-    from lexsplat.queries.vocabulary import QUALITIES
-
     subject, _, last = words.rpartition(" ")
     if not subject or last.lower() not in QUALITIES:
         return words

@@ -10,10 +10,10 @@ import torch
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import MAX_LENGTH, understand
-from lexsplat.queries.phrases import Thing, Understood, things_of, with_things
+from lexsplat.queries.grammar import thing_of, understand
+from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.spelling import corrected, strange
+from lexsplat.queries.spelling import spellings, strange
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.scenes.objects import object_colors
 
@@ -31,20 +31,20 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
         QueryError: If a part of the phrase is empty.
     """
     understood = understand(phrase)
-    if understood.note:
-        return replace(understood, unknown=len(phrase) > MAX_LENGTH)
+    if understood.unknown:
+        return understood
     vocabulary = [*default_vocabulary(scene.clip), *QUALITIES]
     mended: dict[str, str] = {}
 
-    def mend(thing: Thing) -> Thing:
-        meant = thing.text if thing.exact else corrected(thing.text, vocabulary)
-        if meant == thing.text or scene.ask(meant).presences[0] == "no":
-            return thing
-        mended[thing.text] = meant
-        return Thing(meant)
+    def mend(thing: Thing) -> Phrase:
+        for meant in () if thing.exact else spellings(thing.text, vocabulary):
+            if meant != thing.text and scene.ask(meant).presences[0] != "no":
+                mended[thing.text] = meant
+                return thing_of(meant)
+        return thing
 
     found = with_things(understood.phrase, mend)
-    notes = [f'"{typed}" is in no dictionary: asked for "{meant}"' for typed, meant in mended.items()]
+    notes = [*filter(None, (understood.note, mended_note(mended)))]
     unknown = [word for text in things_of(found) for word in strange(text, vocabulary)]
     if scene.clip == "bundled" and unknown:
         listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])

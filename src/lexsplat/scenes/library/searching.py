@@ -17,7 +17,7 @@ from lexsplat.queries.kinds import is_of_kind
 from lexsplat.queries.phrases import Phrase, Thing, things_of
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import PRESENCES, Presence
-from lexsplat.queries.spelling import corrected
+from lexsplat.queries.spelling import spellings
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError
@@ -423,5 +423,5 @@ def spellings_of(phrase: Phrase, clip: str) -> dict[str, tuple[str, ...]]:
     found = {}
     for text in things_of(phrase):
         members = (name for name in names if is_of_kind(name, text))
-        found[text] = tuple(dict.fromkeys((text, corrected(text, [*names, *QUALITIES]), *members)))
+        found[text] = tuple(dict.fromkeys((text, *spellings(text, [*names, *QUALITIES]), *members)))
     return found
