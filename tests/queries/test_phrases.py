@@ -163,6 +163,8 @@ ANY, ME = Anything(), Viewer()
         ("big red thing", Thing("something big red")),
         ('"red toy"', Thing("red toy")),
         ("which toys can you see?", Thing("toy")),
+        ("which toys are there?", Thing("toy")),
+        ("what kinds of fruit are there?", Thing("fruit")),
         ("which red toys can you see?", Colored("red", Thing("toy"))),
         ("what toys are on the table?", Related("on", Thing("toy"), Thing("table"))),
         ("what objects are visible?", ANY),

@@ -113,7 +113,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what|which|who) (?:is|are) ", "thing that is "),
     (r"what (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
     (r"what (\w+s) (?!(?:is|are|was|were)\b)(.+)$", r"something that \1 \2"),
-    (r"(?:which|what) (.+?) (?:is|are) (?:there|visible|present|shown)$", r"\1"),
+    (r"(?:which|what) (.+?) (?:is|are)(?: (?:there|here|visible|present|shown))?$", r"\1"),
     (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
     (r"(?:which|what) (?=\w+ )", ""),
 )  # fmt: skip
