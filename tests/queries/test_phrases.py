@@ -164,6 +164,7 @@ ANY, ME = Anything(), Viewer()
         ('"red toy"', Thing("red toy")),
         ("which toys can you see?", Thing("toy")),
         ("which toys are there?", Thing("toy")),
+        ("the two largest toys", Pick("largest", Thing("toy"), 2)),
         ("what kinds of fruit are there?", Thing("fruit")),
         ("which red toys can you see?", Colored("red", Thing("toy"))),
         ("what toys are on the table?", Related("on", Thing("toy"), Thing("table"))),

@@ -198,7 +198,8 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
         "leftmost": lambda each: -float(each.center @ right),
         "rightmost": lambda each: float(each.center @ right),
     }[phrase.which]
-    return _joined(targets, (max(targets.instances, key=measure),))
+    ranked = sorted(targets.instances, key=measure, reverse=True)
+    return _joined(targets, tuple(ranked[: phrase.count]) if len(ranked) >= phrase.count else ())
 
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:

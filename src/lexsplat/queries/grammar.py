@@ -24,6 +24,7 @@ What does not fit is one thing, asked for in its own words, and `Understood.note
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 from lexsplat.queries.colors import COLOR_WORDS
 from lexsplat.queries.kinds import is_kind
@@ -235,7 +236,8 @@ class _Parser:
                 quantity, bare = number + bool(found["more"]), bare[found.end() :]
             bare = _DETERMINER.sub("", bare)
         if quantity > 1:
-            return AtLeast(quantity, self.phrase(bare, depth))
+            target = self.phrase(bare, depth)
+            return replace(target, count=quantity) if isinstance(target, Pick) else AtLeast(quantity, target)
         place = self.place(bare, depth)
         return place if place is not None else self.thing(bare)
 

@@ -113,13 +113,18 @@ class Except:
 
 @dataclass(frozen=True)
 class Pick:
-    """One instance of several."""
+    """One instance of several, or the first ``count`` of them if there are as many."""
 
     which: PickName
     target: Phrase
+    count: int = 1
 
     def __str__(self) -> str:
-        return f"({self.which} {self.target})"
+        return (
+            f"({self.count} {self.which} {self.target})"
+            if self.count > 1
+            else f"({self.which} {self.target})"
+        )
 
 
 @dataclass(frozen=True)
