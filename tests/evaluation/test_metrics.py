@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from skimage.metrics import peak_signal_noise_ratio
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from lexsplat.evaluation import metrics
 
@@ -37,7 +36,10 @@ def test_psnr_agrees_with_scikit_image():
     assert metrics.psnr(random_image(0), random_image(1)) == pytest.approx(expected)
 
 
+@pytest.mark.slow  # torchmetrics imports transformers
 def test_ssim_agrees_with_torchmetrics_where_the_window_lies_inside():
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     image = np.clip(random_image(0) * 0.3 + np.linspace(0, 0.7, 41)[None, :, None], 0, 1)
     target = np.clip(image + 0.1 * (random_image(1) - 0.5), 0, 1)
     pair = [torch.from_numpy(side.astype(np.float64)).permute(2, 0, 1)[None] for side in (image, target)]

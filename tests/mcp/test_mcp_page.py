@@ -25,6 +25,7 @@ def transcript():
     return [(tool, json.loads(given), " ".join(said.split())) for tool, given, said in calls]
 
 
+@pytest.mark.slow
 def test_the_transcript_of_the_page_is_what_a_client_gets_over_standard_input_and_output():
     async def replay():
         server = StdioServerParameters(command=sys.executable, args=["-m", "lexsplat", "mcp", "demo"])

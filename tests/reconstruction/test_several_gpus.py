@@ -46,6 +46,7 @@ def three_ranks(monkeypatch):
     return become
 
 
+@pytest.mark.slow
 def test_one_process_trains_what_the_usual_trainer_trains(pretended_gpu, group, capture, points):
     usual = Reconstructor(capture, CONFIG, points, device="cuda", seed=3)
     part = PartReconstructor(capture, CONFIG, points, device="cuda", seed=3)
