@@ -402,7 +402,7 @@ def _reconstruct_block(shared: _Shared, block: Block) -> Gaussians:
 
 
 def _train_block(shared: _Shared, block: Block, path: Path) -> Gaussians:
-    """Train a block on its views, as often a view as in the whole, and keep what lies in its cell.
+    """Train a block, each view as often as for the whole capture, and keep the Gaussians in its cell.
 
     The Gaussians may become as many as the cell keeps, those of its margin in proportion, and the coarse ones
     outside.

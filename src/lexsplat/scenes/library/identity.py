@@ -27,36 +27,27 @@ def library_name(root: Path) -> str:
     Raises:
         LibraryError: If there is no library, a damaged one, or one of another format version.
     """
-    path, mending = (
-        root / "library.json",
-        "delete it if it is that of an empty library, or give another folder",
-    )
-    if has_entries(root):
-        mending = (
-            f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
-        )
+    path = root / "library.json"
     if not path.is_file():
         raise LibraryError(
             root,
             expected="a library of scenes",
             found="no library.json in it" if root.exists() else "no such folder",
-            remedy=mending if has_entries(root) else f"make one with: lexsplat library add {root} SCENE",
+            remedy=_mending(root, f"make one with: lexsplat library add {root} SCENE"),
         )
     expected = f"format_version {FORMAT_VERSION} and a name"
     try:
         facts = read_json(path)
     except FileFormatError as error:
-        raise _DamagedError(path, expected=error.expected, found=error.found, remedy=mending) from error
+        raise _damaged(root, error.expected, error.found) from error
     if not isinstance(facts, dict) or not _is_intact(facts):
-        raise _DamagedError(path, expected=expected, found="another content than was written", remedy=mending)
+        raise _damaged(root, expected, "another content than was written")
     version, name = facts.get("format_version"), facts.get("name")
     if type(version) is int and version > FORMAT_VERSION:
         remedy = "add the scenes to a new library with this version of lexsplat"
         raise LibraryError(path, expected=expected, found=f"version {version}", remedy=remedy)
     if version != FORMAT_VERSION or not isinstance(name, str) or not re.fullmatch(r"\w{1,40}", name):
-        raise _DamagedError(
-            path, expected=expected, found=f"{version!r:.20} and {name!r:.40}", remedy=mending
-        )
+        raise _damaged(root, expected, f"{version!r:.20} and {name!r:.40}")
     return name
 
 
@@ -116,6 +107,19 @@ def telling_errors(root: Path) -> Iterator[None]:
             found=str(error.strerror or error),
             remedy="run the command again when that is mended; the library is as it was before",
         ) from error
+
+
+def _damaged(root: Path, expected: str, found: str) -> _DamagedError:
+    remedy = _mending(root, "delete it if it is that of an empty library, or give another folder")
+    return _DamagedError(root / "library.json", expected=expected, found=found, remedy=remedy)
+
+
+def _mending(root: Path, otherwise: str) -> str:
+    """What mends a lost or damaged ``library.json`` beside entries; another remedy where there are none."""
+    mending = (
+        f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
+    )
+    return mending if has_entries(root) else otherwise
 
 
 def _is_intact(facts: dict) -> bool:

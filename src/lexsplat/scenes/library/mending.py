@@ -27,13 +27,13 @@ def problems_of(library: Library) -> dict[str, str]:
         LibraryError: If nothing else is wrong, and the server fails or holds another state of the library.
     """
     found = {**orphans(library), **_entries(library)}
-    try:
-        if library.server:
+    if library.server:
+        try:
             library.server.groups(library.stage, library.groups())
-    except LibraryError as error:
-        if not found:
-            raise
-        found[library.server.url if library.server else ""] = str(error)
+        except LibraryError as error:
+            if not found:
+                raise
+            found[library.server.url] = str(error)
     return found
 
 
@@ -104,5 +104,5 @@ def _repair(library: Library, name: str) -> None:
         return
     place = library.folder(record)
     if (place / "scene.json").is_file():
-        with contextlib.suppress(LexsplatError):  # what is still wrong is told
+        with contextlib.suppress(LexsplatError):  # `mended` tells what is still wrong
             library.enter(place, name)

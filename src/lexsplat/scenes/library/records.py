@@ -178,14 +178,16 @@ def recovered_record(stage: Path, name: str) -> Record | None:
 
 def scenes_without_record(stage: Path) -> set[str]:
     """Names of scenes whose codes are there without a record, and which are not being removed."""
-    known = {path.stem for path in stage.glob("[!.]*.json")} | removals(stage).keys()
-    return {scene for _, scene in _own_files(stage)} - known
+    listed = os.listdir(stage) if stage.is_dir() else []
+    records = {file.removesuffix(".json") for file in listed if file.endswith(".json")}
+    lost = {scene for _, scene in _own_files(stage)} - records
+    return lost - removals(stage).keys() if lost else lost
 
 
 def removals(stage: Path) -> dict[str, Path]:
     """The marks of scenes that are being removed, by name; other files with this ending are none."""
-    there = {scene for _, scene in _own_files(stage)}
-    marks = (path for path in stage.glob(f"[!.]*{REMOVED}") if path.is_file())
+    marks = [path for path in stage.glob(f"[!.]*{REMOVED}") if path.is_file()]
+    there = {scene for _, scene in _own_files(stage)} if marks else set()
     return {path.stem: path for path in marks if path.stem in there or _is_record(path)}
 
 

@@ -43,7 +43,7 @@ _ASKED = 4
 _REBUILT = 2
 """Rebuilt scenes that are looked at before the others, for each scene that is wanted."""
 _TOLD = 5
-"""Notes and skipped scenes that are told to people, at most."""
+"""Largest number of notes, and of skipped scenes, that an answer prints."""
 
 
 @dataclass(frozen=True)
