@@ -61,12 +61,12 @@ def test_what_is_kept_is_what_is_computed_without_it(copy, demo):
 
 
 def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(copy, demo):
-    assert demo.named is not None, (
+    assert demo.kept is not None, (
         "run tools/demo_scene/ship.py, or lexsplat.scenes.kept.keep on the bundled scene"
     )
     (copy / OBJECTS).unlink()
     scene = open_scene(copy, device="cpu")
-    assert scene.named is None
+    assert scene.kept is None
     assert len(scene.objects) == len(demo.objects) > 10
     for found, kept in zip(scene.objects, demo.objects):
         assert (kept.phrase, [name for name, _ in kept.names]) == (
@@ -82,26 +82,26 @@ def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(
         for one, other in zip(kept.box, found.box):
             assert one == pytest.approx(other)
     places = scene.presence_classifier.places
-    assert places.words == demo.named.places.words
-    assert torch.allclose(places.distributions, demo.named.places.distributions, atol=1e-6)
+    assert places.words == demo.kept.places.words
+    assert torch.allclose(places.distributions, demo.kept.places.distributions, atol=1e-6)
 
 
 def test_kept_objects_are_those_of_one_encoder_query_and_scene_or_none(copy, demo):
     content = (copy / OBJECTS).read_bytes()
     for damaged in (content[:1000], b"", content[:-1] + bytes([content[-1] ^ 1])):
         (copy / OBJECTS).write_bytes(damaged)
-        assert open_scene(copy, device="cpu").named is None
+        assert open_scene(copy, device="cpu").kept is None
     (copy / OBJECTS).write_bytes(content)
     scene = open_scene(copy, device="cpu")
-    assert scene.named is not None
+    assert scene.kept is not None
     scene.query = QueryConfig(temperature=5.0)
-    assert scene.named is None, "another query"
+    assert scene.kept is None, "another query"
     scene.query = QueryConfig()
     scene.field.codes[0, 0] ^= 1
-    scene.__dict__.pop("named", None)
-    assert scene.named is None, "another language"
+    scene.__dict__.pop("kept", None)
+    assert scene.kept is None, "another language"
     some = torch.arange(len(demo.gaussians)) % 2 == 0
-    assert demo.with_content(demo.gaussians.select(some), demo.field.select(some)).named is None
+    assert demo.with_content(demo.gaussians.select(some), demo.field.select(some)).kept is None
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_a_saved_edit_keeps_what_its_views_show(copy, tmp_path):
     editor.save(tmp_path / "saved")
     saved = open_scene(tmp_path / "saved", device="cpu")
     assert saved.seen.complete
-    assert saved.named is not None
+    assert saved.kept is not None
     assert "mug" not in [each.phrase for each in saved.objects]
 
 

@@ -2,7 +2,7 @@
 
 ``checkpoints/seen.safetensors`` is written whole or not at all, after a build and for a saved edit. It names the
 Gaussians, segments and cameras that it was computed from. A file of others, or a damaged one, counts as none: what it
-holds is then computed when it is asked for. The objects of the scene are kept beside it (`lexsplat.scenes.named`).
+holds is then computed when it is asked for. The objects of the scene are beside it (`kept_objects`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.named import FILE, Named, read_named, write_named
+from lexsplat.scenes.kept_objects import FILE, KeptObjects, read_objects, write_objects
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -71,8 +71,8 @@ def keep(scene: Scene) -> None:
             return  # no question can be asked with this encoder
         judge = scene.presence_classifier
         scene.embed(judge.colored or ["object"])
-        if scene.named is None and scene.field.segments is not None:
-            write_named(scene, Named(scene.objects, judge.places), path.with_name(FILE))
+        if scene.kept is None and scene.field.segments is not None:
+            write_objects(scene, KeptObjects(scene.objects, judge.places), path.with_name(FILE))
     except (OSError, LexsplatError) as error:  # the file is optional, and questions tell of a missing encoder
         log.warning("%s: not kept (%s)", path, str(error)[:200])
 
@@ -90,10 +90,10 @@ def _path(scene: Scene) -> Path | None:
     return None if scene.folder is None else scene.folder.root / "checkpoints" / "seen.safetensors"
 
 
-def named_of(scene: Scene) -> Named | None:
+def kept_objects_of(scene: Scene) -> KeptObjects | None:
     """The objects of a scene, where its folder keeps them."""
     path = _path(scene)
-    return None if path is None else read_named(scene, path.with_name(FILE))
+    return None if path is None else read_objects(scene, path.with_name(FILE))
 
 
 def scene_key(scene: Scene) -> str:

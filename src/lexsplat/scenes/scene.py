@@ -48,8 +48,8 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView
-from lexsplat.scenes.kept import named_of, seen_of
-from lexsplat.scenes.named import Named
+from lexsplat.scenes.kept import kept_objects_of, seen_of
+from lexsplat.scenes.kept_objects import KeptObjects
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 
@@ -117,7 +117,7 @@ class Scene:
         self._classifier: PresenceClassifier | None = None
         self._scale: EverydayScale | None = None
         self._objects: tuple[Selection, ...] | None = None
-        self.__dict__.pop("named", None)
+        self.__dict__.pop("kept", None)
         kept = max(32, min(1024, _KEPT_BYTES // (9 * max(1, len(self.gaussians)))))
         self._words: Bounded[str, Word] = Bounded(kept)
         self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
@@ -315,7 +315,7 @@ class Scene:
         """Its objects with everyday names (`lexsplat.scenes.objects.objects_of`), the largest first."""
         if self._objects is None:
             with self._working:
-                self._objects = self._objects or (self.named.objects if self.named else objects_of(self))
+                self._objects = self._objects or (self.kept.objects if self.kept else objects_of(self))
         return self._objects
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
@@ -336,7 +336,7 @@ class Scene:
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            known = (self.everyday_scale, self.embed, self.named.places if self.named else None)
+            known = (self.everyday_scale, self.embed, self.kept.places if self.kept else None)
             self._classifier = PresenceClassifier(self.gaussians, self.field, *known)
         return self._classifier
 
@@ -346,9 +346,9 @@ class Scene:
         return seen_of(self)
 
     @cached_property
-    def named(self) -> Named | None:
+    def kept(self) -> KeptObjects | None:
         """Its objects as its folder keeps them; None where it keeps none of this scene, encoder and query."""
-        return None if self._given_encode_text is not None else named_of(self)
+        return None if self._given_encode_text is not None else kept_objects_of(self)
 
     @property
     def hidden(self) -> Tensor:

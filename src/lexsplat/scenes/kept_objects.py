@@ -39,7 +39,7 @@ _VERSION = 1
 
 
 @dataclass(frozen=True)
-class Named:
+class KeptObjects:
     """What a file of objects holds.
 
     Args:
@@ -51,7 +51,7 @@ class Named:
     places: DescribedPlaces
 
 
-def read_named(scene: Scene, path: Path) -> Named | None:
+def read_objects(scene: Scene, path: Path) -> KeptObjects | None:
     """The objects of a scene from a file; None where it does not fit the scene."""
     if not path.exists() or not isinstance(scene.field, CodeField):
         return None
@@ -60,32 +60,32 @@ def read_named(scene: Scene, path: Path) -> Named | None:
         if facts.get("of") != _key(scene, scene.field):
             return None
         places = DescribedPlaces(tensors["places"], tuple(json.loads(facts["words"])))
-        return Named(_selections(scene, tensors, json.loads(facts["objects"])), places)
+        return KeptObjects(_selections(scene, tensors, json.loads(facts["objects"])), places)
     except (FileFormatError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
         log.warning("%s: computed again (%s)", path, str(error)[:100])
         return None
 
 
-def write_named(scene: Scene, named: Named, path: Path) -> None:
+def write_objects(scene: Scene, kept: KeptObjects, path: Path) -> None:
     """Write the objects of a scene; nothing is written of a scene without codes."""
     if not isinstance(scene.field, CodeField):
         return
     numbers = torch.full((len(scene.gaussians),), -1, dtype=torch.int32)
-    for number, each in enumerate(named.objects):
+    for number, each in enumerate(kept.objects):
         numbers[each.indices.cpu()] = number
-    boxes = [np.concatenate([part.ravel() for part in each.box]) for each in named.objects]
+    boxes = [np.concatenate([part.ravel() for part in each.box]) for each in kept.objects]
     tensors = {
-        "numbers": numbers.short() if len(named.objects) < 1 << 15 else numbers,
+        "numbers": numbers.short() if len(kept.objects) < 1 << 15 else numbers,
         "boxes": torch.from_numpy(np.array(boxes).reshape(-1, 15)),
-        "strengths": torch.stack([each.scores[each.indices[0]].cpu() for each in named.objects])
-        if named.objects
+        "strengths": torch.stack([each.scores[each.indices[0]].cpu() for each in kept.objects])
+        if kept.objects
         else torch.zeros(0),
-        "places": named.places.distributions.cpu().contiguous(),
+        "places": kept.places.distributions.cpu().contiguous(),
     }
     facts = {
         "of": _key(scene, scene.field),
-        "objects": json.dumps([[each.phrase, each.names] for each in named.objects]),
-        "words": json.dumps(named.places.words),
+        "objects": json.dumps([[each.phrase, each.names] for each in kept.objects]),
+        "words": json.dumps(kept.places.words),
     }
     write_tensors(path, tensors, facts)
 
