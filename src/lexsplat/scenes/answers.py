@@ -283,8 +283,9 @@ def find_phrase(
 ) -> dict[str, Any]:
     """One entry of `find_phrases`."""
     understood = scene.understand(phrase)
-    found = scene.find(phrase, view, threshold=threshold).to_dict()
-    return {**found, "phrase": phrase, "understood": str(understood.phrase), "note": understood.note}
+    found = scene.find(phrase, view, threshold=threshold)
+    note = "; ".join(filter(None, (understood.note, found.note)))
+    return {**found.to_dict(), "phrase": phrase, "understood": str(understood.phrase), "note": note}
 
 
 def default_views(scene: Scene) -> list[str]:
