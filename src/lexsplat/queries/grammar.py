@@ -60,8 +60,10 @@ from lexsplat.queries.questions import (
     as_phrase,
     asks_for_all,
     asks_yes_or_no,
+    in_full,
     not_in_answer,
     not_understood,
+    states,
     with_asking_words,
 )
 from lexsplat.queries.spelling import singular
@@ -94,10 +96,11 @@ def understand(text: str) -> Understood:
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text.replace("\x00", ""))
     plain = " ".join(hidden.split()).rstrip("?.!").strip()
-    asked, mended = with_asking_words(plain[:1].lower() + plain[1:])
-    parsed = _Parser(text, together=asks_yes_or_no(asked)).question(asked)
+    mended_text, mended = with_asking_words(plain[:1].lower() + plain[1:])
+    asked = in_full(mended_text)
+    parsed = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked)).question(asked)
     aside = not_in_answer(asked)
-    note, unknown = "; ".join(filter(None, (mended_note(mended), aside))), bool(aside)
+    note, unknown = "; ".join(filter(None, (mended_note(mended), aside))), aside.startswith('"')
     left = next(
         filter(None, (not_understood(patterns.HIDDEN.sub("thing", each)) for each in things_of(parsed))), ""
     )
@@ -120,8 +123,8 @@ def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
 class _Parser:
     """Recursive descent: what binds loosest is split first."""
 
-    def __init__(self, whole: str, together: bool = False) -> None:
-        self.whole, self.together = whole, together
+    def __init__(self, whole: str, together: bool = False, stated: bool = False) -> None:
+        self.whole, self.together, self.stated = whole, together, stated
 
     def question(self, asked: str) -> Phrase:
         """A question or a phrase, with the words around the thing."""
@@ -200,8 +203,10 @@ class _Parser:
         together = joint != "or" and " or " not in other
         first, second = self.phrase(re.sub(r"^both\s", "", one), depth), self.phrase(other, depth)
         placed = isinstance(second, (Related, Between, InCorner, InPart)) and "target" not in parts_of(first)
-        if self.together and together and placed:
+        if placed and (self.stated or (self.together and together)):
             first = replace(second, target=first)  # are the mug and the duck on the table?
+        elif self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
+            second = replace(first, reference=second)  # is the mug on the table or the cloth?
         return (Together if together else Both)(first, second)
 
     def one(self, words: str, depth: int) -> Phrase:
@@ -209,7 +214,7 @@ class _Parser:
         if found := patterns.OF_TWO.match(words):
             rest = undetermined(words[found.end() :]) or "thing"
             return Pick(patterns.COMPARATIVES[found["more"].lower()], self.phrase(rest, depth))
-        bare, before = words, None
+        bare, before = patterns.THE_ONE.sub("thing ", words), None
         quantity = rank = 0
         while bare != before:
             before = bare

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from lexsplat.queries.kinds import is_kind
+from lexsplat.queries.vocabulary import COLORS
 
 NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 ORDINALS = (
@@ -28,7 +29,7 @@ _FUNCTION_WORDS = """
     better best worse worst farther farthest further furthest leftmost rightmost topmost
     i me you he him she her it its we us they them myself yourself itself himself herself themselves mine yours
     ours theirs this that these those each everyone everybody everything anyone anybody nobody someone somebody
-    else another same other others
+    else another same other others similar identical alike
     am is are was were be been being do does did doing done has have had having would should shall must
     cannot could ought
     all every any some no none nothing both half most more less least fewer fewest much many several enough dozen
@@ -73,6 +74,7 @@ _UNIT = re.compile(
     r"^(?:(?:centi|milli|kilo)?met(?:er|re)s?|cm|mm|km|inch(?:es)?|feet|foot|yards?) of\b", re.IGNORECASE
 )
 _FIXED = re.compile(
+    rf"\b(?:{'|'.join(sorted(COLORS))}),? and (?=(?:{'|'.join(sorted(COLORS))})\b)|"
     rf"\b(?:with|of) (?:no|\d+|{'|'.join(NUMBERS)}) (?=\w)|\b(?:made|built)(?: out)? of\b|\bfirst aid\b|"
     r"^no \w+ing\b|\bcan of\b|(?<=\w )(?:on|in|at|by) (?=it$)",
     re.IGNORECASE,
@@ -92,15 +94,17 @@ def left_over(text: str) -> str:
     """
     if text.lower() == "can":
         return ""
-    found = _DESCRIBES.match(text)
-    verbs = found.end() if found else len(text)
+    described = _DESCRIBES.match(text)
+    verbs = described.end() if described else len(text)
     shown = _FIXED.sub(lambda found: "." * len(found[0]), text)
-    patterns = (_PART, _UNIT, _NUMBER, _STARTS, *(() if found else (_LATER,)))
+    patterns = (_PART, _UNIT, _NUMBER, _STARTS, *(() if described else (_LATER,)))
     places = [found.span() for pattern in patterns if (found := pattern.search(shown))]
     for word in _WORD.finditer(shown):
-        small = word[0].lower()
-        allowed = word.start() >= verbs and small in _VERB_PHRASE
-        if small in _CLOSED and not allowed and not (found and small == "that" and word.end() <= verbs):
+        small, is_verb = word[0].lower(), described is not None and word.end() <= verbs
+        allowed = (is_verb and small in ("that", "which", "who")) or (
+            word.start() >= verbs and small in _VERB_PHRASE
+        )
+        if small in _CLOSED and not allowed:
             places.append(word.span())
             break
     if places:

@@ -73,7 +73,11 @@ BY_ME = re.compile(
 )
 DETERMINER = re.compile(
     r"^(?:the|a|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|these|those|"
-    r"one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|only|other|such)\s+",
+    r"one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|only|such)\s+",
+    re.IGNORECASE,
+)
+THE_ONE = re.compile(
+    r"^(?:(?:the|that|this) )?one (?=(?:on|in|at|to|near|next|close|behind|under|above|beside|by|from|inside)\b)",
     re.IGNORECASE,
 )
 EXCEPT = re.compile(

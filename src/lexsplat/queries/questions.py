@@ -6,7 +6,7 @@ import re
 from functools import lru_cache
 
 from lexsplat.queries.everyday import everyday_words
-from lexsplat.queries.leftovers import left_over
+from lexsplat.queries.leftovers import ORDINALS, left_over
 from lexsplat.queries.spelling import frame_errors
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, default_vocabulary
 
@@ -79,7 +79,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (rf"where (?:{_CAN}) {_I} (\w+)(?: (.+))?$", "something to @ in"),
     (r"where (?:is|are|was|were|has|have) (?:located |the whereabouts of )?(?=\S)", ""),
     (r"where (.+?) (?:is|are|was|were)(?: located| standing| lying)?$", r"\1"),
-    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|place) of ", ""),
+    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|place|sizes?|heights?|widths?|lengths?|dimensions) of ", ""),
     (r"in which (?:place|corner|spot) (?:is|are) ", ""),
     # How many, how large
     (r"how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)", ""),
@@ -96,6 +96,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:got|seen|anyone seen) ", ""),
     (r"(?:does|do|did) (?=.+ (?:stand|sit|lie|hang|rest|have)\b)", ""),
     # What and which
+    (rf"(?:which|what) ([\w ]+?) (?:is|are) (?:the )?({'|'.join(ORDINALS)}|\d+(?:st|nd|rd|th)) (?:one )?(?=from)", r"\2 \1 "),
     (r"(what|which) else ", r"\1 "),
     (rf"(?:what|which) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", "thing"),
     (rf"(?:what|which) ([\w ]+?) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", r"\1"),
@@ -125,7 +126,9 @@ _FRAMES: tuple[tuple[str, str], ...] = (
 )  # fmt: skip
 _COMPILED = tuple((re.compile("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
 _ADJECTIVE = rf"(?:{'|'.join(sorted(QUALITIES))})"
-_LAST_QUALITIES = re.compile(rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE)
+_LAST_QUALITIES = re.compile(
+    rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE
+)
 _ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
 _STATE = re.compile(
     r"(?<! than)\b(big|small|large|little|tall|open|closed|empty|full|broken|wet|dry|dirty|clean|old|new)$",
@@ -148,9 +151,10 @@ _LEFT_OVER = re.compile(
 _YES_OR_NO = re.compile(
     r"^(?:(?:please|hey|hi|so|well|ok|okay|tell me|check)[\s,]+)*(?:if |whether )?"
     r"(?:(?:is|are|was|were|do|does|did|have|has|can|could)\b|there (?:is|are)\b)"
-    rf"(?! {_I} (?:please |kindly |just )?(?!find|see|spot|detect|locate){_FIND})",
+    rf"(?! {_I} (?:please |kindly |just )?(?!find|see|spot|detect|locate){_FIND})|.*\b(?:whether|if) (?=there|the|a|an|any)\b",
     re.IGNORECASE,
 )
+_STATED = re.compile(r"^(?:is|are|was|were|do|does|did) (?!there\b|you\b|i\b|we\b)", re.IGNORECASE)
 _ALL_OF = re.compile(
     r"^(?:is|are|was|were|do|does|did) (?:all(?: of)?(?: the| my| these| those)?|every|each|everything)\b",
     re.IGNORECASE,
@@ -160,7 +164,8 @@ _ALL_OF = re.compile(
 _ASKING = """
     what where which who how many much there this that these those and the are show find between behind under above
     below inside next left right front with without except not near closest nearest farthest largest smallest thing
-    things object objects everything anything something
+    things object objects everything anything something biggest tallest shortest leftmost rightmost middle second third
+    bigger smaller larger taller shorter
 """
 _FRAME = frozenset(_ASKING.split()) | COLORS
 _NO_ERRORS = frozenset(re.findall(r"[a-z]+", " ".join(pattern for pattern, _ in _FRAMES)))
@@ -178,14 +183,19 @@ def _vocabulary() -> frozenset[str]:
     return frozenset(word for name in names for word in name.lower().split())
 
 
+def in_full(words: str) -> str:
+    """Words without contractions: "what is" for "what's"."""
+    for contraction, long in _CONTRACTIONS:
+        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
+    return words
+
+
 def as_phrase(words: str) -> str:
     """A question or request without the words around the thing: "where can I find the mug" is "the mug".
 
     Args:
-        words: One sentence with single spaces, without the mark at its end.
+        words: One sentence `in_full` with single spaces, without the mark at its end.
     """
-    for contraction, long in _CONTRACTIONS:
-        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
     whole, before = words, ""
     is_asked = False
     while words != before:
@@ -227,6 +237,11 @@ def not_in_answer(words: str) -> str:
         return 'the answer is the thing: "lexsplat list" tells colors'
     state = _STATE.search(words) if asks_yes_or_no(words) else None
     return f'"{state[1]}" is asked as a word of the thing, which photos may not tell' if state else ""
+
+
+def states(words: str) -> bool:
+    """Whether a question asks if a statement is so: "is the mug on the table?", but not "is there a mug?"."""
+    return _STATED.match(words) is not None
 
 
 def asks_for_all(words: str) -> bool:

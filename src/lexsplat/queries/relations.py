@@ -222,9 +222,10 @@ def in_corner(targets: Selection, everything: Selection, corner: CornerName, fra
 
 
 def in_part(targets: Selection, area: Selection, part: PartName, frame: Frame) -> Selection:
-    """The instances of ``targets`` in a part of an area, a rectangle along the viewer's axes.
+    """The instances of ``targets`` over or on ``area`` that are in a part of it.
 
-    The area holds the boxes of ``area``. "Back" and "front" are as the viewer sees them.
+    The parts are those of the rectangle around the boxes of ``area`` along the viewer's axes. "Back" and "front" are
+    as the viewer sees them.
     """
     axes = np.stack([frame.right, frame.ahead])
     places = np.array([axes @ each.center for each in area.instances]).reshape(-1, 2)
@@ -242,7 +243,7 @@ def in_part(targets: Selection, area: Selection, part: PartName, frame: Frame) -
             "front": ahead <= -_MIDDLE,
             "edge": out >= _EDGE,
         }
-        if out <= 1 and held[part]:
+        if held[part] and (out <= 1 or bool(related("on", replace(each, parts=()), area, frame))):
             kept.append(each)
     return _union(targets, kept)
 

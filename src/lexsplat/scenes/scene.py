@@ -298,7 +298,7 @@ class Scene:
         if isinstance(view, Camera):
             return find_in(self, understood, camera, threshold)
         name = view.name if isinstance(view, StoredView) else view
-        key = (str(understood.phrase), name, threshold)
+        key = (str(understood.phrase), understood.unknown, name, threshold)
         return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
     def understand(self, phrase: str) -> Understood:
