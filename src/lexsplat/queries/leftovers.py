@@ -67,9 +67,10 @@ _PART = re.compile(
     re.IGNORECASE,
 )
 _NUMBER = re.compile(
-    rf"(?<![\w-])(?:\d+(?:[.,]\d+)?(?:st|nd|rd|th|cm|mm|m|km)?|{'|'.join((*NUMBERS, *ORDINALS))})(?![\w-])",
+    rf"(?<![\w-])(?:\d+(?:[.,]\d+)?(?:st|nd|rd|th|cm|mm|m|km|(?=\s))|{'|'.join((*NUMBERS, *ORDINALS))})(?![\w-])",
     re.IGNORECASE,
 )
+"""Numbers, but not the one at the end of a name: "room 101"."""
 _UNIT = re.compile(
     r"^(?:(?:centi|milli|kilo)?met(?:er|re)s?|cm|mm|km|inch(?:es)?|feet|foot|yards?) of\b", re.IGNORECASE
 )

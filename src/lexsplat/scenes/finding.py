@@ -11,11 +11,10 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import thing_of, understand
-from lexsplat.queries.kinds import KINDS
+from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings, strange
-from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     understood = understand(phrase)
     if understood.unknown:
         return understood
-    vocabulary = [*default_vocabulary(scene.clip), *QUALITIES, *KINDS]
+    vocabulary = words_of_things(scene.clip)
     mended: dict[str, str] = {}
 
     def mend(thing: Thing) -> Phrase:
