@@ -24,6 +24,7 @@ from lexsplat.queries.phrases import (
     Phrase,
     Pick,
     Related,
+    RelationName,
     Thing,
     Together,
     Viewer,
@@ -49,6 +50,8 @@ _LARGE = 0.05
 """A selection of this share of a scene may be several objects; smaller ones are taken as they are."""
 _TO_VIEWER = ("left of", "right of", "in front of", "behind", "next to", *ORDERED)
 """Relations that a thing can have to a viewer."""
+_HELD_BY: tuple[RelationName, ...] = ("on", "inside")
+"""Relations of a thing to the thing that holds it."""
 _WHOLE = 0.5
 """An object belongs to a selection that has this share of its Gaussians."""
 
@@ -178,6 +181,9 @@ def _part(phrase: InPart, searched: Searched) -> Selection:
     targets = answer(phrase.target, searched)
     frame = _frame(searched, targets)
     reference = answer(phrase.reference, searched)
+    if phrase.reference != Anything():
+        held = [related(relation, targets, reference, frame).parts for relation in _HELD_BY]
+        targets = _joined(targets, (*held[0], *(each for each in held[1] if each not in held[0])))
     found = in_part(targets, reference, phrase.part, frame)
     return replace(found, present=min(found.present, reference.present, key=PRESENCES.index))
 

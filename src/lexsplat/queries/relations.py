@@ -222,7 +222,7 @@ def in_corner(targets: Selection, everything: Selection, corner: CornerName, fra
 
 
 def in_part(targets: Selection, area: Selection, part: PartName, frame: Frame) -> Selection:
-    """The instances of ``targets`` over or on ``area`` that are in a part of it.
+    """The instances of ``targets`` that are in a part of an area, seen from above.
 
     The parts are those of the rectangle around the boxes of ``area`` along the viewer's axes. "Back" and "front" are
     as the viewer sees them.
@@ -243,7 +243,7 @@ def in_part(targets: Selection, area: Selection, part: PartName, frame: Frame) -
             "front": ahead <= -_MIDDLE,
             "edge": out >= _EDGE,
         }
-        if held[part] and (out <= 1 or bool(related("on", replace(each, parts=()), area, frame))):
+        if held[part]:
             kept.append(each)
     return _union(targets, kept)
 
