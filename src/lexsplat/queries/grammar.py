@@ -96,7 +96,7 @@ def understand(text: str) -> Understood:
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text.replace("\x00", ""))
     plain = " ".join(hidden.split()).rstrip("?.!").strip()
-    mended_text, mended = with_asking_words(plain[:1].lower() + plain[1:])
+    mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
     asked = in_full(mended_text)
     parsed = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked)).question(asked)
     aside = not_in_answer(asked)
@@ -191,6 +191,8 @@ class _Parser:
             return None
         joint = f" {words} "[len(parts[0]) : -len(parts[1])].strip().lower()
         one, other = parts[0].strip(), parts[1].strip()
+        if re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE):  # closest to both the mug and the lamp
+            return Thing(words)
         if "," in words and _all_qualities(other):  # vase, white
             return self.phrase(f"{other} {undetermined(one)}", depth)
         if (
@@ -202,11 +204,11 @@ class _Parser:
             one = f"{one} {noun}"  # the red or the yellow ball
         together = joint != "or" and " or " not in other
         first, second = self.phrase(re.sub(r"^both\s", "", one), depth), self.phrase(other, depth)
-        placed = isinstance(second, (Related, Between, InCorner, InPart)) and "target" not in parts_of(first)
-        if placed and (self.stated or (self.together and together)):
-            first = replace(second, target=first)  # are the mug and the duck on the table?
-        elif self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
+        is_placed = "target" in parts_of(first)
+        if self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
             second = replace(first, reference=second)  # is the mug on the table or the cloth?
+        elif not is_placed and (self.stated or (self.together and together)):
+            first = _in_place_of(second, first)  # are the mug and the duck on the table?
         return (Together if together else Both)(first, second)
 
     def one(self, words: str, depth: int) -> Phrase:
@@ -322,6 +324,13 @@ class _Parser:
                 remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
             )
         return thing_of(words if " to " in words or not_understood(words) else singular(words))
+
+
+def _in_place_of(second: Phrase, first: Phrase) -> Phrase:
+    """The first thing with the place of the second, if that has one."""
+    return (
+        replace(second, target=first) if isinstance(second, (Related, Between, InCorner, InPart)) else first
+    )
 
 
 def _loosened(phrase: Phrase, together: bool) -> Phrase:

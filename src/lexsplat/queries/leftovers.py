@@ -62,8 +62,9 @@ _PART_WORD = (
 )
 _PART = re.compile(
     rf"^(?:(?:very|far|near|other|outer|inner) )?(?:{_PART_WORD})(?:$|\s(?:of|side|part|end|half|row)\b)|"
-    r"^something (?:front|back|rear|top|bottom|upper|lower|last|next|central)$|^(?:last|next)\b|"
-    r"\b(?:number|amount|couple|majority|lots?) of\b|\b(?!rally\b)\w{3,}ally\b",
+    r"^something (?:front|back|rear|top|bottom|upper|lower|last|next|central|close|far|near)$|^(?:last|next|final)\b|"
+    r"\b(?:number|amount|couple|majority|lots?) of\b|\b(?!rally\b)\w{3,}ally\b|"
+    r"\b(?!almost\b)\w{2,}most\b",
     re.IGNORECASE,
 )
 _NUMBER = re.compile(

@@ -29,7 +29,8 @@ RELATIONS: tuple[tuple[str, RelationName], ...] = (
 )  # fmt: skip
 LINK = (
     r"(?:(?:that|which|who)\s)?(?:(?:is|are|was|were|there|stands?|sits?|lies|lie|hangs?|rests?|standing|sitting|"
-    r"lying|hanging|resting|located|placed|positioned|found|directly|right|just|immediately|also|much|slightly)\s)*"
+    r"lying|hanging|resting|located|placed|positioned|found|directly|right|just|immediately|also|much|"
+    r"slightly|somewhat|a bit|a little)\s)*"
 )
 RELATION = re.compile(
     rf"\s{LINK}(?P<not>not\s(?:the\s)?)?(?:"
@@ -37,7 +38,9 @@ RELATION = re.compile(
     + r")\s",
     re.IGNORECASE,
 )
-BETWEEN = re.compile(rf"^(.*?)\s{LINK}(not\s)?(?:in )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE)
+BETWEEN = re.compile(
+    rf"^(.*?)\s{LINK}(not\s)?(?:in |halfway |midway )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE
+)
 CORNER = re.compile(
     rf"^(.*?)\s{LINK}(not\s)?(?:in|at|on|into)\s(?:the|a|an|any|one|some)\s(?:(back|front|far|near|rear|top|bottom)"
     r"(?:\s|-)?)?(?:(left|right)(?:\s|-)?(?:hand )?)?corners?(?:\sof\s.*)?$",
@@ -72,8 +75,9 @@ BY_ME = re.compile(
     re.IGNORECASE,
 )
 DETERMINER = re.compile(
-    r"^(?:the|a|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|these|those|"
-    r"one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|only|such)\s+",
+    r"^(?:the|a(?! bit\b)|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|these|those|"
+    r"one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|such|"
+    rf"only(?! (?:\d|(?:{'|'.join(NUMBERS)})\b)))\s+",
     re.IGNORECASE,
 )
 THE_ONE = re.compile(
@@ -86,7 +90,9 @@ EXCEPT = re.compile(
     re.IGNORECASE,
 )
 NOT = re.compile(r"^(?:what is |things? that (?:is|are) )?not (?=(?:the|a|an|my) )", re.IGNORECASE)
-BOTH = re.compile(r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with)\s|\s*,\s*", re.IGNORECASE)
+BOTH = re.compile(
+    r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with|&|\+)\s|\s*,\s*", re.IGNORECASE
+)
 PICKS: tuple[tuple[str, PickName], ...] = (
     (r"largest|biggest|greatest|hugest|bulkiest", "largest"),
     (r"smallest|tiniest|littlest", "smallest"),
@@ -122,7 +128,7 @@ QUANTITY = re.compile(
     rf"^(?P<more>more than |over )?(?:at least )?(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
     r"a few|a couple of|a pair of(?! (?:scissors|glasses|trousers|pants|jeans|shorts|binoculars|headphones|pliers|"
     r"tongs)\b))"
-    r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|cm|mm|m)\b)(?:of\s+)?",
+    r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )
 QUALITY = re.compile(

@@ -55,6 +55,7 @@ _TAIL = re.compile(
     rf"[\s,;]+(?:please|pls|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
     re.IGNORECASE,
 )
+_TAG = re.compile(r",\s*(?:right|correct|yes|no|or not|is it not|are they not)$", re.IGNORECASE)
 _WHERE_IS_IT = re.compile(
     r"[\s,;]+where (?:is it|are they|did it go|did i (?:leave|put) (?:it|them))$", re.IGNORECASE
 )
@@ -118,7 +119,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:which|what) (?:is|are) (?:a|an|the|my) (?=(?:\w+ ?){1,3}$)", ""),
     (r"(?:what|which) (?:is|are) (?:the )?(?=(?:\w+st|leftmost|rightmost)\b(?! (?:to|from|away)\b))", ""),
     (r"(?:what|which|who) (?:is|are) ", "thing that is "),
-    (r"what (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
+    (r"(?:what|who) (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
     (r"what (\w+s) (?!(?:is|are|was|were)\b)(.+)$", r"something that \1 \2"),
     (r"(?:which|what) (.+?) (?:is|are)(?: (?:there|here|visible|present|shown))?$", r"\1"),
     (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
@@ -200,7 +201,7 @@ def as_phrase(words: str) -> str:
     is_asked = False
     while words != before:
         before = words
-        words = _without_tail(_WHERE_IS_IT.sub("", words))
+        words = _without_tail(_TAG.sub("", _WHERE_IS_IT.sub("", words)))
         for pattern, instead in _COMPILED:
             found = pattern.match(words)
             if found is None:
@@ -216,7 +217,7 @@ def as_phrase(words: str) -> str:
                 words, is_asked = words[found.end() :], True
     words = _PURPOSE.sub(r"something to \2", words)
     if is_asked:
-        words = _with_quality_first(words)
+        words = _with_quality_first(words) or f"is {words}"
     return words or whole
 
 
@@ -260,6 +261,11 @@ def _without_tail(words: str) -> str:
 
 
 def _with_quality_first(words: str) -> str:
-    """The statement "the mug red" as a phrase: "red mug"; a statement with a place stays as it is."""
+    """The statement "the mug red" as a phrase: "red mug"; a statement with a place stays as it is.
+
+    One about several things is none: "the apple red and the banana yellow".
+    """
     found = _LAST_QUALITIES.match(words)
+    if found and re.search(r"\b(?:and|or)\b", found[1]):
+        return ""
     return f"{found[2]} {_ARTICLES.sub('', found[1])}" if found else words
