@@ -98,9 +98,10 @@ def understand(text: str) -> Understood:
     plain = " ".join(hidden.split()).rstrip("?.!").strip()
     mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
     asked = in_full(mended_text)
-    parsed = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked)).question(asked)
-    aside = not_in_answer(asked)
-    note, unknown = "; ".join(filter(None, (mended_note(mended), aside))), aside.startswith('"')
+    parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
+    parsed, aside = parser.question(asked), not_in_answer(asked)
+    note = "; ".join(filter(None, (mended_note(mended), *parser.notes, aside)))
+    unknown = aside.startswith('"') or (bool(parser.notes) and parser.stated)  # is the mug big?
     left = next(
         filter(None, (not_understood(patterns.HIDDEN.sub("thing", each)) for each in things_of(parsed))), ""
     )
@@ -125,6 +126,7 @@ class _Parser:
 
     def __init__(self, whole: str, together: bool = False, stated: bool = False) -> None:
         self.whole, self.together, self.stated = whole, together, stated
+        self.notes: list[str] = []
 
     def question(self, asked: str) -> Phrase:
         """A question or a phrase, with the words around the thing."""
@@ -230,8 +232,21 @@ class _Parser:
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
             ordered = numbered(target, max(quantity, 1), max(rank, 1))
             return ordered or (Thing(words) if rank else AtLeast(quantity, target))
+        if found := patterns.SIZE.match(bare):
+            return self.sized(bare, found, depth)
         place = self.place(bare, depth)
         return place if place is not None else self.thing(bare)
+
+    def sized(self, words: str, found: re.Match[str], depth: int) -> Phrase:
+        """ "Small mug on the table": one of several; "small mugs" have no measure."""
+        rest = words[found.end() :]
+        placed = patterns.RELATION.search(f" {rest} ")
+        head = (f" {rest}"[: placed.start()] if placed else rest).strip()
+        if singular(head) != head or patterns.SEVERAL.search(head):
+            return Thing(words)
+        which = patterns.SIZES[found[1].lower()]
+        self.notes.append(f'"{found[1]}" is taken for the {which}')
+        return Pick(which, self.phrase(rest, depth))
 
     def place(self, words: str, depth: int) -> Phrase | None:
         """A phrase with a place or a superlative; None for a thing."""

@@ -17,6 +17,8 @@ ORDINALS = (
     "twelfth",
 )  # fmt: skip
 _SIZES = "big large great huge giant small little tiny tall short high low long wide medium mini"
+_RELATIVE = "big large huge small little tiny tall"
+"""Sizes that say something only among several things."""
 _GRADED = (
     _SIZES
     + """
@@ -116,7 +118,7 @@ def left_over(text: str) -> str:
 
 
 def _size(text: str) -> str:
-    """A size that is asked of no certain thing: "big toy", "something small red"."""
+    """A size that is asked of no certain thing: "big toys", "something small red"."""
     words = text.lower().split()
-    vague = len(words) > 1 and (words[0] == "something" or is_kind(words[-1]))
-    return next((word for word in words if vague and word in _SIZES.split()), "")
+    sizes = _SIZES if len(words) > 1 and (words[0] == "something" or is_kind(words[-1])) else _RELATIVE
+    return next((word for word in words[: len(words) - 1] if word in sizes.split()), "")

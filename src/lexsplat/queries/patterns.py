@@ -75,8 +75,8 @@ BY_ME = re.compile(
     re.IGNORECASE,
 )
 DETERMINER = re.compile(
-    r"^(?:the|a(?! bit\b)|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|these|those|"
-    r"one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|such|"
+    r"^(?:the|a(?! bit\b)|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|"
+    r"these|those|one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|such|"
     rf"only(?! (?:\d|(?:{'|'.join(NUMBERS)})\b)))\s+",
     re.IGNORECASE,
 )
@@ -105,6 +105,13 @@ PICK_WORDS = "|".join(f"(?P<p{i}>{words})" for i, (words, _) in enumerate(PICKS)
 COMPARATIVES: dict[str, PickName] = {
     "bigger": "largest", "larger": "largest", "smaller": "smallest", "taller": "tallest", "shorter": "shortest",
 }  # fmt: skip
+SIZES: dict[str, PickName] = {
+    "big": "largest", "large": "largest", "huge": "largest", "small": "smallest", "little": "smallest",
+    "tiny": "smallest", "tall": "tallest", "short": "shortest",
+}  # fmt: skip
+SIZE = re.compile(rf"^({'|'.join(SIZES)}) (?!sleeved?\b)(?=\S)", re.IGNORECASE)
+"""A size says something only among several things: "the small mug" is the smallest one."""
+SEVERAL = re.compile(r"\b(?:things|objects|items|ones|stuff)$", re.IGNORECASE)
 COMPARATIVE = rf"(?P<more>{'|'.join(COMPARATIVES)})"
 OF_TWO = re.compile(
     rf"^the {COMPARATIVE}(?! than\b)(?: one)?(?: of (?:the )?(?:two|both))?(?:\s|$)", re.IGNORECASE

@@ -132,7 +132,7 @@ _LAST_QUALITIES = re.compile(
 )
 _ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
 _STATE = re.compile(
-    r"(?<! than)\b(big|small|large|little|tall|open|closed|empty|full|broken|wet|dry|dirty|clean|old|new)$",
+    r"(?<! than)\b(open|closed|empty|full|broken|wet|dry|dirty|clean|old|new)$",
     re.IGNORECASE,
 )
 _COUNTED_TAIL = re.compile(

@@ -232,7 +232,10 @@ def answer_queries(
 def _heard_by_find(prompt: str) -> str:
     """What to ask in place of a question or a phrase with grammar, which is asked here in its own words."""
     with contextlib.suppress(QueryError):
-        understood = understand(prompt).phrase
+        parsed = understand(prompt)
+        understood = parsed.phrase
+        if parsed.unknown:
+            return parsed.note
         if str(understood).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
             return f"asked in these words; lexsplat find understands {understood}"
     return ""
