@@ -217,6 +217,7 @@ def test_questions_as_people_ask_them_are_understood(text, expected):
         ("anything within one meter of the mug", "one"),
         ("big toys", "big"),
         ("small red mugs", "small"),
+        ("tiny things on the table", "tiny"),
         ("the middle toy", "middle"),
         ("left side of the mug", "left"),
         ("the top of the mug", "top of"),

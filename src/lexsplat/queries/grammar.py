@@ -243,7 +243,7 @@ class _Parser:
         placed = patterns.RELATION.search(f" {rest} ")
         head = (f" {rest}"[: placed.start()] if placed else rest).strip()
         if singular(head) != head or patterns.SEVERAL.search(head):
-            return Thing(words)
+            return Thing(f"{found[1]} {head}")
         which = patterns.SIZES[found[1].lower()]
         self.notes.append(f'"{found[1]}" is taken for the {which}')
         return Pick(which, self.phrase(rest, depth))
