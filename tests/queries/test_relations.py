@@ -227,6 +227,7 @@ NAMES = {
         ("what is at the front of the table", ("bowl",)),
         ("the far ball at the back of the table", ("far ball",)),
         ("lamp in the middle of the table", ()),
+        ("balls on the left side of the table", ("left ball",)),
     ],
 )
 def test_questions_are_answered_with_the_things_that_fit(things, text, expected):

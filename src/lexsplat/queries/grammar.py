@@ -100,7 +100,7 @@ def understand(text: str) -> Understood:
     asked = in_full(mended_text)
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
     parsed, aside = parser.question(asked), not_in_answer(asked)
-    note = "; ".join(filter(None, (mended_note(mended), *parser.notes, aside)))
+    note = "; ".join(filter(None, (mended_note(mended), *dict.fromkeys(parser.notes), aside)))
     unknown = aside.startswith('"') or (bool(parser.notes) and parser.stated)  # is the mug big?
     left = next(
         filter(None, (not_understood(patterns.HIDDEN.sub("thing", each)) for each in things_of(parsed))), ""
@@ -177,6 +177,8 @@ class _Parser:
         parts = patterns.EXCEPT.split(f" {words} ", maxsplit=1)
         if len(parts) < 2:
             return None
+        if parts[1].strip().lower() in ("one", "two"):  # the largest but one
+            return Thing(words)
         first, second = (self.phrase(part, depth) for part in parts)
         if (
             isinstance(second, Pick)
@@ -312,7 +314,9 @@ class _Parser:
         name = patterns.PARTS.get(part.lower(), "middle")
         is_place = not of or patterns.PLACE.match(of) is not None
         is_surface = bool(of) and singular(undetermined(of.lower())).split()[-1] in SURFACES
-        if of and (not determined or (name in ("back", "front") and not (is_place or is_surface))):
+        if of and (not determined or (name not in ("middle", "edge") and not (is_place or is_surface))):
+            return None
+        if not of and name in ("left", "right"):  # one of several: the mug on the left side
             return None
         things = self.phrase(target or "thing", depth)
         inside = InPart(things, name) if is_place else InPart(things, name, self.phrase(of, depth))

@@ -86,6 +86,11 @@ _FIXED = re.compile(
 """Function words of fixed noun phrases."""
 _DESCRIBES = re.compile(r"something (?:to|that|which|who|made|with)\b|.*\S to (?=\w)", re.IGNORECASE)
 """What has words of a verb phrase after it."""
+_ARTICLE = re.compile(
+    r"\b(?!(?:with|of|for|without|like|from|\w+ing)\b)\w+ (?:the|a|an|my|your)\b(?= \w)|^(?:order|size)\b",
+    re.IGNORECASE,
+)
+"""An article behind a word that joins nothing to it: "shelf holds the book"."""
 _STARTS = re.compile(r"^(?:of|to|from|for|with|without|about|off|out|up|down|over|in|on)\b", re.IGNORECASE)
 _LATER = re.compile(r"(?<=\w )(?:from|about|off|out|up|down|in|on|over)\b", re.IGNORECASE)
 
@@ -101,7 +106,7 @@ def left_over(text: str) -> str:
     described = _DESCRIBES.match(text)
     verbs = described.end() if described else len(text)
     shown = _FIXED.sub(lambda found: "." * len(found[0]), text)
-    patterns = (_PART, _UNIT, _NUMBER, _STARTS, *(() if described else (_LATER,)))
+    patterns = (_PART, _UNIT, _NUMBER, _STARTS, *(() if described else (_LATER, _ARTICLE)))
     places = [found.span() for pattern in patterns if (found := pattern.search(shown))]
     for word in _WORD.finditer(shown):
         small, is_verb = word[0].lower(), described is not None and word.end() <= verbs

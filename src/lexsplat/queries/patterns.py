@@ -9,17 +9,18 @@ from lexsplat.queries.phrases import PartName, PickName, RelationName
 from lexsplat.queries.vocabulary import COLORS
 
 RELATIONS: tuple[tuple[str, RelationName], ...] = (
-    (r"(?:to|on|at) (?:the|my|its) left(?: hand)?(?: side)? of|left of", "left of"),
-    (r"(?:to|on|at) (?:the|my|its) right(?: hand)?(?: side)? of|right of", "right of"),
+    (r"(?:to|on|at|in) (?:the|my|its) left(?: hand)?(?: side)? of|left of", "left of"),
+    (r"(?:to|on|at|in) (?:the|my|its) right(?: hand)?(?: side)? of|right of", "right of"),
     (r"in front of|before", "in front of"),
-    (r"behind|(?:at|in|on) the back of|in back of", "behind"),
+    (r"behind|(?:at|in|on|to) the (?:back|rear) of|in back of", "behind"),
     (r"on top of|upon|onto|on", "on"),
     (r"underneath|beneath|under", "under"),
     (r"above|over", "above"),
     (r"below", "below"),
     (r"inside of|inside|within|into|in", "inside"),
     (r"(?:the )?(?:nearest|closest)(?: to|(?= (?:the|my|a|an) ))", "nearest to"),
-    (r"(?:the )?(?:farthest|furthest|most distant|most far)(?: away)? (?:from|to)", "farthest from"),
+    (r"(?:the )?(?:farthest|furthest|most (?:distant|far))(?: away)? (?:from|to(?! the (?:left|right)\b))",
+     "farthest from"),
     (r"next to|beside|besides|close to|near to|near|close by|alongside|around|surrounding|adjacent to|by|"
      r"at(?! (?:least|most)\b)", "next to"),
     (r"(?:bigger|larger|greater) than", "larger than"),
@@ -48,13 +49,14 @@ CORNER = re.compile(
 )
 PART = re.compile(
     rf"^(.*?)\s{LINK}(not\s)?(?:in|at|on|into|by|near)\s(the\s)?(?:very\s)?(middle|cent(?:er|re)|back|front|rear|edge|border|"
-    r"background|foreground|(?:far|near|back|front)(?=\s(?:side|end|edge)))(?:\s(?:side|part|end|edge|half|row))?"
+    r"background|foreground|(?:far|near|back|front|left|right)(?=\s(?:side|end|edge|half|part)\b))(?:\s(?:side|part|end|edge|half|row))?"
     r"(?:\sof\s(.+))?$",
     re.IGNORECASE,
 )
 PARTS: dict[str, PartName] = {
     "back": "back", "rear": "back", "background": "back", "far": "back", "front": "front", "foreground": "front",
     "near": "front", "edge": "edge", "border": "edge",
+    "left": "left", "right": "right",
 }  # fmt: skip
 PLACE = re.compile(
     r"^(?:the |my |this |your )?(?:room|scene|picture|photo|image|view|place|house|area|space|world)$",

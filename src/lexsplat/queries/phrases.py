@@ -14,7 +14,7 @@ PickName = Literal["largest", "smallest", "tallest", "shortest", "leftmost", "ri
 CornerName = Literal[
     "", "left", "right", "back", "front", "back left", "back right", "front left", "front right"
 ]
-PartName = Literal["middle", "back", "front", "edge"]
+PartName = Literal["middle", "back", "front", "left", "right", "edge"]
 ORDERED = ("nearest to", "farthest from")
 """Relations that compare several instances."""
 

@@ -80,7 +80,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (rf"where (?:{_CAN}) {_I} (\w+)(?: (.+))?$", "something to @ in"),
     (r"where (?:is|are|was|were|has|have) (?:located |the whereabouts of )?(?=\S)", ""),
     (r"where (.+?) (?:is|are|was|were)(?: located| standing| lying)?$", r"\1"),
-    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|place|sizes?|heights?|widths?|lengths?|dimensions) of ", ""),
+    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|poses?|place|sizes?|heights?|widths?|lengths?|dimensions) of ", ""),
     (r"in which (?:place|corner|spot) (?:is|are) ", ""),
     # How many, how large
     (r"how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)", ""),

@@ -32,7 +32,7 @@ _OVER = 0.3
 _CORNER = 0.5
 """In a corner: at least this far out along both sides, from 0 (the middle) to 1."""
 _MIDDLE = 0.5
-"""In the middle: at most this far out along both sides; at the back or the front: at least this far along one."""
+"""In the middle: at most this far out along both sides; at the back, front, left or right: at least this far out."""
 _EDGE = 0.75
 """At the edge: at least this far out along one side."""
 _BESIDE = 0.1
@@ -238,11 +238,9 @@ def in_part(targets: Selection, area: Selection, part: PartName, frame: Frame) -
         right, ahead = 2 * (axes @ each.center - low) / np.maximum(high - low, 1e-9) - 1
         out = max(abs(right), abs(ahead))
         held = {
-            "middle": out <= _MIDDLE,
-            "back": ahead >= _MIDDLE,
-            "front": ahead <= -_MIDDLE,
-            "edge": out >= _EDGE,
-        }
+            "middle": out <= _MIDDLE, "back": ahead >= _MIDDLE, "front": ahead <= -_MIDDLE,
+            "left": right <= -_MIDDLE, "right": right >= _MIDDLE, "edge": out >= _EDGE,
+        }  # fmt: skip
         if held[part]:
             kept.append(each)
     return _union(targets, kept)
