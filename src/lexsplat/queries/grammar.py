@@ -10,6 +10,10 @@ apple and banana                     the union; also "or" and commas
 fruit but not the banana             the difference; also "without", "except", "other than"; "not the mug"
 largest book, leftmost mug           one of several
 two apples                           all of them, if there are as many
+second toy from the left             by its place in an order; also "3 nearest things to the mug"
+is the bear bigger than the duck?    by boxes; "which is bigger, A or B?" is the largest of both
+things at the back of the table      a part of an area; also "in the middle", "at the edge"
+is there an apple and a cat?         both, else nothing; "is everything on the cloth?": all, else nothing
 mug that is blue; is the mug blue?   the same as "blue mug"; "made of metal" as well
 what is on the cloth?                any object; also "thing", "object", "everything"
 red thing, yellow toys               the objects, or those of a kind, in a color
