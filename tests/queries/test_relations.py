@@ -70,6 +70,8 @@ TRUE = [
     ("coin", "on", "table"), ("table", "under", "left ball"), ("lamp", "above", "table"), ("table", "below", "lamp"),
     ("pea", "inside", "bowl"),
     ("left ball", "next to", "bowl"), ("floor ball", "right of", "table"), ("cup", "on", "table"),
+    ("bowl", "larger than", "pea"), ("pea", "smaller than", "bowl"), ("pole", "taller than", "lamp"),
+    ("table", "shorter than", "pea"),
 ]  # fmt: skip
 FALSE = [
     ("right ball", "left of", "left ball"), ("lamp", "on", "table"), ("floor ball", "on", "table"),
@@ -79,6 +81,8 @@ FALSE = [
     ("far ball", "next to", "right ball"),
     ("beside", "on", "table"), ("table", "under", "beside"), ("pole", "next to", "other pole"),
     ("bowl", "inside", "bowl"), ("left ball", "next to", "table"),
+    ("pea", "larger than", "bowl"), ("bowl", "smaller than", "pea"), ("table", "taller than", "pole"),
+    ("bowl", "larger than", "bowl"), ("bowl", "smaller than", "bowl"),
 ]  # fmt: skip
 
 
@@ -205,6 +209,25 @@ NAMES = {
         ("two lamps", ()),
         ("three balls", ("left ball", "right ball", "floor ball")),
         ("ball in the right corner", ("floor ball",)),
+        ("the second ball from the left", ("right ball",)),
+        ("the third nearest ball to the lamp", ("floor ball",)),
+        ("three nearest things to the lamp", ("left ball", "right ball", "bowl")),
+        ("four nearest balls to the lamp", ()),
+        ("the third closest ball to me", ("floor ball",)),
+        ("two balls closest to me", ("left ball", "right ball")),
+        ("things larger than the lamp", ("bowl",)),
+        ("is the bowl smaller than the lamp?", ()),
+        ("which is smaller, the lamp or the bowl?", ("lamp",)),
+        ("is there a lamp and a bowl?", ("lamp", "bowl")),
+        ("are all balls on the table?", ()),
+        ("is every lamp above the table?", ("lamp",)),
+        ("things in the middle", ("right ball",)),
+        ("ball at the back", ("floor ball",)),
+        ("what is at the edge", ("left ball", "floor ball")),
+        ("what is at the front of the table", ("bowl",)),
+        ("the far ball at the back of the table", ("far ball",)),
+        ("lamp in the middle of the table", ()),
+        ("balls on the left side of the table", ("left ball",)),
     ],
 )
 def test_questions_are_answered_with_the_things_that_fit(things, text, expected):
@@ -216,6 +239,26 @@ def test_questions_are_answered_with_the_things_that_fit(things, text, expected)
     assert torch.equal(found.mask, things(*expected).mask if expected else empty)
     assert len(found.instances) == len(expected)
     assert (found.present == "no") == (not expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "present", "note"),
+    [
+        ("is there a ball and a bear?", "no", 'nothing fits "bear"'),
+        ("balls and bears", "yes", 'nothing fits "bear"'),
+        ("is there a ball, a bear and a table?", "no", 'nothing fits "bear"'),
+        ("is there a ball and a table?", "unsure", ""),
+        ("are all balls on the table?", "no", '2 of 3 are ("ball" on "table")'),
+        ("which is bigger, the ball or the bear?", "no", 'nothing fits "bear"'),
+    ],
+)
+def test_what_is_missing_of_several_is_told(things, text, present, note):
+    sure = {"ball": "yes", "table": "unsure", "bear": "no"}
+    words = {**NAMES, "bear": ("lamp",)}
+    searched = Searched(lambda word: replace(things(*words[word]), present=sure[word]), lambda _: FRONT)
+    found = answer(parse(text), searched)
+    assert (found.present, found.note) == (present, note)
+    assert bool(found) == (present != "no")
 
 
 def test_a_cluster_of_several_known_objects_is_answered_by_those_that_score_as_wholes(things):

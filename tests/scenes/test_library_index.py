@@ -13,12 +13,14 @@ from support.library_scenes import OTHERS, THINGS, copied, install, write_scene
 import lexsplat
 from lexsplat import open_scene
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.phrases import Thing
 from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.contents import Contents
+from lexsplat.scenes.library.indexed import decidable
 
 
 @pytest.fixture(autouse=True)
@@ -50,6 +52,12 @@ def rooms(tmp_path_factory) -> Path:
 @pytest.fixture
 def copy(rooms, tmp_path) -> Path:
     return copied(rooms, tmp_path / "rooms")
+
+
+@pytest.mark.parametrize("phrase", ["mug 3", "qzx", "which tyos are here?", "the first mug"])
+def test_words_that_an_encoder_does_not_know_are_left_to_the_scene(phrase):
+    assert decidable("mug", "bundled") == Thing("mug")
+    assert decidable(phrase, "bundled") is None
 
 
 def closed(library: Library) -> Library:

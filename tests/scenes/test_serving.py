@@ -131,6 +131,11 @@ def test_a_query_that_is_a_question_tells_how_find_understands_it(demo, prompt, 
     assert answer["note"] == (understood and f"asked in these words; lexsplat find understands {understood}")
 
 
+def test_a_query_that_is_not_understood_is_told(demo):
+    (answer,) = answer_queries(demo.scene, "the first mug", ["view_033"], None, None)["prompts"]
+    assert answer["note"] == 'not understood ("first"): asked for as one thing, in these words'
+
+
 @pytest.mark.parametrize(
     ("phrase", "understood", "names"),
     [
@@ -163,6 +168,50 @@ def test_typing_errors_find_what_is_meant_and_are_told(demo, typed, understood):
     assert (answer["present"], answer["understood"]) == ("yes", f'"{understood}"')
     assert thing["center"] == meant["center"]
     assert "may be a typing error" in answer["note"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "understood", "word", "meant"),
+    [
+        ("which tyos are there?", '"toy"', "tyos", "toy"),
+        ("mgus on the cloth", '("mug" on "cloth")', "mgus", "mug"),
+        ("blu animls", '(blue "animal")', "animls", "animal"),
+        ("red aples", '"red apple"', "aples", "apple"),
+    ],
+)
+def test_plurals_with_typing_errors_are_mended_and_the_word_is_told_as_it_was_typed(
+    demo, typed, understood, word, meant
+):
+    answer = answer_line(demo, typed)
+    assert answer["understood"] == understood
+    assert f'"{word}" may be a typing error: asked for "{meant}"' in answer["note"]
+
+
+@pytest.mark.parametrize("phrase", ["mug 3", '"apple 42"'])
+def test_numbers_are_no_words_that_the_bundled_encoder_knows(demo, phrase):
+    answer = answer_line(demo, phrase)
+    assert answer["present"] != "yes"
+    assert "the bundled encoder knows English words alone" in answer["note"]
+
+
+def test_what_is_not_understood_stays_unsure_whatever_was_asked_before(demo):
+    certain, stated = answer_line(demo, "the smallest duck"), answer_line(demo, "is the duck small?")
+    assert certain["understood"] == stated["understood"] == '(smallest "duck")'
+    assert (certain["present"], stated["present"]) == ("yes", "unsure")
+
+
+@pytest.mark.parametrize(
+    ("phrase", "present", "note"),
+    [
+        ("is there an apple and a cat?", "no", 'nothing fits "cat"'),
+        ("is there an apple and a banana?", "yes", ""),
+        ("show me the apple and the cat", "yes", 'nothing fits "cat"'),
+        ("is everything on the floor?", "no", '0 of 14 are (any object on "floor")'),
+    ],
+)
+def test_what_is_missing_of_a_question_is_told(demo, phrase, present, note):
+    answer = answer_line(demo, phrase)
+    assert (answer["present"], answer["note"]) == (present, note)
 
 
 @pytest.mark.parametrize("typed", ["qzx", "kup", "tape duk"])

@@ -308,14 +308,15 @@ def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
         QueryError: If the scene does not hold it.
     """
     understood, found = scene.understand(phrase), scene.find(phrase)
+    noted = "; ".join(filter(None, (understood.note, found.note)))
     if found.present == "no" or not found:
-        note = f" ({understood.note})" if understood.note else ""
+        note = f" ({noted})" if noted else ""
         raise QueryError(
             phrase[:60],
             expected="something that the scene holds",
             found=f"not here: nothing fits {shortened(str(understood.phrase))}{note}",
         )
-    present = {"understood": str(understood.phrase), "note": understood.note, "present": found.present}
+    present = {"understood": str(understood.phrase), "note": noted, "present": found.present}
     return found, present
 
 

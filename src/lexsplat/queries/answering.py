@@ -11,18 +11,24 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.phrases import (
+    ORDERED,
     Anything,
     AtLeast,
     Between,
     Both,
     Colored,
+    Every,
     Except,
     InCorner,
+    InPart,
     Phrase,
     Pick,
     Related,
+    RelationName,
     Thing,
+    Together,
     Viewer,
+    parts_of,
 )
 from lexsplat.queries.relations import (
     Frame,
@@ -30,6 +36,8 @@ from lexsplat.queries.relations import (
     between,
     frame_of,
     in_corner,
+    in_order,
+    in_part,
     nearest,
     related,
     same,
@@ -40,6 +48,10 @@ from lexsplat.runtime.errors import QueryError
 
 _LARGE = 0.05
 """A selection of this share of a scene may be several objects; smaller ones are taken as they are."""
+_TO_VIEWER = ("left of", "right of", "in front of", "behind", "next to", *ORDERED)
+"""Relations that a thing can have to a viewer."""
+_HELD_BY: tuple[RelationName, ...] = ("on", "inside")
+"""Relations of a thing to the thing that holds it."""
 _WHOLE = 0.5
 """An object belongs to a selection that has this share of its Gaussians."""
 
@@ -134,17 +146,19 @@ def _related(phrase: Related, searched: Searched) -> Selection:
         targets = _joined(targets, tuple(searched.objects()), present="yes")
     if isinstance(phrase.reference, Viewer):
         camera = searched.viewer(None)
-        if camera is None or phrase.relation in ("on", "under", "above", "below", "inside"):
+        if camera is None or phrase.relation not in _TO_VIEWER:
             raise QueryError(
                 str(phrase),
                 expected="a place as seen by a viewer, in a scene with views",
                 found=f"{phrase.relation} {phrase.reference}",
                 remedy='such as "closest to me" or "in front of me"',
             )
-        return beside_viewer(phrase.relation, targets, camera, frame_of(camera, targets.up.direction))
+        frame = frame_of(camera, targets.up.direction)
+        return beside_viewer(phrase.relation, targets, camera, frame, count=phrase.count, rank=phrase.rank)
     references = answer(phrase.reference, searched)
-    if phrase.relation in ("nearest to", "farthest from"):
-        found = nearest(targets, references, farthest=phrase.relation == "farthest from")
+    if phrase.relation in ORDERED:
+        farthest = phrase.relation == "farthest from"
+        found = nearest(targets, references, farthest=farthest, count=phrase.count, rank=phrase.rank)
     else:
         directed = phrase.relation in ("left of", "right of", "in front of", "behind")
         camera = searched.viewer(references) if directed and references else None
@@ -163,8 +177,32 @@ def _corner(phrase: InCorner, searched: Searched) -> Selection:
     return in_corner(targets, _anything(Anything(), searched), phrase.corner, _frame(searched, targets))
 
 
-def _both(phrase: Both, searched: Searched) -> Selection:
+def _part(phrase: InPart, searched: Searched) -> Selection:
+    targets = answer(phrase.target, searched)
+    frame = _frame(searched, targets)
+    reference = answer(phrase.reference, searched)
+    if phrase.reference != Anything():
+        held = [related(relation, targets, reference, frame).parts for relation in _HELD_BY]
+        targets = _joined(targets, (*held[0], *(each for each in held[1] if each not in held[0])))
+    found = in_part(targets, reference, phrase.part, frame)
+    return replace(found, present=min(found.present, reference.present, key=PRESENCES.index))
+
+
+def _both(phrase: Both | Together, searched: Searched) -> Selection:
     first, second = answer(phrase.first, searched), answer(phrase.second, searched)
+    lacking = [
+        each.note or f"nothing fits {part}"
+        for part, each in ((phrase.first, first), (phrase.second, second))
+        if each.note or each.present == "no"
+    ]
+    found = _united(first, second)
+    if isinstance(phrase, Together):
+        present = min(first.present, second.present, key=PRESENCES.index)
+        found = replace(_joined(found, ()) if present == "no" else found, present=present)
+    return replace(found, note="; ".join(lacking))
+
+
+def _united(first: Selection, second: Selection) -> Selection:
     instances = [*_certain(first), *_certain(second)]
     kept = [
         each
@@ -199,12 +237,20 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
         "rightmost": lambda each: float(each.center @ right),
     }[phrase.which]
     ranked = sorted(targets.instances, key=measure, reverse=True)
-    return _joined(targets, tuple(ranked[: phrase.count]) if len(ranked) >= phrase.count else ())
+    return _joined(targets, tuple(in_order(ranked, phrase.count, phrase.rank)))
 
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
     found = answer(phrase.target, searched)
     return found if found.count >= phrase.count else _joined(found, ())
+
+
+def _every(phrase: Every, searched: Searched) -> Selection:
+    found = answer(phrase.target, searched)
+    among = answer(parts_of(phrase.target)["target"], searched)
+    if found.count >= among.count:
+        return found
+    return replace(_joined(found, ()), note=f"{found.count} of {among.count} are {phrase.target}")
 
 
 def _viewer(phrase: Viewer, searched: Searched) -> Selection:
@@ -214,8 +260,8 @@ def _viewer(phrase: Viewer, searched: Searched) -> Selection:
 
 
 _ANSWERS: dict[type, Callable[..., Selection]] = {
-    Anything: _anything, Colored: _colored, Related: _related, Between: _between, InCorner: _corner, Both: _both,
-    Except: _except, Pick: _pick, AtLeast: _at_least, Viewer: _viewer,
+    Anything: _anything, Colored: _colored, Related: _related, Between: _between, InCorner: _corner, InPart: _part,
+    Both: _both, Together: _both, Except: _except, Pick: _pick, AtLeast: _at_least, Every: _every, Viewer: _viewer,
 }  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """The grammar of phrases and questions, without a language model.
 
 mug                                  a thing; every word goes to the text encoder
-mug on the cloth                     things by their place (`_RELATIONS`)
+mug on the cloth                     things by their place (`patterns.RELATIONS`)
 mug not on the cloth                 all other mugs
 mug next to the duck on the table    right-associative: mug next to (duck on the table)
 mug between the apple and the duck   also "closest to", "farthest from", "in the back left corner"
@@ -10,6 +10,10 @@ apple and banana                     the union; also "or" and commas
 fruit but not the banana             the difference; also "without", "except", "other than"; "not the mug"
 largest book, leftmost mug           one of several
 two apples                           all of them, if there are as many
+second toy from the left             by its place in an order; also "3 nearest things to the mug"
+is the bear bigger than the duck?    by boxes; "which is bigger, A or B?" is the largest of both
+things at the back of the table      a part of an area; also "in the middle", "at the edge"
+is there an apple and a cat?         both, else nothing; "is everything on the cloth?": all, else nothing
 mug that is blue; is the mug blue?   the same as "blue mug"; "made of metal" as well
 what is on the cloth?                any object; also "thing", "object", "everything"
 red thing, yellow toys               the objects, or those of a kind, in a color
@@ -25,128 +29,55 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
+from lexsplat.queries import patterns
 from lexsplat.queries.colors import COLOR_WORDS
 from lexsplat.queries.kinds import is_kind
+from lexsplat.queries.leftovers import NUMBERS, ORDINALS
 from lexsplat.queries.phrases import (
     Anything,
     AtLeast,
     Between,
     Both,
     Colored,
+    Every,
     Except,
     InCorner,
+    InPart,
     Phrase,
     Pick,
     PickName,
     Related,
     RelationName,
     Thing,
+    Together,
     Understood,
     Viewer,
     mended_note,
+    numbered,
+    parts_of,
     things_of,
     with_things,
 )
-from lexsplat.queries.questions import as_phrase, not_understood, with_asking_words
+from lexsplat.queries.questions import (
+    as_phrase,
+    asks_for_all,
+    asks_yes_or_no,
+    in_full,
+    not_in_answer,
+    not_understood,
+    states,
+    with_asking_words,
+)
 from lexsplat.queries.spelling import singular
-from lexsplat.queries.vocabulary import QUALITIES
+from lexsplat.queries.vocabulary import COLORS, QUALITIES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
 MAX_PARTS = 40
 """Limit on the number of parts, and so on the depth of the recursion."""
 MAX_LENGTH = 600
 """Characters from which a text is one thing: no phrase of that length has grammar."""
-
-_RELATIONS: tuple[tuple[str, RelationName], ...] = (
-    (r"(?:to|on|at) (?:the|my|its) left(?: hand)?(?: side)? of|left of", "left of"),
-    (r"(?:to|on|at) (?:the|my|its) right(?: hand)?(?: side)? of|right of", "right of"),
-    (r"in front of|before", "in front of"),
-    (r"behind|(?:at|in|on) the back of|in back of", "behind"),
-    (r"on top of|upon|onto|on", "on"),
-    (r"underneath|beneath|under", "under"),
-    (r"above|over", "above"),
-    (r"below", "below"),
-    (r"inside of|inside|within|into|in", "inside"),
-    (r"(?:the )?(?:nearest|closest) to", "nearest to"),
-    (r"(?:the )?(?:farthest|furthest|most distant|most far)(?: away)? (?:from|to)", "farthest from"),
-    (r"next to|beside|besides|close to|near to|near|close by|alongside|around|surrounding|adjacent to|by|at", "next to"),
-)  # fmt: skip
-_LINK = (
-    r"(?:(?:that|which|who)\s)?(?:(?:is|are|was|were|there|stands?|sits?|lies|lie|hangs?|rests?|standing|sitting|"
-    r"lying|hanging|resting|located|placed|positioned|found|directly|right|just|immediately|also)\s)*"
-)
-_RELATION = re.compile(
-    rf"\s{_LINK}(?P<not>not\s(?:the\s)?)?(?:"
-    + "|".join(f"(?P<r{i}>{words})" for i, (words, _) in enumerate(_RELATIONS))
-    + r")\s",
-    re.IGNORECASE,
-)
-_BETWEEN = re.compile(rf"^(.*?)\s{_LINK}(not\s)?(?:in )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE)
-_CORNER = re.compile(
-    rf"^(.*?)\s{_LINK}(not\s)?(?:in|at|on|into)\s(?:the|a|an|any|one|some)\s(?:(back|front|far|near|rear|top|bottom)"
-    r"(?:\s|-)?)?(?:(left|right)(?:\s|-)?(?:hand )?)?corners?(?:\sof\s.*)?$",
-    re.IGNORECASE,
-)
-_ASIDE = re.compile(
-    rf"^(.*?)\s{_LINK}(?:(?:farthest|furthest|most) )?(?:(?:on|to|at) the )?(?:far |very )?(left|right)(?: (?:hand )?side)?$",
-    re.IGNORECASE,
-)
-_NEAR_ME = re.compile(
-    rf"^(.*?)\s{_LINK}(?:the )?(nearest|closest|farthest|furthest)(?: away)?(?: one)?$", re.IGNORECASE
-)
-_MY_SIDE = re.compile(r"\b(?:to|on|at) my (left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
-_DETERMINER = re.compile(
-    r"^(?:the|a|an|some|all|every|each|any|my|your|our|his|her|their|its|this|that|these|those|one|single|of|only|"
-    r"other|such)\s+",
-    re.IGNORECASE,
-)
-_EXCEPT = re.compile(
-    r"\s(?:but not|but|without|except for|except|minus|excluding|other than|apart from|aside from|"
-    r"(?:(?:that|which) )?(?:is|are) not(?= (?:the|a|an|my) (?!left|right)))\s",
-    re.IGNORECASE,
-)
-_NOT = re.compile(r"^(?:what is |things? that (?:is|are) )?not (?=(?:the|a|an|my) )", re.IGNORECASE)
-_BOTH = re.compile(r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with)\s|\s*,\s*", re.IGNORECASE)
-_PICKS: tuple[tuple[str, PickName], ...] = (
-    (r"largest|biggest|greatest|hugest|bulkiest", "largest"),
-    (r"smallest|tiniest|littlest", "smallest"),
-    (r"tallest|highest", "tallest"),
-    (r"shortest|lowest|flattest", "shortest"),
-    (r"leftmost|left(?! of\b)", "leftmost"),
-    (r"rightmost|right(?! of\b)", "rightmost"),
-)
-_PICK_WORDS = "|".join(f"(?P<p{i}>{words})" for i, (words, _) in enumerate(_PICKS))
-_PICK = re.compile(rf"^(?:very |single )?(?:{_PICK_WORDS})(?:\s+(?:one )?(?:of )?|$)(?!of\b)", re.IGNORECASE)
-_IS_PICK = re.compile(rf"\s{_LINK}(?:the\s)?(?:{_PICK_WORDS})(?:\sone)?$", re.IGNORECASE)
-_EXTREME = re.compile(
-    r"^(?:(nearest|closest)|farthest|furthest|most distant)\s+(.+?)(?:\s+(?:away )?(?:to|from)\s+(.+))?$",
-    re.IGNORECASE,
-)
-_NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-_QUANTITY = re.compile(
-    rf"^(?P<more>more than |over )?(?:at least )?(?P<number>\d{{1,3}}|{'|'.join(_NUMBERS)}|both|several|multiple|many|"
-    r"a few|a couple of|a pair of)\s+(?:of\s+)?",
-    re.IGNORECASE,
-)
-_QUALITY = re.compile(
-    r"\s(?:,\s*)?(?:that|which|who)\s(?:is|are|was|were|looks?|has|have)\s(not\s)?(.+)$", re.IGNORECASE
-)
-_MADE_OF = re.compile(
-    r"\s(?:(?:that|which)\s(?:is|are|was|were)\s)?(?:made|built)?(?:\s?(?:out\s)?of|\sfrom)\s(\w+)$",
-    re.IGNORECASE,
-)
-_MATERIAL = {"wood": "wooden"}
-_THING_WORD = re.compile(
-    r"^(?:(.*?)\s)?(?:things?|objects?|items?|everything|anything|something|stuff|ones?|whatever)$",
-    re.IGNORECASE,
-)
-_SOMETHING = re.compile(r"^(?:things?|objects?|items?|anything|something|stuff)\s+(.+)$", re.IGNORECASE)
-_VIEWER = re.compile(
-    r"^(?:me|us|you|myself|here|the (?:camera|viewer|observer)|(?:my|the) (?:position|viewpoint|view))$",
-    re.IGNORECASE,
-)
-_CORNER_SIDES = {"far": "back", "rear": "back", "top": "back", "near": "front", "bottom": "front"}
 
 
 def parse(text: str) -> Phrase:
@@ -169,17 +100,24 @@ def understand(text: str) -> Understood:
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text.replace("\x00", ""))
     plain = " ".join(hidden.split()).rstrip("?.!").strip()
-    asked, mended = with_asking_words(plain[:1].lower() + plain[1:])
-    parsed = _Parser(text).phrase(as_phrase(asked))
-    note, unknown = mended_note(mended), False
-    if left := next(filter(None, map(not_understood, things_of(parsed))), ""):
+    mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
+    asked = in_full(mended_text)
+    parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
+    parsed, aside = parser.question(asked), not_in_answer(asked)
+    note = "; ".join(filter(None, (mended_note(mended), *dict.fromkeys(parser.notes), aside)))
+    unknown = aside.startswith('"') or (bool(parser.notes) and parser.stated)  # is the mug big?
+    left = next(
+        filter(None, (not_understood(patterns.HIDDEN.sub("thing", each)) for each in things_of(parsed))), ""
+    )
+    if left or parsed is None:
+        quote = f' ("{left}")' if left and re.search(rf"\b{re.escape(left)}\b", plain, re.IGNORECASE) else ""
         parsed, unknown = Thing(plain), True
-        note = f'not understood as a question ("{left}"): asked for as one thing, in these words'
+        note = f"not understood{quote}: asked for as one thing, in these words"
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
 
 
 def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
-    shown = re.sub("\x00(\\d+)\x00", lambda match: quoted[int(match[1])], thing.text).strip()
+    shown = patterns.HIDDEN.sub(lambda match: quoted[int(match[1])], thing.text).strip()
     if not shown:
         raise QueryError(
             "phrase", expected="a thing in the quotation marks", found="nothing", remedy='such as "red mug"'
@@ -190,8 +128,24 @@ def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
 class _Parser:
     """Recursive descent: what binds loosest is split first."""
 
-    def __init__(self, whole: str) -> None:
-        self.whole = whole
+    def __init__(self, whole: str, together: bool = False, stated: bool = False) -> None:
+        self.whole, self.together, self.stated = whole, together, stated
+        self.notes: list[str] = []
+
+    def question(self, asked: str) -> Phrase:
+        """A question or a phrase, with the words around the thing."""
+        if found := patterns.WHICH_OF.match(asked):
+            these = _loosened(self.phrase(re.sub(r"\bor\b", "and", found["these"])), together=True)
+            if found["near"] or found["far"]:
+                to = self.phrase(found["to"] or found["from"] or "me")
+                return Related("nearest to" if found["near"] else "farthest from", these, to)
+            return Pick(
+                patterns.COMPARATIVES[found["more"].lower()] if found["more"] else _picked(found), these
+            )
+        parsed = _loosened(self.phrase(as_phrase(asked)), self.together)
+        if not asks_for_all(asked):
+            return parsed
+        return Every(parsed) if "target" in parts_of(parsed) else Thing(asked)
 
     def phrase(self, words: str, depth: int = 0) -> Phrase:
         if depth >= MAX_PARTS:
@@ -202,61 +156,122 @@ class _Parser:
                 remedy="ask for less at once",
             )
         words, deeper = words.strip(" ,"), depth + 1
-        if _VIEWER.match(words):
+        if patterns.VIEWER.match(words):
             return Viewer()
-        if found := _NOT.match(words):
+        if found := patterns.NOT.match(words):
             return Except(Anything(), self.phrase(words[found.end() :], deeper))
         words = re.sub(r"\s*,\s*(?=(?:that|which|who)\s)", " ", words)
-        if found := _BETWEEN.match(f" {words}"):
+        if found := patterns.BETWEEN.match(f" {words}"):
             target, negated, first, second = found.groups()
             things = self.phrase(target or "thing", deeper)
             middle = Between(things, self.phrase(first, deeper), self.phrase(second, deeper))
             return Except(things, middle) if negated else middle
-        if found := _QUALITY.search(f" {words}"):
+        if found := patterns.QUALITY.search(f" {words}"):
             noun, rest = undetermined(f" {words}"[: found.start()].strip()), found[2]
-            if not found[1] and not _RELATION.search(f" {words} "[found.start() :]) and _is_quality(rest):
-                return self.phrase(f"{rest} {noun}", deeper)
-        for splitter, kind in ((_EXCEPT, Except), (_BOTH, Both)):
-            parts = splitter.split(f" {words} ", maxsplit=1)
-            if len(parts) == 2:
-                if kind is Both and "," in words and _all_qualities(parts[1]):  # vase, white
-                    return self.phrase(f"{parts[1].strip()} {undetermined(parts[0].strip())}", deeper)
-                return kind(self.phrase(parts[0], deeper), self.phrase(parts[1], deeper))
+            if not patterns.RELATION.search(f" {words} "[found.start() :]) and _is_quality(rest):
+                described = self.phrase(f"{rest} {noun}", deeper)
+                return Except(self.phrase(noun, deeper), described) if found[1] else described
+        for split in (self.difference, self.union):
+            if (joined := split(words, deeper)) is not None:
+                return joined
         return self.one(words, deeper)
+
+    def difference(self, words: str, depth: int) -> Phrase | None:
+        """ "A but not B"; None if it is none. "Toys but not the largest" names toys alone."""
+        parts = patterns.EXCEPT.split(f" {words} ", maxsplit=1)
+        if len(parts) < 2:
+            return None
+        if parts[1].strip().lower() in ("one", "two"):  # the largest but one
+            return Thing(words)
+        first, second = (self.phrase(part, depth) for part in parts)
+        if (
+            isinstance(second, Pick)
+            and second.target == Anything()
+            and not patterns.NAMES_THINGS.search(parts[1])
+        ):
+            second = replace(second, target=first)
+        return Except(first, second)
+
+    def union(self, words: str, depth: int) -> Phrase | None:
+        """ "A and B", "A or B", "A, B"; None if it is none of them."""
+        parts = patterns.BOTH.split(f" {words} ", maxsplit=1)
+        if len(parts) < 2:
+            return None
+        joint = f" {words} "[len(parts[0]) : -len(parts[1])].strip().lower()
+        one, other = parts[0].strip(), parts[1].strip()
+        if re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE):  # closest to both the mug and the lamp
+            return Thing(words)
+        if "," in words and _all_qualities(other):  # vase, white
+            return self.phrase(f"{other} {undetermined(one)}", depth)
+        if (
+            _describes(one)
+            and (noun := re.sub(rf"^(?:{patterns.ADJECTIVES}\s)+", "", undetermined(other))) != other
+        ):
+            if joint == "and" and noun != undetermined(other) and one == undetermined(one):
+                return self.thing(words)  # red and white ball
+            one = f"{one} {noun}"  # the red or the yellow ball
+        together = joint != "or" and " or " not in other
+        first, second = self.phrase(re.sub(r"^both\s", "", one), depth), self.phrase(other, depth)
+        is_placed = "target" in parts_of(first)
+        if self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
+            second = replace(first, reference=second)  # is the mug on the table or the cloth?
+        elif not is_placed and (self.stated or (self.together and together)):
+            first = _in_place_of(second, first)  # are the mug and the duck on the table?
+        return (Together if together else Both)(first, second)
 
     def one(self, words: str, depth: int) -> Phrase:
         """A phrase without "and" and "but"."""
-        bare, before = words, None
-        quantity = 0
+        if found := patterns.OF_TWO.match(words):
+            rest = undetermined(words[found.end() :]) or "thing"
+            return Pick(patterns.COMPARATIVES[found["more"].lower()], self.phrase(rest, depth))
+        bare, before = patterns.THE_ONE.sub("thing ", words), None
+        quantity = rank = 0
         while bare != before:
             before = bare
-            if not quantity and (found := _QUANTITY.match(bare)):
-                word = found["number"].lower()
-                number = int(word) if word.isdigit() else _NUMBERS.index(word) + 1 if word in _NUMBERS else 2
-                quantity, bare = number + bool(found["more"]), bare[found.end() :]
-            bare = _DETERMINER.sub("", bare)
-        if quantity > 1:
-            target = self.phrase(bare, depth)
-            return replace(target, count=quantity) if isinstance(target, Pick) else AtLeast(quantity, target)
+            if not rank and (found := patterns.ORDINAL.match(bare)):
+                rank, bare = _number(found["number"]), bare[found.end() :]
+            if not quantity and (found := patterns.QUANTITY.match(bare)):
+                quantity, bare = _number(found["number"]) + bool(found["more"]), bare[found.end() :]
+            bare = patterns.DETERMINER.sub("", bare)
+        if quantity > 1 or rank:
+            asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)
+            target = self.phrase(f"thing {bare}" if asides else bare, depth)
+            ordered = numbered(target, max(quantity, 1), max(rank, 1))
+            return ordered or (Thing(words) if rank else AtLeast(quantity, target))
+        if found := patterns.SIZE.match(bare):
+            return self.sized(bare, found, depth)
         place = self.place(bare, depth)
         return place if place is not None else self.thing(bare)
 
+    def sized(self, words: str, found: re.Match[str], depth: int) -> Phrase:
+        """ "Small mug on the table": one of several; "small mugs" have no measure."""
+        rest = words[found.end() :]
+        placed = patterns.RELATION.search(f" {rest} ")
+        head = (f" {rest}"[: placed.start()] if placed else rest).strip()
+        if singular(head) != head or patterns.SEVERAL.search(head):
+            return Thing(f"{found[1]} {head}")
+        which = patterns.SIZES[found[1].lower()]
+        self.notes.append(f'"{found[1]}" is taken for the {which}')
+        return Pick(which, self.phrase(rest, depth))
+
     def place(self, words: str, depth: int) -> Phrase | None:
         """A phrase with a place or a superlative; None for a thing."""
-        if found := _EXTREME.match(words):
+        if found := patterns.EXTREME.match(words):
             target, reference = self.phrase(found[2], depth), found[3]
             relation: RelationName = "nearest to" if found[1] else "farthest from"
             return Related(relation, target, self.phrase(reference, depth) if reference else Viewer())
-        if found := _PICK.match(words):
+        if found := patterns.PICK.match(words):
             return Pick(_picked(found), self.phrase(words[found.end() :] or "thing", depth))
-        if found := _CORNER.match(f" {words}"):
+        if found := patterns.CORNER.match(f" {words}"):
             return self.corner(found, depth)
-        words = _MY_SIDE.sub(r"\1 of me", words)
-        if found := _RELATION.search(f" {words} "):
+        if (found := patterns.PART.match(f" {words}")) and (part := self.part(found, depth)) is not None:
+            return part
+        words = "thing " * bool(patterns.BY_ME.match(words)) + patterns.MY_SIDE.sub(r"\1 of me", words)
+        if found := patterns.RELATION.search(f" {words} "):
             related = self.related(f" {words} ", found, depth)
             if related is not None:
                 return related
-        for pattern in (_NEAR_ME, _ASIDE):
+        for pattern in (patterns.NEAR_ME, patterns.ASIDE):
             if (found := pattern.match(f" {words}")) and found[1].strip():
                 target, side = self.phrase(found[1], depth), found[2].lower()
                 if side in ("left", "right"):
@@ -264,17 +279,17 @@ class _Parser:
                 return Related(
                     "nearest to" if side in ("nearest", "closest") else "farthest from", target, Viewer()
                 )
-        if (found := _IS_PICK.search(f" {words}")) and found.start():
+        if (found := patterns.IS_PICK.search(f" {words}")) and found.start():
             return Pick(_picked(found), self.phrase(f" {words}"[: found.start()], depth))
         return None
 
     def related(self, words: str, found: re.Match[str], depth: int) -> Phrase | None:
         """Two phrases in a relation; None if the word of the relation belongs to a thing."""
-        number = next(i for i in range(len(_RELATIONS)) if found.group(f"r{i}") is not None)
+        number = next(i for i in range(len(patterns.RELATIONS)) if found.group(f"r{i}") is not None)
         target, reference = words[: found.start()].strip(), words[found.end() :].strip()
         if not reference and (" to " in f" {target} "):  # "something to sit on" has no reference
             return None
-        if reference.lower() in QUALITIES and _RELATIONS[number][1] == "inside":  # a car in red
+        if reference.lower() in QUALITIES and patterns.RELATIONS[number][1] == "inside":  # a car in red
             return self.thing(f"{reference} {target}")
         if not target or not reference:
             raise QueryError(
@@ -286,27 +301,43 @@ class _Parser:
         if re.match(r"(?:the )?(?:far |very )?(?:left|right)(?: side)?$", reference) and number == 4:
             return None  # mug on the left
         things = self.phrase(target, depth)
-        related = Related(_RELATIONS[number][1], things, self.phrase(reference, depth))
+        related = Related(patterns.RELATIONS[number][1], things, self.phrase(reference, depth))
         return Except(things, related) if found.group("not") else related
 
     def corner(self, found: re.Match[str], depth: int) -> Phrase:
         target, negated, one, other = found.groups()
-        along = _CORNER_SIDES.get((one or "").lower(), (one or "").lower())
+        along = patterns.CORNER_SIDES.get((one or "").lower(), (one or "").lower())
         name = " ".join(filter(None, (along, (other or "").lower())))
         things = self.phrase(target or "thing", depth)
         corner = InCorner(things, name)  # type: ignore[arg-type]
         return Except(things, corner) if negated else corner
 
+    def part(self, found: re.Match[str], depth: int) -> Phrase | None:
+        """Things in a part of an area; None for "in front of the mug" and "at the back of the mug"."""
+        target, negated, determined, part, of = found.groups()
+        name = patterns.PARTS.get(part.lower(), "middle")
+        is_place = not of or patterns.PLACE.match(of) is not None
+        is_surface = bool(of) and singular(undetermined(of.lower())).split()[-1] in SURFACES
+        if of and (not determined or (name not in ("middle", "edge") and not (is_place or is_surface))):
+            return None
+        if not of and name in ("left", "right"):  # one of several: the mug on the left side
+            return None
+        things = self.phrase(target or "thing", depth)
+        inside = InPart(things, name) if is_place else InPart(things, name, self.phrase(of, depth))
+        return Except(things, inside) if negated else inside
+
     def thing(self, words: str) -> Phrase:
-        if (found := _MADE_OF.search(words)) and ("made" in found[0] or found[1].lower() in QUALITIES):
+        if (found := patterns.MADE_OF.search(words)) and (
+            "made" in found[0] or found[1].lower() in QUALITIES
+        ):
             material = found[1].lower()
             noun = words[: found.start()].strip()
-            if _THING_WORD.match(noun):
+            if patterns.THING_WORD.match(noun):
                 return Thing(f"something made of {material}")
-            return self.thing(f"{_MATERIAL.get(material, material)} {noun}")
-        if found := _THING_WORD.match(words):
+            return self.thing(f"{patterns.MATERIAL.get(material, material)} {noun}")
+        if found := patterns.THING_WORD.match(words):
             return thing_of(f"something {found[1]}") if found[1] else Anything()
-        if found := _SOMETHING.match(words):
+        if found := patterns.SOMETHING.match(words):
             return thing_of(f"something {found[1]}")
         if not words:
             raise QueryError(
@@ -316,6 +347,23 @@ class _Parser:
                 remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
             )
         return thing_of(words if " to " in words or not_understood(words) else singular(words))
+
+
+def _in_place_of(second: Phrase, first: Phrase) -> Phrase:
+    """The first thing with the place of the second, if that has one."""
+    return (
+        replace(second, target=first) if isinstance(second, (Related, Between, InCorner, InPart)) else first
+    )
+
+
+def _loosened(phrase: Phrase, together: bool) -> Phrase:
+    """The phrase with the union in place of `Together`, but where a whole question asks for both."""
+    parts = parts_of(phrase)
+    keeps = together and isinstance(phrase, Together)
+    changed: dict[str, Any] = {name: _loosened(part, keeps) for name, part in parts.items()}
+    if isinstance(phrase, Together) and not keeps:
+        return Both(**changed)
+    return replace(phrase, **changed) if changed else phrase
 
 
 def thing_of(text: str) -> Phrase:
@@ -330,25 +378,39 @@ def thing_of(text: str) -> Phrase:
 
 def undetermined(words: str) -> str:
     """Words without articles and the like in front."""
-    while (shorter := _DETERMINER.sub("", words)) != words:
+    while (shorter := patterns.DETERMINER.sub("", words)) != words:
         words = shorter
     return words
 
 
 def _picked(found: re.Match[str]) -> PickName:
-    return next(name for i, (_, name) in enumerate(_PICKS) if found.group(f"p{i}") is not None)
+    return next(name for i, (_, name) in enumerate(patterns.PICKS) if found.group(f"p{i}") is not None)
+
+
+def _number(word: str) -> int:
+    """What a numeral says; "several" and the like are two."""
+    small = word.lower()
+    if digits := re.match(r"\d+", small):
+        return int(digits[0])
+    return next((words.index(small) + 1 for words in (NUMBERS, ORDINALS) if small in words), 2)
+
+
+def _describes(words: str) -> bool:
+    """Whether words name a color or the like, but no thing: "the red"."""
+    parts = undetermined(words).lower().split()
+    return bool(parts) and all(part in COLORS or part in patterns.PATTERNS for part in parts)
 
 
 def _is_quality(words: str) -> bool:
     """Whether words after "that is" describe the noun: at most three, and no superlative or material."""
     parts = words.lower().split()
     first = parts[0]
-    names = any(re.fullmatch(pattern, parts[-1]) for pattern, _ in _PICKS)
+    names = any(re.fullmatch(pattern, parts[-1]) for pattern, _ in patterns.PICKS)
     return (
         len(parts) <= 3
         and first not in ("the", "a", "an", "made", "built", "not")
         and not names
-        and not _NEAR_ME.match(f"x {words}")
+        and not patterns.NEAR_ME.match(f"x {words}")
     )
 
 

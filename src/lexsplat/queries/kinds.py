@@ -7,7 +7,7 @@ names are among its members. Only everyday kinds with everyday members are here;
 
 from __future__ import annotations
 
-from lexsplat.queries.vocabulary import words
+from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary, words
 
 _MEMBERS = {
     "toy": "teddy bear, rubber duck, stuffed animal, doll, ball",
@@ -24,6 +24,11 @@ _SAME = {
 KINDS = {kind: frozenset(words(members)) for kind, members in _MEMBERS.items()}
 KIND_PHRASES = (*_MEMBERS, *_SAME)
 """Every text that names a kind."""
+
+
+def words_of_things(clip: str) -> list[str]:
+    """Names of things, their qualities and their kinds: what a misspelled word may mean, for an encoder."""
+    return [*default_vocabulary(clip), *QUALITIES, *KINDS]
 
 
 def is_kind(text: str) -> bool:

@@ -8,12 +8,15 @@ from typing import Any, Literal, Union
 
 RelationName = Literal[
     "left of", "right of", "in front of", "behind", "on", "under", "above", "below", "inside", "next to",
-    "nearest to", "farthest from",
+    "nearest to", "farthest from", "larger than", "smaller than", "taller than", "shorter than",
 ]  # fmt: skip
 PickName = Literal["largest", "smallest", "tallest", "shortest", "leftmost", "rightmost"]
 CornerName = Literal[
     "", "left", "right", "back", "front", "back left", "back right", "front left", "front right"
 ]
+PartName = Literal["middle", "back", "front", "left", "right", "edge"]
+ORDERED = ("nearest to", "farthest from")
+"""Relations that compare several instances."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +59,19 @@ class Viewer:
 
 @dataclass(frozen=True)
 class Related:
-    """The instances of ``target`` that stand in a relation to an instance of ``reference``."""
+    """The instances of ``target`` that stand in a relation to an instance of ``reference``.
+
+    Of the nearest and the farthest it is one, or ``count`` of them from the one with the number ``rank`` on.
+    """
 
     relation: RelationName
     target: Phrase
     reference: Phrase
+    count: int = 1
+    rank: int = 1
 
     def __str__(self) -> str:
-        return f"({self.target} {self.relation} {self.reference})"
+        return f"({self.target} {_numbered(self)}{self.relation} {self.reference})"
 
 
 @dataclass(frozen=True)
@@ -90,6 +98,19 @@ class InCorner:
 
 
 @dataclass(frozen=True)
+class InPart:
+    """The instances of ``target`` in a part of the area of ``reference``, as the viewer sees it."""
+
+    target: Phrase
+    part: PartName
+    reference: Phrase = field(default_factory=Anything)
+
+    def __str__(self) -> str:
+        of = "" if self.reference == Anything() else f" of {self.reference}"
+        return f"({self.target} {'in' if self.part == 'middle' else 'at'} the {self.part}{of})"
+
+
+@dataclass(frozen=True)
 class Both:
     """The union of two phrases."""
 
@@ -98,6 +119,17 @@ class Both:
 
     def __str__(self) -> str:
         return f"({self.first} or {self.second})"
+
+
+@dataclass(frozen=True)
+class Together:
+    """The union of two phrases if the scene has both, else nothing: "is there an apple and a cat?"."""
+
+    first: Phrase
+    second: Phrase
+
+    def __str__(self) -> str:
+        return f"({self.first} and {self.second})"
 
 
 @dataclass(frozen=True)
@@ -113,18 +145,15 @@ class Except:
 
 @dataclass(frozen=True)
 class Pick:
-    """One instance of several, or the first ``count`` of them if there are as many."""
+    """One instance of several, or ``count`` of them from the one with the number ``rank`` on."""
 
     which: PickName
     target: Phrase
     count: int = 1
+    rank: int = 1
 
     def __str__(self) -> str:
-        return (
-            f"({self.count} {self.which} {self.target})"
-            if self.count > 1
-            else f"({self.which} {self.target})"
-        )
+        return f"({_numbered(self)}{self.which} {self.target})"
 
 
 @dataclass(frozen=True)
@@ -138,8 +167,31 @@ class AtLeast:
         return f"(at least {self.count} {self.target})"
 
 
+@dataclass(frozen=True)
+class Every:
+    """The instances of ``target`` if its own target has no other ones, else nothing: "are all toys on the table?"."""
+
+    target: Phrase
+
+    def __str__(self) -> str:
+        return f"(all {parts_of(self.target).get('target', self.target)} are {self.target})"
+
+
 Phrase = Union[  # noqa: UP007  (forward references)
-    Thing, Anything, Colored, Viewer, Related, Between, InCorner, Both, Except, Pick, AtLeast
+    Thing,
+    Anything,
+    Colored,
+    Viewer,
+    Related,
+    Between,
+    InCorner,
+    InPart,
+    Both,
+    Together,
+    Except,
+    Pick,
+    AtLeast,
+    Every,
 ]
 _PARTS = ("target", "reference", "first", "second")
 
@@ -157,6 +209,23 @@ class Understood:
     phrase: Phrase
     note: str = ""
     unknown: bool = False
+
+
+def numbered(phrase: Phrase, count: int, rank: int) -> Phrase | None:
+    """The phrase with ``count`` instances from number ``rank`` on; None if nothing in it is in an order."""
+    if isinstance(phrase, Pick) or (isinstance(phrase, Related) and phrase.relation in ORDERED):
+        return replace(phrase, count=count, rank=rank)
+    if isinstance(phrase, (Related, Between, InCorner, InPart)):
+        target = numbered(phrase.target, count, rank)
+        return None if target is None else replace(phrase, target=target)
+    return None
+
+
+def _numbered(phrase: Pick | Related) -> str:
+    """The number of a pick in front of it: "2nd ", "3 "."""
+    last = {1: "st", 2: "nd", 3: "rd"}.get(phrase.rank if phrase.rank < 20 else phrase.rank % 10, "th")
+    rank = f"{phrase.rank}{last} " if phrase.rank > 1 else ""
+    return rank + (f"{phrase.count} " if phrase.count > 1 else "")
 
 
 def mended_note(meant: Mapping[str, str]) -> str:

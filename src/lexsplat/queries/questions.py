@@ -6,8 +6,9 @@ import re
 from functools import lru_cache
 
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.leftovers import ORDINALS, left_over
 from lexsplat.queries.spelling import frame_errors
-from lexsplat.queries.vocabulary import COLORS, QUALITIES, default_vocabulary
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, default_vocabulary
 
 _I = r"(?:i|we|you|one|someone|somebody|anyone|anybody|they|he|she|it)"
 _CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
@@ -48,11 +49,13 @@ _CONTRACTIONS = (
     (r"\b(i|we|you)'ve\b", r"\1 have"),
     (r"\b(i|we|you)'d\b", r"\1 would"),
     (r"\b(what|where)s\b", r"\1 is"),
+    (rf"\b({'|'.join(sorted(NAMES))})'s (?=\w)", r"\1 "),
 )
 _TAIL = re.compile(
     rf"[\s,;]+(?:please|pls|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
     re.IGNORECASE,
 )
+_TAG = re.compile(r",\s*(?:right|correct|yes|no|or not|is it not|are they not)$", re.IGNORECASE)
 _WHERE_IS_IT = re.compile(
     r"[\s,;]+where (?:is it|are they|did it go|did i (?:leave|put) (?:it|them))$", re.IGNORECASE
 )
@@ -77,9 +80,10 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (rf"where (?:{_CAN}) {_I} (\w+)(?: (.+))?$", "something to @ in"),
     (r"where (?:is|are|was|were|has|have) (?:located |the whereabouts of )?(?=\S)", ""),
     (r"where (.+?) (?:is|are|was|were)(?: located| standing| lying)?$", r"\1"),
-    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|place) of ", ""),
+    (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|poses?|place|sizes?|heights?|widths?|lengths?|dimensions) of ", ""),
     (r"in which (?:place|corner|spot) (?:is|are) ", ""),
-    # How many
+    # How many, how large
+    (r"how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)", ""),
     (r"how (?:many|much)(?: of)?(?: the)? (?:different )?", ""),
     (r"count(?: up)?(?: all)?(?: of)?(?: the)? (?=\S)", ""),
     (r"(?:what (?:is|are) )?(?:the )?(?:total )?(?:number|amount|count|quantity) of ", ""),
@@ -91,8 +95,9 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (rf"(?:has|have) (.+?) been (?:seen|found|{_LEAVE})(?= |$)", r"\1"),
     (rf"have {_I} ", ""),
     (r"(?:got|seen|anyone seen) ", ""),
-    (r"(?:does|do|did) (?=\S+ \S)", ""),
+    (r"(?:does|do|did) (?=.+ (?:stand|sit|lie|hang|rest|have)\b)", ""),
     # What and which
+    (rf"(?:which|what) ([\w ]+?) (?:is|are) (?:the )?({'|'.join(ORDINALS)}|\d+(?:st|nd|rd|th)) (?:one )?(?=from)", r"\2 \1 "),
     (r"(what|which) else ", r"\1 "),
     (rf"(?:what|which) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", "thing"),
     (rf"(?:what|which) ([\w ]+?) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", r"\1"),
@@ -108,16 +113,28 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:which|what) (?:one|ones)? ?of (?:the|these|those|my) ", "which "),
     (r"(?:which|what) (?:color(?:ed)?|colour(?:ed)?|kind of|sort of|type of|kinds of|sorts of|types of) (?=\w)", "which "),
     (r"what (?:is|are) ((?:the|my|a|an) .+?) (?:(?:stand|sitt|ly|rest)ing )?on$", r"thing under \1"),
+    (r"what (?:is|are) ((?:the|my|a|an) .+?) (next to|near|close to|beside|alongside)$", r"thing \2 \1"),
+    (r"what (?:is|are) ((?:the|my|a|an) .+?) in front of$", r"thing behind \1"),
+    (r"what (?:is|are) ((?:the|my|a|an) .+?) behind$", r"thing in front of \1"),
     (r"(?:which|what) (?:is|are) (?:a|an|the|my) (?=(?:\w+ ?){1,3}$)", ""),
     (r"(?:what|which) (?:is|are) (?:the )?(?=(?:\w+st|leftmost|rightmost)\b(?! (?:to|from|away)\b))", ""),
     (r"(?:what|which|who) (?:is|are) ", "thing that is "),
-    (r"what (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
+    (r"(?:what|who) (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
     (r"what (\w+s) (?!(?:is|are|was|were)\b)(.+)$", r"something that \1 \2"),
     (r"(?:which|what) (.+?) (?:is|are)(?: (?:there|here|visible|present|shown))?$", r"\1"),
     (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
-    (r"(?:which|what) (?=\w+ )", ""),
+    (rf"(?:which|what) (?!(?:do|does|did|is|are|was|were|has|have|had|{_CAN})\b)(?=\w+ )", ""),
 )  # fmt: skip
 _COMPILED = tuple((re.compile("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
+_ADJECTIVE = rf"(?:{'|'.join(sorted(QUALITIES))})"
+_LAST_QUALITIES = re.compile(
+    rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE
+)
+_ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
+_STATE = re.compile(
+    r"(?<! than)\b(open|closed|empty|full|broken|wet|dry|dirty|clean|old|new)$",
+    re.IGNORECASE,
+)
 _COUNTED_TAIL = re.compile(
     rf"\s(?:(?:is|are|do|can|could|did|does|would)(?: {_I}| there)?(?: (?:see|find|count|have|spot|get|exist|visible|present|detect))?|exist)$",
     re.IGNORECASE,
@@ -127,24 +144,29 @@ _PURPOSE = re.compile(
     rf"^((?:some|any)?things?|objects?|items?|stuff) (?:that |which )?{_I} (?:can|could|may|might) (.+)$",
     re.IGNORECASE,
 )
-_QUESTION = re.compile(
-    r"^(?:what|where|which|who|whom|whose|why|when|how|is|are|was|were|do|does|did|can|could|would|should|will|am|has|"
-    r"have|if|whether|please)\b|\b(?:what|where|why|when|i|you|we|they|he|she|is|are|was|were|does|did|me|than)\b",
-    re.IGNORECASE,
-)
-
 _LEFT_OVER = re.compile(
-    rf"\b(?:(?:that|which|who) (?:is|are|was|were)(?: (?:the|that|this|these|those|not))?\b|to {_SEE}$"
-    rf"|(?<=something ){_ANY}\b.*|(?:what|where|when|why|does|did)\b)",
+    rf"^(?:can(?! (?:of|openers?)\b)|will|may|might|please)(?= \w)|^something to {_SEE}$|(?<=something ){_ANY}\b.*",
     re.IGNORECASE,
 )
-"""Words around the thing that stay in "something ..." when no frame takes them off."""
+"""Words of a question that stay in a thing when no frame takes them off, beside those of `leftovers`."""
+_YES_OR_NO = re.compile(
+    r"^(?:(?:please|hey|hi|so|well|ok|okay|tell me|check)[\s,]+)*(?:if |whether )?"
+    r"(?:(?:is|are|was|were|do|does|did|have|has|can|could)\b|there (?:is|are)\b)"
+    rf"(?! {_I} (?:please |kindly |just )?(?!find|see|spot|detect|locate){_FIND})|.*\b(?:whether|if) (?=there|the|a|an|any)\b",
+    re.IGNORECASE,
+)
+_STATED = re.compile(r"^(?:is|are|was|were|do|does|did) (?!there\b|you\b|i\b|we\b)", re.IGNORECASE)
+_ALL_OF = re.compile(
+    r"^(?:is|are|was|were|do|does|did) (?:all(?: of)?(?: the| my| these| those)?|every|each|everything)\b",
+    re.IGNORECASE,
+)
 
 
 _ASKING = """
     what where which who how many much there this that these those and the are show find between behind under above
     below inside next left right front with without except not near closest nearest farthest largest smallest thing
-    things object objects everything anything something
+    things object objects everything anything something biggest tallest shortest leftmost rightmost middle second third
+    bigger smaller larger taller shorter
 """
 _FRAME = frozenset(_ASKING.split()) | COLORS
 _NO_ERRORS = frozenset(re.findall(r"[a-z]+", " ".join(pattern for pattern, _ in _FRAMES)))
@@ -162,19 +184,24 @@ def _vocabulary() -> frozenset[str]:
     return frozenset(word for name in names for word in name.lower().split())
 
 
+def in_full(words: str) -> str:
+    """Words without contractions: "what is" for "what's"."""
+    for contraction, long in _CONTRACTIONS:
+        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
+    return words
+
+
 def as_phrase(words: str) -> str:
     """A question or request without the words around the thing: "where can I find the mug" is "the mug".
 
     Args:
-        words: One sentence with single spaces, without the mark at its end.
+        words: One sentence `in_full` with single spaces, without the mark at its end.
     """
-    for contraction, long in _CONTRACTIONS:
-        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
     whole, before = words, ""
     is_asked = False
     while words != before:
         before = words
-        words = _without_tail(_WHERE_IS_IT.sub("", words))
+        words = _without_tail(_TAG.sub("", _WHERE_IS_IT.sub("", words)))
         for pattern, instead in _COMPILED:
             found = pattern.match(words)
             if found is None:
@@ -190,15 +217,37 @@ def as_phrase(words: str) -> str:
                 words, is_asked = words[found.end() :], True
     words = _PURPOSE.sub(r"something to \2", words)
     if is_asked:
-        words = _with_quality_first(words)
+        words = _with_quality_first(words) or f"is {words}"
     return words or whole
 
 
 def not_understood(words: str) -> str:
     """What of a question or a sentence is left in words that should name a thing; "" if nothing."""
-    something = words.lower().startswith("something ")
-    found = (_LEFT_OVER if something else _QUESTION).search(words)
-    return found[0] if found else ""
+    found = _LEFT_OVER.search(words)
+    return found[0] if found else left_over(words)
+
+
+def asks_yes_or_no(words: str) -> bool:
+    """Whether a question asks for a yes or a no, such as "is there", "do you see"."""
+    return _YES_OR_NO.match(words) is not None
+
+
+def not_in_answer(words: str) -> str:
+    """A note on what a question asks for beside a thing and its place; "" if nothing."""
+    if re.match(r"(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b", words, re.IGNORECASE):
+        return 'the answer is the thing: "lexsplat list" tells colors'
+    state = _STATE.search(words) if asks_yes_or_no(words) else None
+    return f'"{state[1]}" is asked as a word of the thing, which photos may not tell' if state else ""
+
+
+def states(words: str) -> bool:
+    """Whether a question asks if a statement is so: "is the mug on the table?", but not "is there a mug?"."""
+    return _STATED.match(words) is not None
+
+
+def asks_for_all(words: str) -> bool:
+    """Whether a question asks for a yes about all of some things, such as "are all toys red?"."""
+    return _ALL_OF.match(words) is not None
 
 
 def _is_count(frame: str) -> bool:
@@ -212,8 +261,11 @@ def _without_tail(words: str) -> str:
 
 
 def _with_quality_first(words: str) -> str:
-    """The statement "the mug red" as a phrase: "red mug"; a statement with a place stays as it is."""
-    subject, _, last = words.rpartition(" ")
-    if not subject or last.lower() not in QUALITIES:
-        return words
-    return f"{last} {re.sub(r'^(?:the|a|an|my|this|that|your) ', '', subject, flags=re.IGNORECASE)}"
+    """The statement "the mug red" as a phrase: "red mug"; a statement with a place stays as it is.
+
+    One about several things is none: "the apple red and the banana yellow".
+    """
+    found = _LAST_QUALITIES.match(words)
+    if found and re.search(r"\b(?:and|or)\b", found[1]):
+        return ""
+    return f"{found[2]} {_ARTICLES.sub('', found[1])}" if found else words

@@ -1,4 +1,4 @@
-"""Spatial relations between selections: left of, on, inside, between, nearest and the like.
+"""Relations between selections: left of, on, inside, between, nearest, larger than and the like.
 
 "Left", "right", "in front of" and "behind" refer to a viewer whose axes are made horizontal by gravity. "On", "above"
 and "under" depend on gravity alone. Relations hold between instances, by their upright boxes and their points.
@@ -6,15 +6,19 @@ and "under" depend on gravity alone. Relations hold between instances, by their 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.geometry.boxes import upright_frame
 from lexsplat.geometry.cameras import Camera
-from lexsplat.queries.phrases import CornerName, RelationName
+from lexsplat.queries.phrases import ORDERED, CornerName, PartName, RelationName
 from lexsplat.queries.selection import Selection, union
+
+_Ranked = TypeVar("_Ranked")
 
 _CONE = 0.5
 """Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
@@ -27,6 +31,10 @@ _OVER = 0.3
 """Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
 _CORNER = 0.5
 """In a corner: at least this far out along both sides, from 0 (the middle) to 1."""
+_MIDDLE = 0.5
+"""In the middle: at most this far out along both sides; at the back, front, left or right: at least this far out."""
+_EDGE = 0.75
+"""At the edge: at least this far out along one side."""
 _BESIDE = 0.1
 """Left or right of the viewer: at least this share of the offset lies sideways (6 degrees)."""
 _INSIDE = 0.6
@@ -70,13 +78,18 @@ def frame_of(camera: Camera | None, up: NDArray[np.float64]) -> Frame:
 def holds(relation: RelationName, target: Selection, reference: Selection, frame: Frame) -> bool:
     """Whether one instance stands in a relation to another.
 
-    "nearest to" compares several instances: see `nearest`.
+    "nearest to" and "farthest from" compare several instances: see `nearest`.
 
     Raises:
-        ValueError: If the relation is unknown or is "nearest to".
+        ValueError: If the relation is unknown or compares several instances.
     """
     if not target or not reference:
         return False
+    if relation in ("larger than", "taller than"):
+        measure = 0 if relation == "larger than" else 1
+        return _sizes(target)[measure] > _sizes(reference)[measure]
+    if relation in ("smaller than", "shorter than"):
+        return holds("larger than" if relation == "smaller than" else "taller than", reference, target, frame)
     if relation in ("left of", "right of", "in front of", "behind"):
         return _sideways(relation, target, reference, frame)
     if relation == "on":
@@ -109,14 +122,36 @@ def related(relation: RelationName, targets: Selection, references: Selection, f
     return _union(targets, pairs)
 
 
-def nearest(targets: Selection, references: Selection, *, farthest: bool = False) -> Selection:
-    """The instance of ``targets`` with the smallest gap to any instance of ``references``, or with the largest."""
+def nearest(
+    targets: Selection, references: Selection, *, farthest: bool = False, count: int = 1, rank: int = 1
+) -> Selection:
+    """The instance of ``targets`` with the smallest gap to any instance of ``references``, or with the largest.
+
+    Args:
+        targets: What to choose from.
+        references: What the gap is to.
+        farthest: Whether the largest gap counts.
+        count: How many are chosen; none if there are fewer.
+        rank: The number of the first one, from 1.
+    """
     gaps = [
-        (min(distance(target, reference) for reference in references.instances), number)
-        for number, target in enumerate(targets.instances)
+        min(distance(target, reference) for reference in references.instances)
         if references and not any(same(target, reference) for reference in references.instances)
+        else None
+        for target in targets.instances
     ]
-    return _union(targets, [targets.instances[(max if farthest else min)(gaps)[1]]] if gaps else [])
+    order = sorted(
+        (number for number, gap in enumerate(gaps) if gap is not None),
+        key=lambda number: gaps[number] or 0.0,
+        reverse=farthest,
+    )
+    return _union(targets, [targets.instances[number] for number in in_order(order, count, rank)])
+
+
+def in_order(ranked: Sequence[_Ranked], count: int, rank: int) -> Sequence[_Ranked]:
+    """``count`` of some in an order, from the one with the number ``rank`` on; none if there are fewer."""
+    end = rank - 1 + count
+    return ranked[rank - 1 : end] if len(ranked) >= end else []
 
 
 def between(targets: Selection, first: Selection, second: Selection) -> Selection:
@@ -135,16 +170,24 @@ def between(targets: Selection, first: Selection, second: Selection) -> Selectio
     )
 
 
-def beside_viewer(relation: RelationName, targets: Selection, camera: Camera, frame: Frame) -> Selection:
-    """The instances of ``targets`` in front of, left of or near whoever stands at a camera.
+def beside_viewer(
+    relation: RelationName,
+    targets: Selection,
+    camera: Camera,
+    frame: Frame,
+    *,
+    count: int = 1,
+    rank: int = 1,
+) -> Selection:
+    """The instances of ``targets`` in front of, left of or near whoever stands at a camera; see `nearest`.
 
     Raises:
         ValueError: If the relation is none to a viewer, such as "on".
     """
     offsets = [_level(each.center - camera.position, frame) for each in targets.instances]
-    if relation in ("nearest to", "farthest from", "next to"):
+    if relation in (*ORDERED, "next to"):
         order = sorted(range(len(offsets)), key=lambda number: float(np.linalg.norm(offsets[number])))
-        found = order[-1:] if relation == "farthest from" else order[:1]
+        found = list(in_order(order[::-1] if relation == "farthest from" else order, count, rank))
     else:
         axis, share = {
             "left of": (-frame.right, _BESIDE), "right of": (frame.right, _BESIDE),
@@ -178,6 +221,31 @@ def in_corner(targets: Selection, everything: Selection, corner: CornerName, fra
     return _union(targets, [each for _, each in best.values()])
 
 
+def in_part(targets: Selection, area: Selection, part: PartName, frame: Frame) -> Selection:
+    """The instances of ``targets`` that are in a part of an area, seen from above.
+
+    The parts are those of the rectangle around the boxes of ``area`` along the viewer's axes. "Back" and "front" are
+    as the viewer sees them.
+    """
+    axes = np.stack([frame.right, frame.ahead])
+    places = np.array([axes @ each.center for each in area.instances]).reshape(-1, 2)
+    if len(places) == 0:
+        return _union(targets, [])
+    reach = np.array([np.abs(axes @ each.box.axes.T) @ each.box.half_sizes for each in area.instances])
+    low, high = (places - reach).min(0), (places + reach).max(0)
+    kept = []
+    for each in targets.instances:
+        right, ahead = 2 * (axes @ each.center - low) / np.maximum(high - low, 1e-9) - 1
+        out = max(abs(right), abs(ahead))
+        held = {
+            "middle": out <= _MIDDLE, "back": ahead >= _MIDDLE, "front": ahead <= -_MIDDLE,
+            "left": right <= -_MIDDLE, "right": right >= _MIDDLE, "edge": out >= _EDGE,
+        }  # fmt: skip
+        if held[part]:
+            kept.append(each)
+    return _union(targets, kept)
+
+
 def distance(first: Selection, second: Selection) -> float:
     """The gap between two selections: the smallest distance between their points, world units.
 
@@ -191,6 +259,11 @@ def distance(first: Selection, second: Selection) -> float:
 
 
 # One relation each
+
+
+def _sizes(each: Selection) -> tuple[float, float]:
+    """The volume and the height of an object."""
+    return each.box.volume, float(each.box.half_sizes[2])
 
 
 def _sideways(relation: str, target: Selection, reference: Selection, frame: Frame) -> bool:

@@ -65,6 +65,7 @@ class Selection:
         parts: Its instances where they are known, such as objects that touch each other; () takes clusters.
         names: Its likeliest names and their probabilities, if it is an object of `Scene.objects`.
         seen: What the views show of the scene's segments; None renders the views.
+        note: What of the question nothing fits; "" if nothing.
     """
 
     gaussians: Gaussians
@@ -78,6 +79,7 @@ class Selection:
     parts: tuple[Selection, ...] = ()
     names: tuple[tuple[str, float], ...] = ()
     seen: Seen | None = None
+    note: str = ""
 
     def __post_init__(self) -> None:
         shape = (len(self.gaussians),)

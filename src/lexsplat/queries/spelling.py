@@ -55,14 +55,12 @@ def is_word(word: str) -> bool:
 
 
 def strange(phrase: str, vocabulary: Iterable[str]) -> list[str]:
-    """The words of a phrase that are neither English nor in a vocabulary, nor numbers."""
+    """The words of a phrase that are neither English nor in a vocabulary; numbers are neither."""
     known = _words_of(vocabulary)
     return [
         word
         for word in phrase.split()
-        if not (
-            word.isdecimal() or all(_is_known(part, known) for part in re.split(r"[-',.&/]", word) if part)
-        )
+        if not all(_is_known(part, known) for part in re.split(r"[-',.&/]", word) if part)
     ]
 
 
@@ -134,6 +132,8 @@ def _meant(word: str, known: set[str]) -> Sequence[str]:
         meant = [entry for entry in known if _may_be_meant(entry, small)]
         return meant if len(meant) == 1 else (word,)
     near = _nearest(small, known) if _is_typed_wrong(word) else []
+    if not near and small.endswith("s") and len(small) > 3 and _is_typed_wrong(word):
+        near = _nearest(small[:-1], known)
     if not near and len(small) > 3:
         near = difflib.get_close_matches(small, sorted(known), n=1, cutoff=_ALIKE)
     return near or (word,)

@@ -232,7 +232,10 @@ def answer_queries(
 def _heard_by_find(prompt: str) -> str:
     """What to ask in place of a question or a phrase with grammar, which is asked here in its own words."""
     with contextlib.suppress(QueryError):
-        understood = understand(prompt).phrase
+        parsed = understand(prompt)
+        understood = parsed.phrase
+        if parsed.unknown:
+            return parsed.note
         if str(understood).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
             return f"asked in these words; lexsplat find understands {understood}"
     return ""
@@ -283,8 +286,9 @@ def find_phrase(
 ) -> dict[str, Any]:
     """One entry of `find_phrases`."""
     understood = scene.understand(phrase)
-    found = scene.find(phrase, view, threshold=threshold).to_dict()
-    return {**found, "phrase": phrase, "understood": str(understood.phrase), "note": understood.note}
+    found = scene.find(phrase, view, threshold=threshold)
+    note = "; ".join(filter(None, (understood.note, found.note)))
+    return {**found.to_dict(), "phrase": phrase, "understood": str(understood.phrase), "note": note}
 
 
 def default_views(scene: Scene) -> list[str]:

@@ -11,10 +11,10 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import thing_of, understand
+from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings, strange
-from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
 from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
@@ -33,13 +33,14 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     understood = understand(phrase)
     if understood.unknown:
         return understood
-    vocabulary = [*default_vocabulary(scene.clip), *QUALITIES]
+    vocabulary = words_of_things(scene.clip)
     mended: dict[str, str] = {}
 
     def mend(thing: Thing) -> Phrase:
         for meant in () if thing.exact else spellings(thing.text, vocabulary):
             if meant != thing.text and scene.ask(meant).presences[0] != "no":
-                mended[thing.text] = meant
+                typed = zip(thing.text.split(), meant.split())
+                mended.update({word: right for word, right in typed if word != right})
                 return thing_of(meant)
         return thing
 

@@ -113,7 +113,8 @@ class Session:
         plain = understood.phrase == Thing(asked.prompt)
         if asked.threshold is None:
             self.history.add(asked.prompt)
-        notes = {"understood": "" if plain else str(understood.phrase), "note": understood.note}
+        note = "; ".join(filter(None, (understood.note, selection.note)))
+        notes = {"understood": "" if plain else str(understood.phrase), "note": note}
         return self._reply(selection, notes)
 
     def what_is(self, asked: Asked) -> bytes:

@@ -28,13 +28,13 @@ from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.kinds import is_kind, is_of_kind, words_of_things
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.presence import DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
 from lexsplat.queries.selection import Presence, Selection
-from lexsplat.queries.spelling import corrected
-from lexsplat.queries.vocabulary import NAMES, QUALITIES, STUFF, default_vocabulary
+from lexsplat.queries.spelling import corrected, strange
+from lexsplat.queries.vocabulary import NAMES, STUFF
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.library.contents import Contents, projected
 
@@ -154,7 +154,10 @@ def decidable(phrase: str, clip: str) -> Thing | None:
     thing = understood.phrase
     if not isinstance(thing, Thing) or understood.note or (clip == "bundled" and not phrase.isascii()):
         return None
-    if not thing.exact and corrected(thing.text, [*default_vocabulary(clip), *QUALITIES]) != thing.text:
+    known = words_of_things(clip)
+    if clip == "bundled" and strange(thing.text, known):
+        return None
+    if not thing.exact and corrected(thing.text, known) != thing.text:
         return None
     return thing
 

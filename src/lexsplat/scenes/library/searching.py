@@ -13,12 +13,12 @@ from torch import Tensor
 
 from lexsplat.geometry.world import World
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.kinds import is_of_kind
+from lexsplat.queries.kinds import is_of_kind, words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, things_of
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import PRESENCES, Presence
 from lexsplat.queries.spelling import spellings
-from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary
+from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError
 from lexsplat.runtime.files import atomic_path
@@ -419,9 +419,9 @@ def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[flo
 
 def spellings_of(phrase: Phrase, clip: str) -> dict[str, tuple[str, ...]]:
     """The texts of the things of a phrase, each with what it may be mended to and the members of its kind."""
-    names = default_vocabulary(clip)
     found = {}
     for text in things_of(phrase):
-        members = (name for name in names if is_of_kind(name, text))
-        found[text] = tuple(dict.fromkeys((text, *spellings(text, [*names, *QUALITIES]), *members)))
+        meant = (text, *spellings(text, words_of_things(clip)))
+        members = (name for name in default_vocabulary(clip) if any(is_of_kind(name, one) for one in meant))
+        found[text] = tuple(dict.fromkeys((*meant, *members)))
     return found
