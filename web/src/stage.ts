@@ -5,6 +5,7 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Place } from "./geometry";
 import { type Manifest, PageError, type ViewEntry } from "./manifest";
+import { FRAGMENT, VERTEX, drawInBatches } from "./splats";
 
 /** Scenes of more splats are stored with less precise centers, to fit into the memory of phones. */
 const MOST_PRECISE = 1_500_000;
@@ -13,22 +14,6 @@ const FLIGHT_MS = 700;
 const MOST_RATE = 30;
 /** Seconds of the swing between two pictures of a video, at most. */
 const LONGEST_STEP = 0.2;
-
-/** Spark's, without what our splats never have (levels of detail, colors to convert): software draws a third faster. */
-const FRAGMENT = `
-  precision highp float;
-  uniform float minAlpha;
-  in vec4 vRgba;
-  in vec2 vSplatUv;
-  flat in float adjustedStdDev;
-  out vec4 fragColor;
-  void main() {
-    float apart = dot(vSplatUv, vSplatUv);
-    float alpha = vRgba.a * exp(-0.5 * apart);
-    if (apart > adjustedStdDev * adjustedStdDev || alpha < minAlpha) discard;
-    fragColor = vec4(vRgba.rgb * alpha, alpha);
-  }
-`;
 
 const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY, sog: SplatFileType.PCSOGSZIP };
 
@@ -68,6 +53,7 @@ export class Stage {
       );
     }
     const { antialiased } = manifest.scene;
+    const drawnSplats = { value: 0 };
     this.#spark = new SparkRenderer({
       renderer: this.renderer,
       sortRadial: false, // scenes are trained with splats in the order of depth
@@ -77,11 +63,14 @@ export class Stage {
       // with its defaults a view of the demo differs from our renderer by 32 dB, with these by 37 dB.
       clipXY: 4,
       maxPixelRadius: 4096,
+      vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
+      extraUniforms: { drawnSplats },
       depthTest: false, // nothing else is in the scene
       enableLod: false, // would start a worker
       onDirty: () => this.#drawing || this.#sorted(), // what changes while drawing is drawn already
     });
+    drawInBatches(this.#spark, drawnSplats);
     this.scene.add(this.#spark);
     this.camera.up.fromArray(manifest.scene.up);
     this.#controls = new OrbitControls(this.camera, canvas);
