@@ -1,6 +1,7 @@
 // The page: one picture, one search bar, and what was found.
 
 import * as THREE from "three";
+import { Budget, leftOut } from "./budget";
 import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
 import { h, save } from "./dom";
 import type { Geometry, Place } from "./geometry";
@@ -54,6 +55,12 @@ export class App {
     root: HTMLElement,
   ) {
     this.#painter = new Painter(stage.mesh, geometry.count);
+    void stage.shown.then(() => this.#painter.begin());
+    const { gaussians, of, budget } = manifest.scene;
+    if (gaussians > budget) {
+      const chosen = new Budget(geometry, budget);
+      stage.onRest = () => this.#painter.leaveOut(chosen.choose(stage.camera));
+    } else stage.onRest = () => undefined;
     this.#bounds = geometry.bounds();
     this.search = new SearchBar({
       complete: (text) => this.source?.complete(text) ?? [],
@@ -65,7 +72,8 @@ export class App {
     this.measure = new Measure(stage, geometry, this.#overlay, manifest);
     const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
     this.objects = objectsPanel(list, this.measure.sizes(), (object) => this.#goTo(object));
-    const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }));
+    const left = leftOut(gaussians, of, budget);
+    const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }), left && h("p", { class: "left", text: left }));
     this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#list);
     this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
     this.#sheet.append(this.#notes.element);

@@ -30,6 +30,8 @@ export interface Preview {
 const WIDTH = 2048;
 /** The bit of the splats that an edit would change. */
 const EDITED = 128;
+/** The bit of the splats that are not drawn, because there are too many. */
+const LEFT_OUT = 64;
 
 export interface Painted {
   scores: Float32Array;
@@ -84,6 +86,9 @@ export class Painter {
   };
   /** What each layer of the scores holds. */
   readonly #held: (Float32Array | null)[] = new Array(MOST_PROMPTS).fill(null);
+  readonly #modifier: ReturnType<typeof modifier>;
+  #out: Uint8Array | null = null;
+  #shown: { answers: Painted[]; preview: Preview | null } = { answers: [], preview: null };
 
   constructor(mesh: SplatMesh, count: number) {
     this.#mesh = mesh;
@@ -107,8 +112,22 @@ export class Painter {
       colors: dyno.dynoSampler2D(this.#colors, "lexsplatColors"),
       ...this.#numbers,
     };
-    mesh.objectModifiers = [modifier(uniforms, count)];
-    mesh.updateGenerator();
+    this.#modifier = modifier(uniforms, count);
+  }
+
+  /** From now on the mesh is painted. The first picture comes sooner without: software compiles for long. */
+  begin(): void {
+    if (this.#mesh.objectModifiers) return;
+    this.#mesh.objectModifiers = [this.#modifier];
+    this.#mesh.updateGenerator();
+  }
+
+  /** Do not draw the splats that have a 1 here. */
+  leaveOut(out: Uint8Array): void {
+    this.begin();
+    this.#out = out;
+    this.#mask(this.#shown.answers, this.#shown.preview);
+    this.#mesh.updateVersion();
   }
 
   /** Show answers; none shows the scene as it is. Uploads one byte a splat for a new prompt. */
@@ -126,6 +145,8 @@ export class Painter {
       this.#scores.addLayerUpdate(row);
       this.#scores.needsUpdate = true;
     });
+    this.#shown = { answers, preview };
+    if (answers.length > 0 || preview) this.begin();
     this.#mask(answers, preview);
     this.#prompts.needsUpdate = true;
     this.#numbers.count.value = Math.min(answers.length, MOST_PROMPTS);
@@ -136,6 +157,7 @@ export class Painter {
 
   /** Show these colors [N, 3] in place of the scene's; null shows the scene's. */
   recolor(colors: Uint8Array | null): void {
+    this.begin();
     this.#numbers.colored.value = colors !== null;
     if (colors) {
       const whole = new Uint8Array(this.#layer * 4);
@@ -150,6 +172,8 @@ export class Painter {
   #mask(answers: Painted[], preview: Preview | null): void {
     const masks = this.#masks.image.data as Uint8Array;
     masks.fill(0);
+    const out = this.#out;
+    if (out) for (let i = 0; i < out.length; i++) if (out[i]) masks[i] = LEFT_OUT;
     answers.forEach(({ splats, scores, threshold }, row) => {
       if (splats) for (const splat of splats) masks[splat] |= 1 << row;
       else for (let i = 0; i < scores.length; i++) if (scores[i] >= threshold) masks[i] |= 1 << row;
@@ -221,6 +245,7 @@ function modifier(uniforms: Record<keyof typeof TYPES, unknown>, count: number) 
           }
           ${o.gsplat}.rgba.rgb = marked;
         }
+        if ((mask & ${LEFT_OUT}u) != 0u) ${o.gsplat}.flags = 0u;
         bool edited = (mask & ${EDITED}u) != 0u;
         if (${i.change} == 1 && edited || ${i.change} == 2 && shown && !edited) ${o.gsplat}.rgba.a = 0.0;
         if (${i.change} == 3 && edited) ${o.gsplat}.rgba.rgb = clamp(${i.paint} * max(light, 0.02), 0.0, 1.0);

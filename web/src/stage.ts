@@ -10,6 +10,12 @@ import { FRAGMENT, VERTEX, drawInBatches } from "./splats";
 /** Scenes of more splats are stored with less precise centers, to fit into the memory of phones. */
 const MOST_PRECISE = 1_500_000;
 const FLIGHT_MS = 700;
+/** Resolution where software draws, while the camera moves and for the first picture. */
+const COARSE = 0.5;
+/** The camera rests when it has not moved for so long. */
+const REST_MS = 200;
+/** What browsers call renderers without a graphics card. */
+const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 /** Pictures a second of a video, at most. */
 const MOST_RATE = 30;
 /** Seconds of the swing between two pictures of a video, at most. */
@@ -24,17 +30,25 @@ export class Stage {
   mesh!: SplatMesh;
   /** Called after the camera moved. */
   onMove: () => void = () => undefined;
+  /** Called when the camera rests, and before the first picture. */
+  onRest: () => void = () => undefined;
   /** Called after every picture. */
   onDraw: () => void = () => undefined;
   manifest: Manifest;
   readonly #controls: OrbitControls;
   readonly #spark: SparkRenderer;
+  /** Whether there is no graphics card: pictures take long. */
+  readonly software: boolean;
   /** Resolves when a picture of the sorted splats is on the screen. */
   readonly shown: Promise<void>;
   #show: () => void = () => undefined;
   #wanted = false;
   #drawing = false;
   #moving = false;
+  /** The pose of the last picture, and what waits for the camera to rest. */
+  #pose = "";
+  #resting: ReturnType<typeof setTimeout> | null = null;
+  #recording = false;
   /** What the last order of the splats was for. */
   #order = "";
   #flight = 0;
@@ -52,6 +66,9 @@ export class Stage {
         "This page needs WebGL 2, which this browser does not offer; use a newer browser or allow hardware acceleration.",
       );
     }
+    const gl = this.renderer.getContext();
+    const told = gl.getExtension("WEBGL_debug_renderer_info");
+    this.software = told !== null && SOFTWARE.test(String(gl.getParameter(told.UNMASKED_RENDERER_WEBGL)));
     const { antialiased } = manifest.scene;
     const drawnSplats = { value: 0 };
     this.#spark = new SparkRenderer({
@@ -101,6 +118,7 @@ export class Stage {
     });
     this.mesh.quaternion.set(...rotation);
     await this.mesh.initialized;
+    this.#pose = "";
     this.scene.add(this.mesh);
   }
 
@@ -121,12 +139,35 @@ export class Stage {
       // Not in every picture: rounding moves the camera a bit each time, and Spark then computes and sorts all splats again.
       if (this.#moving) this.#controls.update(); // it tells if the camera goes on to glide
       this.#moving &&= this.#wanted;
+      this.#fit();
       this.#drawing = true;
       this.renderer.render(this.scene, this.camera);
       this.#drawing = false;
       if (this.#spark.display.numSplats > 0) void this.#drawn().then(this.#show);
       this.onDraw();
     });
+  }
+
+  /** Choose the resolution: software draws the first picture and those of a moving camera coarsely, others sharply. */
+  #fit(): void {
+    this.camera.updateMatrixWorld();
+    const pose = [...this.camera.matrixWorld.elements, this.camera.fov].join();
+    if (this.#pose === "") this.onRest();
+    if (pose !== this.#pose) {
+      this.#pose = pose;
+      clearTimeout(this.#resting ?? 0);
+      const timer = setTimeout(() => void this.shown.then(() => timer === this.#resting && this.#rest()), REST_MS);
+      this.#resting = timer;
+    }
+    const coarse = this.software && this.#resting !== null && !this.#recording;
+    const ratio = Math.min(devicePixelRatio, 2) * (coarse ? COARSE : 1);
+    if (ratio !== this.renderer.getPixelRatio()) this.renderer.setPixelRatio(ratio);
+  }
+
+  #rest(): void {
+    this.#resting = null;
+    this.onRest();
+    this.draw();
   }
 
   /** Resolves when what was drawn is done. */
@@ -141,7 +182,6 @@ export class Stage {
   resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     // What covers the bottom of the picture on phones moves its middle up.
@@ -215,6 +255,7 @@ export class Stage {
     const offset = this.camera.position.clone().sub(this.target);
     const flight = ++this.#flight;
     recorder.start();
+    this.#recording = true; // the size of a video cannot change
     // Where pictures take long, the swing does too: a video of two pictures shows nothing.
     let before = performance.now();
     for (let time = 0; time < seconds && flight === this.#flight; ) {
@@ -229,6 +270,7 @@ export class Stage {
     }
     if (recorder.state !== "inactive") recorder.stop();
     await stopped;
+    this.#recording = false;
     const video = new Blob(parts, { type: kind });
     if (video.size === 0) throw new PageError("The browser recorded no picture; keep this page in front and try again.");
     return { video, suffix: kind.startsWith("video/mp4") ? ".mp4" : ".webm" };
@@ -307,7 +349,7 @@ export class Stage {
     for (let quiet = 0; quiet < 2; quiet++) {
       await new Promise(requestAnimationFrame);
       const { sorting, sortDirty } = this.#spark;
-      if (this.#wanted || sorting || sortDirty || this.#flying === this.#flight) quiet = -1;
+      if (this.#wanted || this.#resting || sorting || sortDirty || this.#flying === this.#flight) quiet = -1;
     }
     await this.#drawn();
   }
