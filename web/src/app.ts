@@ -1,7 +1,7 @@
 // The page: one picture, one search bar, and what was found.
 
 import * as THREE from "three";
-import { Budget, leftOut } from "./budget";
+import { Budget } from "./budget";
 import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
 import { h, save } from "./dom";
 import type { Geometry, Place } from "./geometry";
@@ -9,7 +9,7 @@ import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./ma
 import { Measure } from "./measure";
 import { Overlay } from "./overlay";
 import { Notes } from "./notes";
-import { objectsPanel, viewsPanel } from "./panels";
+import { objectsPanel, titleOf, viewsPanel } from "./panels";
 import { MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
 import { Server } from "./server";
@@ -19,8 +19,7 @@ import { Tables } from "./tables";
 import { toolbar } from "./tools";
 import { workbench } from "./workbench";
 
-/** In larger scenes, colors appear before the places are found. */
-const MOST_AT_ONCE = 200_000;
+const MOST_AT_ONCE = 200_000; // splats; in larger scenes, colors come before places
 
 export class App {
   readonly answers: Answer[] = [];
@@ -31,6 +30,7 @@ export class App {
   /** Who answers, once its files are there. */
   source: Source | null = null;
   readonly answering: Promise<Source>;
+  readonly budget: Budget | null;
   readonly #painter: Painter;
   readonly #overlay: Overlay;
   readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
@@ -56,11 +56,8 @@ export class App {
   ) {
     this.#painter = new Painter(stage.mesh, geometry.count);
     void stage.shown.then(() => this.#painter.begin());
-    const { gaussians, of, budget } = manifest.scene;
-    if (gaussians > budget) {
-      const chosen = new Budget(geometry, budget);
-      stage.onRest = () => this.#painter.leaveOut(chosen.choose(stage.camera));
-    } else stage.onRest = () => undefined;
+    this.budget = Budget.needed(geometry, manifest.scene.budget);
+    stage.onRest = () => void (this.budget && this.#painter.leaveOut(this.budget.choose(stage.camera)));
     this.#bounds = geometry.bounds();
     this.search = new SearchBar({
       complete: (text) => this.source?.complete(text) ?? [],
@@ -72,14 +69,12 @@ export class App {
     this.measure = new Measure(stage, geometry, this.#overlay, manifest);
     const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
     this.objects = objectsPanel(list, this.measure.sizes(), (object) => this.#goTo(object));
-    const left = leftOut(gaussians, of, budget);
-    const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }), left && h("p", { class: "left", text: left }));
     this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#list);
     this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
     this.#sheet.append(this.#notes.element);
     root.append(
       h("div", { class: "bar" }, this.search.element, this.#sheet),
-      head,
+      titleOf(manifest),
       toolbar(this, this.#life.signal),
       this.views.element,
       this.objects.element,
@@ -126,8 +121,8 @@ export class App {
       await this.stage.fly(placed, new THREE.Vector3(a, b, c), false, THREE.MathUtils.clamp(fov, 5, 120));
     } else this.start(view);
     this.#mode = state.mode;
-    const given = state.prompts.map((prompt) => prompt.toLowerCase());
-    if (given.join("\n") === this.answers.map((answer) => answer.prompt.toLowerCase()).join("\n")) return;
+    const joined = (prompts: string[]): string => prompts.join("\n").toLowerCase();
+    if (joined(state.prompts) === joined(this.answers.map((answer) => answer.prompt))) return;
     this.clear();
     for (const prompt of state.prompts) await this.ask(prompt, true, !view && !state.camera);
   }
@@ -298,10 +293,9 @@ export class App {
   #unknown(prompt: string): void {
     if (!(this.source instanceof Tables)) return;
     const { dictionary, loader } = this.source;
-    const near = dictionary.similar(prompt);
     const count = dictionary.phrases.length.toLocaleString("en");
     this.note(`“${prompt}” is not among the ${count} phrases of this page.`);
-    this.#notes.offer(near.map((phrase) => ({ phrase })), true, "Nearest: ");
+    this.#notes.offer(dictionary.similar(prompt).map((phrase) => ({ phrase })), true, "Nearest: ");
     if (loader?.waiting) {
       const size = (loader.bytes / 1e6).toFixed(0);
       this.#notes.append(

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import type { Geometry } from "./geometry";
+import type { Manifest } from "./manifest";
 
 /** Share of the budget for the splats that cover most of the whole scene: they are there when the camera turns. */
 const ANYWHERE = 0.25;
@@ -22,6 +23,11 @@ export class Budget {
     this.#worth = new Float32Array(geometry.count);
     geometry.covers.forEach((covers, i) => (this.#worth[i] = covers));
     this.#anywhere = best(this.#worth, Math.floor(most * ANYWHERE), new Uint8Array(geometry.count));
+  }
+
+  /** The budget of a scene; null where all its splats are drawn. */
+  static needed(geometry: Geometry, most: number): Budget | null {
+    return geometry.count > most ? new Budget(geometry, most) : null;
   }
 
   /** Choose for a camera: by opacity times area over squared distance, of what is in the picture or near it. */
@@ -66,7 +72,7 @@ export function best(worth: Float32Array, most: number, marked: Uint8Array): Uin
 }
 
 /** What is not drawn, in a sentence for each reason; "" if all is. */
-export function leftOut(gaussians: number, of: number, budget: number): string {
+export function leftOut({ gaussians, of, budget }: Manifest["scene"]): string {
   const n = (count: number): string => count.toLocaleString("en");
   const sent = of > gaussians ? `This page holds ${n(gaussians)} of the scene's ${n(of)} Gaussians. ` : "";
   return sent + (gaussians > budget ? `Of ${n(gaussians)} it draws the ${n(budget)} that cover most of the picture from here.` : "");

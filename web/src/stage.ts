@@ -198,6 +198,11 @@ export class Stage {
     this.resize();
   }
 
+  /** Number of splats of the last picture. */
+  get drawn(): number {
+    return this.#spark.activeSplats;
+  }
+
   set background(color: string) {
     this.scene.background = new THREE.Color(color);
     this.draw();

@@ -274,7 +274,7 @@ class Session:
         with tempfile.TemporaryDirectory() as folder:
             path, rotation = write_splats(gaussians, Path(folder))
             files = {path.name: path.read_bytes(), "words.txt": self._words()}
-        manifest = scene_manifest(scene, gaussians, path.name, rotation, budget=self._splats)
+        manifest = scene_manifest(scene, gaussians, path.name, rotation, "", self._splats)
         manifest["words"]["count"] = files["words.txt"].count(b"\n")
         manifest["server"] = {
             "version": self.version,

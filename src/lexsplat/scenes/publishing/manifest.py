@@ -28,8 +28,8 @@ def scene_manifest(
     gaussians: Gaussians,
     file: str,
     rotation: tuple[float, float, float, float],
-    title: str = "",
-    budget: int = DRAWN_SPLATS,
+    title: str,
+    budget: int,
 ) -> dict[str, Any]:
     """What every page says of its scene.
 
