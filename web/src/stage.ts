@@ -49,6 +49,8 @@ export class Stage {
   #pose = "";
   #resting: ReturnType<typeof setTimeout> | null = null;
   #recording = false;
+  /** Until the first picture. */
+  #early = true;
   /** What the last order of the splats was for. */
   #order = "";
   #flight = 0;
@@ -119,6 +121,7 @@ export class Stage {
     this.mesh.quaternion.set(...rotation);
     await this.mesh.initialized;
     this.#pose = "";
+    this.resize();
     this.scene.add(this.mesh);
   }
 
@@ -134,18 +137,25 @@ export class Stage {
     if (moved) this.#order = "";
     if (this.#wanted || !this.mesh?.isInitialized) return;
     this.#wanted = true;
-    requestAnimationFrame(() => {
-      this.#wanted = false;
-      // Not in every picture: rounding moves the camera a bit each time, and Spark then computes and sorts all splats again.
-      if (this.#moving) this.#controls.update(); // it tells if the camera goes on to glide
-      this.#moving &&= this.#wanted;
-      this.#fit();
-      this.#drawing = true;
-      this.renderer.render(this.scene, this.camera);
-      this.#drawing = false;
-      if (this.#spark.display.numSplats > 0) void this.#drawn().then(this.#show);
-      this.onDraw();
-    });
+    // The first picture does not wait for the browser's next frame, which waits for the rest of the page.
+    if (this.#early) queueMicrotask(() => this.#render());
+    else requestAnimationFrame(() => this.#render());
+  }
+
+  #render(): void {
+    this.#wanted = false;
+    // Not in every picture: rounding moves the camera a bit each time, and Spark then computes and sorts all splats again.
+    if (this.#moving) this.#controls.update(); // it tells if the camera goes on to glide
+    this.#moving &&= this.#wanted;
+    this.#fit();
+    this.#drawing = true;
+    this.renderer.render(this.scene, this.camera);
+    this.#drawing = false;
+    if (this.#early && this.#spark.activeSplats > 0) {
+      this.#early = false;
+      void this.#drawn().then(this.#show);
+    }
+    this.onDraw();
   }
 
   /** Choose the resolution: software draws the first picture and those of a moving camera coarsely, others sharply. */
