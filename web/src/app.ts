@@ -54,8 +54,7 @@ export class App {
     readonly server: Server | null,
     root: HTMLElement,
   ) {
-    this.#painter = new Painter(stage.mesh, geometry.count);
-    void stage.shown.then(() => this.#painter.begin());
+    this.#painter = new Painter(stage.mesh, geometry.count, stage.paints);
     this.budget = Budget.needed(geometry, manifest.scene.budget);
     stage.onRest = () => void (this.budget && this.#painter.leaveOut(this.budget.choose(stage.camera)));
     this.#bounds = geometry.bounds();
@@ -140,7 +139,7 @@ export class App {
       if (answer) this.#add(answer);
       else this.#unknown(prompt);
     }
-    if (this.geometry.count > MOST_AT_ONCE) {
+    if (this.geometry.count > MOST_AT_ONCE && !this.stage.software) {
       this.#paint(); // colors first, then places
       await new Promise((resolve) => setTimeout(resolve));
     }

@@ -2,6 +2,7 @@
 
 import type { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
+import { WIDTH } from "./painter";
 
 /**
  * Splats of an instance. Spark has one splat to an instance; software draws each instance on its own, which takes
@@ -13,6 +14,8 @@ const BATCH = 128;
 export const VERTEX = `
   precision highp float;
   precision highp int;
+  precision highp sampler2D;
+  precision highp sampler2DArray;
   precision highp usampler2D;
   precision highp usampler2DArray;
   #include <splatDefines>
@@ -26,11 +29,58 @@ export const VERTEX = `
   uniform float blurAmount;
   uniform float clipXY;
   uniform int drawnSplats;
+  uniform sampler2DArray scores;
+  uniform usampler2D masks;
+  uniform sampler2D prompts;
+  uniform sampler2D colors;
+  uniform int prompted;
+  uniform bool heat;
+  uniform bool colored;
   uniform usampler2D ordering;
   uniform usampler2DArray extSplats;
   out vec4 vRgba;
   out vec2 vSplatUv;
   flat out float adjustedStdDev;
+
+  // Matplotlib's "inferno" as a polynomial (public domain, M. Zucker).
+  vec3 lexsplatHeat(float t) {
+    const vec3 c0 = vec3(0.00021894, 0.00165100, -0.01948090);
+    const vec3 c1 = vec3(0.10651342, 0.56395644, 3.93271239);
+    const vec3 c2 = vec3(11.60249308, -3.97285397, -15.94239411);
+    const vec3 c3 = vec3(-41.70399613, 17.43639888, 44.35414520);
+    const vec3 c4 = vec3(77.16293570, -33.40235894, -81.80730926);
+    const vec3 c5 = vec3(-71.31942824, 32.62606426, 73.20951986);
+    const vec3 c6 = vec3(25.13112622, -12.24266895, -23.07032500);
+    return c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * (c5 + t * c6)))));
+  }
+
+  // The color of a splat for the prompts: marked in the color of the one that fits best, or its best score as heat.
+  vec3 painted(ivec2 at, vec3 own) {
+    uint mask = texelFetch(masks, at, 0).r;
+    float light = dot(own, vec3(0.2126, 0.7152, 0.0722));
+    vec3 rest = mix(own, vec3(0.12 + 0.5 * light), 0.75);
+    vec3 marked = rest;
+    float best = -2.0;
+    for (int p = 0; p < prompted; p++) {
+      float score = texelFetch(scores, ivec3(at, p), 0).r;
+      vec4 prompt = texelFetch(prompts, ivec2(p, 0), 0);
+      if (heat) {
+        if (score > best) {
+          best = score;
+          float strength = smoothstep(0.0, 1.0, score / max(0.05, prompt.w + 0.3));
+          marked = mix(rest * 0.6, lexsplatHeat(clamp(score, 0.0, 1.0)) * (0.55 + 0.7 * light), 0.15 + 0.75 * strength);
+        }
+        continue;
+      }
+      if ((mask & (1u << uint(p))) == 0u) continue;
+      float margin = (score - prompt.w) / max(1e-3, 1.0 - prompt.w);
+      if (margin > best) {
+        best = margin;
+        marked = mix(own, prompt.rgb * (0.35 + 0.9 * light), 0.62);
+      }
+    }
+    return marked;
+  }
 
   void main() {
     gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // outside the picture
@@ -74,7 +124,9 @@ export const VERTEX = `
     adjustedStdDev = min(maxStdDev, sqrt(2.0 * log(alpha / minAlpha)));
     vec2 radii = min(vec2(maxPixelRadius), adjustedStdDev * sqrt(max(vec2(0.0), vec2(middle + apart, middle - apart))));
     vec2 offset = position.x * axis * radii.x + position.y * vec2(axis.y, -axis.x) * radii.y;
-    vRgba = vec4(max(rgba.rgb, vec3(0.0)), alpha);
+    ivec2 at = ivec2(int(splat) % ${WIDTH}, int(splat) / ${WIDTH});
+    vec3 own = colored ? texelFetch(colors, at, 0).rgb : rgba.rgb;
+    vRgba = vec4(prompted > 0 ? painted(at, own) : own, alpha);
     vSplatUv = position.xy * adjustedStdDev;
     gl_Position = vec4(clip.xy + 2.0 / renderSize * offset * clip.w, clip.zw);
   }

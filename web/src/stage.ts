@@ -5,6 +5,7 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Place } from "./geometry";
 import { type Manifest, PageError, type ViewEntry } from "./manifest";
+import type { Paint } from "./painter";
 import { FRAGMENT, VERTEX, drawInBatches } from "./splats";
 
 /** Scenes of more splats are stored with less precise centers, to fit into the memory of phones. */
@@ -12,6 +13,8 @@ const MOST_PRECISE = 1_500_000;
 const FLIGHT_MS = 700;
 /** Resolution where software draws, while the camera moves and for the first picture. */
 const COARSE = 0.5;
+/** Splats that software draws, at most: a million would take seconds. */
+const SOFTWARE_BUDGET = 250_000;
 /** The camera rests when it has not moved for so long. */
 const REST_MS = 200;
 /** What browsers call renderers without a graphics card. */
@@ -35,6 +38,11 @@ export class Stage {
   /** Called after every picture. */
   onDraw: () => void = () => undefined;
   manifest: Manifest;
+  /** What the splats are painted with; a painter fills it. */
+  readonly paints: Paint = {
+    scores: { value: null }, masks: { value: null }, prompts: { value: null }, colors: { value: null },
+    prompted: { value: 0 }, heat: { value: false }, colored: { value: false },
+  };
   readonly #controls: OrbitControls;
   readonly #spark: SparkRenderer;
   /** Whether there is no graphics card: pictures take long. */
@@ -84,7 +92,7 @@ export class Stage {
       maxPixelRadius: 4096,
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
-      extraUniforms: { drawnSplats },
+      extraUniforms: { drawnSplats, ...this.paints },
       depthTest: false, // nothing else is in the scene
       enableLod: false, // would start a worker
       onDirty: () => this.#drawing || this.#sorted(), // what changes while drawing is drawn already
@@ -127,7 +135,8 @@ export class Stage {
 
   /** Spark sorts again also for new colors: the picture in the old order is then right already. */
   #sorted(): void {
-    const order = [this.mesh?.uuid, ...this.camera.matrixWorld.elements].join();
+    const { sortedCenter, sortedDir } = this.#spark; // the camera may be elsewhere by now
+    const order = [this.mesh?.uuid, ...sortedCenter, ...sortedDir].join();
     if (order !== this.#order) this.draw();
     this.#order = order;
   }
@@ -206,6 +215,11 @@ export class Stage {
     if (pixels === this.#bottom) return;
     this.#bottom = pixels;
     this.resize();
+  }
+
+  /** Number of splats that are drawn well at once, at most. */
+  get budget(): number {
+    return this.software ? SOFTWARE_BUDGET : Infinity;
   }
 
   /** Number of splats of the last picture. */
