@@ -419,7 +419,11 @@ def test_two_clicks_measure_the_distance_between_the_surfaces_there(browser, bal
             page.mouse.click(*at)
         until(page, "document.querySelector('.distance').textContent !== ''")
         told = page.locator(".distance").inner_text()
-        assert told.endswith("units (the scale is not known)")
+        assert told.endswith(" units")
+        until(page, "document.querySelector('.status').textContent.endsWith('units (the scale is not known)')")
+        marks = [one.bounding_box() for one in page.locator(".mark").all()]
+        label = page.locator(".distance").bounding_box()
+        assert label["y"] + label["height"] <= min(mark["y"] for mark in marks), "the text hides no point"
         assert float(told.split()[0]) == pytest.approx(np.linalg.norm(first - second), rel=0.03)
         page.close()
 
@@ -533,6 +537,41 @@ def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_a
         assert (drawn["view0"] != drawn["view3"]).sum() > 50
         ask(page, "ball 3")
         assert "here, one place" in page.locator(".card").inner_text(), "answers know all Gaussians"
+        page.close()
+
+
+COUNTING = """
+    const own = HTMLCanvasElement.prototype.getContext;
+    window.calls = [];
+    HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+        const gl = own.call(this, kind, ...rest);
+        if (kind === "webgl2" && gl && !gl.counted) {
+            gl.counted = true;
+            for (const name of ["drawElementsInstanced", "readPixels"]) {
+                const plain = gl[name].bind(gl);
+                gl[name] = (...given) => (window.calls.push([name, this.width, given.at(-1)]), plain(...given));
+            }
+        }
+        return gl;
+    };
+"""
+
+
+def test_software_draws_coarsely_at_first_and_a_prompt_computes_and_sorts_no_splat(browser, ball_page):
+    with serving(ball_page()) as address:
+        page = open_page(browser, address + "#view=view0", 720, 480, COUNTING)
+        page.evaluate("lexsplat.app.stage.settled()")
+        drawn = [call for call in page.evaluate("calls") if call[0] == "drawElementsInstanced"]
+        assert drawn[0][1] == 360, "half the resolution"
+        assert drawn[-1][1] == 720
+        assert all(instances == 12 for _, _, instances in drawn), "1,500 splats, 128 to an instance"
+        assert "readPixels" in {name for name, *_ in page.evaluate("calls")}, "the splats were sorted"
+        before = picture(page)
+        page.evaluate("window.calls.length = 0")
+        page.evaluate("lexsplat.app.ask('ball 3', false, false)")
+        after = picture(page)
+        assert np.abs(after - before)[:, 330:].max() > 60
+        assert {name for name, *_ in page.evaluate("calls")} == {"drawElementsInstanced"}
         page.close()
 
 

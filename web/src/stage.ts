@@ -240,6 +240,7 @@ export class Stage {
   ray(x: number, y: number): THREE.Ray {
     const box = this.canvas.getBoundingClientRect();
     const point = new THREE.Vector2(((x - box.left) / box.width) * 2 - 1, 1 - ((y - box.top) / box.height) * 2);
+    this.camera.updateMatrixWorld(); // it may have moved since the last picture
     const caster = new THREE.Raycaster();
     caster.setFromCamera(point, this.camera);
     return caster.ray;
@@ -253,6 +254,7 @@ export class Stage {
 
   /** Where a point of the scene is on the page; null behind the camera. */
   pixel(point: THREE.Vector3): { x: number; y: number } | null {
+    this.camera.updateMatrixWorld();
     const seen = point.clone().project(this.camera);
     if (seen.z > 1) return null;
     const box = this.canvas.getBoundingClientRect();
