@@ -221,7 +221,7 @@ export class App {
       this.#mode,
       this.#preview,
     );
-    this.stage.draw(this.#preview !== null || this.#previewed);
+    this.stage.paint(this.#preview !== null || this.#previewed);
     this.#previewed = this.#preview !== null;
     this.#write();
   }

@@ -13,6 +13,8 @@ const MOST_PRECISE = 1_500_000;
 const FLIGHT_MS = 700;
 /** Resolution where software draws, while the camera moves and for the first picture. */
 const COARSE = 0.5;
+/** Software draws the colors of more splats than this coarsely at first. */
+const MANY = 100_000;
 /** Splats that software draws, at most: a million would take seconds. */
 const SOFTWARE_BUDGET = 250_000;
 /** The camera rests when it has not moved for so long. */
@@ -174,19 +176,30 @@ export class Stage {
     if (this.#pose === "") this.onRest();
     if (pose !== this.#pose) {
       this.#pose = pose;
-      clearTimeout(this.#resting ?? 0);
-      const timer = setTimeout(() => void this.shown.then(() => timer === this.#resting && this.#rest()), REST_MS);
-      this.#resting = timer;
+      this.#wait(() => this.onRest());
     }
     const coarse = this.software && this.#resting !== null && !this.#recording;
     const ratio = Math.min(devicePixelRatio, 2) * (coarse ? COARSE : 1);
     if (ratio !== this.renderer.getPixelRatio()) this.renderer.setPixelRatio(ratio);
   }
 
-  #rest(): void {
-    this.#resting = null;
-    this.onRest();
-    this.draw();
+  /** Do something once the camera rests, and draw sharply. */
+  #wait(then: () => void): void {
+    clearTimeout(this.#resting ?? 0);
+    const timer = setTimeout(async () => {
+      await this.shown;
+      if (timer !== this.#resting) return;
+      this.#resting = null;
+      then();
+      this.draw();
+    }, REST_MS);
+    this.#resting = timer;
+  }
+
+  /** Draw new colors soon: where software draws many splats, coarsely at first. */
+  paint(moved: boolean): void {
+    if (this.software && this.drawn > MANY && !this.#resting) this.#wait(() => undefined);
+    this.draw(moved);
   }
 
   /** Resolves when what was drawn is done. */
