@@ -420,7 +420,9 @@ def test_two_clicks_measure_the_distance_between_the_surfaces_there(browser, bal
         until(page, "document.querySelector('.distance').textContent !== ''")
         told = page.locator(".distance").inner_text()
         assert told.endswith(" units")
-        until(page, "document.querySelector('.status').textContent.endsWith('units (the scale is not known)')")
+        until(
+            page, "document.querySelector('.status').textContent.endsWith('units (the scale is not known)')"
+        )
         marks = [one.bounding_box() for one in page.locator(".mark").all()]
         label = page.locator(".distance").bounding_box()
         assert label["y"] + label["height"] <= min(mark["y"] for mark in marks), "the text hides no point"
@@ -519,7 +521,9 @@ def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_a
         assert "draws the 400" in page.locator("dialog p.fine").first.text_content()
         drawn = {}
         for view in ("view0", "view3"):
-            page.evaluate("(name) => lexsplat.app.jump(lexsplat.app.manifest.views.find((v) => v.name === name))", view)
+            page.evaluate(
+                "(name) => lexsplat.app.jump(lexsplat.app.manifest.views.find((v) => v.name === name))", view
+            )
             page.evaluate("lexsplat.app.stage.settled()")
             assert page.evaluate("lexsplat.app.stage.drawn") == 400
             drawn[view] = 1 - np.array(page.evaluate("[...lexsplat.app.budget.out]"))
@@ -532,8 +536,12 @@ def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_a
             anywhere = np.argsort(-covers)[:100]
             rest = np.setdiff1d(np.flatnonzero(own), anywhere)
             assert own.sum() == 400
-            left = np.flatnonzero(~own & (np.abs(seen[:, :2]) < 0.2 * seen[:, 2:]).all(1))  # in the picture's middle
-            assert worth[rest].min() > 0.9 * worth[left].max(), "none in the picture is left out for a lesser one"
+            left = np.flatnonzero(
+                ~own & (np.abs(seen[:, :2]) < 0.2 * seen[:, 2:]).all(1)
+            )  # in the picture's middle
+            assert worth[rest].min() > 0.9 * worth[left].max(), (
+                "none in the picture is left out for a lesser one"
+            )
         assert (drawn["view0"] != drawn["view3"]).sum() > 50
         ask(page, "ball 3")
         assert "here, one place" in page.locator(".card").inner_text(), "answers know all Gaussians"
