@@ -95,6 +95,11 @@ def picture(page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
+def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(folder):
+    assert (folder / "text.safetensors").exists()
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 8e6
+
+
 def test_answers_are_those_of_python(page, demo):
     found = page.evaluate(
         """async (prompts) => {

@@ -164,9 +164,15 @@ export class Stage {
     this.#drawing = false;
     if (this.#early && this.#spark.activeSplats > 0) {
       this.#early = false;
-      void this.#drawn().then(this.#show);
+      void this.#presented().then(this.#show);
     }
     this.onDraw();
+  }
+
+  /** Resolves when what was drawn is on the screen: the browser shows it with its next frame. */
+  async #presented(): Promise<void> {
+    await this.#drawn();
+    for (let frame = 0; frame < 2; frame++) await new Promise(requestAnimationFrame);
   }
 
   /** Choose the resolution: software draws the first picture and those of a moving camera coarsely, others sharply. */
