@@ -148,9 +148,7 @@ export class Stage {
     if (moved) this.#order = "";
     if (this.#wanted || !this.mesh?.isInitialized) return;
     this.#wanted = true;
-    // The first picture does not wait for the browser's next frame, which waits for the rest of the page.
-    if (this.#early) queueMicrotask(() => this.#render());
-    else requestAnimationFrame(() => this.#render());
+    requestAnimationFrame(() => this.#render());
   }
 
   #render(): void {
