@@ -95,6 +95,11 @@ def picture(page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
+def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(folder):
+    assert (folder / "text.safetensors").exists()
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 8e6
+
+
 def test_answers_are_those_of_python(page, demo):
     found = page.evaluate(
         """async (prompts) => {
@@ -419,7 +424,13 @@ def test_two_clicks_measure_the_distance_between_the_surfaces_there(browser, bal
             page.mouse.click(*at)
         until(page, "document.querySelector('.distance').textContent !== ''")
         told = page.locator(".distance").inner_text()
-        assert told.endswith("units (the scale is not known)")
+        assert told.endswith(" units")
+        until(
+            page, "document.querySelector('.status').textContent.endsWith('units (the scale is not known)')"
+        )
+        marks = [one.bounding_box() for one in page.locator(".mark").all()]
+        label = page.locator(".distance").bounding_box()
+        assert label["y"] + label["height"] <= min(mark["y"] for mark in marks), "the text hides no point"
         assert float(told.split()[0]) == pytest.approx(np.linalg.norm(first - second), rel=0.03)
         page.close()
 
@@ -502,6 +513,81 @@ def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answe
         page.close()
 
 
+def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_and_it_is_told(
+    browser, ball_page, monkeypatch
+):
+    """The importance of each is worked out here from the scene: opacity times area over squared depth."""
+    monkeypatch.setattr("lexsplat.scenes.publishing.writing.DRAWN_SPLATS", 400)
+    gaussians = ball_page.scene.gaussians
+    with serving(ball_page()) as address:
+        page = open_page(browser, address + "#view=view0", 720, 480)
+        told = page.locator(".title").inner_text()
+        assert "Of 1,500 it draws the 400 that cover most of the picture from here." in told
+        assert "draws the 400" in page.locator("dialog p.fine").first.text_content()
+        drawn = {}
+        for view in ("view0", "view3"):
+            page.evaluate(
+                "(name) => lexsplat.app.jump(lexsplat.app.manifest.views.find((v) => v.name === name))", view
+            )
+            page.evaluate("lexsplat.app.stage.settled()")
+            assert page.evaluate("lexsplat.app.stage.drawn") == 400
+            drawn[view] = 1 - np.array(page.evaluate("[...lexsplat.app.budget.out]"))
+            viewmat = ball_page.scene.camera(view).viewmat
+            seen = gaussians.means.numpy() @ viewmat[:3, :3].T + viewmat[:3, 3]
+            scales = np.sort(gaussians.scales.numpy(), 1)
+            covers = gaussians.opacities.numpy() * scales[:, 1] * scales[:, 2]
+            worth = np.where(seen[:, 2] > 0.01, covers / seen[:, 2] ** 2, 0)
+            own = drawn[view].astype(bool)
+            anywhere = np.argsort(-covers)[:100]
+            rest = np.setdiff1d(np.flatnonzero(own), anywhere)
+            assert own.sum() == 400
+            left = np.flatnonzero(
+                ~own & (np.abs(seen[:, :2]) < 0.2 * seen[:, 2:]).all(1)
+            )  # in the picture's middle
+            assert worth[rest].min() > 0.9 * worth[left].max(), (
+                "none in the picture is left out for a lesser one"
+            )
+        assert (drawn["view0"] != drawn["view3"]).sum() > 50
+        ask(page, "ball 3")
+        assert "here, one place" in page.locator(".card").inner_text(), "answers know all Gaussians"
+        page.close()
+
+
+COUNTING = """
+    const own = HTMLCanvasElement.prototype.getContext;
+    window.calls = [];
+    HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+        const gl = own.call(this, kind, ...rest);
+        if (kind === "webgl2" && gl && !gl.counted) {
+            gl.counted = true;
+            for (const name of ["drawElementsInstanced", "readPixels"]) {
+                const plain = gl[name].bind(gl);
+                gl[name] = (...given) => (window.calls.push([name, this.width, given.at(-1)]), plain(...given));
+            }
+        }
+        return gl;
+    };
+"""
+
+
+def test_software_draws_coarsely_at_first_and_a_prompt_computes_and_sorts_no_splat(browser, ball_page):
+    with serving(ball_page()) as address:
+        page = open_page(browser, address + "#view=view0", 720, 480, COUNTING)
+        page.evaluate("lexsplat.app.stage.settled()")
+        drawn = [call for call in page.evaluate("calls") if call[0] == "drawElementsInstanced"]
+        assert drawn[0][1] == 360, "half the resolution"
+        assert drawn[-1][1] == 720
+        assert all(instances == 12 for _, _, instances in drawn), "1,500 splats, 128 to an instance"
+        assert "readPixels" in {name for name, *_ in page.evaluate("calls")}, "the splats were sorted"
+        before = picture(page)
+        page.evaluate("window.calls.length = 0")
+        page.evaluate("lexsplat.app.ask('ball 3', false, false)")
+        after = picture(page)
+        assert np.abs(after - before)[:, 330:].max() > 60
+        assert {name for name, *_ in page.evaluate("calls")} == {"drawElementsInstanced"}
+        page.close()
+
+
 def test_nothing_is_drawn_while_nothing_changes(page):
     page.evaluate("lexsplat.app.stage.settled()")
     drawn = page.evaluate(
@@ -553,7 +639,7 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
         ),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
-        (lambda m: m.clear(), "version 4 of a lexsplat page"),
+        (lambda m: m.clear(), "version 5 of a lexsplat page"),
     ],
 )
 def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(browser, ball_page, change, told):

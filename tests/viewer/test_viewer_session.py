@@ -101,8 +101,15 @@ def test_a_click_names_and_selects_what_is_there(session, scene_and_balls):
         session.what_is(Asked.from_json(corner))
 
 
-def test_scores_come_in_the_order_of_the_file_when_fewer_gaussians_are_drawn(scene_and_balls):
+def test_pages_get_all_gaussians_and_choose_themselves_which_to_draw(scene_and_balls):
+    session = Session(scene_and_balls[0], 200, History())
+    known = session.content.manifest["scene"]
+    assert (known["gaussians"], known["of"], known["budget"]) == (1500, 1500, 200)
+
+
+def test_scores_come_in_the_order_of_the_file_when_pages_get_fewer_gaussians(scene_and_balls, monkeypatch):
     scene, ground_truth = scene_and_balls
+    monkeypatch.setattr("lexsplat.viewer.session.MOST_SPLATS", 200)
     session = Session(scene, 200, History())
     header, _, labels = read(session.ask(Asked("ball 3")), 200)
     drawn = session.content.drawn.numpy()

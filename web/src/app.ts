@@ -1,6 +1,7 @@
 // The page: one picture, one search bar, and what was found.
 
 import * as THREE from "three";
+import { Budget } from "./budget";
 import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
 import { h, save } from "./dom";
 import type { Geometry, Place } from "./geometry";
@@ -8,7 +9,7 @@ import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./ma
 import { Measure } from "./measure";
 import { Overlay } from "./overlay";
 import { Notes } from "./notes";
-import { objectsPanel, viewsPanel } from "./panels";
+import { objectsPanel, titleOf, viewsPanel } from "./panels";
 import { MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
 import { Server } from "./server";
@@ -18,8 +19,7 @@ import { Tables } from "./tables";
 import { toolbar } from "./tools";
 import { workbench } from "./workbench";
 
-/** In larger scenes, colors appear before the places are found. */
-const MOST_AT_ONCE = 200_000;
+const MOST_AT_ONCE = 200_000; // splats; in larger scenes, colors come before places
 
 export class App {
   readonly answers: Answer[] = [];
@@ -30,6 +30,7 @@ export class App {
   /** Who answers, once its files are there. */
   source: Source | null = null;
   readonly answering: Promise<Source>;
+  readonly budget: Budget | null;
   readonly #painter: Painter;
   readonly #overlay: Overlay;
   readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
@@ -53,7 +54,9 @@ export class App {
     readonly server: Server | null,
     root: HTMLElement,
   ) {
-    this.#painter = new Painter(stage.mesh, geometry.count);
+    this.#painter = new Painter(stage.mesh, geometry.count, stage.paints);
+    this.budget = Budget.needed(geometry, manifest.scene.budget);
+    stage.onRest = () => void (this.budget && this.#painter.leaveOut(this.budget.choose(stage.camera)));
     this.#bounds = geometry.bounds();
     this.search = new SearchBar({
       complete: (text) => this.source?.complete(text) ?? [],
@@ -65,13 +68,12 @@ export class App {
     this.measure = new Measure(stage, geometry, this.#overlay, manifest);
     const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
     this.objects = objectsPanel(list, this.measure.sizes(), (object) => this.#goTo(object));
-    const head = h("div", { class: "title" }, h("h1", { text: manifest.title }), manifest.description && h("p", { text: manifest.description }));
     this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#list);
     this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
     this.#sheet.append(this.#notes.element);
     root.append(
       h("div", { class: "bar" }, this.search.element, this.#sheet),
-      head,
+      titleOf(manifest),
       toolbar(this, this.#life.signal),
       this.views.element,
       this.objects.element,
@@ -118,8 +120,8 @@ export class App {
       await this.stage.fly(placed, new THREE.Vector3(a, b, c), false, THREE.MathUtils.clamp(fov, 5, 120));
     } else this.start(view);
     this.#mode = state.mode;
-    const given = state.prompts.map((prompt) => prompt.toLowerCase());
-    if (given.join("\n") === this.answers.map((answer) => answer.prompt.toLowerCase()).join("\n")) return;
+    const joined = (prompts: string[]): string => prompts.join("\n").toLowerCase();
+    if (joined(state.prompts) === joined(this.answers.map((answer) => answer.prompt))) return;
     this.clear();
     for (const prompt of state.prompts) await this.ask(prompt, true, !view && !state.camera);
   }
@@ -137,7 +139,7 @@ export class App {
       if (answer) this.#add(answer);
       else this.#unknown(prompt);
     }
-    if (this.geometry.count > MOST_AT_ONCE) {
+    if (this.geometry.count > MOST_AT_ONCE && !this.stage.software) {
       this.#paint(); // colors first, then places
       await new Promise((resolve) => setTimeout(resolve));
     }
@@ -219,7 +221,7 @@ export class App {
       this.#mode,
       this.#preview,
     );
-    this.stage.draw(this.#preview !== null || this.#previewed);
+    this.stage.paint(this.#preview !== null || this.#previewed);
     this.#previewed = this.#preview !== null;
     this.#write();
   }
@@ -290,10 +292,9 @@ export class App {
   #unknown(prompt: string): void {
     if (!(this.source instanceof Tables)) return;
     const { dictionary, loader } = this.source;
-    const near = dictionary.similar(prompt);
     const count = dictionary.phrases.length.toLocaleString("en");
     this.note(`“${prompt}” is not among the ${count} phrases of this page.`);
-    this.#notes.offer(near.map((phrase) => ({ phrase })), true, "Nearest: ");
+    this.#notes.offer(dictionary.similar(prompt).map((phrase) => ({ phrase })), true, "Nearest: ");
     if (loader?.waiting) {
       const size = (loader.bytes / 1e6).toFixed(0);
       this.#notes.append(

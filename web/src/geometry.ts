@@ -18,6 +18,8 @@ const MOST_LINKED = 20_000;
 export class Geometry {
   readonly centers: Float32Array;
   readonly opacities: Float32Array;
+  /** Opacity times area: how much of a picture each splat covers from a distance of one. */
+  readonly covers: Float32Array;
   /** Brightness of each splat, 0..1. */
   readonly lights: Float32Array;
   readonly #scales: Float32Array;
@@ -26,6 +28,7 @@ export class Geometry {
   constructor(mesh: SplatMesh, count: number, readonly rule: SelectionRule) {
     this.centers = new Float32Array(3 * count);
     this.opacities = new Float32Array(count);
+    this.covers = new Float32Array(count);
     this.lights = new Float32Array(count);
     this.#scales = new Float32Array(3 * count);
     this.#quats = new Float32Array(4 * count);
@@ -37,6 +40,8 @@ export class Geometry {
       scales.toArray(this.#scales, 3 * i);
       quat.copy(turn).multiply(quaternion).toArray(this.#quats, 4 * i);
       this.opacities[i] = opacity;
+      const { x, y, z } = scales;
+      this.covers[i] = (opacity * x * y * z) / Math.max(Math.min(x, y, z), 1e-12);
       this.lights[i] = 0.2126 * color.r + 0.7152 * color.g + 0.0722 * color.b;
     });
   }

@@ -49,6 +49,7 @@ async function start(root: HTMLElement): Promise<App> {
 async function show(files: Files, manifest: Manifest, stage: Stage, root: HTMLElement): Promise<App> {
   stage.manifest = manifest;
   const { scene } = manifest;
+  scene.budget = Math.min(scene.budget, stage.budget);
   await stage.load(await files.read(scene.file));
   const geometry = new Geometry(stage.mesh, scene.gaussians, manifest.selection_rule);
   if (manifest.server) {

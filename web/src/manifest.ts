@@ -99,7 +99,10 @@ export interface Manifest {
   scene: {
     file: string;
     gaussians: number;
+    /** Gaussians of the scene; fewer may be in the file. */
     of: number;
+    /** Gaussians that are drawn at once, at most. */
+    budget: number;
     /** Quaternion xyzw from the axes of the splat file to those of the scene. */
     rotation: [number, number, number, number];
     antialiased: boolean;
@@ -141,7 +144,7 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 4;
+const FORMAT_VERSION = 5;
 
 const isText = (value: unknown): boolean => typeof value === "string";
 const isRecord = (value: unknown): boolean => typeof value === "object" && value !== null && !Array.isArray(value);
@@ -157,6 +160,7 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
   ["scene.file", "a text", isText],
   ["scene.gaussians", "a number", Number.isFinite],
   ["scene.of", "a number", Number.isFinite],
+  ["scene.budget", "a number", Number.isFinite],
   ["scene.rotation", "4 numbers", areNumbers(4)],
   ["scene.up", "3 numbers", areNumbers(3)],
   ["scene.meters_per_unit", "a number or null", orNull(Number.isFinite)],

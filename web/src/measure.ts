@@ -33,13 +33,14 @@ export class Measure {
     const text = b ? this.length(a.distanceTo(b)) : "";
     this.overlay.show(this.points, text);
     this.stage.draw();
-    return text ? `Distance: ${text}` : "Click on the second point.";
+    const unknown = this.manifest.scene.meters_per_unit === null ? " (the scale is not known)" : "";
+    return text ? `Distance: ${text}${unknown}` : "Click on the second point.";
   }
 
   /** A length in meters where the scale is known, else in units of the scene. */
   length(units: number): string {
     const scale = this.manifest.scene.meters_per_unit;
-    if (scale === null) return `${units.toPrecision(3)} units (the scale is not known)`;
+    if (scale === null) return `${units.toPrecision(3)} units`;
     const meters = units * scale;
     return meters < 1 ? `${(meters * 100).toPrecision(3)} cm` : `${meters.toPrecision(3)} m`;
   }

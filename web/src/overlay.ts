@@ -4,6 +4,9 @@ import * as THREE from "three";
 import { h } from "./dom";
 import type { Stage } from "./stage";
 
+/** Pixels from the upper point to the middle of the text: it hides neither point nor the line. */
+const ABOVE = 26;
+
 export class Overlay {
   readonly element = h("div", { class: "overlay", "aria-hidden": "true" });
   readonly #svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
@@ -41,7 +44,7 @@ export class Overlay {
     for (const [name, value] of Object.entries({ x1: a.x, y1: a.y, x2: b.x, y2: b.y })) {
       this.#line.setAttribute(name, value.toFixed(1));
     }
-    move(this.#label, { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2 });
+    move(this.#label, { x: (a.x + b.x) / 2, y: Math.min(a.y, b.y) - ABOVE });
   }
 }
 

@@ -1,4 +1,5 @@
-// Colors for answers: on the GPU, every splat looks its scores up in a texture, and shows an edit before it is done.
+// Colors for answers: where splats are drawn, each looks its scores up in a texture. A prompt moves no splat, so Spark
+// computes and sorts none. An edit that is shown before it is done moves some; they change where Spark computes them.
 
 import { SplatMesh, dyno } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -27,9 +28,12 @@ export interface Preview {
   scale: number;
 }
 
-const WIDTH = 2048;
+/** Of the textures with a place for each splat. */
+export const WIDTH = 2048;
 /** The bit of the splats that an edit would change. */
 const EDITED = 128;
+/** The bit of the splats that are not drawn, because there are too many. */
+const LEFT_OUT = 64;
 
 export interface Painted {
   scores: Float32Array;
@@ -39,18 +43,18 @@ export interface Painted {
   color: string;
 }
 
+/** What the splats' shader paints with, and the textures behind it. */
+export interface Paint {
+  scores: THREE.IUniform<THREE.DataArrayTexture | null>;
+  masks: THREE.IUniform<THREE.DataTexture | null>;
+  prompts: THREE.IUniform<THREE.DataTexture | null>;
+  colors: THREE.IUniform<THREE.DataTexture | null>;
+  prompted: THREE.IUniform<number>;
+  heat: THREE.IUniform<boolean>;
+  colored: THREE.IUniform<boolean>;
+}
+
 const GLSL = `
-  // Matplotlib's "inferno" as a polynomial (public domain, M. Zucker).
-  vec3 lexsplatHeat(float t) {
-    const vec3 c0 = vec3(0.00021894, 0.00165100, -0.01948090);
-    const vec3 c1 = vec3(0.10651342, 0.56395644, 3.93271239);
-    const vec3 c2 = vec3(11.60249308, -3.97285397, -15.94239411);
-    const vec3 c3 = vec3(-41.70399613, 17.43639888, 44.35414520);
-    const vec3 c4 = vec3(77.16293570, -33.40235894, -81.80730926);
-    const vec3 c5 = vec3(-71.31942824, 32.62606426, 73.20951986);
-    const vec3 c6 = vec3(25.13112622, -12.24266895, -23.07032500);
-    return c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * (c5 + t * c6)))));
-  }
   vec3 lexsplatTurned(vec4 q, vec3 v) {
     return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v);
   }
@@ -71,9 +75,6 @@ export class Painter {
   /** Colors that replace those of the scene. */
   readonly #colors: THREE.DataTexture;
   readonly #numbers = {
-    count: dyno.dynoInt(0, "lexsplatCount"),
-    heat: dyno.dynoBool(false, "lexsplatHeat"),
-    colored: dyno.dynoBool(false, "lexsplatColored"),
     /** 0: none, else one more than the place in CHANGES. */
     change: dyno.dynoInt(0, "lexsplatChange"),
     paint: dyno.dynoVec3(new THREE.Vector3(), "lexsplatPaint"),
@@ -84,8 +85,11 @@ export class Painter {
   };
   /** What each layer of the scores holds. */
   readonly #held: (Float32Array | null)[] = new Array(MOST_PROMPTS).fill(null);
+  readonly #modifier: ReturnType<typeof modifier>;
+  #out: Uint8Array | null = null;
+  #shown: { answers: Painted[]; preview: Preview | null } = { answers: [], preview: null };
 
-  constructor(mesh: SplatMesh, count: number) {
+  constructor(mesh: SplatMesh, count: number, readonly paints: Paint) {
     this.#mesh = mesh;
     const rows = Math.max(1, Math.ceil(count / WIDTH));
     this.#layer = WIDTH * rows;
@@ -100,15 +104,29 @@ export class Painter {
       new Float32Array(4 * MOST_PROMPTS), MOST_PROMPTS, 1, THREE.RGBAFormat, THREE.FloatType,
     );
     this.#prompts.needsUpdate = true;
-    const uniforms = {
-      scores: dyno.dynoSampler2DArray(this.#scores, "lexsplatScores"),
-      masks: dyno.dynoUsampler2D(this.#masks, "lexsplatMasks"),
-      prompts: dyno.dynoSampler2D(this.#prompts, "lexsplatPrompts"),
-      colors: dyno.dynoSampler2D(this.#colors, "lexsplatColors"),
-      ...this.#numbers,
-    };
-    mesh.objectModifiers = [modifier(uniforms, count)];
-    mesh.updateGenerator();
+    paints.scores.value = this.#scores;
+    paints.masks.value = this.#masks;
+    paints.prompts.value = this.#prompts;
+    paints.colors.value = this.#colors;
+    paints.prompted.value = 0;
+    paints.colored.value = false;
+    this.#modifier = modifier({ masks: dyno.dynoUsampler2D(this.#masks, "lexsplatMasks"), ...this.#numbers }, count);
+  }
+
+  /** From now on splats move and vanish. Nothing else needs this, and software compiles for long. */
+  #change(): void {
+    if (!this.#mesh.objectModifiers) {
+      this.#mesh.objectModifiers = [this.#modifier];
+      this.#mesh.updateGenerator();
+    }
+    this.#mesh.updateVersion();
+  }
+
+  /** Do not draw the splats that have a 1 here. */
+  leaveOut(out: Uint8Array): void {
+    this.#out = out;
+    this.#mask(this.#shown.answers, this.#shown.preview);
+    this.#change();
   }
 
   /** Show answers; none shows the scene as it is. Uploads one byte a splat for a new prompt. */
@@ -126,17 +144,19 @@ export class Painter {
       this.#scores.addLayerUpdate(row);
       this.#scores.needsUpdate = true;
     });
+    const changed = preview !== null || this.#shown.preview !== null;
+    this.#shown = { answers, preview };
     this.#mask(answers, preview);
     this.#prompts.needsUpdate = true;
-    this.#numbers.count.value = Math.min(answers.length, MOST_PROMPTS);
-    this.#numbers.heat.value = mode === "heat";
+    this.paints.prompted.value = preview ? 0 : Math.min(answers.length, MOST_PROMPTS);
+    this.paints.heat.value = mode === "heat";
     this.#preview(preview);
-    this.#mesh.updateVersion();
+    if (changed) this.#change();
   }
 
   /** Show these colors [N, 3] in place of the scene's; null shows the scene's. */
   recolor(colors: Uint8Array | null): void {
-    this.#numbers.colored.value = colors !== null;
+    this.paints.colored.value = colors !== null;
     if (colors) {
       const whole = new Uint8Array(this.#layer * 4);
       for (let i = 0, c = 0; c < colors.length; i += 4, c += 3) whole.set(colors.subarray(c, c + 3), i);
@@ -144,12 +164,13 @@ export class Painter {
       this.#colors.image = { data: whole, width: WIDTH, height: this.#layer / WIDTH };
       this.#colors.needsUpdate = true;
     }
-    this.#mesh.updateVersion();
   }
 
   #mask(answers: Painted[], preview: Preview | null): void {
     const masks = this.#masks.image.data as Uint8Array;
     masks.fill(0);
+    const out = this.#out;
+    if (out) for (let i = 0; i < out.length; i++) if (out[i]) masks[i] = LEFT_OUT;
     answers.forEach(({ splats, scores, threshold }, row) => {
       if (splats) for (const splat of splats) masks[splat] |= 1 << row;
       else for (let i = 0; i < scores.length; i++) if (scores[i] >= threshold) masks[i] |= 1 << row;
@@ -174,8 +195,7 @@ export class Painter {
 }
 
 const TYPES = {
-  scores: "sampler2DArray", masks: "usampler2D", prompts: "sampler2D", colors: "sampler2D", count: "int", heat: "bool",
-  colored: "bool", change: "int", paint: "vec3", by: "vec3", pivot: "vec3", turn: "vec4", scale: "float",
+  masks: "usampler2D", change: "int", paint: "vec3", by: "vec3", pivot: "vec3", turn: "vec4", scale: "float",
 } as const;
 
 function modifier(uniforms: Record<keyof typeof TYPES, unknown>, count: number) {
@@ -191,36 +211,8 @@ function modifier(uniforms: Record<keyof typeof TYPES, unknown>, count: number) 
         bool shown = place >= 0 && place < ${count};
         ivec2 at = shown ? ivec2(place % ${WIDTH}, place / ${WIDTH}) : ivec2(0);
         uint mask = shown ? texelFetch(${i.masks}, at, 0).r : 0u;
-        vec3 own = ${i.gsplat}.rgba.rgb;
-        if (shown && ${i.colored}) {
-          own = texelFetch(${i.colors}, at, 0).rgb;
-          ${o.gsplat}.rgba.rgb = own;
-        }
-        float light = dot(own, vec3(0.2126, 0.7152, 0.0722));
-        if (shown && ${i.count} > 0 && ${i.change} == 0) {
-          vec3 rest = mix(own, vec3(0.12 + 0.5 * light), 0.75);
-          vec3 marked = rest;
-          float best = -2.0;
-          for (int p = 0; p < ${i.count}; p++) {
-            float score = texelFetch(${i.scores}, ivec3(at, p), 0).r;
-            vec4 prompt = texelFetch(${i.prompts}, ivec2(p, 0), 0);
-            if (${i.heat}) {
-              if (score > best) {
-                best = score;
-                float strength = smoothstep(0.0, 1.0, score / max(0.05, prompt.w + 0.3));
-                marked = mix(rest * 0.6, lexsplatHeat(clamp(score, 0.0, 1.0)) * (0.55 + 0.7 * light), 0.15 + 0.75 * strength);
-              }
-              continue;
-            }
-            if ((mask & (1u << uint(p))) == 0u) continue;
-            float margin = (score - prompt.w) / max(1e-3, 1.0 - prompt.w);
-            if (margin > best) {
-              best = margin;
-              marked = mix(own, prompt.rgb * (0.35 + 0.9 * light), 0.62);
-            }
-          }
-          ${o.gsplat}.rgba.rgb = marked;
-        }
+        float light = dot(${i.gsplat}.rgba.rgb, vec3(0.2126, 0.7152, 0.0722));
+        if ((mask & ${LEFT_OUT}u) != 0u) ${o.gsplat}.flags = 0u;
         bool edited = (mask & ${EDITED}u) != 0u;
         if (${i.change} == 1 && edited || ${i.change} == 2 && shown && !edited) ${o.gsplat}.rgba.a = 0.0;
         if (${i.change} == 3 && edited) ${o.gsplat}.rgba.rgb = clamp(${i.paint} * max(light, 0.02), 0.0, 1.0);

@@ -1,5 +1,6 @@
 // Panels that open: the original views, and help.
 
+import { leftOut } from "./budget";
 import { h, iconButton } from "./dom";
 import type { Manifest, ObjectEntry, ViewEntry } from "./manifest";
 import type { Server } from "./server";
@@ -99,7 +100,7 @@ const KEYS: [string, string][] = [
 
 export function helpDialog(manifest: Manifest, server: Server | null): HTMLDialogElement {
   const { scene, words, text, lexsplat, licenses } = manifest;
-  const shown = scene.gaussians.toLocaleString("en") + (scene.of > scene.gaussians ? ` of ${scene.of.toLocaleString("en")}` : "");
+  const shown = `${scene.gaussians.toLocaleString("en")} Gaussians. ${leftOut(scene)}`;
   const answering =
     `${words.count.toLocaleString("en")} phrases are answered from tables` +
     (text ? ", all others by a text model in this page." : "; this page has no text model for others.") +
@@ -110,7 +111,7 @@ export function helpDialog(manifest: Manifest, server: Server | null): HTMLDialo
     h("h2", { text: "Search this place with words" }),
     h("p", { text: "Type what you look for. Commas ask for several things, each in its color. Click on anything to hear what it may be." }),
     h("dl", {}, ...keys.flatMap(([keys, what]) => [h("dt", { text: keys }), h("dd", { text: what })])),
-    h("p", { class: "fine", text: `${shown} Gaussians. ${server ? "The server of lexsplat view answers." : answering}` }),
+    h("p", { class: "fine", text: `${shown} ${server ? "The server of lexsplat view answers." : answering}` }),
     server ? names(server) : "",
     h("p", { class: "fine", text: `Made with lexsplat ${lexsplat}. ${Object.entries(licenses).map(([name, license]) => `${name}: ${license}`).join("; ")}.` }),
     h("button", { type: "button", text: "Close", onclick: () => dialog.close() }),
@@ -132,4 +133,10 @@ function names(server: Server): HTMLElement {
     area,
     h("button", { type: "button", text: "Use these names", onclick: () => void use().catch((error: unknown) => (area.value = String(error))) }),
   );
+}
+
+/** Title and description of the scene, and what is not drawn. */
+export function titleOf({ title, description, scene }: Manifest): HTMLElement {
+  const lines = [description, leftOut(scene)].filter(Boolean).map((text) => h("p", { text }));
+  return h("div", { class: "title" }, h("h1", { text: title }), ...lines);
 }

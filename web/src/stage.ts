@@ -5,30 +5,26 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Place } from "./geometry";
 import { type Manifest, PageError, type ViewEntry } from "./manifest";
+import type { Paint } from "./painter";
+import { FRAGMENT, VERTEX, drawInBatches } from "./splats";
 
 /** Scenes of more splats are stored with less precise centers, to fit into the memory of phones. */
 const MOST_PRECISE = 1_500_000;
 const FLIGHT_MS = 700;
+/** Resolution where software draws, while the camera moves and for the first picture. */
+const COARSE = 0.5;
+/** Software draws the colors of more splats than this coarsely at first. */
+const MANY = 100_000;
+/** Splats that software draws, at most: a million would take seconds. */
+const SOFTWARE_BUDGET = 250_000;
+/** The camera rests when it has not moved for so long. */
+const REST_MS = 200;
+/** What browsers call renderers without a graphics card. */
+const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 /** Pictures a second of a video, at most. */
 const MOST_RATE = 30;
 /** Seconds of the swing between two pictures of a video, at most. */
 const LONGEST_STEP = 0.2;
-
-/** Spark's, without what our splats never have (levels of detail, colors to convert): software draws a third faster. */
-const FRAGMENT = `
-  precision highp float;
-  uniform float minAlpha;
-  in vec4 vRgba;
-  in vec2 vSplatUv;
-  flat in float adjustedStdDev;
-  out vec4 fragColor;
-  void main() {
-    float apart = dot(vSplatUv, vSplatUv);
-    float alpha = vRgba.a * exp(-0.5 * apart);
-    if (apart > adjustedStdDev * adjustedStdDev || alpha < minAlpha) discard;
-    fragColor = vec4(vRgba.rgb * alpha, alpha);
-  }
-`;
 
 const TYPES: Record<string, SplatFileType> = { spz: SplatFileType.SPZ, ply: SplatFileType.PLY, sog: SplatFileType.PCSOGSZIP };
 
@@ -39,17 +35,32 @@ export class Stage {
   mesh!: SplatMesh;
   /** Called after the camera moved. */
   onMove: () => void = () => undefined;
+  /** Called when the camera rests, and before the first picture. */
+  onRest: () => void = () => undefined;
   /** Called after every picture. */
   onDraw: () => void = () => undefined;
   manifest: Manifest;
+  /** What the splats are painted with; a painter fills it. */
+  readonly paints: Paint = {
+    scores: { value: null }, masks: { value: null }, prompts: { value: null }, colors: { value: null },
+    prompted: { value: 0 }, heat: { value: false }, colored: { value: false },
+  };
   readonly #controls: OrbitControls;
   readonly #spark: SparkRenderer;
+  /** Whether there is no graphics card: pictures take long. */
+  readonly software: boolean;
   /** Resolves when a picture of the sorted splats is on the screen. */
   readonly shown: Promise<void>;
   #show: () => void = () => undefined;
   #wanted = false;
   #drawing = false;
   #moving = false;
+  /** The pose of the last picture, and what waits for the camera to rest. */
+  #pose = "";
+  #resting: ReturnType<typeof setTimeout> | null = null;
+  #recording = false;
+  /** Until the first picture. */
+  #early = true;
   /** What the last order of the splats was for. */
   #order = "";
   #flight = 0;
@@ -67,7 +78,11 @@ export class Stage {
         "This page needs WebGL 2, which this browser does not offer; use a newer browser or allow hardware acceleration.",
       );
     }
+    const gl = this.renderer.getContext();
+    const told = gl.getExtension("WEBGL_debug_renderer_info");
+    this.software = told !== null && SOFTWARE.test(String(gl.getParameter(told.UNMASKED_RENDERER_WEBGL)));
     const { antialiased } = manifest.scene;
+    const drawnSplats = { value: 0 };
     this.#spark = new SparkRenderer({
       renderer: this.renderer,
       sortRadial: false, // scenes are trained with splats in the order of depth
@@ -77,11 +92,14 @@ export class Stage {
       // with its defaults a view of the demo differs from our renderer by 32 dB, with these by 37 dB.
       clipXY: 4,
       maxPixelRadius: 4096,
+      vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
+      extraUniforms: { drawnSplats, ...this.paints },
       depthTest: false, // nothing else is in the scene
       enableLod: false, // would start a worker
       onDirty: () => this.#drawing || this.#sorted(), // what changes while drawing is drawn already
     });
+    drawInBatches(this.#spark, drawnSplats);
     this.scene.add(this.#spark);
     this.camera.up.fromArray(manifest.scene.up);
     this.#controls = new OrbitControls(this.camera, canvas);
@@ -112,12 +130,15 @@ export class Stage {
     });
     this.mesh.quaternion.set(...rotation);
     await this.mesh.initialized;
+    this.#pose = "";
+    this.resize();
     this.scene.add(this.mesh);
   }
 
   /** Spark sorts again also for new colors: the picture in the old order is then right already. */
   #sorted(): void {
-    const order = [this.mesh?.uuid, ...this.camera.matrixWorld.elements].join();
+    const { sortedCenter, sortedDir } = this.#spark; // the camera may be elsewhere by now
+    const order = [this.mesh?.uuid, ...sortedCenter, ...sortedDir].join();
     if (order !== this.#order) this.draw();
     this.#order = order;
   }
@@ -127,17 +148,62 @@ export class Stage {
     if (moved) this.#order = "";
     if (this.#wanted || !this.mesh?.isInitialized) return;
     this.#wanted = true;
-    requestAnimationFrame(() => {
-      this.#wanted = false;
-      // Not in every picture: rounding moves the camera a bit each time, and Spark then computes and sorts all splats again.
-      if (this.#moving) this.#controls.update(); // it tells if the camera goes on to glide
-      this.#moving &&= this.#wanted;
-      this.#drawing = true;
-      this.renderer.render(this.scene, this.camera);
-      this.#drawing = false;
-      if (this.#spark.display.numSplats > 0) void this.#drawn().then(this.#show);
-      this.onDraw();
-    });
+    requestAnimationFrame(() => this.#render());
+  }
+
+  #render(): void {
+    this.#wanted = false;
+    // Not in every picture: rounding moves the camera a bit each time, and Spark then computes and sorts all splats again.
+    if (this.#moving) this.#controls.update(); // it tells if the camera goes on to glide
+    this.#moving &&= this.#wanted;
+    this.#fit();
+    this.#drawing = true;
+    this.renderer.render(this.scene, this.camera);
+    this.#drawing = false;
+    if (this.#early && this.#spark.activeSplats > 0) {
+      this.#early = false;
+      void this.#presented().then(this.#show);
+    }
+    this.onDraw();
+  }
+
+  /** Resolves when what was drawn is on the screen: the browser shows it with its next frame. */
+  async #presented(): Promise<void> {
+    await this.#drawn();
+    for (let frame = 0; frame < 2; frame++) await new Promise(requestAnimationFrame);
+  }
+
+  /** Choose the resolution: software draws the first picture and those of a moving camera coarsely, others sharply. */
+  #fit(): void {
+    this.camera.updateMatrixWorld();
+    const pose = [...this.camera.matrixWorld.elements, this.camera.fov].join();
+    if (this.#pose === "") this.onRest();
+    if (pose !== this.#pose) {
+      this.#pose = pose;
+      this.#wait(() => this.onRest());
+    }
+    const coarse = this.software && this.#resting !== null && !this.#recording;
+    const ratio = Math.min(devicePixelRatio, 2) * (coarse ? COARSE : 1);
+    if (ratio !== this.renderer.getPixelRatio()) this.renderer.setPixelRatio(ratio);
+  }
+
+  /** Do something once the camera rests, and draw sharply. */
+  #wait(then: () => void): void {
+    clearTimeout(this.#resting ?? 0);
+    const timer = setTimeout(async () => {
+      await this.shown;
+      if (timer !== this.#resting) return;
+      this.#resting = null;
+      then();
+      this.draw();
+    }, REST_MS);
+    this.#resting = timer;
+  }
+
+  /** Draw new colors soon: where software draws many splats, coarsely at first. */
+  paint(moved: boolean): void {
+    if (this.software && this.drawn > MANY && !this.#resting) this.#wait(() => undefined);
+    this.draw(moved);
   }
 
   /** Resolves when what was drawn is done. */
@@ -152,7 +218,6 @@ export class Stage {
   resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     // What covers the bottom of the picture on phones moves its middle up.
@@ -169,6 +234,16 @@ export class Stage {
     this.resize();
   }
 
+  /** Number of splats that are drawn well at once, at most. */
+  get budget(): number {
+    return this.software ? SOFTWARE_BUDGET : Infinity;
+  }
+
+  /** Number of splats of the last picture. */
+  get drawn(): number {
+    return this.#spark.activeSplats;
+  }
+
   set background(color: string) {
     this.scene.background = new THREE.Color(color);
     this.draw();
@@ -182,6 +257,7 @@ export class Stage {
   ray(x: number, y: number): THREE.Ray {
     const box = this.canvas.getBoundingClientRect();
     const point = new THREE.Vector2(((x - box.left) / box.width) * 2 - 1, 1 - ((y - box.top) / box.height) * 2);
+    this.camera.updateMatrixWorld(); // it may have moved since the last picture
     const caster = new THREE.Raycaster();
     caster.setFromCamera(point, this.camera);
     return caster.ray;
@@ -195,6 +271,7 @@ export class Stage {
 
   /** Where a point of the scene is on the page; null behind the camera. */
   pixel(point: THREE.Vector3): { x: number; y: number } | null {
+    this.camera.updateMatrixWorld();
     const seen = point.clone().project(this.camera);
     if (seen.z > 1) return null;
     const box = this.canvas.getBoundingClientRect();
@@ -226,6 +303,7 @@ export class Stage {
     const offset = this.camera.position.clone().sub(this.target);
     const flight = ++this.#flight;
     recorder.start();
+    this.#recording = true; // the size of a video cannot change
     // Where pictures take long, the swing does too: a video of two pictures shows nothing.
     let before = performance.now();
     for (let time = 0; time < seconds && flight === this.#flight; ) {
@@ -240,6 +318,7 @@ export class Stage {
     }
     if (recorder.state !== "inactive") recorder.stop();
     await stopped;
+    this.#recording = false;
     const video = new Blob(parts, { type: kind });
     if (video.size === 0) throw new PageError("The browser recorded no picture; keep this page in front and try again.");
     return { video, suffix: kind.startsWith("video/mp4") ? ".mp4" : ".webm" };
@@ -318,7 +397,7 @@ export class Stage {
     for (let quiet = 0; quiet < 2; quiet++) {
       await new Promise(requestAnimationFrame);
       const { sorting, sortDirty } = this.#spark;
-      if (this.#wanted || sorting || sortDirty || this.#flying === this.#flight) quiet = -1;
+      if (this.#wanted || this.#resting || sorting || sortDirty || this.#flying === this.#flight) quiet = -1;
     }
     await this.#drawn();
   }

@@ -29,6 +29,7 @@ from lexsplat.scenes.exporting import export_gaussians
 from lexsplat.scenes.publishing.manifest import checksums, listed_objects, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
+from lexsplat.scenes.publishing.writing import MOST_SPLATS
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.coloring import MODES, colors_in
 from lexsplat.viewer.history import History
@@ -48,7 +49,7 @@ class Content:
     Args:
         manifest: The content of ``manifest.json``.
         files: The other files by name.
-        drawn: Indices ``[M]`` of the Gaussians that are drawn, in the order of the file.
+        drawn: Indices ``[M]`` of the Gaussians that pages have, in the order of the file.
     """
 
     manifest: dict[str, Any]
@@ -61,7 +62,7 @@ class Session:
 
     Args:
         scene: The scene as it was built. Steps of ``lexsplat edit`` are replayed.
-        splats: Maximum number of Gaussians that a browser draws.
+        splats: Maximum number of Gaussians that a browser draws at once.
         history: Earlier prompts and the vocabulary.
 
     Raises:
@@ -268,12 +269,12 @@ class Session:
         if len(scene.gaussians) < 2 or (damage := scene.gaussians.find_invalid()):
             found = str(len(scene.gaussians)) if len(scene.gaussians) < 2 else damage
             raise QueryError("scene", expected="at least 2 finite Gaussians", found=found)
-        drawn = most_visible(scene.gaussians, self._splats)
+        drawn = most_visible(scene.gaussians, max(MOST_SPLATS, self._splats))
         gaussians = scene.gaussians.select(drawn.to(scene.gaussians.device)).to("cpu")
         with tempfile.TemporaryDirectory() as folder:
             path, rotation = write_splats(gaussians, Path(folder))
             files = {path.name: path.read_bytes(), "words.txt": self._words()}
-        manifest = scene_manifest(scene, gaussians, path.name, rotation)
+        manifest = scene_manifest(scene, gaussians, path.name, rotation, "", self._splats)
         manifest["words"]["count"] = files["words.txt"].count(b"\n")
         manifest["server"] = {
             "version": self.version,

@@ -16,7 +16,9 @@ from lexsplat.queries.selection import Selection
 from lexsplat.scenes.publishing.sidecar import selection_rule
 from lexsplat.scenes.scene import Scene
 
-FORMAT, FORMAT_VERSION = "lexsplat-page", 4
+FORMAT, FORMAT_VERSION = "lexsplat-page", 5
+DRAWN_SPLATS = 1_000_000
+"""Gaussians that a page draws at once, at most; of more, those that cover most of the picture."""
 MOST_OBJECTS = 200
 """Entries of the list of objects, at most."""
 
@@ -26,7 +28,8 @@ def scene_manifest(
     gaussians: Gaussians,
     file: str,
     rotation: tuple[float, float, float, float],
-    title: str = "",
+    title: str,
+    budget: int,
 ) -> dict[str, Any]:
     """What every page says of its scene.
 
@@ -36,6 +39,7 @@ def scene_manifest(
         file: Name of their file.
         rotation: xyzw from the axes of the file to those of the scene.
         title: Title of the page; empty takes the name of the scene folder.
+        budget: Maximum number of Gaussians that the page draws at once.
     """
     record = scene.folder.record if scene.folder else {}
     built_with = {key: record.get("provenance", {}).get(key) for key in ("lexsplat", "versions", "seed")}
@@ -49,6 +53,7 @@ def scene_manifest(
             "file": file,
             "gaussians": len(gaussians),
             "of": len(scene.gaussians),
+            "budget": budget,
             "rotation": rotation,
             "antialiased": gaussians.antialiased,
             "up": [round(float(value), 6) + 0.0 for value in scene.world.up.direction],

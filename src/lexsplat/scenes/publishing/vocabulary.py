@@ -95,7 +95,8 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
         best = scene.presence_classifier.best_heights(batch)
         relevancy = scale.relevancy(codewords, texts.to(codewords.device), best)
         tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
-        scores = field.scores(relevancy).T.contiguous()
+        # Evidence lies in the segments, where there are any; scores of a million Gaussians would take a minute.
+        scores = field.scores(relevancy).T.contiguous() if field.segments is None else texts.new_zeros(0, 0)
         presences += [presence[0] for presence in scene.presence_classifier.classify(batch, texts, scores)]
     return torch.cat(tables), presences
 

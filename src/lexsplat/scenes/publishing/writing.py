@@ -17,6 +17,7 @@ from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file, single_index
 from lexsplat.scenes.publishing.manifest import (
+    DRAWN_SPLATS,
     FORMAT,
     checksums,
     kind_entries,
@@ -210,7 +211,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
         text = write_text_tower(scene, folder / "text.safetensors", folder / "tokenizer.json")
     for name in PAGE_FILES:
         (folder / name).write_bytes(page_file(name))
-    manifest = scene_manifest(scene, gaussians, splats.name, rotation, options.title)
+    manifest = scene_manifest(scene, gaussians, splats.name, rotation, options.title, DRAWN_SPLATS)
     manifest["description"] = one_line(options.description)
     manifest["scene"]["start_view"] = start
     manifest |= {
