@@ -135,6 +135,16 @@ def test_objects_are_judged_and_not_their_parts(judge):
     assert strength(judge, "3") < NO, "a stripe of the ball"
 
 
+def test_parts_need_the_strength_of_objects_and_colors_more(judge, monkeypatch):
+    from lexsplat.queries import presence
+
+    monkeypatch.setattr(presence, "is_part", lambda phrase: phrase == "3")
+    phrases = ["3", "2", "red 0"]
+    found = judge.evidence(phrases, Words()(phrases), torch.zeros(3, 500))
+    assert [evidence.yes for evidence in found] == [0.62, 0.62, 0.82]
+    assert Evidence(0.7, 0.7, found[0].yes).presence == "yes"
+
+
 def test_a_color_is_that_of_the_thing(judge):
     assert min(strength(judge, phrase) for phrase in ("red 0", "green 1")) > YES
     assert max(strength(judge, phrase) for phrase in ("green 0", "red 1")) < YES

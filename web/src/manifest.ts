@@ -26,8 +26,8 @@ export interface EverydayRule {
   peak: number;
   yes: number;
   no: number;
-  /** Borders of "yes" for names of whole objects and for phrases with a color; words that tell which is which. */
-  yes_object: number;
+  /** Borders of "yes" for what is judged at segments and for phrases with a color; words that tell which is which. */
+  yes_segment: number;
   yes_colored: number;
   names: string[];
   qualities: string[];

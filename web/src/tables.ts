@@ -64,11 +64,11 @@ export class Tables implements Source {
     }
     if (isPart(phrase, rule)) {
       this.#parts ??= this.segments.distributions(this.language);
-      return presenceOf(heights, this.#parts, best, rule, rule.yes);
+      return presenceOf(heights, this.#parts, best, rule, rule.yes_segment);
     }
     return hasColor(phrase, rule)
       ? presenceOf(heights, places, colored, rule, rule.yes_colored)
-      : presenceOf(heights, places, best, rule, rule.yes_object);
+      : presenceOf(heights, places, best, rule, rule.yes_segment);
   }
   #parts: Float32Array | null = null;
 

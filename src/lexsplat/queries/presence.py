@@ -37,9 +37,10 @@ from lexsplat.queries.vocabulary import COLORS, has_color, is_part
 
 YES, NO = 0.74, FITS
 """Strengths from which the answer is "yes", and below which it is "no"."""
-YES_OBJECT, YES_COLORED = 0.62, 0.82
-"""The former for names of whole objects, whose means are lower than peaks, and for phrases with a color, which share
-the color or the name with most of what they are confused with. Chosen on the second scene."""
+YES_SEGMENT, YES_COLORED = 0.62, 0.82
+"""The former at objects and their parts, whose means are lower than peaks, and for phrases with a color, which share
+the color or the name with most of what they are confused with. Chosen on the second scene with the bundled encoder and
+three of ``benchmarks/web_like.py``."""
 
 PEAK_SHARE = 5e-4
 PEAK_COUNT = 20
@@ -144,9 +145,9 @@ class PresenceClassifier:
             if self.language.segments is None:
                 places = self._peak(scores[number])[None]
             elif is_part(phrase) and (codes := self.segment_codes) is not None:
-                places = codes.distributions
+                places, yes = codes.distributions, YES_SEGMENT
             else:
-                places, yes = self.places.distributions, YES_COLORED if has_color(phrase) else YES_OBJECT
+                places, yes = self.places.distributions, YES_COLORED if has_color(phrase) else YES_SEGMENT
             ratios, reached = self._compared(heights[:, number : number + 1], places, self._best(phrase))
             place = _strength(ratios, reached)[:, 0].argmax()
             found.append(Evidence(float(ratios[place]), float(reached[place]), yes))
