@@ -36,6 +36,10 @@ _LEAST_CLEAR = 0.2
 """Least share of the drawn pixels of a view that show a surface,"""
 _LEAST_OF_BEST = 0.65
 """and least share relative to good views: where a splat is sharp, a view of fog is no use."""
+_ENOUGH = 0.05
+"""Least share of good views among the candidates: a splat that is hazy everywhere is measured by itself,"""
+_LENIENT = (1.0, 0.5, 0.25)
+"""by these parts of both least shares, one after the other."""
 _ENCLOSED = 0.7
 """Share of good views all around from inside that makes a scene a room."""
 
@@ -141,17 +145,18 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
     qualities = np.zeros(len(candidates), np.float32)
     for done, (camera, target) in enumerate(candidates, start=1):
         depth, clear = look(gaussians, camera)
-        hidden = target is not None and is_hidden(depth, camera, target)
-        qualities[done - 1] = 0 if hidden or clear < _LEAST_CLEAR else clear
+        qualities[done - 1] = 0 if target is not None and is_hidden(depth, camera, target) else clear
         listener(Event("views", done, len(candidates)))
-    best = float(np.quantile(qualities[qualities > 0], 0.9)) if qualities.any() else 0.0
-    good = qualities > _LEAST_OF_BEST * best
-    for index in np.flatnonzero(good):
-        good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
-    if inner and good[len(outer) :].mean() >= _ENCLOSED:  # a room: from outside, walls are seen from behind
-        good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
-    else:  # no room: what is inside is between things, or beside them
-        good[len(outer) :] = False
+    good = np.zeros(len(candidates), bool)
+    for part in _LENIENT:
+        if good.mean() < _ENOUGH:
+            good = _clear_enough(qualities, part)
+            for index in np.flatnonzero(good):
+                good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
+            if inner and good[len(outer) :].mean() >= _ENCLOSED:  # a room: from outside, walls show their backs
+                good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
+            else:  # no room: what is inside is between things, or beside them
+                good[len(outer) :] = False
     looked_at = np.arange(len(gaussians))
     if len(looked_at) > _SAMPLE:
         looked_at = np.sort(generator.choice(looked_at, _SAMPLE, replace=False))
@@ -174,6 +179,13 @@ def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> boo
     distance = float(np.linalg.norm(camera.position - target.center))
     before = float(np.median(depth[rows, columns])) < distance - 1.5 * target.radius
     return before or float((depth < 0.3 * distance).mean()) > 0.05
+
+
+def _clear_enough(qualities: NDArray[np.float32], part: float) -> NDArray[np.bool_]:
+    """Which views show enough surfaces, with both least shares reduced to a part of them."""
+    enough = qualities >= part * _LEAST_CLEAR
+    best = float(np.quantile(qualities[enough], 0.9)) if enough.any() else 0.0
+    return np.asarray(enough & (qualities > part * _LEAST_OF_BEST * best))
 
 
 def _is_behind_a_wall(gaussians: Gaussians, camera: Camera, found: Surroundings) -> bool:
