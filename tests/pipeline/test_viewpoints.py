@@ -196,7 +196,7 @@ def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the
     """Both are within four of their radii from their neighbors, so distances alone do not tell them apart."""
     clean, dust = dusty()
     rng = np.random.default_rng(5)
-    above = solid(rng.uniform([-0.8, -0.8, 1.3], [0.8, 0.8, 2.2], (12, 3)))
+    above = solid(rng.uniform([-1, -1, 0.9], [1, 1, 1.2], (12, 3)))
     around = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     wall = solid(np.stack([9 * np.cos(around), 9 * np.sin(around), np.full(30, 0.5)], 1))
     above.log_scales[:], wall.log_scales[:] = np.log(0.35), np.log(1.5)
