@@ -160,6 +160,14 @@ def test_floaters_in_front_of_a_surface_lower_its_share():
     assert after < 0.8 * before
 
 
+def test_a_bar_that_is_lowered_admits_hazier_views_but_none_far_below_the_best():
+    """The best tenth is at 0.5, so the bars are at 0.325, 0.1625 and 0.08125, and absolutely at 0.2, 0.1 and 0.05."""
+    shares = np.array([0.0, 0.06, 0.09, 0.14, 0.17, 0.25, 0.35, 0.5, 0.5, 0.5, 0.5], np.float32)
+    passed = [choosing._clear_enough(shares, part).sum() for part in (1.0, 0.5, 0.25)]
+    assert passed == [5, 7, 9]
+    assert not choosing._clear_enough(np.zeros(5, np.float32), 0.25).any()
+
+
 def joined(*parts: Gaussians) -> Gaussians:
     return Gaussians(
         **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}

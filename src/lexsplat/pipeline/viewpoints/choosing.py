@@ -153,7 +153,9 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
             good = _clear_enough(qualities, part)
             for index in np.flatnonzero(good):
                 good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
-            if inner and good[len(outer) :].mean() >= _ENCLOSED:  # a room: from outside, walls show their backs
+            if (
+                inner and good[len(outer) :].mean() >= _ENCLOSED
+            ):  # a room: from outside, walls show their backs
                 good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
             else:  # no room: what is inside is between things, or beside them
                 good[len(outer) :] = False
