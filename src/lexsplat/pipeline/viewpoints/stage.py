@@ -54,7 +54,8 @@ def capture_of_splats(
     """
     splats, poses = existing_splats(splats), folder.root / "poses"
     key = fingerprint(_RULES, splats_hash(splats), config.up, config.seed, config.keep_floaters)
-    if not (folder.is_finished("views", key) and (poses / "transforms.json").is_file()):
+    complete = (poses / "transforms.json").is_file() and (poses / _FLOATERS).is_file()
+    if not (complete and folder.is_finished("views", key)):
         start = time.perf_counter()
         folder.reopen("views")
         gaussians = read_splats(splats).to(device)
