@@ -33,7 +33,8 @@ pytestmark = [
     pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux"),
 ]
 
-LEAST_INPUTS = 20_000
+LEAST_INPUTS = 44_000
+LEAST_SPLATS = 23_000
 PROCESSES = 2
 
 
@@ -80,15 +81,18 @@ def test_every_input_is_read_correctly_or_refused_with_a_typed_error_of_one_line
     assert report["peak"] < BASE_BYTES + GIGABYTE
 
 
-def test_the_corpus_has_twenty_thousand_inputs_of_all_kinds(corpus):
-    assert sum(report["inputs"] for report in corpus.values()) >= LEAST_INPUTS
+def test_the_corpus_has_forty_four_thousand_inputs_of_all_kinds(corpus):
+    counts = {name: report["inputs"] for name, report in corpus.items()}
+    assert sum(counts.values()) >= LEAST_INPUTS
+    splats = [name for name, make in READERS.items() if make.__module__.endswith(".splats")]
+    assert sum(counts[name] for name in splats) >= LEAST_SPLATS
     kinds = {kind for report in corpus.values() for kind in report["kinds"]}
     assert {"truncated", "flipped", "numbers", "moved", "foreign", "structure", "names", "counts"} <= kinds
     # The corpus must exercise both acceptance and refusal.
     refused = sum(sum(report["errors"].values()) for report in corpus.values())
     right = sum(report["right"] for report in corpus.values())
-    assert refused > 8000
-    assert right > 2000
+    assert refused > 20_000
+    assert right > 5000
 
 
 def test_the_corpus_is_deterministic():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from lexsplat.geometry.rotations import rotation_about
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.inputs import reload_capture
-from lexsplat.pipeline.viewpoints import choosing
-from lexsplat.pipeline.viewpoints.choosing import choose_views, surface_share
-from lexsplat.pipeline.viewpoints.floaters import read_without_floaters
+from lexsplat.pipeline.viewpoints import choosing, stage
+from lexsplat.pipeline.viewpoints.choosing import choose_views
+from lexsplat.pipeline.viewpoints.floaters import find_floaters, isolation
+from lexsplat.pipeline.viewpoints.looking import look, surface_share
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.scenes.folder import SceneFolder
@@ -153,35 +155,86 @@ def test_floaters_in_front_of_a_surface_lower_its_share():
     dust.opacity_logits[:] = 0
     both = Gaussians(**{n: torch.cat([t, getattr(dust, n)]) for n, t in clean.tensors().items()})
     with torch.no_grad():
-        before, after = (choosing._look(scene, camera)[1] for scene in (clean, both))
+        before, after = (look(scene, camera)[1] for scene in (clean, both))
     assert before > 0.95
     assert after < 0.8 * before
 
 
-def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay(tmp_path, caplog):
+def test_a_bar_that_is_lowered_admits_hazier_views_but_none_far_below_the_best():
+    """The best tenth is at 0.5, so the bars are at 0.325, 0.1625 and 0.08125, and absolutely at 0.2, 0.1 and 0.05."""
+    shares = np.array([0.0, 0.06, 0.09, 0.14, 0.17, 0.25, 0.35, 0.5, 0.5, 0.5, 0.5], np.float32)
+    passed = [choosing._clear_enough(shares, part).sum() for part in (1.0, 0.5, 0.25)]
+    assert passed == [5, 7, 9]
+    assert not choosing._clear_enough(np.zeros(5, np.float32), 0.25).any()
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    return Gaussians(
+        **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
+    )
+
+
+def dusty() -> tuple[Gaussians, Gaussians]:
+    """Balls on a table, and small floaters around them of which some are certainly floaters."""
     clean = solid(on_table())
-    dust = np.random.default_rng(3).uniform([-3, -3, 0.1], [3, 3, 4], (700, 3))
-    floaters = solid(dust)
-    floaters.log_scales[:] = clean.log_scales[:700]
-    both = Gaussians(**{n: torch.cat([t, getattr(floaters, n)]) for n, t in clean.tensors().items()})
-    distances = np.linalg.norm(dust[:, None] - on_table()[None, ::10], axis=2).min(1)
-    splats = tmp_path / "dusty.ply"
-    write_ply(both, splats)
-    assert len(read_without_floaters(splats, keep=True)) == len(both)
+    dust = solid(np.random.default_rng(3).uniform([-3, -3, 0.1], [3, 3, 4], (700, 3)))
+    dust.log_scales[:] = clean.log_scales[:700]
+    return clean, dust
+
+
+def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay(caplog):
+    clean, dust = dusty()
+    distances = np.linalg.norm(dust.means.numpy()[:, None] - on_table()[None, ::10], axis=2).min(1)
+    both = joined(clean, dust)
     with caplog.at_level(logging.WARNING, "lexsplat"):
-        kept = read_without_floaters(splats).means.numpy()
+        floating = find_floaters(both, Path("dusty.ply"))
     assert "dusty.ply" in caplog.text
     assert "float free of all surfaces" in caplog.text
-    left = {tuple(row) for row in kept.tolist()}
-    assert all(tuple(row) in left for row in clean.means.tolist())
-    far = floaters.means[distances > 1].tolist()
+    assert (floating >= len(clean)).all()
+    far = len(clean) + np.flatnonzero(distances > 1)
     assert len(far) > 300
-    assert sum(tuple(row) in left for row in far) < 0.05 * len(far)
+    assert np.isin(far, floating).mean() > 0.95
     caplog.clear()
     for few in (both.select(torch.arange(len(clean) + 100)), clean):
-        write_ply(few, splats)
-        assert len(read_without_floaters(splats)) == len(few)
+        assert len(find_floaters(few, Path("dusty.ply"))) == 0
     assert not caplog.text
+
+
+def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the_scene_stay():
+    """Both are within four of their radii from their neighbors, so distances alone do not tell them apart."""
+    clean, dust = dusty()
+    rng = np.random.default_rng(5)
+    above = solid(rng.uniform([-1, -1, 0.9], [1, 1, 1.2], (12, 3)))
+    around = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    wall = solid(np.stack([9 * np.cos(around), 9 * np.sin(around), np.full(30, 0.5)], 1))
+    above.log_scales[:], wall.log_scales[:] = np.log(0.35), np.log(1.5)
+    scene = joined(clean, dust, above, wall)
+    first = len(clean) + len(dust)
+    own = isolation(scene)[1]
+    assert (own[first:] < 4).all()
+    floating = find_floaters(scene, Path("dusty.ply"))
+    assert np.isin(np.arange(first, first + 12), floating).mean() > 0.8
+    assert not np.isin(np.arange(first + 12, len(scene)), floating).any()
+    assert (floating >= len(clean)).all()
+
+
+@pytest.mark.slow
+def test_a_build_leaves_floaters_out_of_the_scene_unless_they_are_kept(tmp_path, monkeypatch):
+    clean, dust = dusty()
+    scene, splats = joined(clean, dust), tmp_path / "dusty.ply"
+    write_ply(scene, splats)
+    monkeypatch.setattr(stage, "choose_views", lambda *_, **__: choosing.ChosenViews((), UP, 0, 0, 0, 0))
+    monkeypatch.setattr(stage, "write_chosen_capture", lambda _, __, poses: poses.mkdir(parents=True))
+    monkeypatch.setattr(stage, "load_capture", lambda poses, **_: SimpleNamespace(root=poses))
+    for keep, count in ((False, len(scene) - len(find_floaters(scene, splats))), (True, len(scene))):
+        folder = SceneFolder(tmp_path / str(keep))
+        folder.root.mkdir()
+        config = BuildConfig(keep_floaters=keep)
+        capture = stage.capture_of_splats(splats, folder, config, "cpu", lambda _: None)
+        assert len(stage.splats_of_capture(splats, capture, folder)) == count
+        assert folder.record["stages"]["views"]["floaters"] == len(scene) - count
+    photos = SimpleNamespace(root=tmp_path / "photos")
+    assert len(stage.splats_of_capture(splats, photos, SceneFolder(tmp_path / "False"))) == len(scene)
 
 
 @pytest.mark.parametrize("count", [0, 1, 60])

@@ -22,7 +22,7 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.gltf import write_glb
 from lexsplat.scenes.formats.ply import read_ply, write_ply
 from lexsplat.scenes.formats.reading import read_splats
-from lexsplat.scenes.formats.sog_writing import write_sog
+from lexsplat.scenes.formats.sog_writing import _indexed, write_sog
 from lexsplat.scenes.formats.splat import write_splat
 from lexsplat.scenes.formats.spz import write_spz
 
@@ -417,3 +417,19 @@ def test_parts_of_an_unbundled_sog_lie_in_its_folder(tmp_path):
     (tmp_path / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(FileFormatError, match="found damaged content"):
         read_splats(tmp_path)
+
+
+def test_the_tables_of_sog_are_those_of_k_means_over_every_value():
+    values = np.random.default_rng(0).normal(size=(400, 3)).astype(np.float32) ** 3
+    flat = np.sort(values.astype(np.float64).ravel())
+    even = np.linspace(flat[0], flat[-1], 128)
+    centers = np.sort(np.append(np.quantile(flat, np.linspace(0, 1, 128)), even))
+    for _ in range(20):
+        nearest = np.abs(flat[:, None] - centers).argmin(1)
+        means = [flat[nearest == k].mean() if (nearest == k).any() else centers[k] for k in range(256)]
+        centers = np.sort(means)
+    indices, table = _indexed(values)
+    np.testing.assert_allclose(table, centers, atol=1e-6)
+    distances = np.abs(values[..., None] - centers)
+    chosen = np.take_along_axis(distances, indices[..., None].astype(int), 2)[..., 0]
+    assert (chosen <= distances.min(2) + 1e-6).all()

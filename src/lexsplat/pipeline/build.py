@@ -30,7 +30,7 @@ from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, f
 from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
 from lexsplat.pipeline.provenance import model_identity, model_place, write_provenance
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
-from lexsplat.pipeline.viewpoints import capture_of_splats, read_without_floaters
+from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
 from lexsplat.pipeline.viewpoints.choosing import SIZE
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
 from lexsplat.reconstruction.blocks import BlockRun, number_of_blocks, reconstruct_blocks
@@ -297,8 +297,7 @@ class _Builder:
 
     def _take_splats(self) -> dict[str, Any]:
         splats = existing_splats(self.splats)
-        theirs = self.capture.root != self.folder.root / "poses"  # photos of the user show all Gaussians
-        gaussians = read_without_floaters(splats, keep=theirs or self.config.keep_floaters)
+        gaussians = splats_of_capture(splats, self.capture, self.folder)
         check_agreement(gaussians, list(self._training_views.values()), splats)
         self.folder.write_gaussians(gaussians)
         return {"gaussians": len(gaussians), "splats": str(splats.resolve())}

@@ -20,6 +20,7 @@ import time
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ class Hang(BaseException):
     """An input took longer than `SECONDS`."""
 
 
-def _interrupt(number: int, frame: Any) -> None:
+def interrupt(number: int, frame: Any) -> None:
     raise Hang
 
 
@@ -99,8 +100,8 @@ def attempt(target: Reader, folder: Path, report: Report, about: str, whole: byt
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def run_reader(name: str, work: Path, current: Path) -> Report:
-    """Run all mutations of one reader; the file ``current`` names the one in progress."""
+def run_reader(name: str, work: Path, current: Path, *, every: int = 1) -> Report:
+    """Run every n-th mutation of one reader; the file ``current`` names the one in progress."""
     target, report = READERS[name](), Report()
     folder = work / name
     folder.mkdir(parents=True)
@@ -114,7 +115,8 @@ def run_reader(name: str, work: Path, current: Path) -> Report:
     for number, (file, mutations) in enumerate(target.mutations.items()):
         path = folder / file
         content = path.read_bytes()
-        for index, (kind, changed) in enumerate(mutations(content, np.random.default_rng(number))):
+        all_of_them = mutations(content, np.random.default_rng(number))
+        for index, (kind, changed) in enumerate(islice(all_of_them, 0, None, every)):
             about = f"{name} {file} {kind} {index}"
             current.write_text(about)
             path.write_bytes(changed)
@@ -155,7 +157,7 @@ def main() -> None:
     torch.set_num_threads(1)
     logging.getLogger("lexsplat").setLevel(logging.CRITICAL)
     warnings.simplefilter("ignore")
-    signal.signal(signal.SIGALRM, _interrupt)
+    signal.signal(signal.SIGALRM, interrupt)
     reports: dict[str, Any] = {}
     for name in READERS:
         if not _claim(claims / name):

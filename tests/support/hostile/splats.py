@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 import struct
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,6 +16,8 @@ import numpy as np
 
 from support.hostile import mutations as mutate
 from support.hostile.registry import READERS, Reader, finite, reader
+
+FILES = Path(__file__).parents[2] / "data" / "splats"
 
 
 def small_gaussians(count: int = 4, degree: int = 1) -> Any:
@@ -106,28 +109,34 @@ def splat_text_ply() -> Reader:
 
 
 def spz(version: int) -> Callable[[], Reader]:
-    """SPZ, damaged as it is and, of version 3, before it is compressed."""
+    """SPZ, damaged as it is and, of versions 2 and 3, before it is compressed."""
 
     def make_reader() -> Reader:
         from lexsplat.scenes.formats.reading import read_splats
         from lexsplat.scenes.formats.spz import write_spz
 
+        def make(folder: Path) -> None:
+            if version == 2:  # no program here writes it
+                shutil.copy(FILES / "minimal-v2.spz", folder / "a.spz")
+            else:
+                write_spz(small_gaussians(), folder / "a.spz", version=version)
+
         def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
             yield from mutate.binary(content, rng, 400, 500)
-            if version == 3:
+            if version < 4:
                 for kind, changed in mutate.binary(gzip.decompress(content), rng, 400, 500):
                     # Cut before it is compressed, the file is complete and too short.
                     yield "moved" if kind == "truncated" else kind, gzip.compress(changed, 1)
 
         return Reader(
-            lambda folder: write_spz(small_gaussians(), folder / "a.spz", version=version),
-            lambda folder: read_splats(folder / "a.spz"), check_gaussians, {"a.spz": mutations},
+            make, lambda folder: read_splats(folder / "a.spz"), check_gaussians, {"a.spz": mutations},
             exact=("a.spz",),
         )  # fmt: skip
 
     return make_reader
 
 
+READERS["spz_2"] = spz(2)
 READERS["spz"] = spz(3)
 READERS["spz_4"] = spz(4)
 
@@ -212,6 +221,30 @@ def glb() -> Reader:
         lambda folder: read_splats(folder / "a.glb"), check_gaussians, {"a.glb": mutations},
         exact=("a.glb",),
     )  # fmt: skip
+
+
+@reader
+def gltf() -> Reader:
+    """glTF as text: its buffer is a file beside it, which is damaged too."""
+    from lexsplat.scenes.formats.gltf import write_glb
+    from lexsplat.scenes.formats.reading import read_splats
+
+    def make(folder: Path) -> None:
+        write_glb(small_gaussians(), folder / "a.glb")
+        content = (folder / "a.glb").read_bytes()
+        (length,) = struct.unpack_from("<I", content, 12)
+        document = json.loads(content[20 : 20 + length])
+        document["buffers"][0]["uri"] = "a.bin"
+        document["asset"]["generator"] = "another"
+        (folder / "a.gltf").write_text(json.dumps(document))
+        (folder / "a.bin").write_bytes(content[28 + length :])
+        (folder / "a.glb").unlink()
+
+    parts = {
+        "a.gltf": lambda content, rng: mutate.json_file(content, rng, 100, 1000),
+        "a.bin": lambda content, rng: mutate.binary(content, rng, 100, 100),
+    }
+    return Reader(make, lambda folder: read_splats(folder / "a.gltf"), check_gaussians, parts)
 
 
 def compressed(ending: str, count: int) -> Callable[[], Reader]:

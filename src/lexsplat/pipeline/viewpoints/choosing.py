@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.pipeline.viewpoints.candidates import FOV_Y, above, around, inside
+from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
+from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target, find_surroundings
-from lexsplat.rendering import accumulate_weights, prepare, render
+from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.progress import Event, Listener, silent
 
 SIZE = (960, 720)
 """Width and height of the chosen views in pixels."""
-_SMALL = (96, 72)
 _MOST_CANDIDATES = 600
 _MOST_VIEWS = 96
 _FEWEST_VIEWS = 8
@@ -32,14 +32,14 @@ _SEEN = 0.1
 """Weight in pixels of a small view at which a Gaussian counts as seen: a quarter of a cell of a feature map."""
 _LEAST_GAIN = 0.001
 """The choice ends when no view adds this share of all coverage."""
-_SPREAD = 0.1
-"""Standard deviation of depth along a ray, relative to depth, beyond which a pixel shows no surface."""
 _LEAST_CLEAR = 0.2
 """Least share of the drawn pixels of a view that show a surface,"""
 _LEAST_OF_BEST = 0.65
 """and least share relative to good views: where a splat is sharp, a view of fog is no use."""
-_LEAST_DRAWN = 0.15
-"""Least share of the pixels of a view that show anything."""
+_ENOUGH = 0.05
+"""Least share of good views among the candidates: a splat that is hazy everywhere is measured by itself,"""
+_LENIENT = (1.0, 0.5, 0.25)
+"""by these parts of both least shares, one after the other."""
 _ENCLOSED = 0.7
 """Share of good views all around from inside that makes a scene a room."""
 
@@ -95,11 +95,7 @@ def choose_views(
         CaptureError: If the Gaussians form no surfaces, or no place shows any.
     """
 
-    def look(surroundings: Surroundings) -> float:
-        shares = [_look(gaussians, camera)[1] for camera in above(surroundings, _SMALL)]
-        return float(np.mean(sorted(shares)[len(shares) // 2 :]))  # photos are often taken from one side only
-
-    found = find_surroundings(gaussians, up, look, subject, seed)
+    found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
     tried = _good_candidates(gaussians, found, seed, listener)
     if not tried.cameras:
         raise CaptureError(
@@ -140,26 +136,29 @@ class _Tried:
 
 def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, listener: Listener) -> _Tried:
     generator = np.random.default_rng(seed)
-    outer: list[tuple[Camera, Target | None]] = list(around(found, _SMALL))
+    outer: list[tuple[Camera, Target | None]] = list(around(found, SMALL))
     if len(outer) > _MOST_CANDIDATES:
         kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
         outer = [outer[index] for index in kept]
-    inner = inside(found, _SMALL)
+    inner = inside(found, SMALL)
     candidates = [*outer, *((camera, None) for camera in inner)]
     qualities = np.zeros(len(candidates), np.float32)
     for done, (camera, target) in enumerate(candidates, start=1):
-        depth, clear = _look(gaussians, camera)
-        hidden = target is not None and is_hidden(depth, camera, target)
-        qualities[done - 1] = 0 if hidden or clear < _LEAST_CLEAR else clear
+        depth, clear = look(gaussians, camera)
+        qualities[done - 1] = 0 if target is not None and is_hidden(depth, camera, target) else clear
         listener(Event("views", done, len(candidates)))
-    best = float(np.quantile(qualities[qualities > 0], 0.9)) if qualities.any() else 0.0
-    good = qualities > _LEAST_OF_BEST * best
-    for index in np.flatnonzero(good):
-        good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
-    if inner and good[len(outer) :].mean() >= _ENCLOSED:  # a room: from outside, walls are seen from behind
-        good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
-    else:  # no room: what is inside is between things, or beside them
-        good[len(outer) :] = False
+    good = np.zeros(len(candidates), bool)
+    for part in _LENIENT:
+        if good.mean() < _ENOUGH:
+            good = _clear_enough(qualities, part)
+            for index in np.flatnonzero(good):
+                good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
+            if (
+                inner and good[len(outer) :].mean() >= _ENCLOSED
+            ):  # a room: from outside, walls show their backs
+                good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
+            else:  # no room: what is inside is between things, or beside them
+                good[len(outer) :] = False
     looked_at = np.arange(len(gaussians))
     if len(looked_at) > _SAMPLE:
         looked_at = np.sort(generator.choice(looked_at, _SAMPLE, replace=False))
@@ -168,37 +167,6 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
     for row, camera in enumerate(cameras):
         weights[row] = accumulate_weights(gaussians, camera).cpu().numpy()[looked_at]
     return _Tried(len(candidates), cameras, qualities[good], weights)
-
-
-def _look(gaussians: Gaussians, camera: Camera) -> tuple[NDArray[np.float32], float]:
-    """Depth of a small view ``[H, W]``, infinite where nothing is drawn, and its share of surfaces."""
-    prepared = prepare(gaussians, camera)
-    depths = prepared.projection.depths[:, None]
-    moments = torch.cat([depths, depths**2], 1)
-    drawn = render(gaussians, camera, features=moments, color=False, prepared=prepared)
-    alpha = drawn.alpha.cpu().numpy()
-    depth, square = (drawn.features[..., i].cpu().numpy() / np.maximum(alpha, 1e-6) for i in (0, 1))
-    return np.where(alpha > 0.1, depth, np.inf), surface_share(depth, square, alpha)
-
-
-def surface_share(
-    depth: NDArray[np.float32], square: NDArray[np.float32], alpha: NDArray[np.float32]
-) -> float:
-    """Share of the drawn pixels of a view that show a surface; 0 if hardly anything is drawn.
-
-    A pixel shows a surface if it is opaque and what is blended in it lies at one depth. Floaters, fog, holes and the
-    backs of things blend what is far apart.
-
-    Args:
-        depth: Mean depth ``[H, W]``, world units.
-        square: Mean squared depth ``[H, W]``.
-        alpha: ``[H, W]`` in 0..1.
-    """
-    drawn = alpha > 0.1
-    if drawn.mean() < _LEAST_DRAWN:
-        return 0.0
-    spread = np.sqrt(np.maximum(square - depth**2, 0)) / np.maximum(depth, 1e-6)
-    return float(((alpha > 0.9) & (spread < _SPREAD)).sum() / drawn.sum())
 
 
 def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> bool:
@@ -215,6 +183,13 @@ def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> boo
     return before or float((depth < 0.3 * distance).mean()) > 0.05
 
 
+def _clear_enough(qualities: NDArray[np.float32], part: float) -> NDArray[np.bool_]:
+    """Which views show enough surfaces, with both least shares reduced to a part of them."""
+    enough = qualities >= part * _LEAST_CLEAR
+    best = float(np.quantile(qualities[enough], 0.9)) if enough.any() else 0.0
+    return np.asarray(enough & (qualities > part * _LEAST_OF_BEST * best))
+
+
 def _is_behind_a_wall(gaussians: Gaussians, camera: Camera, found: Surroundings) -> bool:
     """Whether a camera outside of the scene does not see into it: it would show the back of a wall."""
     if found.box.contains(camera.position[None])[0]:
@@ -224,8 +199,8 @@ def _is_behind_a_wall(gaussians: Gaussians, camera: Camera, found: Surroundings)
         np.linalg.norm(whole.center - camera.position)
     )
     upwards = camera.viewmat[0, :3] if steep else found.up.direction
-    inwards = look_at(camera.position, whole.center, upwards, *_SMALL, FOV_Y)
-    depth, _ = _look(gaussians, inwards)
+    inwards = look_at(camera.position, whole.center, upwards, *SMALL, FOV_Y)
+    depth, _ = look(gaussians, inwards)
     return is_hidden(depth, inwards, Target(whole.center, whole.radius * 2 / 3))
 
 

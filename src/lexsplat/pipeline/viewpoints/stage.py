@@ -7,22 +7,31 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from lexsplat.captures import Capture, load_capture
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import parse_vector
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints.choosing import choose_views
-from lexsplat.pipeline.viewpoints.floaters import read_without_floaters
+from lexsplat.pipeline.viewpoints.floaters import find_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
+from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import NOTE, Listener
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.reading import read_splats
 
 log = logging.getLogger("lexsplat")
 
 _MANY_UNSEEN = 0.1
 """Share of the visible Gaussians above which those in no view are a warning."""
+_FLOATERS = "floaters.npy"
+"""Indices of the Gaussians of the file that are left out, beside the chosen views."""
+_RULES = 2
+"""Changes where other views would be chosen, or other Gaussians left out, of the same file."""
 
 
 def capture_of_splats(
@@ -44,14 +53,21 @@ def capture_of_splats(
         CaptureError: If no views can be chosen.
     """
     splats, poses = existing_splats(splats), folder.root / "poses"
-    key = fingerprint(splats_hash(splats), config.up, config.seed, config.keep_floaters)
-    if not (folder.is_finished("views", key) and (poses / "transforms.json").is_file()):
+    key = fingerprint(_RULES, splats_hash(splats), config.up, config.seed, config.keep_floaters)
+    complete = (poses / "transforms.json").is_file() and (poses / _FLOATERS).is_file()
+    if not (complete and folder.is_finished("views", key)):
         start = time.perf_counter()
         folder.reopen("views")
-        gaussians = read_without_floaters(splats, keep=config.keep_floaters).to(device)
+        gaussians = read_splats(splats).to(device)
         up = None if config.up is None else np.array(parse_vector(config.up))
+        floaters = np.zeros(0, np.int64)
+        if not config.keep_floaters:
+            floaters = find_floaters(gaussians, splats, up=up, seed=config.seed)
+        gaussians = _without(gaussians, floaters)
         chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
         write_chosen_capture(gaussians, chosen, poses)
+        with atomic_path(poses / _FLOATERS) as path, open(path, "wb") as file:
+            np.save(file, floaters)
         few = chosen.unseen <= _MANY_UNSEEN * chosen.visible
         log.log(NOTE if few else logging.WARNING, "%s: %s", splats, chosen.note)
         facts = {
@@ -60,8 +76,30 @@ def capture_of_splats(
             "showed_no_surfaces": chosen.left_out,
             "visible": chosen.visible,
             "unseen": chosen.unseen,
+            "floaters": len(floaters),
         }
         folder.finish("views", key, time.perf_counter() - start, **facts)
     folder.record["images"] = "poses/images"
     folder.record["capture"] = None
     return load_capture(poses, test_every=0)
+
+
+def splats_of_capture(splats: Path, capture: Capture, folder: SceneFolder) -> Gaussians:
+    """The Gaussians of a file that a scene takes: without floaters if its views were chosen, else all.
+
+    The photos of a user show all Gaussians.
+
+    Raises:
+        FileFormatError: If the file is missing or damaged.
+    """
+    gaussians, poses = read_splats(splats), folder.root / "poses"
+    if capture.root != poses:
+        return gaussians
+    return _without(gaussians, np.load(poses / _FLOATERS, allow_pickle=False))
+
+
+def _without(gaussians: Gaussians, indices: NDArray[np.int64]) -> Gaussians:
+    if not len(indices):
+        return gaussians
+    kept = np.delete(np.arange(len(gaussians)), indices)
+    return gaussians.select(torch.from_numpy(kept).to(gaussians.device))

@@ -86,6 +86,8 @@ def find_surroundings(
     look: Callable[[Surroundings], float],
     subject: Path,
     seed: int = 0,
+    *,
+    warn: bool = True,
 ) -> Surroundings:
     """Look at a sample of the Gaussians.
 
@@ -95,6 +97,7 @@ def find_surroundings(
         look: How much the splat looks like surfaces from above its ground, in 0..1; helps to estimate up.
         subject: The file, for errors.
         seed: Seed of the sample and of the targets.
+        warn: Warn of an up direction that is a guess or seems wrong, and of a flat scene.
 
     Raises:
         CaptureError: If fewer than `FEWEST` Gaussians are solid, or all are at one point.
@@ -125,7 +128,8 @@ def find_surroundings(
     best = candidates[int(scores.argmax())][0]
     others = [s for s, (direction, _) in zip(scores, candidates) if direction @ best < _OTHER]
     estimated = Up(best, bool(scores.max() - max(others) > _LEAD))
-    _warn(estimated, up, points, subject)
+    if warn:
+        _warn(estimated, up, points, subject)
     return facing(estimated if up is None else Up(up / np.linalg.norm(up), True))
 
 

@@ -116,14 +116,17 @@ def _indexed(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], list[float
     Half of the first centers are quantiles, half are evenly spaced, which keeps rare extremes.
     """
     flat = values.astype(np.float64).ravel()
-    sample = flat[:: max(1, len(flat) // _TABLE_SAMPLE)]
+    sample = np.sort(flat[:: max(1, len(flat) // _TABLE_SAMPLE)])
+    sums = np.append(0, np.cumsum(sample))
     even = np.linspace(flat.min(), flat.max(), _TABLE // 2)
     centers = np.sort(np.append(np.quantile(sample, np.linspace(0, 1, _TABLE // 2)), even))
     for _ in range(_LLOYD_STEPS):
-        labels = np.searchsorted((centers[1:] + centers[:-1]) / 2, sample)
-        counts = np.bincount(labels, minlength=_TABLE)
-        sums = np.bincount(labels, sample, _TABLE)
-        centers = np.sort(np.where(counts, sums / np.maximum(counts, 1), centers))
+        ends = np.searchsorted(sample, (centers[1:] + centers[:-1]) / 2)
+        ends = np.concatenate(
+            [[0], ends, [len(sample)]]
+        )  # the nearest values of a center are a run of the sample
+        counts = np.diff(ends)
+        centers = np.sort(np.where(counts, np.diff(sums[ends]) / np.maximum(counts, 1), centers))
     labels = np.searchsorted((centers[1:] + centers[:-1]) / 2, flat)
     return labels.astype(np.uint8).reshape(values.shape), centers.astype(np.float32).tolist()
 
