@@ -23,6 +23,8 @@ from lexsplat.runtime.files import read_json, write_json, write_tensors
 MOMENTS = ("exp_avg", "exp_avg_sq")
 STATISTICS = ("grad2d", "count")
 EXPOSURES = "exposures/"
+BETAS = (0.9, 0.999)
+"""Decays of Adam's moments in a visit."""
 
 
 @dataclass
@@ -106,7 +108,7 @@ def plan(blocks: Blocks, iterations: int, rounds: int) -> list[list[Visit]]:
     # Rounding is done on the blocks in order, so that the visits add up to the iterations.
     before = [sum(len(b.views) for b in blocks.blocks[:n]) / views for n in range(len(blocks.blocks) + 1)]
     for index in range(rounds):
-        ends = [round((index + 1 ) * iterations / rounds * share) for share in before]
+        ends = [round((index + 1) * iterations / rounds * share) for share in before]
         for phase in phases:
             group = []
             for block in phase:
@@ -207,7 +209,7 @@ class CellFiles:
         return tuple(read_json(path)["gaussians"]) if path.exists() else None
 
     def write_room(self, number: int, room: tuple[int, ...]) -> None:
-        """Keep the numbers of Gaussians that the cells may have in a round."""
+        """Keep the numbers of Gaussians that a round may add to the cells."""
         write_json(self._room_path(number), {"gaussians": list(room)})
 
     def _room_path(self, number: int) -> Path:
@@ -228,7 +230,7 @@ def idle(state: CellState, name: str, rate: float, steps: int, at: int) -> None:
     """Give a parameter that no step has loaded the updates that Adam would have made without gradients, in place.
 
     The moments decay, and the first one moves the parameter on. With the decays 0.9 and 0.999 this is a geometric
-    series; the corrections of the bias are those of its first step.
+    series; the corrections of the bias are those of its middle.
 
     Args:
         state: The Gaussians.
@@ -239,10 +241,11 @@ def idle(state: CellState, name: str, rate: float, steps: int, at: int) -> None:
     """
     if steps == 0 or at == 0:
         return
-    first, second = 0.9, 0.999
+    first, second = BETAS
     ratio = first / math.sqrt(second)
     series = ratio * (1 - ratio**steps) / (1 - ratio)
-    bias = math.sqrt(1 - second**at) / (1 - first**at)
+    middle = at + min(steps, round(1 / (1 - ratio)))
+    bias = math.sqrt(1 - second**middle) / (1 - first**middle)
     mean, square = (state.moments[f"{moment}/{name}"] for moment in MOMENTS)
     state.parameters[name].sub_(rate * series * bias * mean / (square.sqrt() + 1e-15))
     mean.mul_(first**steps)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction.block_files import (
+    BETAS,
     EXPOSURES,
     MOMENTS,
     STATISTICS,
@@ -94,7 +95,7 @@ class _Shared:
     groups: int
     """Number of groups of visits before this one."""
     room: tuple[int, ...]
-    """Gaussians that each cell may have."""
+    """Gaussians that density control may add to each cell in this round."""
 
 
 class VisitReconstructor(Reconstructor):
@@ -134,6 +135,12 @@ class VisitReconstructor(Reconstructor):
     def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
         return {n: torch.nn.Parameter(t.to(self.device)) for n, t in self._state.parameters.items()}
 
+    def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
+        optimizers = super()._new_optimizers()
+        for optimizer in optimizers.values():
+            optimizer.param_groups[0]["betas"] = BETAS
+        return optimizers
+
     def _load_moments(self) -> None:
         for name in self._parameters:
             if steps := adam_steps(self.config, name, self._visit.start):
@@ -157,7 +164,9 @@ class VisitReconstructor(Reconstructor):
             for m in MOMENTS
             for name, value in parameters.items()
         }
-        statistics = {name: tensors.get(f"density/{name}", self._state.statistics[name]) for name in STATISTICS}
+        statistics = {
+            name: tensors.get(f"density/{name}", self._state.statistics[name]) for name in STATISTICS
+        }
         exposures = {name: tensor for name, tensor in tensors.items() if name.startswith(EXPOSURES)}
         return CellState(parameters, moments, statistics), exposures
 
@@ -216,7 +225,9 @@ def reconstruct_blocks(
     if run.device == "cpu":
         trained = math.ceil(cap / count * max(len(block.trained) for block in blocks.blocks))
         need = 2 * trained * budget.GAUSSIAN_BYTES
-        budget.require("reconstruct", need, run.memory, f"{trained:,} Gaussians of a block", "a larger --blocks")
+        budget.require(
+            "reconstruct", need, run.memory, f"{trained:,} Gaussians of a block", "a larger --blocks"
+        )
     rounds = max(ROUNDS, math.ceil(config.iterations / ROUND_STEPS))
     groups = plan(blocks, config.iterations, max(1, min(rounds, config.iterations // (FEWEST_STEPS * count))))
     total, listener, workers = sum(map(len, groups)), run.listener, run.workers
@@ -232,8 +243,13 @@ def reconstruct_blocks(
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
                 room = _room(files, group[0].round, index, config, cap)
             shared = _Shared(capture, config, blocks, folder, files, own, index, room)
-            items = {f"block {visit.block.number + 1} of {count}, round {visit.round + 1}": visit for visit in group}
-            for done, size in enumerate(results(workers.map(_visit, shared, items, needs)), group[0].number + 1):
+            items = {
+                f"block {visit.block.number + 1} of {count}, round {visit.round + 1}": visit
+                for visit in group
+            }
+            for done, size in enumerate(
+                results(workers.map(_visit, shared, items, needs)), group[0].number + 1
+            ):
                 listener(Event("blocks", done, total, {"gaussians": float(size)}))
             files.remove_old(index + 1)
         latest = files.latest(len(groups))
@@ -255,7 +271,7 @@ def _write_start(
 def _room(
     files: CellFiles, number: int, groups: int, config: ReconstructionConfig, cap: int
 ) -> tuple[int, ...]:
-    """How many Gaussians each cell may have after round ``number`` of density control.
+    """How many Gaussians round ``number`` of density control may add to each cell.
 
     Within the cap of the whole, those with the largest gradients grow. The numbers are kept in a file, because a run
     that was killed in a round goes on with those of its start.
@@ -268,7 +284,7 @@ def _room(
     threshold = config.grow_gradient
     if int((every > threshold).sum()) > free:
         threshold = float(torch.topk(every, free + 1).values[-1])
-    room = tuple(len(of_cell) + int((of_cell > threshold).sum()) for of_cell in gradients)
+    room = tuple(int((of_cell > threshold).sum()) for of_cell in gradients)
     files.write_room(number, room)
     return room
 
@@ -321,7 +337,7 @@ def _present(shared: _Shared, visit: Visit, cell: int, written: int, last: int) 
         idle(state, name, rates[name], visit.start - last, adam_steps(config, name, last))
     if cell in visit.block.owned and visit.round and len(state):
         control = DensityControl(
-            replace(config, max_gaussians=shared.room[cell]),
+            replace(config, max_gaussians=len(state) + shared.room[cell]),
             capture.extent,
             seed=_seed(shared.run.seed, visit.number, cell),
         )

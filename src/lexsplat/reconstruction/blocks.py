@@ -164,7 +164,7 @@ def cut_blocks(
     shares = np.array([_shares(view, points, cells, axes) for view in views]).reshape(len(views), count)
     for number, cell in enumerate(cells):
         own, shown = int(cell.holds(points @ axes.T).sum()), int((shares[:, number] > 0).sum())
-        if shown < _FEWEST_VIEWS or not own or len(views) < _FEWEST_VIEWS * count:
+        if shown < _FEWEST_VIEWS or not own or len(views) < 2 * count:
             raise CaptureError(
                 f"block {number + 1} of {count}",
                 expected=f"points, and at least {_FEWEST_VIEWS} views that show them",
