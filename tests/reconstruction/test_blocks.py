@@ -17,7 +17,7 @@ from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction import Reconstructor, block_training
-from lexsplat.reconstruction.block_files import CellState, idle, plan
+from lexsplat.reconstruction.block_files import BETAS, CellState, idle, plan
 from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks
 from lexsplat.reconstruction.blocks import cut_blocks, ground_axes, in_sight, number_of_blocks
 from lexsplat.reconstruction.settings import ReconstructionConfig
@@ -125,7 +125,7 @@ def test_idle_steps_are_those_of_adam_without_gradients():
         )
     )
     parameter = torch.nn.Parameter(gaussians.means.clone())
-    optimizer = torch.optim.Adam([parameter], lr=0.01, eps=1e-15)
+    optimizer = torch.optim.Adam([parameter], lr=0.01, betas=BETAS, eps=1e-15)
     for _ in range(200):
         parameter.grad = torch.randn(5, 3, generator=generator)
         optimizer.step()
@@ -156,7 +156,8 @@ def test_balls_that_a_camera_shows_are_in_sight(capture):
         assert not shown.any()
 
 
-def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points):
+def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, monkeypatch):
+    monkeypatch.setattr(block_training, "BETAS", (0.9, 0.999))  # those of one piece
     whole = Reconstructor(capture, dataclasses.replace(CONFIG, warm_up=0.0), points)
     cut = cut_blocks(capture, points.points, ground_axes(UP), 1)
     (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)

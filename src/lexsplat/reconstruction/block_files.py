@@ -23,8 +23,9 @@ from lexsplat.runtime.files import read_json, write_json, write_tensors
 MOMENTS = ("exp_avg", "exp_avg_sq")
 STATISTICS = ("grad2d", "count")
 EXPOSURES = "exposures/"
-BETAS = (0.9, 0.999)
-"""Decays of Adam's moments in a visit."""
+BETAS = (0.3, 0.999)
+"""Decays of Adam's moments. In one piece a Gaussian is seen every few steps, between which the first moment moves it
+on; in a visit most steps show it, and a decay of 0.9 would carry it too far."""
 
 
 @dataclass
@@ -229,8 +230,8 @@ def merged(parts: list[Gaussians]) -> Gaussians:
 def idle(state: CellState, name: str, rate: float, steps: int, at: int) -> None:
     """Give a parameter that no step has loaded the updates that Adam would have made without gradients, in place.
 
-    The moments decay, and the first one moves the parameter on. With the decays 0.9 and 0.999 this is a geometric
-    series; the corrections of the bias are those of its middle.
+    The moments decay, and the first one moves the parameter on. With constant decays this is a geometric series;
+    the corrections of the bias are those of its middle.
 
     Args:
         state: The Gaussians.

@@ -56,6 +56,10 @@ FEWEST_STEPS = 4
 """Steps of a visit at least; short trainings have fewer rounds."""
 FIXED_BYTES = 1_000
 """Bytes per Gaussian that takes part with fixed values: its values, a copy beside the trained ones, a gradient."""
+CALM = (0.7, 0.1)
+"""From the first share of the iterations on, all learning rates fall, exponentially, to the second share of them at
+the end: the views of the last visits would otherwise count for more than the others."""
+
 _NEVER = 1 << 40
 
 
@@ -128,12 +132,17 @@ class VisitReconstructor(Reconstructor):
         super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
         self._fixed = None if fixed is None else fixed.to(self.device)
         self.steps_done = visit.start
+        self.rate_factor = 1.0  # sets the learning rates of this step
         self._load_moments()
         order = {name: index for index, name in enumerate(self._names)}
         self._own = [order[name] for name in visit.block.views]
 
     def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
         return {n: torch.nn.Parameter(t.to(self.device)) for n, t in self._state.parameters.items()}
+
+    def _rates(self) -> dict[str, float]:
+        calm = calm_factor(self.config, self.steps_done)
+        return {name: calm * rate for name, rate in super()._rates().items()}
 
     def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
         optimizers = super()._new_optimizers()
@@ -193,6 +202,12 @@ class VisitReconstructor(Reconstructor):
         super()._control_density(own, radii[:count], image_size)
 
 
+def calm_factor(config: ReconstructionConfig, step: int) -> float:
+    """Factor of all learning rates at a step (`CALM`)."""
+    start, last = CALM
+    return float(last ** max(0.0, (step / config.iterations - start) / (1 - start)))
+
+
 def adam_steps(config: ReconstructionConfig, name: str, step: int) -> int:
     """Steps of the optimizer of a parameter before ``step``; those of "shN" begin with the second degree."""
     if name != "shN":
@@ -235,7 +250,8 @@ def reconstruct_blocks(
     own = replace(run, workers=IN_PROCESS, listener=silent)
     with SharedFolder.offered(run.folder) as folder:
         files = CellFiles(folder.path, run.key, blocks, groups)
-        finished, room = files.finished(), ()
+        finished = files.finished()
+        room: tuple[int, ...] = ()
         if finished < 0:
             finished = 0
             _write_start(files, blocks, config, points, run)
@@ -333,8 +349,9 @@ def _present(shared: _Shared, visit: Visit, cell: int, written: int, last: int) 
     state = shared.files.cell(written, cell)
     rates = config.rates(capture.extent)
     rates["means"] *= (config.means_rate_final / config.means_rate) ** (last / config.iterations)
+    calm = calm_factor(config, last)
     for name in state.parameters:
-        idle(state, name, rates[name], visit.start - last, adam_steps(config, name, last))
+        idle(state, name, calm * rates[name], visit.start - last, adam_steps(config, name, last))
     if cell in visit.block.owned and visit.round and len(state):
         control = DensityControl(
             replace(config, max_gaussians=len(state) + shared.room[cell]),

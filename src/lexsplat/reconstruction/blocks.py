@@ -174,10 +174,10 @@ def cut_blocks(
     groups = _groups(np.array([view.camera.position @ axes.T for view in views]), count)
     weights = np.array([shares[group].sum(0) for group in groups])
     trained = [_cells_seen_most(row) for row in weights]
-    for cell in range(count):
-        if not any(cell in of_block for of_block in trained):
-            trained[int(weights[:, cell].argmax())].add(cell)
-    trains = np.array([[cell in of_block for cell in range(count)] for of_block in trained])
+    for index in range(count):
+        if not any(index in of_block for of_block in trained):
+            trained[int(weights[:, index].argmax())].add(index)
+    trains = np.array([[index in of_block for index in range(count)] for of_block in trained])
     owner = np.where(trains, weights, -1.0).argmax(0)
     blocks = tuple(
         Block(
@@ -221,7 +221,7 @@ def _shown(camera: Camera, points: NDArray[np.float32]) -> tuple[NDArray[np.int6
     return shown, depth[shown]
 
 
-def in_sight(camera: Camera, centers: NDArray[np.float32], radii: NDArray[np.float32]) -> NDArray[np.bool_]:
+def in_sight(camera: Camera, centers: NDArray[np.floating], radii: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which balls ``[N]`` reach into the image of a camera; some that are just outside of it too."""
     local = centers @ camera.viewmat[:3, :3].T.astype(np.float32) + camera.viewmat[:3, 3].astype(np.float32)
     depth = np.maximum(local[:, 2], 1e-3)
