@@ -91,6 +91,8 @@ def test_a_block_of_a_street_trains_the_cells_in_front_of_its_views(capture):
             assert own.max() > stands.min() - 3
             assert own.min() < stands.max() + 3
         assert 1 <= len(block.trained) <= 3
+        assert not set(block.trained) & set(block.shown)
+        assert len(block.trained) + len(block.shown) < 6, "cells that no view shows take no part"
 
 
 def test_blocks_that_are_trained_side_by_side_have_no_cell_in_common(capture):

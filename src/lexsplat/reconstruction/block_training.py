@@ -386,9 +386,7 @@ def _fixed(shared: _Shared, block: Block, latest: Mapping[str, tuple[int, int]])
     """The Gaussians of the cells that a block does not train, as far as its views show them."""
     cameras = [shared.capture.views[name].camera for name in block.views]
     parts = []
-    for cell in range(len(shared.blocks.cells)):
-        if cell in block.trained:
-            continue
+    for cell in block.shown:
         gaussians = shared.files.gaussians(latest[str(cell)][0], cell, shared.config.antialiased)
         centers = gaussians.means.numpy()
         radii = 3.0 * gaussians.scales.max(1).values.numpy()

@@ -60,12 +60,14 @@ class Block:
         views: Names of its training views.
         trained: Indices of the cells that it trains, in ascending order.
         owned: Those of them in which it adds and removes Gaussians; each cell is owned by one block.
+        shown: Cells that it does not train and that its views show.
     """
 
     number: int
     views: tuple[str, ...]
     trained: tuple[int, ...]
     owned: tuple[int, ...]
+    shown: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -185,6 +187,7 @@ def cut_blocks(
             tuple(views[index].name for index in group),
             tuple(sorted(trained[number])),
             tuple(np.flatnonzero(owner == number).tolist()),
+            tuple(np.flatnonzero((weights[number] > 0) & ~trains[number]).tolist()),
         )
         for number, group in enumerate(groups)
     )
