@@ -22,6 +22,7 @@ from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor,
 from lexsplat.reconstruction.blocks import cut_blocks, ground_axes, in_sight, number_of_blocks
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.runtime.errors import CaptureError, MemoryBudgetError, WorkersError
+from lexsplat.runtime.workers import open_workers
 from lexsplat.scenes.folder import SceneFolder
 
 UP = Up(np.array([0.0, 0.0, 1.0]), True)
@@ -331,3 +332,16 @@ def test_stray_points_far_away_do_not_change_what_a_block_trains(capture):
         cut_blocks(made, each, axes, 4).blocks for each in (places, np.concatenate([places, strays]))
     )
     assert [(block.trained, block.owned) for block in before] == [(b.trained, b.owned) for b in after]
+
+
+@pytest.mark.slow
+def test_blocks_on_ray_have_the_bits_of_one_process(capture, points, tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    config = dataclasses.replace(CONFIG, iterations=24, densify_min_every=2, densify_every=2)
+    run = BlockRun("cpu", 0, 256 << 20, tmp_path / "here", "key")
+    here = reconstruct_blocks(capture, config, points, UP, 2, run)
+    with open_workers("ray", (capture.root,)) as workers:
+        run = dataclasses.replace(run, folder=tmp_path / "ray", workers=workers)
+        there = reconstruct_blocks(capture, config, points, UP, 2, run)
+    assert all(torch.equal(a, b) for a, b in zip(here.tensors().values(), there.tensors().values()))

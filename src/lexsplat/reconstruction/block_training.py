@@ -236,6 +236,8 @@ def reconstruct_blocks(
         WorkersError: If a worker does not see ``run.folder``.
     """
     blocks = cut_blocks(capture, points.points, ground_axes(up), count)
+    none = capture.points[:0]  # workers get the capture with every group of visits, and need its views only
+    capture = replace(capture, points=none, point_colors=capture.point_colors[:0])
     cap = config.cap(torch.device(run.device))
     if run.device == "cpu":
         trained = math.ceil(cap / count * max(len(block.trained) for block in blocks.blocks))
