@@ -31,7 +31,7 @@ from lexsplat.reconstruction.block_files import (
     merged,
     plan,
 )
-from lexsplat.reconstruction.blocks import Block, Blocks, cut_blocks, ground_axes, in_sight
+from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes, in_sight
 from lexsplat.reconstruction.densification import DensityControl
 from lexsplat.reconstruction.optimizers import adam, load_optimizer_tensors
 from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, ReconstructionConfig
@@ -96,6 +96,7 @@ class _Shared:
     folder: SharedFolder
     files: CellFiles
     run: BlockRun
+    extent: float
     groups: int
     """Number of groups of visits before this one."""
     room: tuple[int, ...]
@@ -106,13 +107,13 @@ class VisitReconstructor(Reconstructor):
     """A part of a reconstruction: the steps of one visit, on the views of its block.
 
     Args:
-        capture: The whole capture.
+        capture: The capture with the views of the block.
         config: Settings of the whole.
         visit: The visit.
         state: The Gaussians that are trained, as they are before it.
         fixed: Gaussians that take part with fixed values; None if there are none.
         seed: Seed of the whole training.
-        options: Device and memory, as in `Reconstructor`.
+        options: Device, memory and the extent of the whole capture, as in `Reconstructor`.
     """
 
     def __init__(
@@ -134,8 +135,6 @@ class VisitReconstructor(Reconstructor):
         self.steps_done = visit.start
         self.rate_factor = 1.0  # sets the learning rates of this step
         self._load_moments()
-        order = {name: index for index, name in enumerate(self._names)}
-        self._own = [order[name] for name in visit.block.views]
 
     def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
         return {n: torch.nn.Parameter(t.to(self.device)) for n, t in self._state.parameters.items()}
@@ -185,11 +184,7 @@ class VisitReconstructor(Reconstructor):
             self._exposures.load_state_tensors(tensors)
 
     def _next_view(self) -> int:
-        """Views follow random permutations of those of the block, over its visits."""
-        place = self._visit.first + self.steps_done - self._visit.start
-        turn, place = divmod(place, len(self._own))
-        seed = [self._seed, self._visit.block.number, turn]
-        return self._own[int(np.random.default_rng(seed).permutation(len(self._own))[place])]
+        return self._names.index(_view_of(self._visit, self.steps_done, self._seed))
 
     def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
         return super()._render(gaussians if self._fixed is None else merged([gaussians, self._fixed]), camera)
@@ -200,6 +195,13 @@ class VisitReconstructor(Reconstructor):
         if means2d.grad is not None:
             own.grad = means2d.grad.view(-1, *means2d.shape[-2:])[..., :count, :]
         super()._control_density(own, radii[:count], image_size)
+
+
+def _view_of(visit: Visit, step: int, seed: int) -> str:
+    """Name of the view of a step: random permutations of those of the block, over all its visits."""
+    views = visit.block.views
+    turn, place = divmod(visit.first + step - visit.start, len(views))
+    return views[int(np.random.default_rng([seed, visit.block.number, turn]).permutation(len(views))[place])]
 
 
 def calm_factor(config: ReconstructionConfig, step: int) -> float:
@@ -252,7 +254,7 @@ def reconstruct_blocks(
     own = replace(run, workers=IN_PROCESS, listener=silent)
     with SharedFolder.offered(run.folder) as folder:
         files = CellFiles(folder.path, run.key, blocks, groups)
-        finished = files.finished()
+        finished, extent = files.finished(), capture.extent
         room: tuple[int, ...] = ()
         if finished < 0:
             finished = 0
@@ -260,7 +262,7 @@ def reconstruct_blocks(
         for index, group in enumerate(groups[finished:], start=finished):
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
                 room = _room(files, group[0].round, index, config, cap)
-            shared = _Shared(capture, config, blocks, folder, files, own, index, room)
+            shared = _Shared(capture, config, blocks, folder, files, own, extent, index, room)
             items = {
                 f"block {visit.block.number + 1} of {count}, round {visit.round + 1}": visit
                 for visit in group
@@ -322,7 +324,7 @@ def _visit(shared: _Shared, visit: Visit) -> int:
         return sum(len(files.gaussians(visit.number, cell, False)) for cell in block.trained)
     states = {cell: _present(shared, visit, cell, *latest[str(cell)]) for cell in block.trained}
     homes = np.repeat(list(states), [len(state) for state in states.values()])
-    fixed = _fixed(shared, block, latest)
+    fixed = _fixed(shared, visit, latest)
     if run.device == "cpu":
         others = 0 if fixed is None else len(fixed)
         need = len(homes) * budget.GAUSSIAN_BYTES + others * FIXED_BYTES
@@ -330,9 +332,10 @@ def _visit(shared: _Shared, visit: Visit) -> int:
         budget.require("reconstruct", need, run.memory, what, "a larger --blocks")
     state = CellState.joined(states.values())
     states.clear()
-    trainer = VisitReconstructor(
-        shared.capture, shared.config, visit, state, fixed, run.seed, device=run.device, memory=run.memory
-    )
+    own = {name: shared.capture.views[name] for name in block.views}
+    part = replace(shared.capture, views=own, train_names=block.views, test_names=())
+    options = {"device": run.device, "memory": run.memory, "extent": shared.extent}
+    trainer = VisitReconstructor(part, shared.config, visit, state, fixed, run.seed, **options)
     before = latest.get(f"{EXPOSURES}{block.number}")
     if before is not None:
         trainer.load_exposures(files.read(before[0], EXPOSURES))
@@ -347,9 +350,9 @@ def _visit(shared: _Shared, visit: Visit) -> int:
 
 def _present(shared: _Shared, visit: Visit, cell: int, written: int, last: int) -> CellState:
     """The Gaussians of a cell at the start of a visit; a round of density control is due if the block owns it."""
-    config, capture = shared.config, shared.capture
+    config = shared.config
     state = shared.files.cell(written, cell)
-    rates = config.rates(capture.extent)
+    rates = config.rates(shared.extent)
     rates["means"] *= (config.means_rate_final / config.means_rate) ** (last / config.iterations)
     calm = calm_factor(config, last)
     for name in state.parameters:
@@ -357,7 +360,7 @@ def _present(shared: _Shared, visit: Visit, cell: int, written: int, last: int) 
     if cell in visit.block.owned and visit.round and len(state):
         control = DensityControl(
             replace(config, max_gaussians=len(state) + shared.room[cell]),
-            capture.extent,
+            shared.extent,
             seed=_seed(shared.run.seed, visit.number, cell),
         )
         state = _refined(state, control, visit.start, visit.round_steps)
@@ -384,11 +387,12 @@ def _refined(state: CellState, control: DensityControl, step: int, steps: int) -
     return CellState(found, moments, statistics)
 
 
-def _fixed(shared: _Shared, block: Block, latest: Mapping[str, tuple[int, int]]) -> Gaussians | None:
-    """The Gaussians of the cells that a block does not train, as far as its views show them."""
-    cameras = [shared.capture.views[name].camera for name in block.views]
+def _fixed(shared: _Shared, visit: Visit, latest: Mapping[str, tuple[int, int]]) -> Gaussians | None:
+    """The Gaussians of the cells that a visit does not train, as far as its views show them."""
+    names = {_view_of(visit, step, shared.run.seed) for step in range(visit.start, visit.end)}
+    cameras = [shared.capture.views[name].camera for name in sorted(names)]
     parts = []
-    for cell in block.shown:
+    for cell in visit.block.shown:
         gaussians = shared.files.gaussians(latest[str(cell)][0], cell, shared.config.antialiased)
         centers = gaussians.means.numpy()
         radii = 3.0 * gaussians.scales.max(1).values.numpy()

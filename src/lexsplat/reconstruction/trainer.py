@@ -51,6 +51,7 @@ class Reconstructor:
         seed: Seed of the view order and of density control.
         memory: Total budget in bytes. Cached photos take a quarter of it, at most 1 GiB; the budget does not
             affect the result.
+        extent: Scene scale, if it is not that of the capture's training views.
 
     Raises:
         TrainingError: If there is no training view or no point.
@@ -67,6 +68,7 @@ class Reconstructor:
         device: torch.device | str = "cpu",
         seed: int = 0,
         memory: int = DEFAULT_MEMORY,
+        extent: float | None = None,
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
@@ -85,7 +87,7 @@ class Reconstructor:
                 found="none",
                 remedy="hold out fewer views",
             )
-        self._extent = capture.extent
+        self._extent = capture.extent if extent is None else extent
         self._background = torch.tensor(capture.background, dtype=torch.float32, device=self.device)
         self._generator = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.int64)
