@@ -255,14 +255,15 @@ def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_sa
     )
 
 
-def test_density_control_changes_the_numbers_and_keeps_the_cap(capture, points, tmp_path):
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_density_control_adds_gaussians_and_keeps_the_cap(strategy, capture, points, tmp_path):
     config = dataclasses.replace(
-        CONFIG, iterations=48, densify_min_every=2, densify_every=2, grow_gradient=1e-9
+        CONFIG, strategy=strategy, exposure=True, iterations=48, densify_min_every=2, densify_every=2
     )
+    config = dataclasses.replace(config, grow_gradient=1e-9)
     few = dataclasses.replace(points, points=points.points[::2], colors=points.colors[::2])
     config = dataclasses.replace(config, max_gaussians=len(few.points) + 40)
-    sizes = []
-    run = BlockRun("cpu", 0, 1 << 30, tmp_path, "key", listener=lambda event: sizes.append(event.metrics))
+    run = BlockRun("cpu", 0, 1 << 30, tmp_path, "key")
     found = reconstruct_blocks(capture, config, few, UP, 2, run)
     assert len(few.points) < len(found) <= config.max_gaussians
 

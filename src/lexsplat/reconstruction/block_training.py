@@ -300,6 +300,11 @@ def _room(
         return kept
     gradients = [sums / times.clamp_min(1) for sums, times in files.all_statistics(groups)]
     free = max(0, cap - sum(map(len, gradients)))
+    if config.strategy == "mcmc":  # it adds a share at random, without statistics
+        total = max(1, sum(map(len, gradients)))
+        room = tuple(free * len(of_cell) // total for of_cell in gradients)
+        files.write_room(number, room)
+        return room
     every = torch.cat(gradients)
     threshold = config.grow_gradient
     if int((every > threshold).sum()) > free:
