@@ -28,14 +28,8 @@ from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.reconstruction.blocks import (
-    Block,
-    BlockRun,
-    cut_blocks,
-    ground_axes,
-    places_in_image,
-    reconstruct_blocks,
-)
+from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
+from lexsplat.reconstruction.blocks import cut_blocks, ground_axes
 from lexsplat.rendering import render
 from lexsplat.scenes.formats.ply import write_ply
 
@@ -63,8 +57,6 @@ def main() -> None:
         gaussians = trainer.gaussians()
     else:
         up = World.of_cameras(view.camera for view in capture.train_views).up
-        blocks = cut_blocks(capture, points.points, ground_axes(up), given.blocks)
-        result |= _work_of(capture, blocks)
         with tempfile.TemporaryDirectory() as folder:
             run = BlockRun("cpu", 0, 4 << 30, Path(folder), "benchmark")
             gaussians = reconstruct_blocks(capture, config, points, up, given.blocks, run)
@@ -97,22 +89,13 @@ def _psnr(gaussians: Gaussians, view: View) -> float:
     return -10 * float(np.log10(np.mean((_image(gaussians, view) - view.load_image()) ** 2)))
 
 
-def _work_of(capture: Capture, blocks: list[Block]) -> dict[str, float]:
-    """Iterations and pixels of all blocks together, in those of one piece."""
-    areas = [(r - left) * (b - top) for block in blocks for left, top, r, b in block.windows.values()]
-    views = len(capture.train_names)
-    return {"iterations_share": round(len(areas) / views, 2), "pixels_share": round(sum(areas) / views, 2)}
-
-
 def _views_of_seams(capture: Capture, points: InitialPoints, count: int, views: int = 4) -> list[View]:
     """The held-out views in which the points of two cells are most nearly equal in number."""
     axes = ground_axes(World.of_cameras(view.camera for view in capture.train_views).up)
-    cells = cut_blocks(capture, points.points, axes, count)
-    cell = np.argmax([block.holds(points.points @ axes.T) for block in cells], 0)
+    cut = cut_blocks(capture, points.points, axes, count)
 
-    def second(view: View) -> int:
-        shown, _ = places_in_image(view, points.points)
-        return int(np.sort(np.bincount(cell[shown], minlength=count))[-2])
+    def second(view: View) -> float:
+        return float(np.sort(cut.shares(view, points.points))[-2])
 
     return sorted(capture.test_views, key=second)[-views:]
 

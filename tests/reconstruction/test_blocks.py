@@ -15,18 +15,14 @@ from lexsplat.captures import load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera
-from lexsplat.reconstruction import Reconstructor, blocks
-from lexsplat.reconstruction.blocks import (
-    BlockReconstructor,
-    BlockRun,
-    cut_blocks,
-    ground_axes,
-    number_of_blocks,
-    reconstruct_blocks,
-)
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.reconstruction import Reconstructor, block_training
+from lexsplat.reconstruction.block_files import BETAS, CellState, idle, plan
+from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks
+from lexsplat.reconstruction.blocks import cut_blocks, ground_axes, in_sight, number_of_blocks
 from lexsplat.reconstruction.settings import ReconstructionConfig
-from lexsplat.runtime.errors import CaptureError, MemoryBudgetError
-from lexsplat.runtime.files import read_tensors
+from lexsplat.runtime.errors import CaptureError, MemoryBudgetError, WorkersError
+from lexsplat.runtime.workers import open_workers
 from lexsplat.scenes.folder import SceneFolder
 
 UP = Up(np.array([0.0, 0.0, 1.0]), True)
@@ -66,24 +62,133 @@ def street(capture, length: float = 40.0):
 def test_cells_cover_the_plane_once_with_equal_numbers_of_points(count, capture):
     made, places = street(capture)
     axes = ground_axes(UP)
-    cut = cut_blocks(made, places, axes, count)
+    cells = cut_blocks(made, places, axes, count).cells
     anywhere = np.random.default_rng(1).normal(0, 100, (500, 2))
-    assert (sum(block.holds(anywhere).astype(int) for block in cut) == 1).all(), "also far away"
-    numbers = [block.holds(places @ axes.T).sum() for block in cut]
+    assert (sum(cell.holds(anywhere).astype(int) for cell in cells) == 1).all(), "also far away"
+    numbers = [cell.holds(places @ axes.T).sum() for cell in cells]
     assert sum(numbers) == 4000
     np.testing.assert_allclose(numbers, 4000 / count, rtol=0.02)
 
 
-def test_a_block_of_a_street_has_the_views_in_front_of_it_and_few_points_of_the_others(capture):
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_each_view_belongs_to_one_block_and_each_cell_is_owned_by_one_that_trains_it(count, capture):
+    made, places = street(capture)
+    cut = cut_blocks(made, places, ground_axes(UP), count)
+    assert sorted(name for block in cut.blocks for name in block.views) == sorted(made.views)
+    assert max(len(b.views) for b in cut.blocks) - min(len(b.views) for b in cut.blocks) <= 1
+    assert sorted(cell for block in cut.blocks for cell in block.owned) == list(range(count))
+    assert all(set(block.owned) <= set(block.trained) for block in cut.blocks)
+
+
+def test_a_block_of_a_street_trains_the_cells_in_front_of_its_views(capture):
     made, places = street(capture)
     axes = ground_axes(UP)
-    for block in cut_blocks(made, places, axes, 4):
-        own = places[block.holds(places @ axes.T)][:, 0]
-        near = {name for name in made.views if own.min() <= float(name) <= own.max()}
-        assert near <= set(block.windows)
-        # A view shows three meters to either side; the margin is 1.5 m.
-        assert all(own.min() - 5 < float(name) < own.max() + 5 for name in block.windows)
-        assert len(block.inside) < 0.4 * len(places)
+    cut = cut_blocks(made, places, axes, 6)
+    for block in cut.blocks:
+        stands = np.array([float(name) for name in block.views])
+        for cell in block.trained:
+            own = places[cut.cells[cell].holds(places @ axes.T)][:, 0]
+            # A view shows three meters to either side.
+            assert own.max() > stands.min() - 3
+            assert own.min() < stands.max() + 3
+        assert 1 <= len(block.trained) <= 3
+        assert not set(block.trained) & set(block.shown)
+        assert len(block.trained) + len(block.shown) < 6, "cells that no view shows take no part"
+
+
+def test_blocks_that_are_trained_side_by_side_have_no_cell_in_common(capture):
+    made, places = street(capture)
+    cut = cut_blocks(made, places, ground_axes(UP), 6)
+    assert len(cut.phases) < 6
+    for phase in cut.phases:
+        cells = [cell for block in phase for cell in block.trained]
+        assert len(cells) == len(set(cells))
+
+
+@pytest.mark.parametrize(("iterations", "rounds"), [(100, 4), (101, 7), (5, 3)])
+def test_visits_have_all_steps_of_the_training_once_and_each_block_its_share(iterations, rounds, capture):
+    made, places = street(capture)
+    cut = cut_blocks(made, places, ground_axes(UP), 3)
+    visits = [visit for group in plan(cut, iterations, rounds) for visit in group]
+    assert [visit.start for visit in visits] == [0, *(visit.end for visit in visits[:-1])]
+    assert visits[-1].end == iterations
+    for block in cut.blocks:
+        own = [visit for visit in visits if visit.block is block]
+        steps = np.cumsum([0, *(visit.end - visit.start for visit in own)])
+        assert [visit.first for visit in own] == steps[:-1].tolist()
+        assert abs(steps[-1] - iterations * len(block.views) / len(made.views)) <= 1
+
+
+def test_idle_steps_are_those_of_adam_without_gradients():
+    generator = torch.Generator().manual_seed(0)
+    gaussians = Gaussians(
+        *(
+            torch.rand(size, generator=generator)
+            for size in ((5, 3), (5, 4), (5, 3), (5,), (5, 1, 3), (5, 0, 3))
+        )
+    )
+    parameter = torch.nn.Parameter(gaussians.means.clone())
+    optimizer = torch.optim.Adam([parameter], lr=0.01, betas=BETAS, eps=1e-15)
+    for _ in range(200):
+        parameter.grad = torch.randn(5, 3, generator=generator)
+        optimizer.step()
+    state = CellState.untrained(gaussians)
+    state.parameters["means"] = parameter.detach().clone()
+    for name, tensor in optimizer.state[parameter].items():
+        state.moments[f"{name}/means"] = tensor.clone()
+    idle(state, "means", 0.01, 30, 200)
+    for _ in range(30):
+        parameter.grad = torch.zeros(5, 3)
+        optimizer.step()
+    torch.testing.assert_close(state.parameters["means"], parameter.detach(), rtol=0, atol=5e-4)
+    torch.testing.assert_close(state.moments["exp_avg_sq/means"], optimizer.state[parameter]["exp_avg_sq"])
+
+
+def test_balls_that_a_camera_shows_are_in_sight(capture):
+    made, _ = street(capture)
+    camera = made.views["08.0"].camera
+    places = np.random.default_rng(0).uniform((-10, -6, -5), (30, 9, 8), (500, 3)).astype(np.float32)
+    local = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    surface = np.random.default_rng(1).normal(size=(2000, 3))
+    surface /= np.linalg.norm(surface, axis=1, keepdims=True)
+    found, radius = in_sight(camera, places, np.full(500, 0.7, np.float32)), 0.7
+    assert 0 < found.sum() < 400
+    for center in local[~found]:
+        x, y, z = (center + radius * surface).T
+        shown = (z > 0) & (abs(50 * x / z) < 48) & (abs(50 * y / z) < 36)
+        assert not shown.any()
+
+
+def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, monkeypatch):
+    monkeypatch.setattr(block_training, "BETAS", (0.9, 0.999))  # those of one piece
+    whole = Reconstructor(capture, dataclasses.replace(CONFIG, warm_up=0.0), points)
+    cut = cut_blocks(capture, points.points, ground_axes(UP), 1)
+    (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)
+    config, start = whole.config, CellState.untrained(whole.gaussians().map(torch.clone))
+    trainer = VisitReconstructor(capture, config, visit, start, None, 0)
+    for _ in range(8):
+        order = trainer._next_view()
+        whole._next_view = lambda order=order: order
+        whole.step()
+        trainer.step()
+    for name, tensor in whole.gaussians().tensors().items():
+        assert torch.equal(tensor, trainer.gaussians().tensors()[name])
+
+
+def test_gaussians_of_other_cells_are_drawn_and_stay_as_they_are(capture, points):
+    cut = cut_blocks(capture, points.points, ground_axes(UP), 1)
+    (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)
+    gaussians = Reconstructor(capture, CONFIG, points).gaussians().map(torch.clone)
+    half = len(gaussians) // 2
+    own, fixed = gaussians.select(slice(0, half)), gaussians.select(slice(half, None))
+    trainer = VisitReconstructor(capture, CONFIG, visit, CellState.untrained(own), fixed, 0)
+    camera = capture.train_views[0].camera
+    drawn = trainer._render(trainer._as_gaussians(), camera).image
+    torch.testing.assert_close(drawn, Reconstructor(capture, CONFIG, points)._render(gaussians, camera).image)
+    before = fixed.means.clone()
+    trainer.step()
+    assert torch.equal(trainer._fixed.means, before)
+    assert len(trainer.gaussians()) == half
 
 
 def test_blocks_that_no_view_sees_are_refused(capture):
@@ -107,48 +212,67 @@ def test_auto_takes_as_few_blocks_as_fit():
     config = ReconstructionConfig(max_gaussians=1_000_000)
     need = 2 * 1_000_000 * 1_700
     assert number_of_blocks("auto", config, "cpu", need) == 1
-    assert number_of_blocks("auto", config, "cpu", need - 1) == 4, (
-        "a block has three times its share of Gaussians"
-    )
-    assert number_of_blocks("auto", config, "cpu", need // 4) == 12
+    assert number_of_blocks("auto", config, "cpu", need - 1) == 5, "a block trains up to four cells"
+    assert number_of_blocks("auto", config, "cpu", need // 4) == 16
     assert number_of_blocks("none", config, "cpu", 1) == 1
     for wrong in ("0", "-1", "2.5", "many", "", "100000"):
         with pytest.raises(ValueError, match="blocks must be auto, none or a number"):
             number_of_blocks(wrong, config, "cpu", need)
 
 
-def test_merged_gaussians_lie_each_in_the_cell_of_its_block_and_a_second_run_keeps_finished_blocks(
+def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_same_result(
     capture, points, tmp_path, monkeypatch
 ):
-    trained, coarse, events = [], [], []
-    train, model = blocks._train_block, Reconstructor.run
+    config = dataclasses.replace(CONFIG, iterations=24, densify_min_every=2, densify_every=2)
+    visit, events = block_training._visit, []
 
-    def counted_model(self, *arguments):
-        if type(self) is Reconstructor:
-            coarse.append(self)
-        model(self, *arguments)
+    def killed(left):
+        def some(shared, item):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return visit(shared, item)
 
-    monkeypatch.setattr(Reconstructor, "run", counted_model)
+        return some
 
-    def counted(shared, block, path):
-        trained.append(block)
-        found = train(shared, block, path)
-        assert block.holds(found.means.numpy() @ shared.axes.T).all()
-        return found
+    run = BlockRun("cpu", 0, 1 << 30, tmp_path / "whole", "key", listener=events.append)
+    whole = reconstruct_blocks(capture, config, points, UP, 2, run)
+    done = [event.done for event in events if event.stage == "blocks"]
+    assert done == list(range(1, len(done) + 1))
+    assert len(done) == events[-1].total > 4
+    assert 0 < len(whole) <= config.max_gaussians
+    run = dataclasses.replace(run, folder=tmp_path / "killed")
+    for _ in range(len(done)):
+        monkeypatch.setattr(block_training, "_visit", killed([2]))
+        try:
+            again = reconstruct_blocks(capture, config, points, UP, 2, run)
+            break
+        except KeyboardInterrupt:
+            continue
+    assert all(torch.equal(a, b) for a, b in zip(whole.tensors().values(), again.tensors().values()))
+    assert len(list((tmp_path / "killed").glob("*.safetensors"))) <= 3, (
+        "files that no state needs are deleted"
+    )
 
-    monkeypatch.setattr(blocks, "_train_block", counted)
-    run = BlockRun("cpu", 0, 1 << 30, tmp_path, "key", listener=events.append)
-    first = reconstruct_blocks(capture, CONFIG, points, UP, 3, run)
-    assert len(trained) == 3
-    assert [e.done for e in events if e.stage == "blocks"] == [0, 1, 2, 3]
-    assert 0 < len(first) <= 2 * CONFIG.max_gaussians
-    for path in tmp_path.glob("*.safetensors"):
-        if trained[0].holds(read_tensors(path)[0]["means"].numpy() @ ground_axes(UP).T).all():
-            path.unlink()
-    again = reconstruct_blocks(capture, CONFIG, points, UP, 3, run)
-    assert len(trained) == 4
-    assert len(coarse) == 1, "the coarse model is kept too"
-    assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), again.tensors().values()))
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_density_control_adds_gaussians_and_keeps_the_cap(strategy, capture, points, tmp_path):
+    config = dataclasses.replace(
+        CONFIG, strategy=strategy, exposure=True, iterations=48, densify_min_every=2, densify_every=2
+    )
+    config = dataclasses.replace(config, grow_gradient=1e-9)
+    few = dataclasses.replace(points, points=points.points[::2], colors=points.colors[::2])
+    config = dataclasses.replace(config, max_gaussians=len(few.points) + 40)
+    run = BlockRun("cpu", 0, 1 << 30, tmp_path, "key")
+    found = reconstruct_blocks(capture, config, few, UP, 2, run)
+    assert len(few.points) < len(found) <= config.max_gaussians
+
+
+def test_a_worker_that_does_not_see_the_folder_is_refused_in_one_line(capture, points, tmp_path, monkeypatch):
+    monkeypatch.setattr(block_training.SharedFolder, "is_visible", False)
+    run = BlockRun("cpu", 0, 1 << 30, tmp_path, "key")
+    with pytest.raises(WorkersError, match=r"a folder that every worker sees.*mounts at the same path"):
+        reconstruct_blocks(capture, CONFIG, points, UP, 2, run)
 
 
 def test_a_block_that_does_not_fit_is_refused_before_it_starts(capture, points, tmp_path):
@@ -201,60 +325,24 @@ def test_a_command_tells_in_one_line_why_it_cannot_cut(count, message, capture, 
     assert re.fullmatch(message, errors[0])
 
 
-def test_stray_points_far_away_do_not_widen_a_block(capture):
+def test_stray_points_far_away_do_not_change_what_a_block_trains(capture):
     made, places = street(capture)
     axes = ground_axes(UP)
     strays = np.array([[900.0, 3.0, 1.0], [-700.0, 3.0, 1.0]], np.float32)
-    for block in cut_blocks(made, np.concatenate([places, strays]), axes, 4):
-        assert block.margin.max() < 2.0
-        assert len(block.windows) < len(made.views) / 2
+    before, after = (
+        cut_blocks(made, each, axes, 4).blocks for each in (places, np.concatenate([places, strays]))
+    )
+    assert [(block.trained, block.owned) for block in before] == [(b.trained, b.owned) for b in after]
 
 
-def test_the_window_of_a_view_shows_the_points_of_the_block_and_leaves_the_rest_out(capture):
-    made, places = street(capture)
-    areas = []
-    for block in cut_blocks(made, places, ground_axes(UP), 4):
-        for name, (left, top, right, bottom) in block.windows.items():
-            camera = made.views[name].camera
-            local = places[block.inside] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-            x, y = local[:, :2].T / local[:, 2] * 50 + [[48], [36]]
-            shown = (x >= 0) & (x < 96) & (y >= 0) & (y < 72)
-            kept = (x >= 96 * left) & (x < 96 * right) & (y >= 72 * top) & (y < 72 * bottom)
-            assert (shown & ~kept).sum() <= 0.03 * shown.sum()
-            if block.holds(np.array([[float(name), 0.0, 1.5]]) @ ground_axes(UP).T)[0]:
-                assert (left, top, right, bottom) == (0.0, 0.0, 1.0, 1.0), "a view from within"
-            else:
-                areas.append((right - left) * (bottom - top))
-    assert max(areas) < 0.8
-
-
-def test_gaussians_are_added_in_the_cell_and_its_margin_only(capture, points):
-    axes = ground_axes(UP)
-    block = cut_blocks(capture, points.points, axes, 2)[0]
-    start = dataclasses.replace(points, points=points.points[::9], colors=points.colors[::9])
-    coarse = Reconstructor(capture, CONFIG, start).gaussians()
-    part = dataclasses.replace(capture, train_names=tuple(block.windows))
-    trainer = BlockReconstructor(part, CONFIG, start, coarse, block, axes)
-    means = trainer.gaussians().means
-    assert torch.equal(means, torch.cat([coarse.means, torch.from_numpy(start.points)])), "coarse and own"
-    trainer.step()
-    means2d = torch.zeros(len(means), 2)
-    means2d.grad = torch.ones(len(means), 2)
-    means = trainer.gaussians().means.numpy()
-    trainer._control_density(means2d, torch.ones(len(means)), (96, 72))
-    ground = means @ axes.T
-    inside = np.all((ground >= block.low - block.margin) & (ground < block.high + block.margin), axis=1)
-    assert 0 < inside.sum() < len(inside)
-    np.testing.assert_array_equal(means2d.grad.all(1).numpy(), inside)
-
-
-def test_a_view_that_stands_in_a_cell_and_looks_elsewhere_belongs_to_it_as_a_whole(capture):
-    made, places = street(capture)
-    name = "08.0"
-    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ made.views[name].camera.viewmat
-    view = dataclasses.replace(made.views[name], camera=Camera(96, 72, made.views[name].camera.K, turned))
-    made = dataclasses.replace(made, views={**made.views, name: view})
-    shown = blocks.places_in_image(view, places)[0]
-    assert len(shown) == 0
-    cut = cut_blocks(made, places, ground_axes(UP), 4)
-    assert [block.windows.get(name) for block in cut].count((0.0, 0.0, 1.0, 1.0)) == 1
+@pytest.mark.slow
+def test_blocks_on_ray_have_the_bits_of_one_process(capture, points, tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    config = dataclasses.replace(CONFIG, iterations=24, densify_min_every=2, densify_every=2)
+    run = BlockRun("cpu", 0, 256 << 20, tmp_path / "here", "key")
+    here = reconstruct_blocks(capture, config, points, UP, 2, run)
+    with open_workers("ray", (capture.root,)) as workers:
+        run = dataclasses.replace(run, folder=tmp_path / "ray", workers=workers)
+        there = reconstruct_blocks(capture, config, points, UP, 2, run)
+    assert all(torch.equal(a, b) for a, b in zip(here.tensors().values(), there.tensors().values()))

@@ -54,25 +54,3 @@ def test_downscaled_images_and_cameras_agree(views):
 
 def test_views_without_a_mask_use_all_pixels(views):
     assert TrainingImages(views, memory=0).valid(views[0].name) is None
-
-
-def test_a_window_is_the_part_of_the_photo_that_its_camera_sees(views):
-    view = views[0]
-    whole, part = (
-        TrainingImages([view], memory=1 << 20, windows=windows)
-        for windows in (None, {view.name: (0.25, 0.1, 0.8, 1.0)})
-    )
-    camera = part.camera(view.name)
-    left, top = round(0.25 * view.camera.width), round(0.1 * view.camera.height)
-    np.testing.assert_array_equal(
-        part.target(view.name).image,
-        whole.target(view.name).image[top : top + camera.height, left : left + camera.width],
-    )
-    point = view.camera.viewmat[:3, :3].T @ (np.array([0.1, -0.2, 3.0]) - view.camera.viewmat[:3, 3])
-    for seen, shift in ((view.camera, (0, 0)), (camera, (left, top))):
-        local = seen.viewmat[:3, :3] @ point + seen.viewmat[:3, 3]
-        place = (seen.K @ local)[:2] / local[2] + shift
-        np.testing.assert_allclose(place, (view.camera.K @ [0.1, -0.2, 3.0])[:2] / 3.0)
-    pixels = view.camera.width * view.camera.height
-    assert part.share(view.name) == pytest.approx(camera.width * camera.height / pixels)
-    assert whole.share(view.name) == 1.0

@@ -33,7 +33,8 @@ from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_ha
 from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
 from lexsplat.pipeline.viewpoints.choosing import SIZE
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
-from lexsplat.reconstruction.blocks import BlockRun, number_of_blocks, reconstruct_blocks
+from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
+from lexsplat.reconstruction.blocks import number_of_blocks
 from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
@@ -281,10 +282,8 @@ class _Builder:
     def _reconstruct_blocks(self) -> dict[str, Any]:
         config, folder = self.config, self._checkpoints / "blocks"
         points = self._initial_points()
-        key, seconds = self.fingerprints["reconstruct"], config.checkpoint_seconds
-        run = BlockRun(
-            self.device, config.seed, self.memory, folder, key, seconds, self.workers, self.listener
-        )
+        key = self.fingerprints["reconstruct"]
+        run = BlockRun(self.device, config.seed, self.memory, folder, key, self.workers, self.listener)
         world = World.of_cameras(view.camera for view in self.capture.train_views)
         if config.up is not None:
             world = world.with_up(parse_vector(config.up))

@@ -53,8 +53,8 @@ class BuildConfig:
             come on top (docs/conventions.md).
         workers: Where views and scenes are worked on: "none" is this process, "ray" the cluster of RAY_ADDRESS or the
             cores of this machine, "ray://HOST:PORT" a cluster (docs/scaling.md).
-        blocks: Number of blocks of the ground plane that are reconstructed apart, "auto" for as few as fit into the
-            memory, or "none".
+        blocks: Number of blocks in which the Gaussians and the photos are loaded one after the other, "auto" for as
+            few as fit into the memory, or "none".
         checkpoint_seconds: Seconds between two checkpoints of a training.
         downscale: Factor by which photos are reduced for reconstruction and language; by default what suits the
             device.

@@ -120,17 +120,60 @@ class DensityControl:
             elif step < self.schedule.stop:
                 self._accumulate(means2d, radii, image_size)
                 if changed:
-                    # gsplat accumulates and refines in one call; shown no visible Gaussian, it only refines.
-                    count = radii.shape[-1]
-                    self._strategy.grow_grad2d = self._threshold_within_cap(count)
-                    nothing = _nothing_visible(count, self._device)
-                    self._strategy.step_post_backward(*subjects, self._state, step, nothing)
+                    self._refine(subjects, step)
                 if self.config.resets_opacities and step > 0 and step % self.schedule.reset_every == 0:
-                    from gsplat.strategy import ops
-
-                    ops.reset_opa(*subjects, self._state, value=2.0 * self.config.min_opacity)
+                    self._reset_opacities(subjects)
         parameters.update({name: theirs[GSPLAT_NAMES.get(name, name)] for name in parameters})
         return changed
+
+    def refine(
+        self,
+        parameters: dict[str, torch.nn.Parameter],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        step: int,
+        steps: int,
+    ) -> bool:
+        """Change the set of Gaussians now, with the statistics so far; replaces entries of ``parameters``.
+
+        Args:
+            parameters: As in `step`.
+            optimizers: As in `step`.
+            step: Number of finished steps.
+            steps: Number of steps since the last call; opacities are reset if one of them would have done it.
+
+        Returns:
+            Whether it was done: from the first round of the schedule to its end.
+        """
+        schedule = self.schedule
+        due = step // schedule.every * schedule.every
+        if not schedule.start < due < schedule.stop or step >= schedule.stop:
+            return False
+        theirs = {GSPLAT_NAMES.get(name, name): value for name, value in parameters.items()}
+        subjects = theirs, {GSPLAT_NAMES.get(name, name): value for name, value in optimizers.items()}
+        with self._own_randomness(), _operators_for(self._device):
+            if self.config.strategy == "mcmc":
+                if not bool((theirs["opacities"].sigmoid() > self.config.min_opacity).any()):
+                    return False
+                self._strategy.step_post_backward(*subjects, self._state, due, {}, lr=0.0)
+            else:
+                self._refine(subjects, due)
+                every = schedule.reset_every
+                if self.config.resets_opacities and step // every > (step - steps) // every:
+                    self._reset_opacities(subjects)
+        parameters.update({name: theirs[GSPLAT_NAMES.get(name, name)] for name in parameters})
+        return True
+
+    def _refine(self, subjects: tuple[dict[str, Any], dict[str, Any]], step: int) -> None:
+        # gsplat accumulates and refines in one call; shown no visible Gaussian, it only refines.
+        count = len(subjects[0]["means"])
+        self._strategy.grow_grad2d = self._threshold_within_cap(count)
+        nothing = _nothing_visible(count, self._device)
+        self._strategy.step_post_backward(*subjects, self._state, step, nothing)
+
+    def _reset_opacities(self, subjects: tuple[dict[str, Any], dict[str, Any]]) -> None:
+        from gsplat.strategy import ops
+
+        ops.reset_opa(*subjects, self._state, value=2.0 * self.config.min_opacity)
 
     def _accumulate(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
         """Accumulate gradients and visibility as gsplat does, but without index gathers: four passes over ``[N]``."""

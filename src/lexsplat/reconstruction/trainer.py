@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.geometry.cameras import Camera
-    from lexsplat.reconstruction.photos import TrainingImages, Window
+    from lexsplat.reconstruction.photos import TrainingImages
     from lexsplat.rendering import Rendering
     from lexsplat.runtime.training import Checkpoint
 
@@ -52,8 +51,7 @@ class Reconstructor:
         seed: Seed of the view order and of density control.
         memory: Total budget in bytes. Cached photos take a quarter of it, at most 1 GiB; the budget does not
             affect the result.
-        windows: Parts of views that are trained on, as if the other pixels were masked; views that are not named
-            are trained on as a whole.
+        extent: Scene scale, if it is not that of the capture's training views.
 
     Raises:
         TrainingError: If there is no training view or no point.
@@ -70,10 +68,9 @@ class Reconstructor:
         device: torch.device | str = "cpu",
         seed: int = 0,
         memory: int = DEFAULT_MEMORY,
-        windows: Mapping[str, Window] | None = None,
+        extent: float | None = None,
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
-        from lexsplat.reconstruction.photos import cropped
 
         self.config = config
         self.device = torch.device(device)
@@ -81,11 +78,7 @@ class Reconstructor:
         self._photo_bytes = min(PHOTO_BYTES_MAX, memory // 4)
         self._views = {view.name: view for view in capture.train_views}
         self._names = sorted(self._views)
-        self._windows = windows or {}
         halves = [view.camera.downscaled(2.0) for view in self._views.values()]
-        halves += [
-            cropped(self._views[name].camera.downscaled(2.0), self._windows[name]) for name in self._windows
-        ]
         self._can_shrink = all(min(half.width, half.height) >= SMALLEST_SIDE for half in halves)
         if not self._names:
             raise TrainingError(
@@ -94,7 +87,7 @@ class Reconstructor:
                 found="none",
                 remedy="hold out fewer views",
             )
-        self._extent = capture.extent
+        self._extent = capture.extent if extent is None else extent
         self._background = torch.tensor(capture.background, dtype=torch.float32, device=self.device)
         self._generator = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.int64)
@@ -180,7 +173,7 @@ class Reconstructor:
         if valid is not None:
             image = torch.where(valid[..., None], image, target.image)
         loss = photometric_loss(image, target, self.config.ssim_weight)
-        loss = images.share(name) * loss + self._regularization()
+        loss = loss + self._regularization()
         loss.backward()
         value = loss.item() if self.reads_loss(self.steps_done + 1) else 0.0
         if not math.isfinite(value):
@@ -192,7 +185,7 @@ class Reconstructor:
             )
         self._update_errors(image, target.image)
         self._optimize()
-        self._control_density(rendering.means2d, rendering.radii, images.whole_size(name))
+        self._control_density(rendering.means2d, rendering.radii, (camera.width, camera.height))
         self.last_view = name
         if len(self._parameters["means"]) == 0:
             raise TrainingError(
@@ -280,22 +273,7 @@ class Reconstructor:
             self._exposures.load_state_tensors(below_prefix("exposures/", tensors))
 
     def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
-        points, colors = start.points, start.colors
-        if len(points) == 0:
-            raise TrainingError(
-                "reconstruction", expected="initial points", found="none", remedy="check the cameras"
-            )
-        cap = self.config.cap(self.device)
-        if len(points) > cap:
-            chosen = torch.randperm(len(points), generator=self._generator)[:cap]
-            points, colors = points[chosen.numpy()], colors[chosen.numpy()]
-        gaussians = gaussians_from_points(
-            points,
-            colors,
-            sh_degree=self.config.sh_degree,
-            opacity=self.config.initial_opacity,
-            device=self.device,
-        )
+        gaussians = initial_gaussians(self.config, start, self.device, self._generator)
         return {name: torch.nn.Parameter(value) for name, value in gaussians.tensors().items()}
 
     def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
@@ -334,7 +312,6 @@ class Reconstructor:
                 memory=self._photo_bytes,
                 shrink=shrink,
                 device=self.device,
-                windows=self._windows,
             )
             self._images_shrink = shrink
         return self._images
@@ -383,6 +360,27 @@ class Reconstructor:
             optimizer.zero_grad(set_to_none=True)
         if self._exposures is not None:
             self._exposures.optimize()
+
+
+def initial_gaussians(
+    config: ReconstructionConfig, start: InitialPoints, device: torch.device, generator: torch.Generator
+) -> Gaussians:
+    """The Gaussians that a training begins with: one a point, of a random choice within the cap.
+
+    Raises:
+        TrainingError: If there are no points.
+    """
+    points, colors = start.points, start.colors
+    if len(points) == 0:
+        raise TrainingError(
+            "reconstruction", expected="initial points", found="none", remedy="check the cameras"
+        )
+    if len(points) > (cap := config.cap(device)):
+        chosen = torch.randperm(len(points), generator=generator)[:cap]
+        points, colors = points[chosen.numpy()], colors[chosen.numpy()]
+    return gaussians_from_points(
+        points, colors, sh_degree=config.sh_degree, opacity=config.initial_opacity, device=device
+    )
 
 
 def check_state(tensors: dict[str, Tensor], views: int, iterations: int) -> dict[str, Tensor]:

@@ -1,0 +1,413 @@
+"""Reconstruction by blocks, for captures whose Gaussians do not fit into the memory of one reconstruction.
+
+The training of the whole is cut into visits: in each round, every block is loaded from disk once, trained on some of
+its views, and written back, with Adam's moments. Steps, learning rates and density control are those of one piece;
+only the order of the views differs. Blocks that train no cell in common are visited side by side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.reconstruction.block_files import (
+    BETAS,
+    EXPOSURES,
+    MOMENTS,
+    STATISTICS,
+    CellFiles,
+    CellState,
+    Visit,
+    idle,
+    merged,
+    plan,
+)
+from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes, in_sight
+from lexsplat.reconstruction.densification import DensityControl
+from lexsplat.reconstruction.optimizers import adam, load_optimizer_tensors
+from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, ReconstructionConfig
+from lexsplat.reconstruction.trainer import Reconstructor, initial_gaussians
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import WorkersError
+from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, results
+
+if TYPE_CHECKING:
+    from lexsplat.captures import Capture
+    from lexsplat.captures.sfm.triangulation import InitialPoints
+    from lexsplat.geometry.boxes import Up
+    from lexsplat.geometry.cameras import Camera
+    from lexsplat.rendering import Rendering
+
+ROUNDS = 32
+"""Rounds in which all blocks are visited, at least."""
+ROUND_STEPS = 500
+"""Steps of a round at most; longer trainings have more rounds."""
+FEWEST_STEPS = 4
+"""Steps of a visit at least; short trainings have fewer rounds."""
+FIXED_BYTES = 1_000
+"""Bytes per Gaussian that takes part with fixed values: its values, a copy beside the trained ones, a gradient."""
+CALM = (0.7, 0.1)
+"""From the first share of the iterations on, all learning rates fall, exponentially, to the second share of them at
+the end: the views of the last visits would otherwise count for more than the others."""
+
+_NEVER = 1 << 40
+
+
+@dataclass(frozen=True)
+class BlockRun:
+    """How blocks are reconstructed.
+
+    Args:
+        device: Device to train on.
+        seed: Seed of the training.
+        memory: Host memory of one block in bytes.
+        folder: Where the state is kept between visits, and for the next run; every worker must see it.
+        key: Fingerprint of everything that the result depends on.
+        workers: Where the blocks are trained: one after the other in this process, or side by side.
+        listener: Receives an event of stage "blocks" after each visit.
+    """
+
+    device: str
+    seed: int
+    memory: int
+    folder: Path
+    key: str
+    workers: Workers = IN_PROCESS
+    listener: Listener = silent
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What the visits of a group read."""
+
+    capture: Capture
+    config: ReconstructionConfig
+    blocks: Blocks
+    folder: SharedFolder
+    files: CellFiles
+    run: BlockRun
+    extent: float
+    groups: int
+    """Number of groups of visits before this one."""
+    room: tuple[int, ...]
+    """Gaussians that density control may add to each cell in this round."""
+
+
+class VisitReconstructor(Reconstructor):
+    """A part of a reconstruction: the steps of one visit, on the views of its block.
+
+    Args:
+        capture: The capture with the views of the block.
+        config: Settings of the whole.
+        visit: The visit.
+        state: The Gaussians that are trained, as they are before it.
+        fixed: Gaussians that take part with fixed values; None if there are none.
+        seed: Seed of the whole training.
+        options: Device, memory and the extent of the whole capture, as in `Reconstructor`.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        config: ReconstructionConfig,
+        visit: Visit,
+        state: CellState,
+        fixed: Gaussians | None,
+        seed: int,
+        **options: Any,
+    ) -> None:
+        self._visit, self._state, self._seed = visit, state, seed
+        # Gaussians are added and removed between the visits.
+        config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
+        own = _seed(seed, visit.number)
+        super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
+        self._fixed = None if fixed is None else fixed.to(self.device)
+        self.steps_done = visit.start
+        self.rate_factor = 1.0  # sets the learning rates of this step
+        self._load_moments()
+
+    def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
+        return {n: torch.nn.Parameter(t.to(self.device)) for n, t in self._state.parameters.items()}
+
+    def _rates(self) -> dict[str, float]:
+        calm = calm_factor(self.config, self.steps_done)
+        return {name: calm * rate for name, rate in super()._rates().items()}
+
+    def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
+        optimizers = super()._new_optimizers()
+        for optimizer in optimizers.values():
+            optimizer.param_groups[0]["betas"] = BETAS
+        return optimizers
+
+    def _load_moments(self) -> None:
+        for name in self._parameters:
+            if steps := adam_steps(self.config, name, self._visit.start):
+                moments = {m: self._state.moments[f"{m}/{name}"].to(self.device) for m in MOMENTS}
+                load_optimizer_tensors(
+                    self._optimizers[name], {"step": torch.tensor(float(steps)), **moments}
+                )
+        self._density.load_state_tensors({**self._density.state_tensors(), **self._state.statistics})
+
+    @property
+    def total_steps(self) -> int:
+        """Step at which the visit ends."""
+        return self._visit.end
+
+    def result(self) -> tuple[CellState, dict[str, Tensor]]:
+        """The trained Gaussians, and the exposures of the photos, on the CPU."""
+        tensors = {name: tensor.to("cpu") for name, tensor in self.state_dict().items()}
+        parameters = {name: tensors[f"parameters/{name}"] for name in self._parameters}
+        moments = {
+            f"{m}/{name}": tensors.get(f"optimizers/{name}/{m}", torch.zeros_like(value))
+            for m in MOMENTS
+            for name, value in parameters.items()
+        }
+        statistics = {
+            name: tensors.get(f"density/{name}", self._state.statistics[name]) for name in STATISTICS
+        }
+        exposures = {name: tensor for name, tensor in tensors.items() if name.startswith(EXPOSURES)}
+        return CellState(parameters, moments, statistics), exposures
+
+    def load_exposures(self, tensors: dict[str, Tensor]) -> None:
+        """Continue with the exposures of the last visit of this block."""
+        if self._exposures is not None and tensors:
+            self._exposures.load_state_tensors(tensors)
+
+    def _next_view(self) -> int:
+        return self._names.index(_view_of(self._visit, self.steps_done, self._seed))
+
+    def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
+        return super()._render(gaussians if self._fixed is None else merged([gaussians, self._fixed]), camera)
+
+    def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
+        count = len(self._parameters["means"])
+        own: Any = SimpleNamespace(shape=(count, 2), grad=None)
+        if means2d.grad is not None:
+            own.grad = means2d.grad.view(-1, *means2d.shape[-2:])[..., :count, :]
+        super()._control_density(own, radii[:count], image_size)
+
+
+def _view_of(visit: Visit, step: int, seed: int) -> str:
+    """Name of the view of a step: random permutations of those of the block, over all its visits."""
+    views = visit.block.views
+    turn, place = divmod(visit.first + step - visit.start, len(views))
+    return views[int(np.random.default_rng([seed, visit.block.number, turn]).permutation(len(views))[place])]
+
+
+def calm_factor(config: ReconstructionConfig, step: int) -> float:
+    """Factor of all learning rates at a step (`CALM`)."""
+    start, last = CALM
+    return float(last ** max(0.0, (step / config.iterations - start) / (1 - start)))
+
+
+def adam_steps(config: ReconstructionConfig, name: str, step: int) -> int:
+    """Steps of the optimizer of a parameter before ``step``; those of "shN" begin with the second degree."""
+    if name != "shN":
+        return step
+    every = math.ceil(config.sh_degree_every * config.iterations / REFERENCE_ITERATIONS)
+    return max(0, step - every) if config.sh_degree else 0
+
+
+def reconstruct_blocks(
+    capture: Capture, config: ReconstructionConfig, points: InitialPoints, up: Up, count: int, run: BlockRun
+) -> Gaussians:
+    """Reconstruct a capture block by block; a run that was killed goes on after the last finished visits.
+
+    Args:
+        capture: Views and split.
+        config: Settings of the whole.
+        points: Initial points of the whole.
+        up: Up direction.
+        count: Number of blocks.
+        run: How they are reconstructed.
+
+    Raises:
+        CaptureError: If there is no ground plane, or a block has no views.
+        MemoryBudgetError: If a block does not fit into ``run.memory``.
+        TrainingError: If a block diverges; finished visits are kept.
+        WorkersError: If a worker does not see ``run.folder``.
+    """
+    blocks = cut_blocks(capture, points.points, ground_axes(up), count)
+    none = capture.points[:0]  # workers get the capture with every group of visits, and need its views only
+    capture = replace(capture, points=none, point_colors=capture.point_colors[:0])
+    cap = config.cap(torch.device(run.device))
+    if run.device == "cpu":
+        trained = math.ceil(cap / count * max(len(block.trained) for block in blocks.blocks))
+        need = 2 * trained * budget.GAUSSIAN_BYTES
+        budget.require(
+            "reconstruct", need, run.memory, f"{trained:,} Gaussians of a block", "a larger --blocks"
+        )
+    rounds = max(ROUNDS, math.ceil(config.iterations / ROUND_STEPS))
+    groups = plan(blocks, config.iterations, max(1, min(rounds, config.iterations // (FEWEST_STEPS * count))))
+    total, listener, workers = sum(map(len, groups)), run.listener, run.workers
+    needs = Needs(memory=run.memory, gpu=run.device == "cuda")
+    own = replace(run, workers=IN_PROCESS, listener=silent)
+    with SharedFolder.offered(run.folder) as folder:
+        files = CellFiles(folder.path, run.key, blocks, groups)
+        finished, extent = files.finished(), capture.extent
+        room: tuple[int, ...] = ()
+        if finished < 0:
+            finished = 0
+            _write_start(files, blocks, config, points, run)
+        for index, group in enumerate(groups[finished:], start=finished):
+            if index == 0 or group[0].round != groups[index - 1][0].round or not room:
+                room = _room(files, group[0].round, index, config, cap)
+            shared = _Shared(capture, config, blocks, folder, files, own, extent, index, room)
+            items = {
+                f"block {visit.block.number + 1} of {count}, round {visit.round + 1}": visit
+                for visit in group
+            }
+            for done, size in enumerate(
+                results(workers.map(_visit, shared, items, needs)), group[0].number + 1
+            ):
+                listener(Event("blocks", done, total, {"gaussians": float(size)}))
+            files.remove_old(index + 1)
+        latest = files.latest(len(groups))
+        parts = [files.gaussians(latest[str(cell)][0], cell, config.antialiased) for cell in range(count)]
+    return merged(parts)
+
+
+def _write_start(
+    files: CellFiles, blocks: Blocks, config: ReconstructionConfig, points: InitialPoints, run: BlockRun
+) -> None:
+    """The state before the first visit."""
+    generator = torch.Generator().manual_seed(run.seed)
+    config = replace(config, max_gaussians=config.cap(torch.device(run.device)))
+    gaussians = initial_gaussians(config, points, torch.device("cpu"), generator)
+    state, cells = CellState.untrained(gaussians), blocks.cells_of(gaussians.means.numpy())
+    files.write(-1, {n: state.select(torch.from_numpy(cells == n)) for n in range(len(blocks.cells))})
+
+
+def _room(
+    files: CellFiles, number: int, groups: int, config: ReconstructionConfig, cap: int
+) -> tuple[int, ...]:
+    """How many Gaussians round ``number`` of density control may add to each cell.
+
+    Within the cap of the whole, those with the largest gradients grow. The numbers are kept in a file, because a run
+    that was killed in a round goes on with those of its start.
+    """
+    if (kept := files.room(number)) is not None:
+        return kept
+    gradients = [sums / times.clamp_min(1) for sums, times in files.all_statistics(groups)]
+    free = max(0, cap - sum(map(len, gradients)))
+    if config.strategy == "mcmc":  # it adds a share at random, without statistics
+        total = max(1, sum(map(len, gradients)))
+        room = tuple(free * len(of_cell) // total for of_cell in gradients)
+        files.write_room(number, room)
+        return room
+    every = torch.cat(gradients)
+    threshold = config.grow_gradient
+    if int((every > threshold).sum()) > free:
+        threshold = float(torch.topk(every, free + 1).values[-1])
+    room = tuple(int((of_cell > threshold).sum()) for of_cell in gradients)
+    files.write_room(number, room)
+    return room
+
+
+def _visit(shared: _Shared, visit: Visit) -> int:
+    """Train a block for the steps of a visit and write its cells; returns the number of its Gaussians."""
+    run, files, blocks = shared.run, shared.files, shared.blocks
+    if not shared.folder.is_visible:
+        raise WorkersError(
+            shared.folder.path,
+            expected="a folder that every worker sees",
+            found="no such folder on one of them",
+            remedy="give an --output on a file system that every node mounts at the same path",
+        )
+    latest, block = files.latest(shared.groups), visit.block
+    if files.path(visit.number).exists():  # by a run that was killed before the others of its group had ended
+        return sum(len(files.gaussians(visit.number, cell, False)) for cell in block.trained)
+    states = {cell: _present(shared, visit, cell, *latest[str(cell)]) for cell in block.trained}
+    homes = np.repeat(list(states), [len(state) for state in states.values()])
+    fixed = _fixed(shared, visit, latest)
+    if run.device == "cpu":
+        others = 0 if fixed is None else len(fixed)
+        need = len(homes) * budget.GAUSSIAN_BYTES + others * FIXED_BYTES
+        what = f"{len(homes):,} Gaussians of a block and {others:,} that its views show"
+        budget.require("reconstruct", need, run.memory, what, "a larger --blocks")
+    state = CellState.joined(states.values())
+    states.clear()
+    own = {name: shared.capture.views[name] for name in block.views}
+    part = replace(shared.capture, views=own, train_names=block.views, test_names=())
+    options = {"device": run.device, "memory": run.memory, "extent": shared.extent}
+    trainer = VisitReconstructor(part, shared.config, visit, state, fixed, run.seed, **options)
+    before = latest.get(f"{EXPOSURES}{block.number}")
+    if before is not None:
+        trainer.load_exposures(files.read(before[0], EXPOSURES))
+    trainer.run()
+    state, exposures = trainer.result()
+    cells = blocks.cells_of(state.parameters["means"].numpy())
+    cells = np.where(np.isin(cells, block.trained), cells, homes)
+    after = {cell: state.select(torch.from_numpy(cells == cell)) for cell in block.trained}
+    files.write(visit.number, after, exposures)
+    return len(cells)
+
+
+def _present(shared: _Shared, visit: Visit, cell: int, written: int, last: int) -> CellState:
+    """The Gaussians of a cell at the start of a visit; a round of density control is due if the block owns it."""
+    config = shared.config
+    state = shared.files.cell(written, cell)
+    rates = config.rates(shared.extent)
+    rates["means"] *= (config.means_rate_final / config.means_rate) ** (last / config.iterations)
+    calm = calm_factor(config, last)
+    for name in state.parameters:
+        idle(state, name, calm * rates[name], visit.start - last, adam_steps(config, name, last))
+    if cell in visit.block.owned and visit.round and len(state):
+        control = DensityControl(
+            replace(config, max_gaussians=len(state) + shared.room[cell]),
+            shared.extent,
+            seed=_seed(shared.run.seed, visit.number, cell),
+        )
+        state = _refined(state, control, visit.start, visit.round_steps)
+    return state
+
+
+def _refined(state: CellState, control: DensityControl, step: int, steps: int) -> CellState:
+    """The Gaussians after a round of density control."""
+    parameters = {name: torch.nn.Parameter(tensor) for name, tensor in state.parameters.items()}
+    optimizers = {name: adam(parameter, 0.0) for name, parameter in parameters.items()}
+    for name, optimizer in optimizers.items():
+        moments = {moment: state.moments[f"{moment}/{name}"] for moment in MOMENTS}
+        load_optimizer_tensors(optimizer, {"step": torch.tensor(1.0), **moments})
+    control.load_state_tensors({**control.state_tensors(), **state.statistics})
+    if not control.refine(parameters, optimizers, step, steps):
+        return state
+    found = {name: parameter.detach() for name, parameter in parameters.items()}
+    moments = {
+        f"{moment}/{name}": optimizers[name].state[parameters[name]][moment]
+        for moment in MOMENTS
+        for name in parameters
+    }
+    statistics = {name: torch.zeros(len(found["means"])) for name in STATISTICS}
+    return CellState(found, moments, statistics)
+
+
+def _fixed(shared: _Shared, visit: Visit, latest: Mapping[str, tuple[int, int]]) -> Gaussians | None:
+    """The Gaussians of the cells that a visit does not train, as far as its views show them."""
+    names = {_view_of(visit, step, shared.run.seed) for step in range(visit.start, visit.end)}
+    cameras = [shared.capture.views[name].camera for name in sorted(names)]
+    parts = []
+    for cell in visit.block.shown:
+        gaussians = shared.files.gaussians(latest[str(cell)][0], cell, shared.config.antialiased)
+        centers = gaussians.means.numpy()
+        radii = 3.0 * gaussians.scales.max(1).values.numpy()
+        seen = np.zeros(len(centers), bool)
+        for camera in cameras:
+            seen |= in_sight(camera, centers, radii)
+        parts.append(gaussians.select(torch.from_numpy(seen)))
+    return merged(parts) if sum(map(len, parts)) else None
+
+
+def _seed(*numbers: int) -> int:
+    """A seed for a part of the training."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
