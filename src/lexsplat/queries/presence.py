@@ -39,8 +39,8 @@ YES, NO = 0.74, FITS
 """Strengths from which the answer is "yes", and below which it is "no"."""
 YES_SEGMENT, YES_COLORED = 0.62, 0.82
 """The former at objects and their parts, whose means are lower than peaks, and for phrases with a color, which share
-the color or the name with most of what they are confused with. Chosen on the second scene with the bundled encoder and
-three of ``benchmarks/web_like.py``."""
+the color or the name with most of what they are confused with. Chosen on the second scene, with the bundled encoder
+and three of ``benchmarks/web_like.py``."""
 
 PEAK_SHARE = 5e-4
 PEAK_COUNT = 20
