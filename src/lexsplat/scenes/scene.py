@@ -418,7 +418,7 @@ class Scene:
         if len(matches) != 1:
             known = ", ".join(list(self.views)[:5])
             raise QueryError(
-                f"view {name!r}",
+                f"view {name[:60]!r}",
                 expected="the name of a view",
                 found="no match" if not matches else f"{len(matches)} matches",
                 remedy=f"the scene has {len(self.views)} views, such as {known}",
