@@ -10,7 +10,8 @@ scene=${1:-demo}
 [ $# -gt 0 ] || set -- apple mug unicorn "thing left of the vase"
 
 for thing in "$@"; do
-    printf '{"ask": "%s", "id": "%s"}\n' "$thing" "$thing"
+    quoted=$(printf '%s' "$thing" | sed 's/[\\"]/\\&/g')
+    printf '{"ask": "%s", "id": "%s"}\n' "$quoted" "$quoted"
 done |
     ${LEXSPLAT:-lexsplat} ask "$scene" --stdin |
     while IFS= read -r line; do

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -28,7 +29,8 @@ def transcript():
 @pytest.mark.slow
 def test_the_transcript_of_the_page_is_what_a_client_gets_over_standard_input_and_output():
     async def replay():
-        server = StdioServerParameters(command=sys.executable, args=["-m", "lexsplat", "mcp", "demo"])
+        command = ["-m", "lexsplat", "mcp", "demo"]
+        server = StdioServerParameters(command=sys.executable, args=command, env=dict(os.environ))
         async with Client(server) as client:
             return [await client.call_tool(tool, given) for tool, given, _ in transcript()]
 

@@ -3,11 +3,11 @@
 
 import asyncio
 import contextlib
+import os
 import shutil
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -16,9 +16,9 @@ from jsonschema import Draft202012Validator
 
 pytest.importorskip("mcp")
 import httpx2
-import uvicorn
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters
+from support.mcp_clients import ask, served, talk
 from support.schemas import validated
 
 from lexsplat.mcp.server import http_app, make_server
@@ -43,22 +43,6 @@ def scenes():
 @pytest.fixture(scope="module")
 def server(scenes):
     return make_server(scenes)
-
-
-def talk(server, dialogue):
-    """Run an asynchronous dialogue with a server, in process."""
-
-    async def run():
-        async with Client(server) as client:
-            return await dialogue(client)
-
-    return asyncio.run(run())
-
-
-def ask(server, tool, **arguments):
-    """The answer of one tool, and the text that goes with it."""
-    reply = talk(server, lambda client: client.call_tool(tool, arguments))
-    return reply, " ".join(part.text for part in reply.content if part.type == "text")
 
 
 def place(thing):
@@ -243,44 +227,6 @@ def test_heat_is_drawn_for_what_a_question_asks_and_for_what_a_relation_finds(se
     assert 'Heat for "mug": present yes' in text
 
 
-HOSTILE = [
-    ("find", {"phrase": "mug", "scene": "../../etc/passwd"}, "no such name"),
-    ("find", {"phrase": "mug", "view": "../view"}, "view"),
-    ("find", {"phrase": "mug", "threshold": -1e308}, "0..1"),
-    ("find", {"phrase": ""}, "word or phrase"),
-    ("find", {"phrase": '"mug'}, "quotation"),
-    ("find", {"phrase": ["mug"]}, "string"),
-    ("find", {}, "phrase"),
-    ("what_is_at", {"view": "view_000", "x": 1e300, "y": -1e300}, "outside"),
-    ("what_is_at", {"view": "view_000", "x": float("nan"), "y": 0}, "number"),
-    ("nearest", {"target": "mug", "point": [1, 2]}, "three finite numbers"),
-    ("nearest", {"target": "mug", "point": [1e200, 0, 0]}, "three finite numbers"),
-    ("nearest", {"target": "mug", "point": [1e400, 0, 0]}, "number"),
-    ("measure", {"first": "unicorn", "second": "mug"}, "not here"),
-    ("relate", {"first": "mug", "relation": "eats", "second": "mug"}, "relation"),
-    ("render", {"phrases": ["a"] * 50}, "phrases"),
-    ("export", {"phrase": "mug", "file": "x.ply"}, "Unknown tool"),
-]
-
-
-@pytest.mark.parametrize(("tool", "arguments", "told"), HOSTILE)
-def test_hostile_arguments_are_answered_with_an_error_that_tells_what_was_expected(
-    server, tool, arguments, told
-):
-    reply, text = ask(server, tool, **arguments)
-    assert reply.is_error
-    assert told in text
-
-
-@pytest.mark.parametrize(
-    "phrase", ["x" * 100_000, "where is the " * 8000, "\x07\x1b[31m", "🍎", "красное яблоко"]
-)
-def test_any_text_is_a_phrase(server, phrase):
-    reply, _ = ask(server, "find", phrase=phrase)
-    assert not reply.is_error
-    assert len(reply.content[0].text) < 1000
-
-
 def test_resources_and_prompts_are_offered(server):
     async def dialogue(client):
         facts = await client.read_resource("lexsplat://scene/demo")
@@ -335,16 +281,11 @@ def test_ten_clients_at_once_get_the_answers_of_one(server):
 @pytest.mark.slow
 def test_over_http_clients_are_served_and_one_that_leaves_in_the_middle_disturbs_nobody(scenes):
     server = make_server(scenes)  # an HTTP application runs once
-    for url in _served(http_app(server, "127.0.0.1", None)):
+    for url in served(http_app(server, "127.0.0.1", None)):
         with socket.create_connection(("127.0.0.1", httpx2.URL(url).port)) as rude:
             rude.sendall(b"POST /mcp HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 500\r\n\r\n{")
         reply, _ = ask(url, "find", phrase="red apple")
         assert reply.structured_content["phrases"][0]["present"] == "yes"
-        for tool, arguments, told in HOSTILE:
-            reply, text = ask(url, tool, **arguments)
-            assert reply.is_error
-            assert told in text
-        assert not ask(url, "find", phrase="x" * 100_000)[0].is_error
         initialize = {"Accept": "application/json, text/event-stream", "Content-Type": "application/json"}
         for header in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
             assert httpx2.post(url, headers={**initialize, **header}, content="{}").status_code in (403, 421)
@@ -356,27 +297,10 @@ def test_elsewhere_a_token_is_needed(scenes):
     server = make_server(scenes)
     with pytest.raises(ValueError, match="token"):
         http_app(server, "0.0.0.0", None)
-    for url in _served(http_app(server, "0.0.0.0", TOKEN)):
+    for url in served(http_app(server, "0.0.0.0", TOKEN)):
         for given in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": TOKEN}):
             assert httpx2.post(url, headers=given, content="{}").status_code == 401
         assert httpx2.post(url, headers={"Authorization": f"Bearer {TOKEN}"}, content="{}").status_code != 401
-
-
-def _served(app):
-    """The address of an application that runs while the loop does."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    running = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_level="error"))
-    thread = threading.Thread(target=running.run, daemon=True)
-    thread.start()
-    while not running.started:
-        time.sleep(0.01)
-    try:
-        yield f"http://127.0.0.1:{port}/mcp"
-    finally:
-        running.should_exit = True
-        thread.join(10)
 
 
 @pytest.mark.slow
@@ -384,7 +308,8 @@ def test_over_standard_input_and_output_and_a_killed_server_is_noticed():
     command = [sys.executable, "-m", "lexsplat", "mcp", "demo"]
 
     async def run():
-        async with Client(StdioServerParameters(command=command[0], args=command[1:])) as client:
+        started = StdioServerParameters(command=command[0], args=command[1:], env=dict(os.environ))
+        async with Client(started) as client:
             reply = await client.call_tool("find", {"phrase": "where is the vase?"})
             assert reply.structured_content["phrases"][0]["present"] == "yes"
 

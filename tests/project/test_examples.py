@@ -82,13 +82,14 @@ def test_07_tells_which_scenes_hold_a_thing(run, tmp_path):
 
 def test_08_asks_from_a_shell():
     environment = {**os.environ, "LEXSPLAT": f"{sys.executable} -m lexsplat", "PYTHON": sys.executable}
-    arguments = ["sh", EXAMPLES / "08_shell.sh", "demo", "apple", "unicorn", "mug left of"]
+    arguments = ["sh", EXAMPLES / "08_shell.sh", "demo", "apple", "unicorn", "mug left of", 'a "mug"', "\\"]
     done = subprocess.run(arguments, capture_output=True, text=True, env=environment, timeout=300)
     rows = [line.split("\t") for line in done.stdout.splitlines()]
     assert done.returncode == 0, done.stderr
-    assert [row[0] for row in rows] == ["apple", "unicorn", "mug left of"]
+    assert [row[0] for row in rows] == arguments[3:]
     assert rows[0][1:3] == ["yes", "1"]
     assert rows[1][1:] == ["no", "0", "-"]
+    assert [row[1] for row in rows[2:4]] == ["error", "yes"]
 
 
 def test_09_asks_in_a_notebook(capsys, monkeypatch, tmp_path):

@@ -1,16 +1,22 @@
 """What a scene keeps on disk for its first questions, and kinds that are answered alike everywhere."""
 
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.world import World
+from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
+from lexsplat.scenes import kept_objects
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.folder import BUNDLED_SCENE
-from lexsplat.scenes.kept import keep
+from lexsplat.scenes.kept import keep, scene_key
 from lexsplat.scenes.scene import open_scene
 from lexsplat.scenes.serving import OpenScene, answer_line
 
@@ -102,6 +108,98 @@ def test_kept_objects_are_those_of_one_encoder_query_and_scene_or_none(copy, dem
     assert scene.kept is None, "another language"
     some = torch.arange(len(demo.gaussians)) % 2 == 0
     assert demo.with_content(demo.gaussians.select(some), demo.field.select(some)).kept is None
+
+
+def changed(tensor):
+    tensor.view(-1)[0] = not tensor.view(-1)[0] if tensor.dtype == torch.bool else tensor.view(-1)[0] + 1
+
+
+def test_the_key_of_a_scene_depends_on_everything_that_its_views_show(copy):
+    scene = open_scene(copy, device="cpu")
+    gaussians, segments = scene.gaussians, scene.field.segments
+    keys = [scene_key(scene)]
+    for tensor in (
+        *(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits),
+        *(segments.labels, segments.masses, segments.levels),
+    ):
+        changed(tensor)
+        keys.append(scene_key(scene))
+    gaussians.antialiased = not gaussians.antialiased
+    keys.append(scene_key(scene))
+    name, view = next(iter(scene.views.items()))
+    camera = view.camera
+    K, viewmat = camera.K.copy(), camera.viewmat.copy()
+    K[0, 0] += 1
+    viewmat[0, 3] += 1
+    for other in (
+        replace(view, split="test" if view.split == "train" else "train"),
+        replace(view, camera=replace(camera, width=camera.width + 1)),
+        replace(view, camera=replace(camera, height=camera.height + 1)),
+        replace(view, camera=replace(camera, K=K)),
+        replace(view, camera=replace(camera, viewmat=viewmat)),
+    ):
+        scene.views[name] = other
+        keys.append(scene_key(scene))
+    scene.views = {"another": scene.views.pop(name), **scene.views}
+    keys.append(scene_key(scene))
+    assert len(set(keys)) == len(keys) == 15
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda scene, _: changed(scene.field.codes),
+        lambda scene, _: changed(scene.field.weights),
+        lambda scene, _: changed(scene.field.codebook.clip),
+        lambda scene, _: changed(scene.field.segments.levels),
+        lambda scene, _: setattr(scene, "query", QueryConfig(templates=("a photo of {}",))),
+        lambda scene, _: setattr(scene, "_world", World(Up(np.array([0.0, 1.0, 0.0]), True))),
+        lambda scene, _: scene.folder.record["stages"]["features"].update(clip_hash="another"),
+        lambda _, patch: patch.setattr(kept_objects, "everyday_words", lambda: ["one", "two"]),
+        lambda _, patch: patch.setattr(kept_objects, "default_vocabulary", lambda clip: ["one"]),
+        lambda _, patch: patch.setattr(kept_objects, "STUFF", {"one"}),
+        lambda _, patch: patch.setattr(kept_objects, "_VERSION", -1),
+    ],
+    ids=[
+        "codes",
+        "weights",
+        "codebook",
+        "levels",
+        "query",
+        "up",
+        "encoder",
+        "words",
+        "names",
+        "stuff",
+        "version",
+    ],
+)
+def test_kept_objects_depend_on_everything_that_they_come_from(copy, monkeypatch, change):
+    assert open_scene(copy, device="cpu").kept is not None
+    scene = open_scene(copy, device="cpu")
+    change(scene, monkeypatch)
+    assert scene.kept is None
+
+
+def test_a_kept_answer_depends_on_what_was_understood_and_the_view_and_the_threshold(demo):
+    phrases = {
+        "as it is": Understood(Thing("mug")),
+        "exact": Understood(Thing("mug", exact=True)),
+        "not understood": Understood(Thing("mug"), unknown=True),
+    }
+    scene = demo.with_content(demo.gaussians, demo.field)
+    for text, understood in phrases.items():
+        scene._understood.put(text, understood)
+    for text in (*phrases, *reversed(phrases)):
+        assert scene.find(text).present == ("unsure" if text == "not understood" else "yes"), text
+    one, other = (
+        scene.find("mug left of the apple", "view_000"),
+        scene.find("mug left of the apple", "view_036"),
+    )
+    assert one is not other
+    assert scene.find("mug left of the apple", "view_000.jpg") is one
+    assert scene.find("mug", threshold=0.75).threshold == 0.75
+    assert scene.find("mug").threshold == 0.5
 
 
 @pytest.mark.slow

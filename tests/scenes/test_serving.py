@@ -1,5 +1,6 @@
 """A scene that many questions are asked of: by lines, by threads, and while its folder changes."""
 
+import io
 import json
 import shutil
 import threading
@@ -14,7 +15,7 @@ from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import answer_queries
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
-from lexsplat.scenes.serving import OpenScene, answer_line
+from lexsplat.scenes.serving import MAX_LINE, OpenScene, answer_line, json_line, lines_of
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "ask.json").read_text())
 
@@ -45,7 +46,10 @@ def test_what_was_used_least_recently_is_forgotten():
         ("🍎", ""),
         ("{", "one JSON object"),
         ("[" * 100_000, "one JSON object"),
-        ('{"ask": 5}', "an object with"),
+        ('\ufeff{"ask": "red apple"}', ""),
+        ('{"ask": 5}', "ask: expected text, found 5"),
+        ("{}", "ask: expected text, found nothing"),
+        ('["mug"]', "one JSON object"),
         ('{"ask": "mug", "vew": "view_033"}', "vew"),
         ('{"ask": "mug", "view": "nope"}', "view"),
         ('{"ask": "mug", "view": 5}', "view"),
@@ -85,7 +89,33 @@ def test_a_threshold_that_is_no_number_in_its_range_is_refused_by_the_scene(demo
 def test_an_answer_has_the_id_of_its_question_also_if_it_is_an_error(demo):
     assert answer_line(demo, '{"ask": "mug", "id": [1, "a"]}')["id"] == [1, "a"]
     assert answer_line(demo, '{"ask": "mug", "view": "nope", "id": 3}')["id"] == 3
+    for wrong in ('{"ask": 5, "id": 3}', '{"ask": "mug", "vew": "", "id": 3}', '{"id": 3}'):
+        assert (answer_line(demo, wrong)["id"], "error" in answer_line(demo, wrong)) == (3, True)
     assert "id" not in answer_line(demo, "mug")
+
+
+def test_a_line_beyond_the_limit_is_never_held_as_a_whole():
+    class Counting(io.StringIO):
+        longest = 0
+
+        def readline(self, size=-1):
+            line = super().readline(size)
+            self.longest = max(self.longest, len(line))
+            return line
+
+    for end in ("\n", ""):
+        stream = Counting(f"mug\n\n{'x' * (5 * MAX_LINE)}\nduck{end}")
+        lines = list(lines_of(stream))
+        assert [line[:5] for line in lines] == ["mug\n", "\n", "xxxxx", f"duck{end}"]
+        assert len(lines[2]) > MAX_LINE, "answer_line refuses it"
+        assert stream.longest <= MAX_LINE + 1
+
+
+def test_an_answer_is_one_line_for_readers_that_split_at_unicode_separators(demo):
+    for text in ("mug\u2028lamp", "mug\u2029lamp", "mug\x85lamp"):
+        line = json_line(answer_line(demo, text))
+        assert len(line.splitlines()) == 1
+        assert json.loads(line)["phrase"] == text
 
 
 def test_a_no_has_no_instances_and_says_so(demo):

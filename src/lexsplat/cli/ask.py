@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from typing import Annotated, ClassVar
 
@@ -46,7 +45,7 @@ class Ask:
     def run(self) -> None:
         """Answer."""
         from lexsplat.scenes.answers import find_phrase
-        from lexsplat.scenes.serving import OpenScene, answer_line, sentence
+        from lexsplat.scenes.serving import OpenScene, answer_line, json_line, lines_of, sentence
 
         note_hidden("demo", self.scene)
         # Where a terminal has other letters, "\\u1f34e" stands for an apple; lone surrogates stay valid JSON.
@@ -60,6 +59,6 @@ class Ask:
         print(f"{self.scene}: ready, one question a line", file=sys.stderr, flush=True)
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
         sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # type: ignore[union-attr]
-        for line in sys.stdin:
+        for line in lines_of(sys.stdin):
             if line.strip():
-                print(json.dumps(answer_line(served, line), ensure_ascii=False), flush=True)
+                print(json_line(answer_line(served, line)), flush=True)

@@ -12,17 +12,24 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 from mcp.server import MCPServer
-from mcp.server.mcpserver.exceptions import ResourceError
+from mcp.server.mcpserver.exceptions import ToolError, UnexpectedToolError
+from mcp.server.stdio import stdio_server
 from mcp.server.transport_security import TransportSecuritySettings
-from mcp_types import CallToolResult, ImageContent, TextContent, ToolAnnotations
+from mcp.shared.exceptions import MCPError
+from mcp_types import INVALID_PARAMS, CallToolResult, ImageContent, TextContent, Tool, ToolAnnotations
+from pydantic import ValidationError
 
 from lexsplat import __version__
+from lexsplat.mcp.arguments import check_names, wrong_value
 from lexsplat.mcp.library import LibraryTools
+from lexsplat.mcp.lines import messages
 from lexsplat.mcp.tools import Reply, Tools
 from lexsplat.mcp.writing import WritingTools
-from lexsplat.runtime.errors import LexsplatError
+from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, error_document
+
+log = logging.getLogger("lexsplat")
 
 MAX_BODY = 1 << 20
 """Size limit of an HTTP request in bytes."""
@@ -45,9 +52,7 @@ def make_server(
         output: Where the tools that write put their files; None offers none of these tools.
         library: A library that is searched, and whose scenes are served as well.
     """
-    server: MCPServer = MCPServer(
-        "lexsplat", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING"
-    )
+    server = _Server("lexsplat", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING")
     logging.getLogger("mcp").setLevel(logging.ERROR)
     tools = Tools(scenes) if library is None else LibraryTools(scenes, library)
     reading = ToolAnnotations(read_only_hint=True, open_world_hint=False)
@@ -55,13 +60,73 @@ def make_server(
         server.add_tool(_tool(getattr(tools, name)), name=name, annotations=reading)
     if output is not None:
         writing = WritingTools(scenes, output, library)
-        for name in set(_public(WritingTools)) - set(_public(Tools)):
+        for name in sorted(set(_public(WritingTools)) - set(_public(Tools))):
             server.add_tool(
                 _tool(getattr(writing, name)), name=name, annotations=ToolAnnotations(read_only_hint=False)
             )
     _add_resources(server, tools)
     _add_prompts(server)
     return server
+
+
+class _Server(MCPServer):
+    """A server that refuses every wrong call with one line and the keys of our other errors."""
+
+    async def run_stdio_async(self) -> None:
+        server = self._lowlevel_server  # as in the base class, but for `messages`
+        async with stdio_server() as (received, sent):
+            lines: Any = messages(received, sent)
+            await server.run(lines, sent, server.create_initialization_options())
+
+    async def list_tools(self) -> list[Tool]:
+        tools = await super().list_tools()
+        for tool in tools:
+            tool.input_schema["additionalProperties"] = False
+        return tools
+
+    async def call_tool(self, name: str, arguments: dict[str, Any], context: Any = None) -> Any:
+        schemas = {tool.name: tool.input_schema for tool in await self.list_tools()}
+        try:
+            check_names("tool", name, arguments, schemas)
+            return await super().call_tool(name, arguments, context)
+        except QueryError as error:
+            return _refusal(error)
+        except UnexpectedToolError as error:  # the next call is answered, whatever this one meets
+            log.exception("a call was not answered")
+            remedy = "please report it with the arguments"
+            found = repr(error.__cause__)[:80]
+            return _refusal(QueryError(name, expected="an answer", found=found, remedy=remedy))
+        except ToolError as error:
+            if not isinstance(error.__cause__, ValidationError):
+                raise
+            return _refusal(wrong_value(error.__cause__, schemas[name]))
+
+    async def get_prompt(
+        self, name: str, arguments: dict[str, Any] | None = None, context: Any = None
+    ) -> Any:
+        schemas = {}
+        for prompt in await self.list_prompts():
+            taken = prompt.arguments or []
+            schemas[prompt.name] = {
+                "properties": {each.name: {"type": "string"} for each in taken},
+                "required": [each.name for each in taken if each.required],
+            }
+        try:
+            check_names("prompt", name, arguments or {}, schemas)
+        except QueryError as error:
+            raise _protocol_error(error) from error
+        return await super().get_prompt(name, arguments, context)
+
+
+def _refusal(error: LexsplatError) -> CallToolResult:
+    return CallToolResult(
+        content=[TextContent(text=str(error))], structured_content=error_document(error), is_error=True
+    )
+
+
+def _protocol_error(error: LexsplatError) -> MCPError:
+    """An error where the protocol has no place for an answer."""
+    return MCPError(INVALID_PARAMS, str(error), error_document(error))
 
 
 def serve_http(server: MCPServer, host: str, port: int, token: str | None) -> None:
@@ -123,11 +188,7 @@ def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
         try:
             reply = function(**arguments)
         except LexsplatError as error:
-            return CallToolResult(
-                content=[TextContent(text=str(error))],
-                structured_content=error_document(error),
-                is_error=True,
-            )
+            return _refusal(error)
         content: list[Any] = [TextContent(text=reply.sentence)]
         if reply.image is not None:
             import base64
@@ -157,7 +218,7 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
         try:
             return json.dumps(tools.describe_scene(name).document)
         except LexsplatError as error:
-            raise ResourceError(str(error)) from error
+            raise _protocol_error(error) from error
 
     @server.resource("lexsplat://scene/{name}/view/{view}", mime_type="image/png")
     def view(name: str, view: str) -> bytes:
@@ -165,7 +226,7 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
         try:
             return tools.render(view, scene=name).image or b""
         except LexsplatError as error:
-            raise ResourceError(str(error)) from error
+            raise _protocol_error(error) from error
 
 
 def _add_prompts(server: MCPServer) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from lexsplat.mcp import answers
+from lexsplat.mcp.arguments import NOT_BLANK, nearest
 from lexsplat.mcp.pictures import picture
 from lexsplat.queries.phrases import Related, RelationName, Understood
 from lexsplat.queries.relations import distance, same
@@ -22,12 +23,16 @@ from lexsplat.scenes.finding import find_in
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.serving import OpenScene, qualified, sentence, shortened
+from lexsplat.scenes.serving import MAX_LINE, OpenScene, qualified, sentence, shortened
 
 SceneName = Annotated[str, Field(description="Name from list_scenes; may be left out if there is one scene.")]
 PhraseText = Annotated[
     str,
-    Field(description='Free text, such as "red apple", "what is on the table?" or "mug left of the lamp".'),
+    Field(
+        description='Free text, such as "red apple", "what is on the table?" or "mug left of the lamp".',
+        pattern=NOT_BLANK,
+        max_length=MAX_LINE,
+    ),
 ]
 ViewName = Annotated[
     str, Field(description="Name of a view (a photo): what left, right and me refer to; may be empty.")
@@ -121,7 +126,7 @@ class Tools:
     def relate(
         self,
         first: PhraseText,
-        relation: RelationName,
+        relation: Annotated[RelationName, Field(description="How the first stands to the second.")],
         second: PhraseText,
         scene: SceneName = "",
         view: ViewName = "",
@@ -143,12 +148,19 @@ class Tools:
         self,
         target: PhraseText,
         to: Annotated[
-            str, Field(description="What the target is nearest to, in words; empty if a point is given.")
+            str,
+            Field(
+                description="What the target is nearest to, in words; left out if a point is given.",
+                max_length=MAX_LINE,
+            ),
         ] = "",
-        point: Annotated[list[float], Field(description="Or a point x, y, z in scene units.")] = [],  # noqa: B006
+        point: Annotated[
+            list[float], Field(description="A point x, y, z in scene units in place of words.")
+        ] = [],  # noqa: B006
         scene: SceneName = "",
     ) -> Annotated[Reply, answers.NearestAnswer]:
         """Find which of several things is nearest to another thing or to a point, and how far away it is."""
+        _one_of({"to": to.strip(), "point": point})
         place = self._scene(scene)
         things, asked = _found(place, target)
         understood = shortened(asked["understood"])
@@ -168,7 +180,12 @@ class Tools:
                 if not any(same(one, other) for other in others)
             ]
         if not gaps:
-            raise QueryError(target, expected="something else than what it is nearest to", found="nothing")
+            raise QueryError(
+                target[:60],
+                expected=f"more than what is near: something beside {where}",
+                found=f"{understood} alone",
+                remedy='name another target, such as "thing" for any object',
+            )
         gap, best = min(gaps, key=lambda entry: entry[0])
         document = {
             **place.world.to_json(),
@@ -239,17 +256,25 @@ class Tools:
     def render(
         self,
         view: ViewName = "",
-        look_at: Annotated[str, Field(description="Or a phrase: the view that shows it best.")] = "",
+        look_at: Annotated[
+            str,
+            Field(
+                description="A phrase in place of a view: the view that shows it best.", max_length=MAX_LINE
+            ),
+        ] = "",
         phrases: Annotated[
-            list[str], Field(description="Up to 4 phrases whose relevancy is drawn as heat.", max_length=4)
+            list[PhraseText],
+            Field(description="Up to 4 phrases whose relevancy is drawn as heat.", max_length=4),
         ] = [],  # noqa: B006
         scene: SceneName = "",
     ) -> Annotated[Reply, answers.RenderAnswer]:
         """Show a picture of a place: a view, or the view that shows a thing best; with a heatmap for each phrase."""
+        if view or look_at:
+            _one_of({"view": view, "look_at": look_at})
         place = self._scene(scene)
         name = place.view(view).name if view else ""
         looked_at = None
-        if look_at and not name:
+        if look_at:
             (best, *_), looked_at = _found(place, look_at)
             name = best.best_view
         name = name or next(iter(place.views))
@@ -270,9 +295,27 @@ class Tools:
         if name not in self.scenes and self.library is not None and name in self.library.names():
             return self.library.scene(name)
         if name not in self.scenes:
-            known = ", ".join([*self.scenes, *(self.library.names() if self.library else [])])[:200]
-            raise QueryError(f"scene {name[:60]!r}", expected=f"one of {known}", found="no such name")
+            known = [*self.scenes, *(self.library.names() if self.library else [])]
+            raise QueryError(
+                f"scene {name[:60]!r}",
+                expected=f"one of {', '.join(known)[:200]}",
+                found="no such name",
+                remedy=nearest(name, known, "list_scenes has the names"),
+            )
         return self.scenes[name].scene
+
+
+def _one_of(arguments: dict[str, Any]) -> None:
+    """Refuse two arguments of which each takes the place of the other, and none of them."""
+    given = [name for name, value in arguments.items() if value]
+    if len(given) != 1:
+        first, second = arguments
+        raise QueryError(
+            f"{first} and {second}",
+            expected="one of the two",
+            found="both" if given else "neither",
+            remedy=f"give {first} or {second}" if not given else f"leave out {first} or {second}",
+        )
 
 
 def _facts(scene: Scene) -> dict[str, Any]:

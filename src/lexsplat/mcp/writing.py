@@ -37,7 +37,7 @@ class WritingTools(Tools):
         self, phrase: PhraseText, file: FileName, scene: SceneName = ""
     ) -> Annotated[Reply, answers.ExportAnswer]:
         """Write the Gaussians of a thing to a new file for other programs; the ending selects the format."""
-        place, path = self._scene(scene), self._new(file)
+        place, path = self._scene(scene), self._new("file", file)
         ending_of(path)
         found, asked = asked_of(place, phrase)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,11 +54,14 @@ class WritingTools(Tools):
         color: Annotated[list[float], Field(description="Red, green, blue in 0..1, for recolor.")] = [],  # noqa: B006
         scene: SceneName = "",
         confirm: Annotated[
-            bool, Field(description='True edits also where the scene is "unsure" that it is the thing.')
+            bool,
+            Field(
+                description='False, the default, refuses what the scene is "unsure" of; true edits that as well.'
+            ),
         ] = False,
     ) -> Annotated[Reply, answers.EditAnswer]:
-        """Make a new scene without a thing, with a thing alone, or with a thing in another color; the scene stays."""
-        place, path = self._scene(scene), self._new(folder)
+        """Make a new scene without a thing, with it alone or in another color; "unsure" needs confirm=true."""
+        place, path = self._scene(scene), self._new("folder", folder)
         if action == "recolor" and not (len(color) == 3 and all(0 <= value <= 1 for value in color)):
             raise QueryError(
                 "color",
@@ -71,7 +74,7 @@ class WritingTools(Tools):
             raise QueryError(
                 phrase[:60],
                 expected="something that the scene holds for certain",
-                found=sentence({**found.to_dict(), **asked}, place.world.meters_per_unit),
+                found=sentence({**found.to_dict(), **asked}, place.world.meters_per_unit).rstrip("."),
                 remedy="look at it with render, then edit with confirm=true, or name it in other words",
             )
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,7 +89,7 @@ class WritingTools(Tools):
         said = f"{action} {what}: {len(found)} Gaussians; the result is the scene {saved.root}."
         return Reply(said + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
-    def _new(self, name: str) -> Path:
+    def _new(self, argument: str, name: str) -> Path:
         path = self.output / name
         if (
             not name
@@ -95,7 +98,9 @@ class WritingTools(Tools):
             or not name.isprintable()
             or len(name) > 100
         ):
-            raise QueryError("file", expected="a plain name without a folder", found=repr(name)[:60])
+            raise QueryError(
+                argument, expected="a plain name of at most 100 characters", found=repr(name[:60])
+            )
         if path.exists() or path.is_symlink():
             raise SceneFolderError(
                 path, expected="a new name", found="a file that exists", remedy="give another name"

@@ -102,10 +102,10 @@ def scene_key(scene: Scene) -> str:
 
 
 def _parts(scene: Scene) -> Iterator[bytes]:
-    yield f"{_VERSION}".encode()
+    yield f"{_VERSION} {scene.gaussians.antialiased}".encode()
     gaussians, segments = scene.gaussians, scene.field.segments
     tensors = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits]
-    for tensor in [*tensors, *([segments.labels, segments.masses] if segments else [])]:
+    for tensor in [*tensors, *([segments.labels, segments.masses, segments.levels] if segments else [])]:
         yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
     for name, view in scene.views.items():
         yield f"{name}\0{view.split}\0{view.camera.width}x{view.camera.height}".encode()

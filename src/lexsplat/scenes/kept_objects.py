@@ -23,7 +23,7 @@ from lexsplat.language.fields import CodeField
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.presence import DescribedPlaces
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.vocabulary import default_vocabulary
+from lexsplat.queries.vocabulary import STUFF, default_vocabulary
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
@@ -134,6 +134,7 @@ def _parts(scene: Scene, field: CodeField) -> Iterator[bytes]:
     words = (
         everyday_words(),
         default_vocabulary(scene.clip),
+        sorted(STUFF),
         encoder.get("encoder_hash", encoder["encoder"]),
     )
     yield repr((words, scene.query, scene.world.up.direction.tolist())).encode()

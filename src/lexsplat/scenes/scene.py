@@ -297,8 +297,8 @@ class Scene:
         camera = None if view is None else self.camera(view)
         if isinstance(view, Camera):
             return find_in(self, understood, camera, threshold)
-        name = view.name if isinstance(view, StoredView) else view
-        key = (str(understood.phrase), understood.unknown, name, threshold)
+        name = None if view is None else (view if isinstance(view, StoredView) else self.view(view)).name
+        key = (repr(understood.phrase), understood.unknown, name, threshold)
         return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
     def understand(self, phrase: str) -> Understood:
@@ -418,7 +418,7 @@ class Scene:
         if len(matches) != 1:
             known = ", ".join(list(self.views)[:5])
             raise QueryError(
-                f"view {name!r}",
+                f"view {name[:60]!r}",
                 expected="the name of a view",
                 found="no match" if not matches else f"{len(matches)} matches",
                 remedy=f"the scene has {len(self.views)} views, such as {known}",

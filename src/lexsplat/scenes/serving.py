@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import re
+import reprlib
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
@@ -134,52 +136,80 @@ def shortened(text: str, length: int = 200) -> str:
     return text if len(text) <= length else f"{text[:length]}..."
 
 
+def lines_of(stream: TextIO) -> Iterator[str]:
+    """The lines of a stream; of one that is longer than `MAX_LINE`, its beginning, so that memory is bounded."""
+    while line := stream.readline(MAX_LINE + 1):
+        yield line
+        while line and not line.endswith("\n"):
+            line = stream.readline(MAX_LINE)
+
+
+def json_line(document: Mapping[str, Any]) -> str:
+    """JSON in one line for every reader: some take U+0085, U+2028 and U+2029 for ends of lines."""
+    text = json.dumps(document, ensure_ascii=False)
+    return re.sub("[\x85\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
 def answer_line(served: OpenScene, line: str) -> dict[str, Any]:
     """The answer to a line of ``lexsplat ask --stdin`` (docs/schemas/ask.json).
 
     A line is a phrase, or a JSON object with "ask" and optionally "view", "threshold" and "id". Errors are answers
     as well: one line with "error". No line raises.
     """
-    request: dict[str, Any] = {}
+    identity: dict[str, Any] = {}
     try:
-        if len(line) > MAX_LINE:
-            raise QueryError("line", expected=f"at most {MAX_LINE} characters", found=str(len(line)))
-        request = _request(line)
+        request = _parsed(line)
+        if "id" in request:
+            identity = {"id": _checked_id(request["id"])}
+        _check(request)
         scene = served.scene
         answer = find_phrase(scene, request["ask"], request.get("view"), request.get("threshold"))
-        return {**_id(request), **answer, "sentence": sentence(answer, scene.world.meters_per_unit)}
+        return {**identity, **answer, "sentence": sentence(answer, scene.world.meters_per_unit)}
     except LexsplatError as error:
-        return {**_id(request), **error_document(error)}
+        return {**identity, **error_document(error)}
     except Exception as error:  # the next line is answered, whatever this one meets
         log.exception("a line was not answered")
         unforeseen = QueryError(
             "line", expected="an answer", found=repr(error)[:80], remedy="please report it with the line"
         )
-        return {**_id(request), **error_document(unforeseen)}
+        return {**identity, **error_document(unforeseen)}
 
 
-def _id(request: Mapping[str, Any]) -> dict[str, Any]:
-    return {"id": request["id"]} if "id" in request else {}
+_KEYS = ("ask", "view", "threshold", "id")
+_REMEDY = '{"ask": "red apple", "view": "view_033", "threshold": 0.5, "id": 1}; all but "ask" may be left out'
 
 
-def _request(line: str) -> dict[str, Any]:
-    text = line.strip()
+def _parsed(line: str) -> dict[str, Any]:
+    """The object of a line; a phrase alone is asked."""
+    if len(line) > MAX_LINE:
+        raise QueryError("line", expected=f"at most {MAX_LINE} characters", found="more")
+    text = line.strip().removeprefix("\ufeff").strip()
     if not text.startswith(("{", "[")):
-        return {"ask": text.removeprefix("\ufeff")}
-    remedy = (
-        '{"ask": "red apple", "view": "view_033", "threshold": 0.5, "id": 1}; all but "ask" may be left out'
-    )
+        return {"ask": text}
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise QueryError("line", expected="one JSON object", found=str(error)[:80], remedy=remedy) from error
-    if not isinstance(found, dict) or not isinstance(found.get("ask"), str):
-        raise QueryError("line", expected='an object with "ask"', found=text[:60], remedy=remedy)
-    unknown = set(found) - {"ask", "view", "threshold", "id"}
-    if unknown:
-        raise QueryError("line", expected="known keys", found=", ".join(sorted(unknown))[:60], remedy=remedy)
-    try:
-        json.dumps(found.get("id"), allow_nan=False)
-    except (ValueError, RecursionError) as error:
-        raise QueryError("id", expected="a value of JSON", found=str(error)[:80], remedy=remedy) from error
+        raise QueryError("line", expected="one JSON object", found=str(error)[:80], remedy=_REMEDY) from error
+    if not isinstance(found, dict):
+        raise QueryError("line", expected="one JSON object", found=text[:60], remedy=_REMEDY)
     return found
+
+
+def _checked_id(value: Any) -> Any:
+    try:
+        json.dumps(value, allow_nan=False)
+    except (ValueError, RecursionError) as error:
+        raise QueryError("id", expected="a value of JSON", found=str(error)[:80], remedy=_REMEDY) from error
+    return value
+
+
+def _check(request: Mapping[str, Any]) -> None:
+    unknown = sorted(set(request) - set(_KEYS))
+    if unknown:
+        listed = ", ".join(repr(key[:60]) for key in unknown)[:120]
+        raise QueryError("line", expected=f"the keys {', '.join(_KEYS)}", found=listed, remedy=_REMEDY)
+    for key, needed in (("ask", True), ("view", False)):
+        value = request.get(key)
+        if not isinstance(value, str) and (needed or value is not None):
+            found = reprlib.repr(value) if key in request else "nothing"
+            raise QueryError(key, expected="text", found=found, remedy=_REMEDY)
