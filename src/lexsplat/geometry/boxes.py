@@ -141,17 +141,18 @@ def _turn(angle: float) -> NDArray[np.float64]:
 def _ends(values: NDArray, weights: NDArray, trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted quantiles ``trim`` and ``1 - trim`` of every column ``[M, C]``."""
     count, columns = values.shape
-    rows = np.concatenate([values.T, -values.T])
+    rows = np.ascontiguousarray(values.T)
     limit, kept = trim * float(weights.sum()), min(count, 16 + int(6 * trim * count))
     while True:  # only the tails are sorted; light tails have more points
-        tails = np.argpartition(rows, kept - 1, axis=1)[:, :kept]
-        order = np.argsort(np.take_along_axis(rows, tails, 1), axis=1)
-        tails = np.take_along_axis(tails, order, 1)
-        beyond = np.cumsum(weights[tails], axis=1)
+        parted = np.argpartition(rows, sorted({kept - 1, count - kept}), axis=1)  # both tails of a row
+        tails = np.concatenate([parted[:, :kept], parted[:, count - kept :]])
+        found = np.take_along_axis(np.concatenate([rows, -rows]), tails, 1)
+        order = np.argsort(found, axis=1)
+        beyond = np.cumsum(weights[np.take_along_axis(tails, order, 1)], axis=1)
         if kept == count or beyond[:, -1].min() > limit:
             break
         kept = min(count, 4 * kept)
     places = np.concatenate([(beyond[:columns] < limit).sum(1), (beyond[columns:] <= limit).sum(1)])
-    every = np.arange(len(rows))
-    ends = rows[every, tails[every, places.clip(0, kept - 1)]]
+    every = np.arange(len(found))
+    ends = found[every, order[every, places.clip(0, kept - 1)]]
     return ends[:columns], -ends[columns:]
