@@ -77,8 +77,8 @@ class Mcp:
         alone = [path for path in self.scenes if path not in libraries]
         scenes = open_scenes(alone, self.device, self.clip)
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
-        for served in scenes.values():  # meanwhile the client connects
-            threading.Thread(target=served.warm, daemon=True).start()
+        for served in scenes.values():  # meanwhile the client connects; the process ends after them
+            threading.Thread(target=served.warm).start()
         if self.http:
             serve_http(server, self.host, self.port, self.token)
         else:

@@ -26,6 +26,7 @@ from lexsplat.mcp.lines import messages
 from lexsplat.mcp.tools import Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError, QueryError
+from lexsplat.runtime.listening import listen
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, error_document
 
@@ -133,10 +134,15 @@ def serve_http(server: MCPServer, host: str, port: int, token: str | None) -> No
     """Serve over Streamable HTTP at ``/mcp`` until Ctrl-C.
 
     Host and Origin must be this machine's. Bound elsewhere, each request needs the token.
+
+    Raises:
+        BackendError: If the address is not of this machine, or the port is taken.
     """
     import uvicorn
 
-    uvicorn.run(http_app(server, host, token), host=host, port=port, log_level="warning")
+    with listen(host, port) as listening:
+        settings = uvicorn.Config(http_app(server, host, token), host=host, port=port, log_level="warning")
+        uvicorn.Server(settings).run([listening])
 
 
 def http_app(server: MCPServer, host: str, token: str | None) -> Callable[..., Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import secrets
 import socket
 import threading
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 
 import uvicorn
 
-from lexsplat.runtime.errors import BackendError
+from lexsplat.runtime.listening import listen
 from lexsplat.scenes.scene import Scene
 from lexsplat.viewer.app import make_app
 from lexsplat.viewer.guard import Guard
@@ -62,7 +61,7 @@ class ViewerServer:
 
     def __init__(self, scene: Scene, config: ViewerConfig | None = None) -> None:
         self.config = config or ViewerConfig()
-        self.socket = _listen(self.config.host, self.config.port)
+        self.socket = listen(self.config.host, self.config.port, _PORTS)
         try:
             folder = scene.folder.root if scene.folder and not scene.folder.is_bundled else None
             self.session = Session(scene, self.config.splats, History.load(folder, scene.clip))
@@ -101,36 +100,6 @@ class ViewerServer:
         self._thread.join(timeout=10)
         self._warming.join(timeout=10)
         self.socket.close()
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """A socket that listens on the port, or on one of the next ones if it is taken."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        for number in range(port, min(port + _PORTS, 65536)) if port else [0]:
-            listening = socket.socket(family, kind, protocol)
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listening.bind((address[0], number, *address[2:]))
-                listening.listen()
-                return listening
-            except OSError as error:
-                listening.close()
-                if error.errno != errno.EADDRINUSE:
-                    raise
-    except (OSError, UnicodeError) as error:
-        raise BackendError(
-            f"--host {host}", expected="an address of this machine", found=str(error),
-            remedy="use 127.0.0.1, or 0.0.0.0 for all networks of this machine",
-        ) from error  # fmt: skip
-    raise BackendError(
-        f"--port {port}",
-        expected="a free port",
-        found=f"{port} and the next ones are taken",
-        remedy="--port 0 takes any",
-    )
 
 
 def _is_loopback(listening: socket.socket) -> bool:

@@ -1,0 +1,35 @@
+"""The command ``lexsplat mcp`` as clients start and leave it."""
+
+import socket
+import subprocess
+import sys
+
+import pytest
+
+
+def run(*arguments):
+    command = [sys.executable, "-m", "lexsplat", "mcp", "demo", *arguments]
+    return subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.slow
+def test_a_client_that_leaves_at_once_leaves_a_server_that_ends_in_order():
+    for _ in range(2):  # the warm-up may be anywhere
+        left = run()
+        assert (left.returncode, left.stderr) == (0, "")
+
+
+@pytest.mark.slow
+def test_a_taken_port_and_a_foreign_address_end_in_one_line():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        refused = run("--http", "--port", str(port))
+    assert refused.returncode == 1
+    assert len(refused.stderr.splitlines()) == 1
+    assert f"{port} is taken" in refused.stderr
+    foreign = run("--http", "--host", "host.invalid", "--token", "0123456789abcdef")
+    assert foreign.returncode == 1
+    assert len(foreign.stderr.splitlines()) == 1
+    assert "host.invalid" in foreign.stderr
