@@ -11,7 +11,7 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.phrases import (
-    ORDERED,
+    TO_VIEWER,
     Anything,
     AtLeast,
     Between,
@@ -48,8 +48,6 @@ from lexsplat.runtime.errors import QueryError
 
 _LARGE = 0.05
 """A selection of this share of a scene may be several objects; smaller ones are taken as they are."""
-_TO_VIEWER = ("left of", "right of", "in front of", "behind", "next to", *ORDERED)
-"""Relations that a thing can have to a viewer."""
 _HELD_BY: tuple[RelationName, ...] = ("on", "inside")
 """Relations of a thing to the thing that holds it."""
 _WHOLE = 0.5
@@ -146,7 +144,7 @@ def _related(phrase: Related, searched: Searched) -> Selection:
         targets = _joined(targets, tuple(searched.objects()), present="yes")
     if isinstance(phrase.reference, Viewer):
         camera = searched.viewer(None)
-        if camera is None or phrase.relation not in _TO_VIEWER:
+        if camera is None or phrase.relation not in TO_VIEWER:
             raise QueryError(
                 str(phrase),
                 expected="a place as seen by a viewer, in a scene with views",
@@ -233,6 +231,8 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
         "smallest": lambda each: -each.box.volume,
         "tallest": lambda each: each.box.half_sizes[2],
         "shortest": lambda each: -each.box.half_sizes[2],
+        "widest": lambda each: max(each.box.half_sizes[:2]),
+        "longest": lambda each: max(each.box.half_sizes),
         "leftmost": lambda each: -float(each.center @ right),
         "rightmost": lambda each: float(each.center @ right),
     }[phrase.which]
@@ -242,7 +242,9 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
     found = answer(phrase.target, searched)
-    return found if found.count >= phrase.count else _joined(found, ())
+    if phrase.count <= found.count <= (found.count if phrase.most is None else phrase.most):
+        return found
+    return replace(_joined(found, ()), note=f"{found.count} found of {phrase.target}")
 
 
 def _every(phrase: Every, searched: Searched) -> Selection:

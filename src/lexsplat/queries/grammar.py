@@ -28,14 +28,16 @@ What does not fit is one thing, asked for in its own words, and `Understood.note
 from __future__ import annotations
 
 import re
+import string
 from dataclasses import replace
 from typing import Any
 
 from lexsplat.queries import patterns
 from lexsplat.queries.colors import COLOR_WORDS
 from lexsplat.queries.kinds import is_kind
-from lexsplat.queries.leftovers import NUMBERS, ORDINALS
+from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
 from lexsplat.queries.phrases import (
+    ORDERED,
     Anything,
     AtLeast,
     Between,
@@ -54,16 +56,20 @@ from lexsplat.queries.phrases import (
     Together,
     Understood,
     Viewer,
+    has_stray_viewer,
     mended_note,
     numbered,
     parts_of,
+    placed,
     things_of,
     with_things,
+    without,
 )
 from lexsplat.queries.questions import (
     as_phrase,
     asks_for_all,
     asks_yes_or_no,
+    command_note,
     in_full,
     not_in_answer,
     not_understood,
@@ -80,6 +86,10 @@ MAX_LENGTH = 600
 """Characters from which a text is one thing: no phrase of that length has grammar."""
 
 
+class _IncompleteError(Exception):
+    """A phrase lacks a part; the text of the error is the word that asks for it."""
+
+
 def parse(text: str) -> Phrase:
     """The parsed phrase; see `understand`."""
     return understand(text).phrase
@@ -89,7 +99,7 @@ def understand(text: str) -> Understood:
     """A phrase or question, parsed.
 
     Raises:
-        QueryError: If a part is empty, a quotation mark is missing, or there are too many parts.
+        QueryError: If it is empty, a quotation mark is missing, or there are too many parts.
     """
     if len(text) > MAX_LENGTH:
         return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", unknown=True)
@@ -99,21 +109,44 @@ def understand(text: str) -> Understood:
     quoted: list[str] = re.findall(r'"([^"]*)"', text)
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text.replace("\x00", ""))
-    plain = " ".join(hidden.split()).rstrip("?.!").strip()
+    plain = " ".join(hidden.split()).rstrip("?.!").strip() or text.strip()
+    if not plain:
+        raise QueryError("phrase", expected="words", found="nothing", remedy='such as "red mug"')
     mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
     asked = in_full(mended_text)
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
-    parsed, aside = parser.question(asked), not_in_answer(asked)
-    note = "; ".join(filter(None, (mended_note(mended), *dict.fromkeys(parser.notes), aside)))
-    unknown = aside.startswith('"') or (bool(parser.notes) and parser.stated)  # is the mug big?
-    left = next(
-        filter(None, (not_understood(patterns.HIDDEN.sub("thing", each)) for each in things_of(parsed))), ""
-    )
-    if left or parsed is None:
-        quote = f' ("{left}")' if left and re.search(rf"\b{re.escape(left)}\b", plain, re.IGNORECASE) else ""
+    aside = not_in_answer(asked)
+    unknown = aside.startswith('"')
+    try:
+        parsed = parser.whole_phrase(asked)
+    except _IncompleteError as incomplete:
         parsed, unknown = Thing(plain), True
-        note = f"not understood{quote}: asked for as one thing, in these words"
+        quote = _own_words(str(incomplete), plain)
+        note = f'not understood ("{quote}"): asked for as one thing, in these words'
+    else:
+        unknown = unknown or (bool(parser.notes) and parser.stated)  # is the mug big?
+        told = (mended_note(mended), *dict.fromkeys((*parser.notes, *parser.asides)), command_note(asked), aside)
+        note = _in_own_letters("; ".join(filter(None, told)), plain)
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
+
+
+def _own_words(left: str, plain: str) -> str:
+    """What of a text was not understood, in its own letters: the first of several that is in it."""
+    shown = " ".join(patterns.HIDDEN.sub(" ", plain).split())
+    if "not" in left.lower().split() and (short := re.search(r"\b\w+n['\u2019\u02bc]t\b", shown)):
+        return short[0]
+    for words in (left, *left.split(), left_over(shown), *shown.split()[:1]):
+        if words and (found := re.search(rf"(?<!\w){re.escape(words)}(?!\w)", shown, re.IGNORECASE)):
+            return found[0]
+    return shown[:20]
+
+
+def _in_own_letters(note: str, plain: str) -> str:
+    def own(quoted: re.Match[str]) -> str:
+        found = re.search(rf"(?<!\w){re.escape(quoted[1])}(?!\w)", plain, re.IGNORECASE)
+        return f'"{found[0]}"' if found else quoted[0]
+
+    return re.sub(r'"([^"]+)"', own, note)
 
 
 def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
@@ -131,6 +164,23 @@ class _Parser:
     def __init__(self, whole: str, together: bool = False, stated: bool = False) -> None:
         self.whole, self.together, self.stated = whole, together, stated
         self.notes: list[str] = []
+        self.asides: list[str] = []
+
+    def whole_phrase(self, asked: str) -> Phrase:
+        """A question or a phrase that is complete, and whose things are things.
+
+        Raises:
+            _IncompleteError: If it is not so.
+        """
+        if not asked.strip(string.punctuation + " "):
+            raise _IncompleteError("")
+        parsed = self.question(asked)
+        for thing in things_of(parsed):
+            if left := not_understood(patterns.HIDDEN.sub("thing", thing)):
+                raise _IncompleteError(left)
+        if has_stray_viewer(parsed):
+            raise _IncompleteError("me")
+        return parsed
 
     def question(self, asked: str) -> Phrase:
         """A question or a phrase, with the words around the thing."""
@@ -142,6 +192,8 @@ class _Parser:
             return Pick(
                 patterns.COMPARATIVES[found["more"].lower()] if found["more"] else _picked(found), these
             )
+        if self.stated and _is_place(as_phrase(asked)):  # is on the table
+            raise _IncompleteError(asked.split()[0])
         parsed = _loosened(self.phrase(as_phrase(asked)), self.together)
         if not asks_for_all(asked):
             return parsed
@@ -169,12 +221,25 @@ class _Parser:
         if found := patterns.QUALITY.search(f" {words}"):
             noun, rest = undetermined(f" {words}"[: found.start()].strip()), found[2]
             if not patterns.RELATION.search(f" {words} "[found.start() :]) and _is_quality(rest):
+                if (picked := self.picked(noun, rest, found[1], deeper)) is not None:
+                    return picked
                 described = self.phrase(f"{rest} {noun}", deeper)
                 return Except(self.phrase(noun, deeper), described) if found[1] else described
         for split in (self.difference, self.union):
             if (joined := split(words, deeper)) is not None:
                 return joined
         return self.one(words, deeper)
+
+    def picked(self, noun: str, quality: str, negated: str | None, depth: int) -> Phrase | None:
+        """ "Largest toy that is (not) red": one of those; None for a noun without a superlative."""
+        pick = self.phrase(noun, depth)
+        if not isinstance(pick, (Pick, Related)) or not isinstance(pick.target, (Thing, Anything)):
+            return None
+        if isinstance(pick, Related) and pick.relation not in ORDERED:
+            return None
+        name = "thing" if isinstance(pick.target, Anything) else pick.target.text
+        described = self.phrase(f"{quality} {name}", depth)
+        return replace(pick, target=Except(pick.target, described) if negated else described)
 
     def difference(self, words: str, depth: int) -> Phrase | None:
         """ "A but not B"; None if it is none. "Toys but not the largest" names toys alone."""
@@ -183,14 +248,16 @@ class _Parser:
             return None
         if parts[1].strip().lower() in ("one", "two"):  # the largest but one
             return Thing(words)
-        first, second = (self.phrase(part, depth) for part in parts)
+        named = parts[0].strip()
+        first = Anything() if not named or patterns.ALL.match(named) else self.phrase(named, depth)
+        second = self.phrase(parts[1], depth)
         if (
             isinstance(second, Pick)
             and second.target == Anything()
             and not patterns.NAMES_THINGS.search(parts[1])
         ):
             second = replace(second, target=first)
-        return Except(first, second)
+        return without(first, second) or Except(first, second)
 
     def union(self, words: str, depth: int) -> Phrase | None:
         """ "A and B", "A or B", "A, B"; None if it is none of them."""
@@ -199,8 +266,6 @@ class _Parser:
             return None
         joint = f" {words} "[len(parts[0]) : -len(parts[1])].strip().lower()
         one, other = parts[0].strip(), parts[1].strip()
-        if re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE):  # closest to both the mug and the lamp
-            return Thing(words)
         if "," in words and _all_qualities(other):  # vase, white
             return self.phrase(f"{other} {undetermined(one)}", depth)
         if (
@@ -211,13 +276,37 @@ class _Parser:
                 return self.thing(words)  # red and white ball
             one = f"{one} {noun}"  # the red or the yellow ball
         together = joint != "or" and " or " not in other
-        first, second = self.phrase(re.sub(r"^both\s", "", one), depth), self.phrase(other, depth)
+        shared = re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE)  # next to both the mug and the lamp
+        one = re.sub(r"(?:^|(?<=\s))(?:both|either)\s", "", one)
+        first, second = self.phrase(one, depth), self.phrase(other, depth)
+        if _is_place(other):
+            return self.second_place(first, second, joint)
         is_placed = "target" in parts_of(first)
+        if isinstance(first, Related) and (shared or (first.target == Anything() and not self.stated)):
+            return self.second_reference(first, second, joint)
         if self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
             second = replace(first, reference=second)  # is the mug on the table or the cloth?
         elif not is_placed and (self.stated or (self.together and together)):
             first = _in_place_of(second, first)  # are the mug and the duck on the table?
         return (Together if together else Both)(first, second)
+
+    def second_place(self, first: Phrase, place: Phrase, joint: str) -> Phrase:
+        """ "Mug on the cloth and left of the duck": both of one thing; with "or" one of them."""
+        is_placed = isinstance(first, (Related, Between, InCorner, InPart))
+        if joint.endswith("or") and isinstance(first, (Related, Between, InCorner, InPart)):
+            return Both(first, placed(place, first.target))
+        if not is_placed and joint != ",":
+            raise _IncompleteError(joint)
+        return placed(place, first)
+
+    def second_reference(self, first: Related, second: Phrase, joint: str) -> Phrase:
+        """ "What is next to the mug and the duck": things next to both, but on the one or the other."""
+        if first.relation in ORDERED or not isinstance(second, (Thing, Both, Together)):
+            raise _IncompleteError(joint)
+        one_of = joint.endswith("or") or first.relation in ("on", "inside", "under", "below")
+        if one_of or not isinstance(second, Thing):
+            return Both(first, replace(first, reference=second))
+        return replace(first, target=first, reference=second)
 
     def one(self, words: str, depth: int) -> Phrase:
         """A phrase without "and" and "but"."""
@@ -225,19 +314,22 @@ class _Parser:
             rest = undetermined(words[found.end() :]) or "thing"
             return Pick(patterns.COMPARATIVES[found["more"].lower()], self.phrase(rest, depth))
         bare, before = patterns.THE_ONE.sub("thing ", words), None
-        quantity = rank = 0
+        quantity, rank, exact = 0, 0, False
         while bare != before:
             before = bare
             if not rank and (found := patterns.ORDINAL.match(bare)):
                 rank, bare = _number(found["number"]), bare[found.end() :]
             if not quantity and (found := patterns.QUANTITY.match(bare)):
                 quantity, bare = _number(found["number"]) + bool(found["more"]), bare[found.end() :]
+                exact = bool(found["exact"])
             bare = patterns.DETERMINER.sub("", bare)
-        if quantity > 1 or rank:
+        if quantity > 1 or rank or exact:
             asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
             ordered = numbered(target, max(quantity, 1), max(rank, 1))
-            return ordered or (Thing(words) if rank else AtLeast(quantity, target))
+            return ordered or (
+                Thing(words) if rank else AtLeast(quantity, target, quantity if exact else None)
+            )
         if found := patterns.SIZE.match(bare):
             return self.sized(bare, found, depth)
         place = self.place(bare, depth)
@@ -266,14 +358,15 @@ class _Parser:
             return self.corner(found, depth)
         if (found := patterns.PART.match(f" {words}")) and (part := self.part(found, depth)) is not None:
             return part
-        words = "thing " * bool(patterns.BY_ME.match(words)) + patterns.MY_SIDE.sub(r"\1 of me", words)
+        words = patterns.MY_SIDE.sub(r"\1 of me", words)
         if found := patterns.RELATION.search(f" {words} "):
             related = self.related(f" {words} ", found, depth)
             if related is not None:
                 return related
         for pattern in (patterns.NEAR_ME, patterns.ASIDE):
-            if (found := pattern.match(f" {words}")) and found[1].strip():
-                target, side = self.phrase(found[1], depth), found[2].lower()
+            found = pattern.match(f" {words}")
+            if found and (found[1].strip() or patterns.AT.match(words)):
+                target, side = self.phrase(found[1] or "thing", depth), found[2].lower()
                 if side in ("left", "right"):
                     return Pick("leftmost" if side == "left" else "rightmost", target)
                 return Related(
@@ -291,21 +384,18 @@ class _Parser:
             return None
         if reference.lower() in QUALITIES and patterns.RELATIONS[number][1] == "inside":  # a car in red
             return self.thing(f"{reference} {target}")
-        if not target or not reference:
-            raise QueryError(
-                f"phrase {self.whole!r}",
-                expected="a thing on either side",
-                found="an empty part",
-                remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
-            )
-        if re.match(r"(?:the )?(?:far |very )?(?:left|right)(?: side)?$", reference) and number == 4:
+        if not reference:
+            raise _IncompleteError(found[0].strip())
+        if patterns.TO_A_SIDE.match(reference):
             return None  # mug on the left
-        things = self.phrase(target, depth)
+        things = self.phrase(target, depth) if target else Anything()
         related = Related(patterns.RELATIONS[number][1], things, self.phrase(reference, depth))
         return Except(things, related) if found.group("not") else related
 
     def corner(self, found: re.Match[str], depth: int) -> Phrase:
-        target, negated, one, other = found.groups()
+        target, negated, one, other, of = found.groups()
+        if of and not patterns.PLACE.match(of):
+            self.asides.append(f'"of {of}" is left out: corners are those of the whole scene')
         along = patterns.CORNER_SIDES.get((one or "").lower(), (one or "").lower())
         name = " ".join(filter(None, (along, (other or "").lower())))
         things = self.phrase(target or "thing", depth)
@@ -340,12 +430,7 @@ class _Parser:
         if found := patterns.SOMETHING.match(words):
             return thing_of(f"something {found[1]}")
         if not words:
-            raise QueryError(
-                f"phrase {self.whole!r}",
-                expected="a thing on either side",
-                found="an empty part",
-                remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
-            )
+            raise _IncompleteError("")
         return thing_of(words if " to " in words or not_understood(words) else singular(words))
 
 
@@ -354,6 +439,14 @@ def _in_place_of(second: Phrase, first: Phrase) -> Phrase:
     return (
         replace(second, target=first) if isinstance(second, (Related, Between, InCorner, InPart)) else first
     )
+
+
+def _is_place(words: str) -> bool:
+    """Whether words are a place alone: "left of the mug", "not in the corner"."""
+    if patterns.RELATION.match(f" {words} "):
+        return True
+    places = (patterns.BETWEEN, patterns.CORNER, patterns.PART)
+    return any((found := place.match(f" {words}")) is not None and not found[1] for place in places)
 
 
 def _loosened(phrase: Phrase, together: bool) -> Phrase:
