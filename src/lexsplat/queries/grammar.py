@@ -33,23 +33,18 @@ from dataclasses import replace
 from typing import Any
 
 from lexsplat.queries import patterns
-from lexsplat.queries.colors import COLOR_WORDS
-from lexsplat.queries.kinds import is_kind
-from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
 from lexsplat.queries.phrases import (
     ORDERED,
     Anything,
     AtLeast,
     Between,
     Both,
-    Colored,
     Every,
     Except,
     InCorner,
     InPart,
     Phrase,
     Pick,
-    PickName,
     Related,
     RelationName,
     Thing,
@@ -77,7 +72,19 @@ from lexsplat.queries.questions import (
     with_asking_words,
 )
 from lexsplat.queries.spelling import singular
-from lexsplat.queries.vocabulary import COLORS, QUALITIES, SURFACES
+from lexsplat.queries.vocabulary import QUALITIES, SURFACES
+from lexsplat.queries.wording import (
+    all_qualities,
+    describes,
+    in_own_letters,
+    is_place,
+    is_quality,
+    number,
+    own_words,
+    picked,
+    thing_of,
+    undetermined,
+)
 from lexsplat.runtime.errors import QueryError
 
 MAX_PARTS = 40
@@ -121,32 +128,18 @@ def understand(text: str) -> Understood:
         parsed = parser.whole_phrase(asked)
     except _IncompleteError as incomplete:
         parsed, unknown = Thing(plain), True
-        quote = _own_words(str(incomplete), plain)
+        quote = own_words(str(incomplete), plain)
         note = f'not understood ("{quote}"): asked for as one thing, in these words'
     else:
         unknown = unknown or (bool(parser.notes) and parser.stated)  # is the mug big?
-        told = (mended_note(mended), *dict.fromkeys((*parser.notes, *parser.asides)), command_note(asked), aside)
-        note = _in_own_letters("; ".join(filter(None, told)), plain)
+        told = (
+            mended_note(mended),
+            *dict.fromkeys((*parser.notes, *parser.asides)),
+            command_note(asked),
+            aside,
+        )
+        note = in_own_letters("; ".join(filter(None, told)), plain)
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
-
-
-def _own_words(left: str, plain: str) -> str:
-    """What of a text was not understood, in its own letters: the first of several that is in it."""
-    shown = " ".join(patterns.HIDDEN.sub(" ", plain).split())
-    if "not" in left.lower().split() and (short := re.search(r"\b\w+n['\u2019\u02bc]t\b", shown)):
-        return short[0]
-    for words in (left, *left.split(), left_over(shown), *shown.split()[:1]):
-        if words and (found := re.search(rf"(?<!\w){re.escape(words)}(?!\w)", shown, re.IGNORECASE)):
-            return found[0]
-    return shown[:20]
-
-
-def _in_own_letters(note: str, plain: str) -> str:
-    def own(quoted: re.Match[str]) -> str:
-        found = re.search(rf"(?<!\w){re.escape(quoted[1])}(?!\w)", plain, re.IGNORECASE)
-        return f'"{found[0]}"' if found else quoted[0]
-
-    return re.sub(r'"([^"]+)"', own, note)
 
 
 def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
@@ -190,9 +183,9 @@ class _Parser:
                 to = self.phrase(found["to"] or found["from"] or "me")
                 return Related("nearest to" if found["near"] else "farthest from", these, to)
             return Pick(
-                patterns.COMPARATIVES[found["more"].lower()] if found["more"] else _picked(found), these
+                patterns.COMPARATIVES[found["more"].lower()] if found["more"] else picked(found), these
             )
-        if self.stated and _is_place(as_phrase(asked)):  # is on the table
+        if self.stated and is_place(as_phrase(asked)):  # is on the table
             raise _IncompleteError(asked.split()[0])
         parsed = _loosened(self.phrase(as_phrase(asked)), self.together)
         if not asks_for_all(asked):
@@ -220,9 +213,9 @@ class _Parser:
             return Except(things, middle) if negated else middle
         if found := patterns.QUALITY.search(f" {words}"):
             noun, rest = undetermined(f" {words}"[: found.start()].strip()), found[2]
-            if not patterns.RELATION.search(f" {words} "[found.start() :]) and _is_quality(rest):
-                if (picked := self.picked(noun, rest, found[1], deeper)) is not None:
-                    return picked
+            if not patterns.RELATION.search(f" {words} "[found.start() :]) and is_quality(rest):
+                if (pick := self.picked(noun, rest, found[1], deeper)) is not None:
+                    return pick
                 described = self.phrase(f"{rest} {noun}", deeper)
                 return Except(self.phrase(noun, deeper), described) if found[1] else described
         for split in (self.difference, self.union):
@@ -266,10 +259,10 @@ class _Parser:
             return None
         joint = f" {words} "[len(parts[0]) : -len(parts[1])].strip().lower()
         one, other = parts[0].strip(), parts[1].strip()
-        if "," in words and _all_qualities(other):  # vase, white
+        if "," in words and all_qualities(other):  # vase, white
             return self.phrase(f"{other} {undetermined(one)}", depth)
         if (
-            _describes(one)
+            describes(one)
             and (noun := re.sub(rf"^(?:{patterns.ADJECTIVES}\s)+", "", undetermined(other))) != other
         ):
             if joint == "and" and noun != undetermined(other) and one == undetermined(one):
@@ -279,7 +272,7 @@ class _Parser:
         shared = re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE)  # next to both the mug and the lamp
         one = re.sub(r"(?:^|(?<=\s))(?:both|either)\s", "", one)
         first, second = self.phrase(one, depth), self.phrase(other, depth)
-        if _is_place(other):
+        if is_place(other):
             return self.second_place(first, second, joint)
         is_placed = "target" in parts_of(first)
         if isinstance(first, Related) and (shared or (first.target == Anything() and not self.stated)):
@@ -318,9 +311,9 @@ class _Parser:
         while bare != before:
             before = bare
             if not rank and (found := patterns.ORDINAL.match(bare)):
-                rank, bare = _number(found["number"]), bare[found.end() :]
+                rank, bare = number(found["number"]), bare[found.end() :]
             if not quantity and (found := patterns.QUANTITY.match(bare)):
-                quantity, bare = _number(found["number"]) + bool(found["more"]), bare[found.end() :]
+                quantity, bare = number(found["number"]) + bool(found["more"]), bare[found.end() :]
                 exact = bool(found["exact"])
             bare = patterns.DETERMINER.sub("", bare)
         if quantity > 1 or rank or exact:
@@ -353,7 +346,7 @@ class _Parser:
             relation: RelationName = "nearest to" if found[1] else "farthest from"
             return Related(relation, target, self.phrase(reference, depth) if reference else Viewer())
         if found := patterns.PICK.match(words):
-            return Pick(_picked(found), self.phrase(words[found.end() :] or "thing", depth))
+            return Pick(picked(found), self.phrase(words[found.end() :] or "thing", depth))
         if found := patterns.CORNER.match(f" {words}"):
             return self.corner(found, depth)
         if (found := patterns.PART.match(f" {words}")) and (part := self.part(found, depth)) is not None:
@@ -373,23 +366,23 @@ class _Parser:
                     "nearest to" if side in ("nearest", "closest") else "farthest from", target, Viewer()
                 )
         if (found := patterns.IS_PICK.search(f" {words}")) and found.start():
-            return Pick(_picked(found), self.phrase(f" {words}"[: found.start()], depth))
+            return Pick(picked(found), self.phrase(f" {words}"[: found.start()], depth))
         return None
 
     def related(self, words: str, found: re.Match[str], depth: int) -> Phrase | None:
         """Two phrases in a relation; None if the word of the relation belongs to a thing."""
-        number = next(i for i in range(len(patterns.RELATIONS)) if found.group(f"r{i}") is not None)
+        relation = next(name for i, (_, name) in enumerate(patterns.RELATIONS) if found.group(f"r{i}"))
         target, reference = words[: found.start()].strip(), words[found.end() :].strip()
         if not reference and (" to " in f" {target} "):  # "something to sit on" has no reference
             return None
-        if reference.lower() in QUALITIES and patterns.RELATIONS[number][1] == "inside":  # a car in red
+        if reference.lower() in QUALITIES and relation == "inside":  # a car in red
             return self.thing(f"{reference} {target}")
         if not reference:
             raise _IncompleteError(found[0].strip())
         if patterns.TO_A_SIDE.match(reference):
             return None  # mug on the left
         things = self.phrase(target, depth) if target else Anything()
-        related = Related(patterns.RELATIONS[number][1], things, self.phrase(reference, depth))
+        related = Related(relation, things, self.phrase(reference, depth))
         return Except(things, related) if found.group("not") else related
 
     def corner(self, found: re.Match[str], depth: int) -> Phrase:
@@ -406,14 +399,14 @@ class _Parser:
         """Things in a part of an area; None for "in front of the mug" and "at the back of the mug"."""
         target, negated, determined, part, of = found.groups()
         name = patterns.PARTS.get(part.lower(), "middle")
-        is_place = not of or patterns.PLACE.match(of) is not None
+        is_room = not of or patterns.PLACE.match(of) is not None
         is_surface = bool(of) and singular(undetermined(of.lower())).split()[-1] in SURFACES
-        if of and (not determined or (name not in ("middle", "edge") and not (is_place or is_surface))):
+        if of and (not determined or (name not in ("middle", "edge") and not (is_room or is_surface))):
             return None
         if not of and name in ("left", "right"):  # one of several: the mug on the left side
             return None
         things = self.phrase(target or "thing", depth)
-        inside = InPart(things, name) if is_place else InPart(things, name, self.phrase(of, depth))
+        inside = InPart(things, name) if is_room else InPart(things, name, self.phrase(of, depth))
         return Except(things, inside) if negated else inside
 
     def thing(self, words: str) -> Phrase:
@@ -441,14 +434,6 @@ def _in_place_of(second: Phrase, first: Phrase) -> Phrase:
     )
 
 
-def _is_place(words: str) -> bool:
-    """Whether words are a place alone: "left of the mug", "not in the corner"."""
-    if patterns.RELATION.match(f" {words} "):
-        return True
-    places = (patterns.BETWEEN, patterns.CORNER, patterns.PART)
-    return any((found := place.match(f" {words}")) is not None and not found[1] for place in places)
-
-
 def _loosened(phrase: Phrase, together: bool) -> Phrase:
     """The phrase with the union in place of `Together`, but where a whole question asks for both."""
     parts = parts_of(phrase)
@@ -457,56 +442,3 @@ def _loosened(phrase: Phrase, together: bool) -> Phrase:
     if isinstance(phrase, Together) and not keeps:
         return Both(**changed)
     return replace(phrase, **changed) if changed else phrase
-
-
-def thing_of(text: str) -> Phrase:
-    """A thing by its words; "something red" and "red toy" are objects of the scene in a color."""
-    words = text.lower().split()
-    color, target = words.pop() if words[:1] == ["something"] else words.pop(0), " ".join(words)
-    color = "gray" if color == "grey" else color
-    if color in COLOR_WORDS and (target == "something" or is_kind(target)):
-        return Colored(color, Anything() if target == "something" else Thing(target))
-    return Thing(text)
-
-
-def undetermined(words: str) -> str:
-    """Words without articles and the like in front."""
-    while (shorter := patterns.DETERMINER.sub("", words)) != words:
-        words = shorter
-    return words
-
-
-def _picked(found: re.Match[str]) -> PickName:
-    return next(name for i, (_, name) in enumerate(patterns.PICKS) if found.group(f"p{i}") is not None)
-
-
-def _number(word: str) -> int:
-    """What a numeral says; "several" and the like are two."""
-    small = word.lower()
-    if digits := re.match(r"\d+", small):
-        return int(digits[0])
-    return next((words.index(small) + 1 for words in (NUMBERS, ORDINALS) if small in words), 2)
-
-
-def _describes(words: str) -> bool:
-    """Whether words name a color or the like, but no thing: "the red"."""
-    parts = undetermined(words).lower().split()
-    return bool(parts) and all(part in COLORS or part in patterns.PATTERNS for part in parts)
-
-
-def _is_quality(words: str) -> bool:
-    """Whether words after "that is" describe the noun: at most three, and no superlative or material."""
-    parts = words.lower().split()
-    first = parts[0]
-    names = any(re.fullmatch(pattern, parts[-1]) for pattern, _ in patterns.PICKS)
-    return (
-        len(parts) <= 3
-        and first not in ("the", "a", "an", "made", "built", "not")
-        and not names
-        and not patterns.NEAR_ME.match(f"x {words}")
-    )
-
-
-def _all_qualities(words: str) -> bool:
-    parts = re.split(r"[\s,]+(?:and\s)?", words.strip().lower())
-    return all(part in QUALITIES for part in parts)

@@ -63,7 +63,8 @@ PLACE = re.compile(
     re.IGNORECASE,
 )
 ASIDE = re.compile(
-    rf"^(.*?)\s{LINK}(?:(?:farthest|furthest|most) )?(?:(?:counting |counted |starting )?(?:(?:on|to|at) the |"
+    rf"^(.*?)\s{LINK}(?:(?:farthest|furthest|closest|nearest|most) )?"
+    r"(?:(?:counting |counted |starting )?(?:(?:on|to|at) the |"
     r"from (?:the )?))?(?:far |very )?(left|right)(?: (?:hand )?side)?$",
     re.IGNORECASE,
 )
@@ -82,7 +83,8 @@ THE_ONE = re.compile(
     re.IGNORECASE,
 )
 EXCEPT = re.compile(
-    r"\s(?:but not|but|and not(?= (?:the|a|an|my) (?!left|right))|without|except for|except|minus|excluding|other than|apart from|aside from|"
+    r"\s(?:but not|but|and not(?= (?:the|a|an|my) (?!left|right))|"
+    r"without|except for|except|minus|excluding|other than|apart from|aside from|"
     r"(?:(?:that|which) )?(?:is|are) not(?= (?:the|a|an|my) (?!left|right)))\s",
     re.IGNORECASE,
 )
@@ -126,12 +128,14 @@ WHICH_OF = re.compile(
 PICK = re.compile(rf"^(?:very |single )?(?:{PICK_WORDS})(?:\s+(?:one )?(?:of )?|$)(?!of\b)", re.IGNORECASE)
 IS_PICK = re.compile(rf"\s{LINK}(?:the\s)?(?:{PICK_WORDS})(?:\sone)?$", re.IGNORECASE)
 EXTREME = re.compile(
-    r"^(?:(nearest|closest)|farthest|furthest|most distant)\s+(?!(?:to|from|away)\s)(.+?)(?:\s+(?:away )?(?:to|from)\s+(.+))?$",
+    r"^(?:(nearest|closest)|farthest|furthest|most distant)\s+(?!(?:to|from|away)\s)(.+?)"
+    r"(?:\s+(?:away )?(?:to|from)\s+(.+))?$",
     re.IGNORECASE,
 )
 ORDINAL = re.compile(rf"^(?P<number>{'|'.join(ORDINALS)}|\d{{1,2}}(?:st|nd|rd|th))[\s-]+", re.IGNORECASE)
 QUANTITY = re.compile(
-    rf"^(?P<more>more than |over )?(?:at least )?(?P<exact>(?:exactly|precisely|only|just) )?(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
+    rf"^(?P<more>more than |over )?(?:at least )?(?P<exact>(?:exactly|precisely|only|just) )?"
+    rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
     r"a few|a couple of|a pair of(?! (?:scissors|glasses|trousers|pants|jeans|shorts|binoculars|headphones|pliers|"
     r"tongs)\b))"
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
@@ -152,7 +156,9 @@ THING_WORD = re.compile(
     r"^(?:(.*?)\s)?(?:things?|objects?|items?|everything|anything|something|stuff|ones?|whatever)$",
     re.IGNORECASE,
 )
-SOMETHING = re.compile(r"^(?:things?|objects?|items?|everything|anything|something|stuff)\s+(.+)$", re.IGNORECASE)
+SOMETHING = re.compile(
+    r"^(?:things?|objects?|items?|everything|anything|something|stuff)\s+(.+)$", re.IGNORECASE
+)
 VIEWER = re.compile(
     r"^(?:me|us|you|myself|here|the (?:camera|viewer|observer)|(?:my|the) (?:position|viewpoint|view))$",
     re.IGNORECASE,

@@ -228,12 +228,12 @@ def numbered(phrase: Phrase, count: int, rank: int) -> Phrase | None:
 
 def without(phrase: Phrase, other: Phrase) -> Phrase | None:
     """The phrase with ``other`` taken off what it picks or counts from; None if it does neither."""
-    counts = isinstance(phrase, (Pick, AtLeast))
-    if counts or (isinstance(phrase, Related) and phrase.relation in ORDERED):
-        inner = without(phrase.target, other)  # type: ignore[union-attr]
-        return replace(phrase, target=inner or Except(phrase.target, other))  # type: ignore[call-arg, union-attr]
+    if isinstance(phrase, (Pick, AtLeast)):
+        return replace(phrase, target=without(phrase.target, other) or Except(phrase.target, other))
     if isinstance(phrase, (Related, Between, InCorner, InPart)):
         inner = without(phrase.target, other)
+        if inner is None and isinstance(phrase, Related) and phrase.relation in ORDERED:
+            inner = Except(phrase.target, other)
         return None if inner is None else replace(phrase, target=inner)
     return None
 

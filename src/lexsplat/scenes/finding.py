@@ -10,11 +10,12 @@ import torch
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import thing_of, understand
+from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings, strange
+from lexsplat.queries.wording import thing_of
 from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
