@@ -8,8 +8,12 @@ mug between the apple and the duck   also "closest to", "farthest from", "in the
 toy in front of me                   "me" stands where the view was taken
 apple and banana                     the union; also "or" and commas
 fruit but not the banana             the difference; also "without", "except", "other than"; "not the mug"
+largest toy but the bear             the exception is taken off before the largest is picked
+on the table                         a place alone: any object there
+mug on the cloth and left of the duck    both places of one thing
+isn't the mug on the cloth?          asks what "is the mug on the cloth?" asks
 largest book, leftmost mug           one of several
-two apples                           all of them, if there are as many
+two apples                           all of them, if there are as many; "exactly two", "only one": and no more
 second toy from the left             by its place in an order; also "3 nearest things to the mug"
 is the bear bigger than the duck?    by boxes; "which is bigger, A or B?" is the largest of both
 things at the back of the table      a part of an area; also "in the middle", "at the edge"
@@ -22,7 +26,7 @@ how many apples are there?           the same as "apple"; plurals are asked for 
 where is the mug? show me the mug    the same as "mug" (`_FRAMES`)
 "something on wheels"                in quotation marks: one thing, whatever its words
 
-What does not fit is one thing, asked for in its own words, and `Understood.note` says so.
+What does not fit or lacks a part is one thing, asked for in its own words, and `Understood.note` says so.
 """
 
 from __future__ import annotations
@@ -243,7 +247,7 @@ class _Parser:
             return Thing(words)
         named = parts[0].strip()
         first = Anything() if not named or patterns.ALL.match(named) else self.phrase(named, depth)
-        second = self.phrase(parts[1], depth)
+        second = self.phrase(patterns.AND_NOT.sub(" and ", parts[1]), depth)
         if (
             isinstance(second, Pick)
             and second.target == Anything()

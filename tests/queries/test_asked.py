@@ -147,6 +147,7 @@ def test_an_exception_is_taken_off_before_the_superlative_picks(text, expected):
     ("text", "expected"),
     [
         ("duck, mug and not the apple", Except(Both(DUCK, MUG), APPLE)),
+        ("toys, but not the duck and not the bear", Except(TOY, Both(DUCK, BEAR))),
         ("plz find mug", MUG),
         ("the mug of red color", Thing("red mug")),
         ("everything red", Colored("red", ANY)),
@@ -214,6 +215,7 @@ def test_what_a_question_asks_beside_the_thing_is_told(text, expected, told):
         ("don't show me the mug", "don't"),
         ("do not touch the mug", "do"),
         ("turn left", "turn"),
+        ("where isn't the mug", "where"),
         ("is on the table", "is"),
         ("hasn't the duck a beak", "hasn't"),
         ("turn on the lamp", "turn"),
