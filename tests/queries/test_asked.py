@@ -15,6 +15,7 @@ from lexsplat.queries.phrases import (
     Pick,
     Related,
     Thing,
+    Together,
     Understood,
     Viewer,
 )
@@ -148,6 +149,7 @@ def test_an_exception_is_taken_off_before_the_superlative_picks(text, expected):
     [
         ("duck, mug and not the apple", Except(Both(DUCK, MUG), APPLE)),
         ("toys, but not the duck and not the bear", Except(TOY, Both(DUCK, BEAR))),
+        ("is there a thing on the mug and a duck?", Together(Related("on", ANY, MUG), DUCK)),
         ("plz find mug", MUG),
         ("the mug of red color", Thing("red mug")),
         ("everything red", Colored("red", ANY)),

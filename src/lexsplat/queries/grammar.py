@@ -110,7 +110,7 @@ def understand(text: str) -> Understood:
     """A phrase or question, parsed.
 
     Raises:
-        QueryError: If it is empty, a quotation mark is missing, or there are too many parts.
+        QueryError: If it is empty, lacks a quotation mark, or has too many parts.
     """
     if len(text) > MAX_LENGTH:
         return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", unknown=True)
@@ -136,12 +136,7 @@ def understand(text: str) -> Understood:
         note = f'not understood ("{quote}"): asked for as one thing, in these words'
     else:
         unknown = unknown or (bool(parser.notes) and parser.stated)  # is the mug big?
-        told = (
-            mended_note(mended),
-            *dict.fromkeys((*parser.notes, *parser.asides)),
-            command_note(asked),
-            aside,
-        )
+        told = (mended_note(mended), *dict.fromkeys(parser.notes + parser.asides), command_note(asked), aside)
         note = in_own_letters("; ".join(filter(None, told)), plain)
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
 
@@ -274,12 +269,15 @@ class _Parser:
             one = f"{one} {noun}"  # the red or the yellow ball
         together = joint != "or" and " or " not in other
         shared = re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE)  # next to both the mug and the lamp
+        another = self.together and patterns.INDEFINITE.match(other)  # is there a thing on the mug and a cat
         one = re.sub(r"(?:^|(?<=\s))(?:both|either)\s", "", one)
         first, second = self.phrase(one, depth), self.phrase(other, depth)
         if is_place(other):
             return self.second_place(first, second, joint)
         is_placed = "target" in parts_of(first)
-        if isinstance(first, Related) and (shared or (first.target == Anything() and not self.stated)):
+        if isinstance(first, Related) and (
+            shared or (first.target == Anything() and not self.stated and not another)
+        ):
             return self.second_reference(first, second, joint)
         if self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
             second = replace(first, reference=second)  # is the mug on the table or the cloth?

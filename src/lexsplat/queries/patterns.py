@@ -163,6 +163,7 @@ VIEWER = re.compile(
     r"^(?:me|us|you|myself|here|the (?:camera|viewer|observer)|(?:my|the) (?:position|viewpoint|view))$",
     re.IGNORECASE,
 )
+INDEFINITE = re.compile(r"^(?:an?|any|some)\s", re.IGNORECASE)
 AND_NOT = re.compile(r"\s(?:and|or|nor) not (?=(?:the|a|an|my) )", re.IGNORECASE)
 """Behind "but not", which holds for what follows as well."""
 ALL = re.compile(r"^(?:all|any|everyone|anyone)$", re.IGNORECASE)
