@@ -88,7 +88,7 @@ def test_find_prints_positions_in_3d(built, capsys):
     printed = capsys.readouterr().out
     assert f"{first['count']} found" in printed
     assert f"understood as {first['understood']}" in printed
-    assert cli.main(["find", str(built), "on the table"]) == 1
+    assert cli.main(["find", str(built), 'the "table']) == 1
 
 
 def test_an_empty_prompt_is_refused(built, capsys):

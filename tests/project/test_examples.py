@@ -82,7 +82,7 @@ def test_07_tells_which_scenes_hold_a_thing(run, tmp_path):
 
 def test_08_asks_from_a_shell():
     environment = {**os.environ, "LEXSPLAT": f"{sys.executable} -m lexsplat", "PYTHON": sys.executable}
-    arguments = ["sh", EXAMPLES / "08_shell.sh", "demo", "apple", "unicorn", "mug left of", 'a "mug"', "\\"]
+    arguments = ["sh", EXAMPLES / "08_shell.sh", "demo", "apple", "unicorn", 'the "mug', 'a "mug"', "\\"]
     done = subprocess.run(arguments, capture_output=True, text=True, env=environment, timeout=300)
     rows = [line.split("\t") for line in done.stdout.splitlines()]
     assert done.returncode == 0, done.stderr

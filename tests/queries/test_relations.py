@@ -12,6 +12,7 @@ from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import parse
+from lexsplat.queries.phrases import Related, Thing, Viewer
 from lexsplat.queries.relations import distance, frame_of, holds, nearest, related
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
@@ -277,6 +278,6 @@ def test_a_cluster_of_several_known_objects_is_answered_by_those_that_score_as_w
 def test_a_place_that_a_viewer_cannot_be_at_is_refused(things):
     searched = Searched(lambda word: things("lamp"), lambda _: FRONT)
     with pytest.raises(QueryError, match="closest to me"):
-        answer(parse("lamp on me"), searched)
+        answer(Related("on", Thing("lamp"), Viewer()), searched)
     with pytest.raises(QueryError, match="in front of me"):
-        answer(parse("me"), searched)
+        answer(Viewer(), searched)

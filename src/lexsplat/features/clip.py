@@ -176,16 +176,17 @@ class ClipEncoder(PretrainedModel):
 
     def _warn_if_truncated(self, prompt: str) -> None:
         """Warn about a truncated prompt; a token has at least one character, except for the start and end tokens."""
-        if len(prompt) + 2 <= self._text_length:
-            return
-        count = len(self._tokenizer(prompt, verbose=False)["input_ids"])
-        if count > self._text_length:
+        if over := self.tokens_over(prompt):
+            subject, limit = prompt[:30] + "...", self._text_length
             log.warning(
-                "%r: prompt truncated: %d tokens, the model's limit is %d",
-                prompt[:30] + "...",
-                count,
-                self._text_length,
+                "%r: prompt truncated: %d tokens, the model's limit is %d", subject, limit + over, limit
             )
+
+    def tokens_over(self, prompt: str) -> int:
+        """How many tokens of a prompt are more than the model reads, and so cut."""
+        if len(prompt) + 2 <= self._text_length:
+            return 0
+        return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)
 
     def _vision_inputs(self, pixels: Tensor) -> dict[str, Tensor]:
         """Input of the image tower: pixels, or a list of patches for SigLIP 2 of variable size ("NaFlex")."""

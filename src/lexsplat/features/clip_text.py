@@ -165,6 +165,10 @@ class ClipText:
         end = ids if self._end == _LEGACY_END else (ids == self._end).int()
         return F.normalize(x[0, int(end.argmax())] @ weights["text_projection.weight"].T, dim=-1).cpu()
 
+    def tokens_over(self, prompt: str) -> int:
+        """How many tokens of a prompt are more than the model has positions, and so cut."""
+        return max(len(self._tokenizer.encode(prompt).ids) - self._limit, 0)
+
     def _tokens(self, prompt: str) -> Tensor:
         """Numbers of the tokens ``[T]``, with start and end, at most as many as the model has positions."""
         tokens = self._tokenizer.encode(prompt).ids

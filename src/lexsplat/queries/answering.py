@@ -12,6 +12,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.phrases import (
     ORDERED,
+    TO_VIEWER,
     Anything,
     AtLeast,
     Between,
@@ -29,6 +30,7 @@ from lexsplat.queries.phrases import (
     Together,
     Viewer,
     parts_of,
+    things_of,
 )
 from lexsplat.queries.relations import (
     Frame,
@@ -43,13 +45,11 @@ from lexsplat.queries.relations import (
     same,
 )
 from lexsplat.queries.selection import PRESENCES, Presence, Selection, union
-from lexsplat.queries.vocabulary import NAMES, SURFACES
+from lexsplat.queries.vocabulary import COLORS, NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
 _LARGE = 0.05
 """A selection of this share of a scene may be several objects; smaller ones are taken as they are."""
-_TO_VIEWER = ("left of", "right of", "in front of", "behind", "next to", *ORDERED)
-"""Relations that a thing can have to a viewer."""
 _HELD_BY: tuple[RelationName, ...] = ("on", "inside")
 """Relations of a thing to the thing that holds it."""
 _WHOLE = 0.5
@@ -146,7 +146,7 @@ def _related(phrase: Related, searched: Searched) -> Selection:
         targets = _joined(targets, tuple(searched.objects()), present="yes")
     if isinstance(phrase.reference, Viewer):
         camera = searched.viewer(None)
-        if camera is None or phrase.relation not in _TO_VIEWER:
+        if camera is None or phrase.relation not in TO_VIEWER:
             raise QueryError(
                 str(phrase),
                 expected="a place as seen by a viewer, in a scene with views",
@@ -195,19 +195,34 @@ def _both(phrase: Both | Together, searched: Searched) -> Selection:
         for part, each in ((phrase.first, first), (phrase.second, second))
         if each.note or each.present == "no"
     ]
-    found = _united(first, second)
+    found = _united(first, second, colors_of_one=_is_one_noun(phrase))
     if isinstance(phrase, Together):
         present = min(first.present, second.present, key=PRESENCES.index)
         found = replace(_joined(found, ()) if present == "no" else found, present=present)
     return replace(found, note="; ".join(lacking))
 
 
-def _united(first: Selection, second: Selection) -> Selection:
+def _is_one_noun(phrase: Both | Together) -> bool:
+    """Whether a union is of one thing in several colors: "red apple or green apple"."""
+    if not all(isinstance(part, (Thing, Both, Together)) for part in (phrase.first, phrase.second)):
+        return False
+    return len({frozenset(text.lower().split()) - COLORS for text in things_of(phrase)}) == 1
+
+
+def _united(first: Selection, second: Selection, colors_of_one: bool = False) -> Selection:
+    """The union; of ``colors_of_one`` thing, an instance inside another is a part of it."""
     instances = [*_certain(first), *_certain(second)]
+    if colors_of_one:
+        instances.sort(key=len, reverse=True)
+
+    def is_again(each: Selection, other: Selection) -> bool:
+        inside = colors_of_one and int(other.mask[each.indices].sum()) > _WHOLE * len(each)
+        return inside or same(each, other)
+
     kept = [
         each
         for number, each in enumerate(instances)
-        if not any(same(each, other) for other in instances[:number])
+        if not any(is_again(each, other) for other in instances[:number])
     ]
     return _joined(first | second, tuple(kept))
 
@@ -233,6 +248,8 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
         "smallest": lambda each: -each.box.volume,
         "tallest": lambda each: each.box.half_sizes[2],
         "shortest": lambda each: -each.box.half_sizes[2],
+        "widest": lambda each: max(each.box.half_sizes[:2]),
+        "longest": lambda each: max(each.box.half_sizes),
         "leftmost": lambda each: -float(each.center @ right),
         "rightmost": lambda each: float(each.center @ right),
     }[phrase.which]
@@ -242,7 +259,9 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
     found = answer(phrase.target, searched)
-    return found if found.count >= phrase.count else _joined(found, ())
+    if phrase.count <= found.count <= (found.count if phrase.most is None else phrase.most):
+        return found
+    return replace(_joined(found, ()), note=f"{found.count} found of {phrase.target}")
 
 
 def _every(phrase: Every, searched: Searched) -> Selection:

@@ -8,8 +8,12 @@ mug between the apple and the duck   also "closest to", "farthest from", "in the
 toy in front of me                   "me" stands where the view was taken
 apple and banana                     the union; also "or" and commas
 fruit but not the banana             the difference; also "without", "except", "other than"; "not the mug"
+largest toy but the bear             the exception is taken off before the largest is picked
+on the table                         a place alone: any object there
+mug on the cloth and left of the duck    both places of one thing
+isn't the mug on the cloth?          asks what "is the mug on the cloth?" asks
 largest book, leftmost mug           one of several
-two apples                           all of them, if there are as many
+two apples                           all of them, if there are as many; "exactly two", "only one": and no more
 second toy from the left             by its place in an order; also "3 nearest things to the mug"
 is the bear bigger than the duck?    by boxes; "which is bigger, A or B?" is the largest of both
 things at the back of the table      a part of an area; also "in the middle", "at the edge"
@@ -22,48 +26,49 @@ how many apples are there?           the same as "apple"; plurals are asked for 
 where is the mug? show me the mug    the same as "mug" (`_FRAMES`)
 "something on wheels"                in quotation marks: one thing, whatever its words
 
-What does not fit is one thing, asked for in its own words, and `Understood.note` says so.
+What does not fit or lacks a part is one thing, asked for in its own words, and `Understood.note` says so.
 """
 
 from __future__ import annotations
 
 import re
+import string
 from dataclasses import replace
 from typing import Any
 
 from lexsplat.queries import patterns
-from lexsplat.queries.colors import COLOR_WORDS
-from lexsplat.queries.kinds import is_kind
-from lexsplat.queries.leftovers import NUMBERS, ORDINALS
 from lexsplat.queries.phrases import (
+    ORDERED,
     Anything,
     AtLeast,
     Between,
     Both,
-    Colored,
     Every,
     Except,
     InCorner,
     InPart,
     Phrase,
     Pick,
-    PickName,
     Related,
     RelationName,
     Thing,
     Together,
     Understood,
     Viewer,
+    has_stray_viewer,
     mended_note,
     numbered,
     parts_of,
+    placed,
     things_of,
     with_things,
+    without,
 )
 from lexsplat.queries.questions import (
     as_phrase,
     asks_for_all,
     asks_yes_or_no,
+    command_note,
     in_full,
     not_in_answer,
     not_understood,
@@ -71,13 +76,29 @@ from lexsplat.queries.questions import (
     with_asking_words,
 )
 from lexsplat.queries.spelling import singular
-from lexsplat.queries.vocabulary import COLORS, QUALITIES, SURFACES
+from lexsplat.queries.vocabulary import QUALITIES, SURFACES
+from lexsplat.queries.wording import (
+    all_qualities,
+    describes,
+    in_own_letters,
+    is_place,
+    is_quality,
+    number,
+    own_words,
+    picked,
+    thing_of,
+    undetermined,
+)
 from lexsplat.runtime.errors import QueryError
 
 MAX_PARTS = 40
 """Limit on the number of parts, and so on the depth of the recursion."""
 MAX_LENGTH = 600
 """Characters from which a text is one thing: no phrase of that length has grammar."""
+
+
+class _IncompleteError(Exception):
+    """A phrase lacks a part; the text of the error is the word that asks for it."""
 
 
 def parse(text: str) -> Phrase:
@@ -89,7 +110,7 @@ def understand(text: str) -> Understood:
     """A phrase or question, parsed.
 
     Raises:
-        QueryError: If a part is empty, a quotation mark is missing, or there are too many parts.
+        QueryError: If it is empty, lacks a quotation mark, or has too many parts.
     """
     if len(text) > MAX_LENGTH:
         return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", unknown=True)
@@ -99,20 +120,24 @@ def understand(text: str) -> Understood:
     quoted: list[str] = re.findall(r'"([^"]*)"', text)
     numbers = iter(range(len(quoted)))
     hidden = re.sub(r'"[^"]*"', lambda _: f"\x00{next(numbers)}\x00", text.replace("\x00", ""))
-    plain = " ".join(hidden.split()).rstrip("?.!").strip()
+    plain = " ".join(hidden.split()).rstrip("?.!").strip() or text.strip()
+    if not plain:
+        raise QueryError("phrase", expected="words", found="nothing", remedy='such as "red mug"')
     mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
     asked = in_full(mended_text)
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
-    parsed, aside = parser.question(asked), not_in_answer(asked)
-    note = "; ".join(filter(None, (mended_note(mended), *dict.fromkeys(parser.notes), aside)))
-    unknown = aside.startswith('"') or (bool(parser.notes) and parser.stated)  # is the mug big?
-    left = next(
-        filter(None, (not_understood(patterns.HIDDEN.sub("thing", each)) for each in things_of(parsed))), ""
-    )
-    if left or parsed is None:
-        quote = f' ("{left}")' if left and re.search(rf"\b{re.escape(left)}\b", plain, re.IGNORECASE) else ""
+    aside = not_in_answer(asked)
+    unknown = aside.startswith('"')
+    try:
+        parsed = parser.whole_phrase(asked)
+    except _IncompleteError as incomplete:
         parsed, unknown = Thing(plain), True
-        note = f"not understood{quote}: asked for as one thing, in these words"
+        quote = own_words(str(incomplete), plain)
+        note = f'not understood ("{quote}"): asked for as one thing, in these words'
+    else:
+        unknown = unknown or (bool(parser.notes) and parser.stated)  # is the mug big?
+        told = (mended_note(mended), *dict.fromkeys(parser.notes + parser.asides), command_note(asked), aside)
+        note = in_own_letters("; ".join(filter(None, told)), plain)
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
 
 
@@ -131,6 +156,23 @@ class _Parser:
     def __init__(self, whole: str, together: bool = False, stated: bool = False) -> None:
         self.whole, self.together, self.stated = whole, together, stated
         self.notes: list[str] = []
+        self.asides: list[str] = []
+
+    def whole_phrase(self, asked: str) -> Phrase:
+        """A question or a phrase that is complete, and whose things are things.
+
+        Raises:
+            _IncompleteError: If it is not so.
+        """
+        if not asked.strip(string.punctuation + " "):
+            raise _IncompleteError("")
+        parsed = self.question(asked)
+        for thing in things_of(parsed):
+            if left := not_understood(patterns.HIDDEN.sub("thing", thing)):
+                raise _IncompleteError(left)
+        if has_stray_viewer(parsed):
+            raise _IncompleteError("me")
+        return parsed
 
     def question(self, asked: str) -> Phrase:
         """A question or a phrase, with the words around the thing."""
@@ -140,8 +182,10 @@ class _Parser:
                 to = self.phrase(found["to"] or found["from"] or "me")
                 return Related("nearest to" if found["near"] else "farthest from", these, to)
             return Pick(
-                patterns.COMPARATIVES[found["more"].lower()] if found["more"] else _picked(found), these
+                patterns.COMPARATIVES[found["more"].lower()] if found["more"] else picked(found), these
             )
+        if self.stated and is_place(as_phrase(asked)):  # is on the table
+            raise _IncompleteError(asked.split()[0])
         parsed = _loosened(self.phrase(as_phrase(asked)), self.together)
         if not asks_for_all(asked):
             return parsed
@@ -168,13 +212,26 @@ class _Parser:
             return Except(things, middle) if negated else middle
         if found := patterns.QUALITY.search(f" {words}"):
             noun, rest = undetermined(f" {words}"[: found.start()].strip()), found[2]
-            if not patterns.RELATION.search(f" {words} "[found.start() :]) and _is_quality(rest):
+            if not patterns.RELATION.search(f" {words} "[found.start() :]) and is_quality(rest):
+                if (pick := self.picked(noun, rest, found[1], deeper)) is not None:
+                    return pick
                 described = self.phrase(f"{rest} {noun}", deeper)
                 return Except(self.phrase(noun, deeper), described) if found[1] else described
         for split in (self.difference, self.union):
             if (joined := split(words, deeper)) is not None:
                 return joined
         return self.one(words, deeper)
+
+    def picked(self, noun: str, quality: str, negated: str | None, depth: int) -> Phrase | None:
+        """ "Largest toy that is (not) red": one of those; None for a noun without a superlative."""
+        pick = self.phrase(noun, depth)
+        if not isinstance(pick, (Pick, Related)) or not isinstance(pick.target, (Thing, Anything)):
+            return None
+        if isinstance(pick, Related) and pick.relation not in ORDERED:
+            return None
+        name = "thing" if isinstance(pick.target, Anything) else pick.target.text
+        described = self.phrase(f"{quality} {name}", depth)
+        return replace(pick, target=Except(pick.target, described) if negated else described)
 
     def difference(self, words: str, depth: int) -> Phrase | None:
         """ "A but not B"; None if it is none. "Toys but not the largest" names toys alone."""
@@ -183,14 +240,16 @@ class _Parser:
             return None
         if parts[1].strip().lower() in ("one", "two"):  # the largest but one
             return Thing(words)
-        first, second = (self.phrase(part, depth) for part in parts)
+        named = parts[0].strip()
+        first = Anything() if not named or patterns.ALL.match(named) else self.phrase(named, depth)
+        second = self.phrase(patterns.AND_NOT.sub(" and ", parts[1]), depth)
         if (
             isinstance(second, Pick)
             and second.target == Anything()
             and not patterns.NAMES_THINGS.search(parts[1])
         ):
             second = replace(second, target=first)
-        return Except(first, second)
+        return without(first, second) or Except(first, second)
 
     def union(self, words: str, depth: int) -> Phrase | None:
         """ "A and B", "A or B", "A, B"; None if it is none of them."""
@@ -199,25 +258,50 @@ class _Parser:
             return None
         joint = f" {words} "[len(parts[0]) : -len(parts[1])].strip().lower()
         one, other = parts[0].strip(), parts[1].strip()
-        if re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE):  # closest to both the mug and the lamp
-            return Thing(words)
-        if "," in words and _all_qualities(other):  # vase, white
+        if "," in words and all_qualities(other):  # vase, white
             return self.phrase(f"{other} {undetermined(one)}", depth)
         if (
-            _describes(one)
+            describes(one)
             and (noun := re.sub(rf"^(?:{patterns.ADJECTIVES}\s)+", "", undetermined(other))) != other
         ):
             if joint == "and" and noun != undetermined(other) and one == undetermined(one):
                 return self.thing(words)  # red and white ball
             one = f"{one} {noun}"  # the red or the yellow ball
         together = joint != "or" and " or " not in other
-        first, second = self.phrase(re.sub(r"^both\s", "", one), depth), self.phrase(other, depth)
+        shared = re.search(r"\S\s(?:both|either)\s", one, re.IGNORECASE)  # next to both the mug and the lamp
+        another = self.together and patterns.INDEFINITE.match(other)  # is there a thing on the mug and a cat
+        one = re.sub(r"(?:^|(?<=\s))(?:both|either)\s", "", one)
+        first, second = self.phrase(one, depth), self.phrase(other, depth)
+        if is_place(other):
+            return self.second_place(first, second, joint)
         is_placed = "target" in parts_of(first)
+        if isinstance(first, Related) and (
+            shared or (first.target == Anything() and not self.stated and not another)
+        ):
+            return self.second_reference(first, second, joint)
         if self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
             second = replace(first, reference=second)  # is the mug on the table or the cloth?
         elif not is_placed and (self.stated or (self.together and together)):
             first = _in_place_of(second, first)  # are the mug and the duck on the table?
         return (Together if together else Both)(first, second)
+
+    def second_place(self, first: Phrase, place: Phrase, joint: str) -> Phrase:
+        """ "Mug on the cloth and left of the duck": both of one thing; with "or" one of them."""
+        is_placed = isinstance(first, (Related, Between, InCorner, InPart))
+        if joint.endswith("or") and isinstance(first, (Related, Between, InCorner, InPart)):
+            return Both(first, placed(place, first.target))
+        if not is_placed and joint != ",":
+            raise _IncompleteError(joint)
+        return placed(place, first)
+
+    def second_reference(self, first: Related, second: Phrase, joint: str) -> Phrase:
+        """ "What is next to the mug and the duck": things next to both, but on the one or the other."""
+        if first.relation in ORDERED or not isinstance(second, (Thing, Both, Together)):
+            raise _IncompleteError(joint)
+        one_of = joint.endswith("or") or first.relation in ("on", "inside", "under", "below")
+        if one_of or not isinstance(second, Thing):
+            return Both(first, replace(first, reference=second))
+        return replace(first, target=first, reference=second)
 
     def one(self, words: str, depth: int) -> Phrase:
         """A phrase without "and" and "but"."""
@@ -225,19 +309,22 @@ class _Parser:
             rest = undetermined(words[found.end() :]) or "thing"
             return Pick(patterns.COMPARATIVES[found["more"].lower()], self.phrase(rest, depth))
         bare, before = patterns.THE_ONE.sub("thing ", words), None
-        quantity = rank = 0
+        quantity, rank, exact = 0, 0, False
         while bare != before:
             before = bare
             if not rank and (found := patterns.ORDINAL.match(bare)):
-                rank, bare = _number(found["number"]), bare[found.end() :]
+                rank, bare = number(found["number"]), bare[found.end() :]
             if not quantity and (found := patterns.QUANTITY.match(bare)):
-                quantity, bare = _number(found["number"]) + bool(found["more"]), bare[found.end() :]
+                quantity, bare = number(found["number"]) + bool(found["more"]), bare[found.end() :]
+                exact = bool(found["exact"])
             bare = patterns.DETERMINER.sub("", bare)
-        if quantity > 1 or rank:
+        if quantity > 1 or rank or exact:
             asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
             ordered = numbered(target, max(quantity, 1), max(rank, 1))
-            return ordered or (Thing(words) if rank else AtLeast(quantity, target))
+            return ordered or (
+                Thing(words) if rank else AtLeast(quantity, target, quantity if exact else None)
+            )
         if found := patterns.SIZE.match(bare):
             return self.sized(bare, found, depth)
         place = self.place(bare, depth)
@@ -261,51 +348,49 @@ class _Parser:
             relation: RelationName = "nearest to" if found[1] else "farthest from"
             return Related(relation, target, self.phrase(reference, depth) if reference else Viewer())
         if found := patterns.PICK.match(words):
-            return Pick(_picked(found), self.phrase(words[found.end() :] or "thing", depth))
+            return Pick(picked(found), self.phrase(words[found.end() :] or "thing", depth))
         if found := patterns.CORNER.match(f" {words}"):
             return self.corner(found, depth)
         if (found := patterns.PART.match(f" {words}")) and (part := self.part(found, depth)) is not None:
             return part
-        words = "thing " * bool(patterns.BY_ME.match(words)) + patterns.MY_SIDE.sub(r"\1 of me", words)
+        words = patterns.MY_SIDE.sub(r"\1 of me", words)
         if found := patterns.RELATION.search(f" {words} "):
             related = self.related(f" {words} ", found, depth)
             if related is not None:
                 return related
         for pattern in (patterns.NEAR_ME, patterns.ASIDE):
-            if (found := pattern.match(f" {words}")) and found[1].strip():
-                target, side = self.phrase(found[1], depth), found[2].lower()
+            found = pattern.match(f" {words}")
+            if found and (found[1].strip() or patterns.AT.match(words)):
+                target, side = self.phrase(found[1] or "thing", depth), found[2].lower()
                 if side in ("left", "right"):
                     return Pick("leftmost" if side == "left" else "rightmost", target)
                 return Related(
                     "nearest to" if side in ("nearest", "closest") else "farthest from", target, Viewer()
                 )
         if (found := patterns.IS_PICK.search(f" {words}")) and found.start():
-            return Pick(_picked(found), self.phrase(f" {words}"[: found.start()], depth))
+            return Pick(picked(found), self.phrase(f" {words}"[: found.start()], depth))
         return None
 
     def related(self, words: str, found: re.Match[str], depth: int) -> Phrase | None:
         """Two phrases in a relation; None if the word of the relation belongs to a thing."""
-        number = next(i for i in range(len(patterns.RELATIONS)) if found.group(f"r{i}") is not None)
+        relation = next(name for i, (_, name) in enumerate(patterns.RELATIONS) if found.group(f"r{i}"))
         target, reference = words[: found.start()].strip(), words[found.end() :].strip()
         if not reference and (" to " in f" {target} "):  # "something to sit on" has no reference
             return None
-        if reference.lower() in QUALITIES and patterns.RELATIONS[number][1] == "inside":  # a car in red
+        if reference.lower() in QUALITIES and relation == "inside":  # a car in red
             return self.thing(f"{reference} {target}")
-        if not target or not reference:
-            raise QueryError(
-                f"phrase {self.whole!r}",
-                expected="a thing on either side",
-                found="an empty part",
-                remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
-            )
-        if re.match(r"(?:the )?(?:far |very )?(?:left|right)(?: side)?$", reference) and number == 4:
+        if not reference:
+            raise _IncompleteError(found[0].strip())
+        if patterns.TO_A_SIDE.match(reference):
             return None  # mug on the left
-        things = self.phrase(target, depth)
-        related = Related(patterns.RELATIONS[number][1], things, self.phrase(reference, depth))
+        things = self.phrase(target, depth) if target else Anything()
+        related = Related(relation, things, self.phrase(reference, depth))
         return Except(things, related) if found.group("not") else related
 
     def corner(self, found: re.Match[str], depth: int) -> Phrase:
-        target, negated, one, other = found.groups()
+        target, negated, one, other, of = found.groups()
+        if of and not patterns.PLACE.match(of):
+            self.asides.append(f'"of {of}" is left out: corners are those of the whole scene')
         along = patterns.CORNER_SIDES.get((one or "").lower(), (one or "").lower())
         name = " ".join(filter(None, (along, (other or "").lower())))
         things = self.phrase(target or "thing", depth)
@@ -316,14 +401,14 @@ class _Parser:
         """Things in a part of an area; None for "in front of the mug" and "at the back of the mug"."""
         target, negated, determined, part, of = found.groups()
         name = patterns.PARTS.get(part.lower(), "middle")
-        is_place = not of or patterns.PLACE.match(of) is not None
+        is_room = not of or patterns.PLACE.match(of) is not None
         is_surface = bool(of) and singular(undetermined(of.lower())).split()[-1] in SURFACES
-        if of and (not determined or (name not in ("middle", "edge") and not (is_place or is_surface))):
+        if of and (not determined or (name not in ("middle", "edge") and not (is_room or is_surface))):
             return None
         if not of and name in ("left", "right"):  # one of several: the mug on the left side
             return None
         things = self.phrase(target or "thing", depth)
-        inside = InPart(things, name) if is_place else InPart(things, name, self.phrase(of, depth))
+        inside = InPart(things, name) if is_room else InPart(things, name, self.phrase(of, depth))
         return Except(things, inside) if negated else inside
 
     def thing(self, words: str) -> Phrase:
@@ -340,12 +425,7 @@ class _Parser:
         if found := patterns.SOMETHING.match(words):
             return thing_of(f"something {found[1]}")
         if not words:
-            raise QueryError(
-                f"phrase {self.whole!r}",
-                expected="a thing on either side",
-                found="an empty part",
-                remedy='such as: mug left of the lamp; words in "quotation marks" stay together',
-            )
+            raise _IncompleteError("")
         return thing_of(words if " to " in words or not_understood(words) else singular(words))
 
 
@@ -364,56 +444,3 @@ def _loosened(phrase: Phrase, together: bool) -> Phrase:
     if isinstance(phrase, Together) and not keeps:
         return Both(**changed)
     return replace(phrase, **changed) if changed else phrase
-
-
-def thing_of(text: str) -> Phrase:
-    """A thing by its words; "something red" and "red toy" are objects of the scene in a color."""
-    words = text.lower().split()
-    color, target = words.pop() if words[:1] == ["something"] else words.pop(0), " ".join(words)
-    color = "gray" if color == "grey" else color
-    if color in COLOR_WORDS and (target == "something" or is_kind(target)):
-        return Colored(color, Anything() if target == "something" else Thing(target))
-    return Thing(text)
-
-
-def undetermined(words: str) -> str:
-    """Words without articles and the like in front."""
-    while (shorter := patterns.DETERMINER.sub("", words)) != words:
-        words = shorter
-    return words
-
-
-def _picked(found: re.Match[str]) -> PickName:
-    return next(name for i, (_, name) in enumerate(patterns.PICKS) if found.group(f"p{i}") is not None)
-
-
-def _number(word: str) -> int:
-    """What a numeral says; "several" and the like are two."""
-    small = word.lower()
-    if digits := re.match(r"\d+", small):
-        return int(digits[0])
-    return next((words.index(small) + 1 for words in (NUMBERS, ORDINALS) if small in words), 2)
-
-
-def _describes(words: str) -> bool:
-    """Whether words name a color or the like, but no thing: "the red"."""
-    parts = undetermined(words).lower().split()
-    return bool(parts) and all(part in COLORS or part in patterns.PATTERNS for part in parts)
-
-
-def _is_quality(words: str) -> bool:
-    """Whether words after "that is" describe the noun: at most three, and no superlative or material."""
-    parts = words.lower().split()
-    first = parts[0]
-    names = any(re.fullmatch(pattern, parts[-1]) for pattern, _ in patterns.PICKS)
-    return (
-        len(parts) <= 3
-        and first not in ("the", "a", "an", "made", "built", "not")
-        and not names
-        and not patterns.NEAR_ME.match(f"x {words}")
-    )
-
-
-def _all_qualities(words: str) -> bool:
-    parts = re.split(r"[\s,]+(?:and\s)?", words.strip().lower())
-    return all(part in QUALITIES for part in parts)

@@ -44,7 +44,7 @@ BETWEEN = re.compile(
 )
 CORNER = re.compile(
     rf"^(.*?)\s{LINK}(not\s)?(?:in|at|on|into)\s(?:the|a|an|any|one|some)\s(?:(back|front|far|near|rear|top|bottom)"
-    r"(?:\s|-)?)?(?:(left|right)(?:\s|-)?(?:hand )?)?corners?(?:\sof\s.*)?$",
+    r"(?:\s|-)?)?(?:(left|right)(?:\s|-)?(?:hand )?)?corners?(?:\sof\s(.*))?$",
     re.IGNORECASE,
 )
 PART = re.compile(
@@ -63,7 +63,8 @@ PLACE = re.compile(
     re.IGNORECASE,
 )
 ASIDE = re.compile(
-    rf"^(.*?)\s{LINK}(?:(?:farthest|furthest|most) )?(?:(?:counting |counted |starting )?(?:(?:on|to|at) the |"
+    rf"^(.*?)\s{LINK}(?:(?:farthest|furthest|closest|nearest|most) )?"
+    r"(?:(?:counting |counted |starting )?(?:(?:on|to|at) the |"
     r"from (?:the )?))?(?:far |very )?(left|right)(?: (?:hand )?side)?$",
     re.IGNORECASE,
 )
@@ -71,11 +72,6 @@ NEAR_ME = re.compile(
     rf"^(.*?)\s{LINK}(?:the )?(nearest|closest|farthest|furthest)(?: away)?(?: one)?$", re.IGNORECASE
 )
 MY_SIDE = re.compile(r"\b(?:to|on|at) my (left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
-BY_ME = re.compile(
-    r"^(?:(?:to|on|at) my (?:left|right)(?: (?:hand )?side)?|"
-    r"(?:in front of|behind|near|next to|close to|around) me)$",
-    re.IGNORECASE,
-)
 DETERMINER = re.compile(
     r"^(?:the|a(?! bit\b)|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|"
     r"these|those|one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|such|"
@@ -87,7 +83,8 @@ THE_ONE = re.compile(
     re.IGNORECASE,
 )
 EXCEPT = re.compile(
-    r"\s(?:but not|but|without|except for|except|minus|excluding|other than|apart from|aside from|"
+    r"\s(?:but not|but|and not(?= (?:the|a|an|my) (?!left|right))|"
+    r"without|except for|except|minus|excluding|other than|apart from|aside from|"
     r"(?:(?:that|which) )?(?:is|are) not(?= (?:the|a|an|my) (?!left|right)))\s",
     re.IGNORECASE,
 )
@@ -100,6 +97,8 @@ PICKS: tuple[tuple[str, PickName], ...] = (
     (r"smallest|tiniest|littlest", "smallest"),
     (r"tallest|highest", "tallest"),
     (r"shortest|lowest|flattest", "shortest"),
+    (r"widest|broadest", "widest"),
+    (r"longest", "longest"),
     (r"leftmost|left(?! (?:of|side|end|half|part)\b)", "leftmost"),
     (r"rightmost|right(?! (?:of|side|end|half|part)\b)", "rightmost"),
 )
@@ -129,12 +128,14 @@ WHICH_OF = re.compile(
 PICK = re.compile(rf"^(?:very |single )?(?:{PICK_WORDS})(?:\s+(?:one )?(?:of )?|$)(?!of\b)", re.IGNORECASE)
 IS_PICK = re.compile(rf"\s{LINK}(?:the\s)?(?:{PICK_WORDS})(?:\sone)?$", re.IGNORECASE)
 EXTREME = re.compile(
-    r"^(?:(nearest|closest)|farthest|furthest|most distant)\s+(.+?)(?:\s+(?:away )?(?:to|from)\s+(.+))?$",
+    r"^(?:(nearest|closest)|farthest|furthest|most distant)\s+(?!(?:to|from|away)\s)(.+?)"
+    r"(?:\s+(?:away )?(?:to|from)\s+(.+))?$",
     re.IGNORECASE,
 )
 ORDINAL = re.compile(rf"^(?P<number>{'|'.join(ORDINALS)}|\d{{1,2}}(?:st|nd|rd|th))[\s-]+", re.IGNORECASE)
 QUANTITY = re.compile(
-    rf"^(?P<more>more than |over )?(?:at least )?(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
+    rf"^(?P<more>more than |over )?(?:at least )?(?P<exact>(?:exactly|precisely|only|just) )?"
+    rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
     r"a few|a couple of|a pair of(?! (?:scissors|glasses|trousers|pants|jeans|shorts|binoculars|headphones|pliers|"
     r"tongs)\b))"
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
@@ -155,11 +156,19 @@ THING_WORD = re.compile(
     r"^(?:(.*?)\s)?(?:things?|objects?|items?|everything|anything|something|stuff|ones?|whatever)$",
     re.IGNORECASE,
 )
-SOMETHING = re.compile(r"^(?:things?|objects?|items?|anything|something|stuff)\s+(.+)$", re.IGNORECASE)
+SOMETHING = re.compile(
+    r"^(?:things?|objects?|items?|everything|anything|something|stuff)\s+(.+)$", re.IGNORECASE
+)
 VIEWER = re.compile(
     r"^(?:me|us|you|myself|here|the (?:camera|viewer|observer)|(?:my|the) (?:position|viewpoint|view))$",
     re.IGNORECASE,
 )
+INDEFINITE = re.compile(r"^(?:an?|any|some)\s", re.IGNORECASE)
+AND_NOT = re.compile(r"\s(?:and|or|nor) not (?=(?:the|a|an|my) )", re.IGNORECASE)
+"""Behind "but not", which holds for what follows as well."""
+ALL = re.compile(r"^(?:all|any|everyone|anyone)$", re.IGNORECASE)
+TO_A_SIDE = re.compile(r"(?:the )?(?:far |very )?(?:left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
+AT = re.compile(r"^(?:on|at|to) ", re.IGNORECASE)
 HIDDEN = re.compile("\x00(\\d+)\x00")
 """A part in quotation marks, by its number."""
 CORNER_SIDES = {"far": "back", "rear": "back", "top": "back", "near": "front", "bottom": "front"}

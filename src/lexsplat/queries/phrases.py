@@ -10,13 +10,17 @@ RelationName = Literal[
     "left of", "right of", "in front of", "behind", "on", "under", "above", "below", "inside", "next to",
     "nearest to", "farthest from", "larger than", "smaller than", "taller than", "shorter than",
 ]  # fmt: skip
-PickName = Literal["largest", "smallest", "tallest", "shortest", "leftmost", "rightmost"]
+PickName = Literal[
+    "largest", "smallest", "tallest", "shortest", "widest", "longest", "leftmost", "rightmost"
+]  # fmt: skip
 CornerName = Literal[
     "", "left", "right", "back", "front", "back left", "back right", "front left", "front right"
 ]
 PartName = Literal["middle", "back", "front", "left", "right", "edge"]
 ORDERED = ("nearest to", "farthest from")
 """Relations that compare several instances."""
+TO_VIEWER = ("left of", "right of", "in front of", "behind", "next to", *ORDERED)
+"""Relations that a thing can have to a viewer."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +162,14 @@ class Pick:
 
 @dataclass(frozen=True)
 class AtLeast:
-    """All instances of ``target`` if there are as many as asked for, else nothing."""
+    """All instances of ``target`` if there are as many as asked for, and at most ``most`` if that is given."""
 
     count: int
     target: Phrase
+    most: int | None = None
 
     def __str__(self) -> str:
-        return f"(at least {self.count} {self.target})"
+        return f"({'at least' if self.most is None else 'exactly'} {self.count} {self.target})"
 
 
 @dataclass(frozen=True)
@@ -219,6 +224,41 @@ def numbered(phrase: Phrase, count: int, rank: int) -> Phrase | None:
         target = numbered(phrase.target, count, rank)
         return None if target is None else replace(phrase, target=target)
     return None
+
+
+def without(phrase: Phrase, other: Phrase) -> Phrase | None:
+    """The phrase with ``other`` taken off what it picks or counts from; None if it does neither."""
+    if isinstance(phrase, (Pick, AtLeast)):
+        return replace(phrase, target=without(phrase.target, other) or Except(phrase.target, other))
+    if isinstance(phrase, (Related, Between, InCorner, InPart)):
+        inner = without(phrase.target, other)
+        if inner is None and isinstance(phrase, Related) and phrase.relation in ORDERED:
+            inner = Except(phrase.target, other)
+        return None if inner is None else replace(phrase, target=inner)
+    return None
+
+
+def placed(place: Phrase, target: Phrase) -> Phrase:
+    """A place of any object as the place of ``target``: "left of the mug" as "duck left of the mug"."""
+    if isinstance(place, Anything):
+        return target
+    if isinstance(place, (Related, Between, InCorner, InPart)):
+        return replace(place, target=placed(place.target, target))
+    if isinstance(place, (Both, Together)):
+        return replace(place, first=placed(place.first, target), second=placed(place.second, target))
+    if isinstance(place, Except) and place.first == Anything():
+        return Except(target, placed(place.second, target))
+    return place
+
+
+def has_stray_viewer(phrase: Phrase) -> bool:
+    """Whether whoever asks stands where only a thing can: "me", "mug on me"."""
+    relates = isinstance(phrase, Related) and phrase.relation in TO_VIEWER
+    return isinstance(phrase, Viewer) or any(
+        has_stray_viewer(part)
+        for name, part in parts_of(phrase).items()
+        if not (relates and name == "reference" and isinstance(part, Viewer))
+    )
 
 
 def _numbered(phrase: Pick | Related) -> str:

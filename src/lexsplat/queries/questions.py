@@ -6,7 +6,7 @@ import re
 from functools import lru_cache
 
 from lexsplat.queries.everyday import everyday_words
-from lexsplat.queries.leftovers import ORDINALS, left_over
+from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
 from lexsplat.queries.spelling import frame_errors
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, default_vocabulary
 
@@ -52,18 +52,49 @@ _CONTRACTIONS = (
     (rf"\b({'|'.join(sorted(NAMES))})'s (?=\w)", r"\1 "),
 )
 _TAIL = re.compile(
-    rf"[\s,;]+(?:please|pls|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
+    rf"[\s,;]+(?:please|pls|plz|thx|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
     re.IGNORECASE,
 )
-_TAG = re.compile(r",\s*(?:right|correct|yes|no|or not|is it not|are they not)$", re.IGNORECASE)
+_ROBOT = r"(?:robot|alexa|siri|cortana|computer|google|assistant)"
+_TAG = re.compile(
+    rf",\s*(?:right|correct|yes|no|or not|{_ROBOT}|(?:is|are|was|were|does|do) (?:it|they|there)(?: not)?|"
+    r"(?:is|are) not (?:it|they|there)|is it not|are they not)$",
+    re.IGNORECASE,
+)
+_NEGATIVE = re.compile(
+    r"^((?:(?:please|hey|hi|so|well|ok|okay)[\s,]+)*(?:is|are|was|were|does|did|has|had|"
+    r"(?:do|have|can|could|would)(?= not (?:i|we|you|they|it|there|the|my|any|all|some|these|those|this|that)\b)"
+    r")) not (?=\w+ \S)",
+    re.IGNORECASE,
+)
+"""A negative question; it asks what its positive statement asks."""
+_REWORDED = (
+    (_NEGATIVE, r"\1 "),
+    (re.compile(r"\b(everything|anything|nothing|all)( else)? besides\b", re.IGNORECASE), r"\1 except"),
+    (
+        re.compile(
+            rf"\b(\w+) (?:of|in|with) (?:a |the )?({'|'.join(sorted(COLORS))}) colou?r\b", re.IGNORECASE
+        ),
+        r"\2 \1",
+    ),
+)
+_MOVES = r"(?:move|turn|drive|go|navigate|walk|fly|run|lead|guide|take)"
+_COMMAND = re.compile(
+    rf"^(?:(?:please|plz|hey|ok|okay|now|so|{_ROBOT}|can|could|would|will|you)[\s,:!]+)*({_MOVES})\s(?:me |us )?"
+    r"(?=(?:back |over |up |down |straight )?(?:to|towards?|around|past|at|the|a|an|my|near|next|behind|in|left|right)\b)",
+    re.IGNORECASE,
+)
 _WHERE_IS_IT = re.compile(
     r"[\s,;]+where (?:is it|are they|did it go|did i (?:leave|put) (?:it|them))$", re.IGNORECASE
 )
 
 _FRAMES: tuple[tuple[str, str], ...] = (
     # Courtesies and requests
-    (r"(?:please|pls|kindly|just|hey|hi|hello|ok|okay|so|well|now|um+|excuse me|and|also)[\s,!:]+", ""),
-    (rf"{_CAN} {_I} (?:please |kindly |just |ever )?(?={_FIND}\b)", ""),
+    (rf"(?:(?:hey|hi|hello|ok|okay) )?{_ROBOT}\s?[,:!]\s?", ""),
+    (rf"(?:hey|hi|hello|ok|okay) {_ROBOT} ", ""),
+    (rf"(?:please|pls|plz|kindly|just(?! (?:\d|{'|'.join(NUMBERS)})\b)|hey|hi|hello|ok|okay|so|well|now|um+|sorry|excuse me|and|also)[\s,!:]+", ""),
+    (rf"{_CAN} {_I} (?:please |kindly |just |ever |possibly |perhaps |maybe )*(?={_FIND}\b)", ""),
+    (rf"{_MOVES} (?:around|past) (?=the|a|an|my)", ""),
     (rf"(?:{_I} (?:want|need|wish|would like|would love|have|am trying|try|am going) (?:you )?to )(?={_FIND}\b)", ""),
     (r"(?:do you know|i wonder|i want to know|i would like to know|any idea|i am asking)(?: about)?[\s,]+(?=where|what|which|how|if)", ""),
     (r"if (?=there (?:is|are)\b)", ""),
@@ -76,25 +107,32 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     # Where
     (r"where (?:is it|are they)[\s,]+", ""),
     (rf"where(?: else| exactly)? {_CAN} {_I} (?:find|see|get|spot|look for|buy|locate)\s+", ""),
-    (rf"where (?:do|did|have|has|had|would) {_I} (?:ever |last )?(?:{_LEAVE}|have)\s+", ""),
-    (rf"where (?:{_CAN}) {_I} (\w+)(?: (.+))?$", "something to @ in"),
-    (r"where (?:is|are|was|were|has|have) (?:located |the whereabouts of )?(?=\S)", ""),
-    (r"where (.+?) (?:is|are|was|were)(?: located| standing| lying)?$", r"\1"),
+    (rf"where (?:did|have|has|had) {_I} (?:ever |last )?(?:{_LEAVE}|have)\s+", ""),
+    (rf"where do {_I} (?:keep|have|store) (?=(?:the|my|our|a|an)\b)", ""),
+    (rf"where (?:{_CAN}) {_I} (?!{_LEAVE} (?:the|my|our|this|that|these|those|it|them)\b)(\w+)(?: (.+))?$", "something to @ in"),
+    (r"where (?:is|are|was|were) (.+?) at$", r"\1"),
+    (rf"where (?:could|might|may|did|does|do) (?!{_I} )(.+?) (?:be|go|live|stand|sit|lie)$", r"\1"),
+    (rf"where (?:has|have|had) (?!{_I} )(.+?) (?:gone|been)$", r"\1"),
+    (r"where (?:is|are|was|were|has|have) (?!not\b)(?:located |the whereabouts of )?(?=\S)", ""),
+    (r"where (?!is not)(.+?) (?:is|are|was|were|(?:might|may|could|can) be)(?: located| standing| lying)?$", r"\1"),
     (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|poses?|place|sizes?|heights?|widths?|lengths?|dimensions) of ", ""),
     (r"in which (?:place|corner|spot) (?:is|are) ", ""),
+    (r"(?:which|what) (?:place|corner|spot) (?:is|are) (.+?) in$", r"\1"),
     # How many, how large
     (r"how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)", ""),
+    (rf"how (?:many|much)(?: of)?(?: the)? ([\w ]+?) (?:is|are) ((?:not )?(?:{'|'.join(sorted(QUALITIES))}))$", r"\1 that are \2"),
     (r"how (?:many|much)(?: of)?(?: the)? (?:different )?", ""),
     (r"count(?: up)?(?: all)?(?: of)?(?: the)? (?=\S)", ""),
     (r"(?:what (?:is|are) )?(?:the )?(?:total )?(?:number|amount|count|quantity) of ", ""),
     # Is there
-    (r"(?:(?:is|are|was|were) there|there (?:is|are)) ", ""),
+    (r"(?:(?:is|are|was|were) there|there (?:is|are)) (?:(?:still|already|really|actually|maybe|perhaps) )*", ""),
     (rf"{_CAN} (?:{_I}|{_ROOM}) (?:\w+ )?(?:see|have|find|spot|contain|hold|show|own|know|include|notice|recognize)(?: of)? ", ""),
     (rf"(?:have|has) (?:{_I}|{_ROOM}) (?:got|seen|found|noticed) ", ""),
     (rf"(?:have|has|had|did|do|does)(?: not)? {_I} (?:ever |just |already )?{_LEAVE} ", ""),
     (rf"(?:has|have) (.+?) been (?:seen|found|{_LEAVE})(?= |$)", r"\1"),
     (rf"have {_I} ", ""),
     (r"(?:got|seen|anyone seen) ", ""),
+    (r"(?:what|who) (?:does|do|did) ((?:the|my|a|an) .+?) (?:stand|sit|lie|hang|rest|lean) (?=(?:on|near|next to|close to|beside|alongside|in front of|behind)$)", r"what is \1 "),
     (r"(?:does|do|did) (?=.+ (?:stand|sit|lie|hang|rest|have)\b)", ""),
     # What and which
     (rf"(?:which|what) ([\w ]+?) (?:is|are) (?:the )?({'|'.join(ORDINALS)}|\d+(?:st|nd|rd|th)) (?:one )?(?=from)", r"\2 \1 "),
@@ -145,10 +183,15 @@ _PURPOSE = re.compile(
     re.IGNORECASE,
 )
 _LEFT_OVER = re.compile(
-    rf"^(?:can(?! (?:of|openers?)\b)|will|may|might|please)(?= \w)|^something to {_SEE}$|(?<=something ){_ANY}\b.*",
+    rf"^(?:can(?! (?:of|openers?)\b)|will|may|might|please)(?= \w)|^(?:turn|switch|go|move|walk)$|^something to {_SEE}$|(?<=something ){_ANY}\b.*",
     re.IGNORECASE,
 )
 """Words of a question that stay in a thing when no frame takes them off, beside those of `leftovers`."""
+_HOW_LARGE = re.compile(
+    r"^(?:.*\b)?how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)|"
+    r"\b(?:sizes?|heights?|widths?|lengths?|dimensions) of\b",
+    re.IGNORECASE,
+)
 _YES_OR_NO = re.compile(
     r"^(?:(?:please|hey|hi|so|well|ok|okay|tell me|check)[\s,]+)*(?:if |whether )?"
     r"(?:(?:is|are|was|were|do|does|did|have|has|can|could)\b|there (?:is|are)\b)"
@@ -185,9 +228,14 @@ def _vocabulary() -> frozenset[str]:
 
 
 def in_full(words: str) -> str:
-    """Words without contractions: "what is" for "what's"."""
+    """Words without contractions, "what is" for "what's", and a question without its "not".
+
+    "Isn't the mug on the table?" asks what "is the mug on the table?" asks.
+    """
     for contraction, long in _CONTRACTIONS:
         words = re.sub(contraction, long, words, flags=re.IGNORECASE)
+    for pattern, instead in _REWORDED:
+        words = pattern.sub(instead, words)
     return words
 
 
@@ -236,8 +284,16 @@ def not_in_answer(words: str) -> str:
     """A note on what a question asks for beside a thing and its place; "" if nothing."""
     if re.match(r"(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b", words, re.IGNORECASE):
         return 'the answer is the thing: "lexsplat list" tells colors'
+    if _HOW_LARGE.search(words):
+        return 'the answer is the thing: "lexsplat find" and "lexsplat list" tell its size'
     state = _STATE.search(words) if asks_yes_or_no(words) else None
     return f'"{state[1]}" is asked as a word of the thing, which photos may not tell' if state else ""
+
+
+def command_note(words: str) -> str:
+    """A note on a command to move, which a search does not do; "" if there is none."""
+    found = _COMMAND.match(words)
+    return f'"{found[1]}" is not done, only looked for' if found else ""
 
 
 def states(words: str) -> bool:
@@ -266,6 +322,8 @@ def _with_quality_first(words: str) -> str:
     One about several things is none: "the apple red and the banana yellow".
     """
     found = _LAST_QUALITIES.match(words)
+    if found and (noun := re.sub(r" not$", "", found[1], flags=re.IGNORECASE)) != found[1]:
+        return f"{_ARTICLES.sub('', noun)} that is not {found[2]}"
     if found and re.search(r"\b(?:and|or)\b", found[1]):
         return ""
     return f"{found[2]} {_ARTICLES.sub('', found[1])}" if found else words

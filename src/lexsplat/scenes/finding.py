@@ -10,16 +10,19 @@ import torch
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import thing_of, understand
+from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings, strange
+from lexsplat.queries.wording import thing_of
 from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
 
+_SHORT = 60
+"""Letters of a thing that every encoder reads whole; with longer ones it is asked."""
 _SHOWN = 40
 """Letters of an unknown word that a note shows, at most."""
 
@@ -31,6 +34,10 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
         QueryError: If a part of the phrase is empty.
     """
     understood = understand(phrase)
+    cut = max((_tokens_over(scene, text) for text in things_of(understood.phrase)), default=0)
+    if cut:
+        told = f"longer than the encoder reads: the last {cut} of its tokens are left out"
+        understood = replace(understood, note="; ".join(filter(None, (understood.note, told))))
     if understood.unknown:
         return understood
     vocabulary = words_of_things(scene.clip)
@@ -52,6 +59,13 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
         notes.append(f"the bundled encoder knows English words alone, not {listed}")
         return Understood(found, "; ".join(notes), unknown=True)
     return Understood(found, "; ".join(notes))
+
+
+def _tokens_over(scene: Scene, text: str) -> int:
+    """How many tokens of a text the encoder cuts off; 0 if the encoder does not tell."""
+    if len(text) <= _SHORT or scene.given_encode_text is not None:
+        return 0
+    return int(getattr(scene.preload(), "tokens_over", lambda _: 0)(text))
 
 
 def find_in(

@@ -93,7 +93,7 @@ class Scene:
         self._working = threading.RLock()
         """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
-        self._given_encode_text = encode_text
+        self.given_encode_text = encode_text
         self._encoder: TextTower | None = None
         self._cache: TextCache | None = None
         if folder is not None:
@@ -126,7 +126,7 @@ class Scene:
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
         other = Scene(
-            gaussians, field, self.views, self.clip, self.query, self.folder, self._given_encode_text
+            gaussians, field, self.views, self.clip, self.query, self.folder, self.given_encode_text
         )
         other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
         other.listener = self.listener
@@ -158,8 +158,8 @@ class Scene:
         Raises:
             ModelError: If the encoder cannot be loaded, or is not the one that belongs to the language.
         """
-        if self._given_encode_text is not None:
-            return self._given_encode_text(texts)
+        if self.given_encode_text is not None:
+            return self.given_encode_text(texts)
         known = self._encoder_hash
         if self._cache is None or known is None:
             return encode_each(self.preload(), texts, self.listener)
@@ -348,7 +348,7 @@ class Scene:
     @cached_property
     def kept(self) -> KeptObjects | None:
         """Its objects as its folder keeps them; None where it keeps none of this scene, encoder and query."""
-        return None if self._given_encode_text is not None else kept_objects_of(self)
+        return None if self.given_encode_text is not None else kept_objects_of(self)
 
     @property
     def hidden(self) -> Tensor:

@@ -1,0 +1,97 @@
+"""Words of a phrase: articles, numbers, qualities and places, and how a note quotes them."""
+
+from __future__ import annotations
+
+import re
+
+from lexsplat.queries import patterns
+from lexsplat.queries.colors import COLOR_WORDS
+from lexsplat.queries.kinds import is_kind
+from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
+from lexsplat.queries.phrases import Anything, Colored, Phrase, PickName, Thing
+from lexsplat.queries.vocabulary import COLORS, QUALITIES
+
+
+def own_words(left: str, plain: str) -> str:
+    """What of a text was not understood, in its own letters: the first of several that is in it."""
+    shown = " ".join(patterns.HIDDEN.sub(" ", plain).split())
+    short = re.search(r"\b\w+n['\u2019\u02bc]t\b", shown)
+    if short and short[0].lower().startswith(tuple(left.lower().split())):  # don't
+        return short[0]
+    for words in (left, *left.split(), left_over(shown), *shown.split()[:1]):
+        if words and (found := re.search(rf"(?<!\w){re.escape(words)}(?!\w)", shown, re.IGNORECASE)):
+            return found[0]
+    return shown[:20]
+
+
+def in_own_letters(note: str, plain: str) -> str:
+    """A note whose quotations have the letters of the text, in capitals or not."""
+
+    def own(quoted: re.Match[str]) -> str:
+        found = re.search(rf"(?<!\w){re.escape(quoted[1])}(?!\w)", plain, re.IGNORECASE)
+        return f'"{found[0]}"' if found else quoted[0]
+
+    return re.sub(r'"([^"]+)"', own, note)
+
+
+def is_place(words: str) -> bool:
+    """Whether words are a place alone: "left of the mug", "not in the corner"."""
+    if patterns.RELATION.match(f" {words} "):
+        return True
+    places = (patterns.BETWEEN, patterns.CORNER, patterns.PART)
+    return any((found := place.match(f" {words}")) is not None and not found[1] for place in places)
+
+
+def thing_of(text: str) -> Phrase:
+    """A thing by its words; "something red" and "red toy" are objects of the scene in a color."""
+    words = text.lower().split()
+    color, target = words.pop() if words[:1] == ["something"] else words.pop(0), " ".join(words)
+    color = "gray" if color == "grey" else color
+    if color in COLOR_WORDS and (target == "something" or is_kind(target)):
+        return Colored(color, Anything() if target == "something" else Thing(target))
+    return Thing(text)
+
+
+def undetermined(words: str) -> str:
+    """Words without articles and the like in front."""
+    while (shorter := patterns.DETERMINER.sub("", words)) != words:
+        words = shorter
+    return words
+
+
+def picked(found: re.Match[str]) -> PickName:
+    """The superlative of a match of `patterns.PICK_WORDS`."""
+    return next(name for i, (_, name) in enumerate(patterns.PICKS) if found.group(f"p{i}") is not None)
+
+
+def number(word: str) -> int:
+    """What a numeral says; "several" and the like are two."""
+    small = word.lower()
+    if digits := re.match(r"\d+", small):
+        return int(digits[0])
+    return next((words.index(small) + 1 for words in (NUMBERS, ORDINALS) if small in words), 2)
+
+
+def describes(words: str) -> bool:
+    """Whether words name a color or the like, but no thing: "the red"."""
+    parts = undetermined(words).lower().split()
+    return bool(parts) and all(part in COLORS or part in patterns.PATTERNS for part in parts)
+
+
+def is_quality(words: str) -> bool:
+    """Whether words after "that is" describe the noun: at most three, and no superlative or material."""
+    parts = words.lower().split()
+    first = parts[0]
+    names = any(re.fullmatch(pattern, parts[-1]) for pattern, _ in patterns.PICKS)
+    return (
+        len(parts) <= 3
+        and first not in ("the", "a", "an", "made", "built", "not")
+        and not names
+        and not patterns.NEAR_ME.match(f"x {words}")
+    )
+
+
+def all_qualities(words: str) -> bool:
+    """Whether each word describes a thing: "red, striped"."""
+    parts = re.split(r"[\s,]+(?:and\s)?", words.strip().lower())
+    return all(part in QUALITIES for part in parts)

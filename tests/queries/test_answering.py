@@ -1,0 +1,98 @@
+"""Answers to unions, counts and widths, on groups of points at known places."""
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.queries.answering import Searched, answer
+from lexsplat.queries.grammar import parse
+from lexsplat.queries.selection import Selection
+
+UP = np.array([0.0, 0.0, 1.0])
+SIZES = {  # half sizes along x, y and z of boxes of points, of which 20 are in the middle
+    "apple": (0.2, 0.2, 0.2),
+    "other apple": (0.2, 0.2, 0.2),
+    "board": (0.9, 0.2, 0.05),
+    "pole": (0.1, 0.1, 1.2),
+}
+CAMERAS = {"front": look_at([0.0, -9.0, 1.5], [0.0, 0.0, 0.0], UP, 64, 48, 0.8)}
+
+
+@pytest.fixture(scope="module")
+def select():
+    rng = np.random.default_rng(0)
+    points = [
+        rng.uniform(-1, 1, (200, 3)) * size * np.where(np.arange(200) < 20, 0.2, 1.0)[:, None]
+        + (3.0 * number, 0, 0)
+        for number, size in enumerate(SIZES.values())
+    ]
+    gaussians = gaussians_from_points(
+        np.concatenate(points), np.full((200 * len(SIZES), 3), 0.5), sh_degree=0, opacity=0.8
+    )
+
+    def select(*names: str, first: int = 200) -> Selection:
+        mask = torch.zeros(len(gaussians), dtype=torch.bool)
+        for name in names:
+            start = 200 * list(SIZES).index(name)
+            mask[start : start + first] = True
+        return Selection(gaussians, CAMERAS, mask, mask.float(), phrase=" ".join(names))
+
+    return select
+
+
+def asked(text: str, words: dict[str, Selection], objects: tuple[Selection, ...] = ()) -> Selection:
+    return answer(parse(text), Searched(lambda word: words[word], lambda _: None, lambda: objects))
+
+
+def test_an_apple_that_is_red_and_a_bit_green_is_counted_once(select):
+    words = {"red apple": select("apple"), "green apple": select("apple", first=20)}
+    assert asked("is the apple red or green?", words).count == 1
+    assert asked("is the apple green or red?", words).count == 1
+    assert len(asked("is the apple green or red?", words)) == 200
+
+
+def test_apples_of_two_colors_are_counted_both(select):
+    words = {"red apple": select("apple"), "green apple": select("other apple")}
+    assert asked("the red or the green apple", words).count == 2
+
+
+def test_a_stem_and_its_apple_stay_apart(select):
+    assert asked("apple or stem", {"apple": select("apple"), "stem": select("apple", first=20)}).count == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("exactly two apples", 2), ("exactly one apple", 0), ("only one apple", 0), ("exactly three apples", 0),
+     ("at least one apple", 2)],
+)  # fmt: skip
+def test_a_number_is_exact_where_it_is_asked_so(select, text, count):
+    found = asked(text, {"apple": select("apple", "other apple")})
+    assert found.count == count
+    assert (found.present == "no") == (count == 0)
+    assert ("2 found" in found.note) == (count == 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("the widest thing", "board"),
+        ("the longest thing", "pole"),
+        ("the longest thing but the pole", "board"),
+    ],
+)
+def test_widths_are_horizontal_and_lengths_are_of_any_direction(select, text, name):
+    objects = tuple(select(each) for each in SIZES)
+    found = asked(text, {"pole": select("pole")}, objects)
+    assert [each.phrase for each in found.instances] == [name]
+
+
+def test_an_exception_leaves_the_next_one_of_a_superlative(select):
+    objects = tuple(select(each) for each in SIZES)
+    words = {"pole": select("pole"), "apple": select("apple")}
+    (found,) = asked("the tallest thing except the pole", words, objects).instances
+    assert "apple" in found.phrase
+    words["board"] = select("board")
+    (found,) = asked("the closest thing to the pole except the board", words, objects).instances
+    assert found.phrase == "other apple"

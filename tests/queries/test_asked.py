@@ -1,0 +1,238 @@
+"""Questions whose words turn an answer round: negatives, places alone, exceptions from superlatives, commands."""
+
+import re
+
+import pytest
+
+from lexsplat.queries.grammar import parse, understand
+from lexsplat.queries.phrases import (
+    Anything,
+    AtLeast,
+    Both,
+    Colored,
+    Except,
+    InCorner,
+    Pick,
+    Related,
+    Thing,
+    Together,
+    Understood,
+    Viewer,
+)
+
+ANY, ME = Anything(), Viewer()
+MUG, DUCK, TABLE, CLOTH = Thing("mug"), Thing("duck"), Thing("table"), Thing("cloth")
+LAMP, TOY, APPLE, BEAR = Thing("lamp"), Thing("toy"), Thing("apple"), Thing("bear")
+NOT_LAMP, ON_CLOTH = Except(ANY, LAMP), Related("on", MUG, CLOTH)
+
+
+@pytest.mark.parametrize(
+    ("negative", "positive"),
+    [
+        ("isn't the duck on the table?", "is the duck on the table?"),
+        ("isn't the mug on the cloth", "is the mug on the cloth"),
+        ("aren't the books on the table", "are the books on the table"),
+        ("doesn't the lamp stand on the table", "does the lamp stand on the table"),
+        ("wasn't the mug on the table", "was the mug on the table"),
+        ("is not the mug on the table?", "is the mug on the table?"),
+        ("isn't there a cat", "is there a cat"),
+        ("aren't there two ducks", "are there two ducks"),
+        ("wasn't there a mug here?", "was there a mug here?"),
+        ("isn't the mug blue?", "is the mug blue?"),
+        ("can't you see the mug on the table", "can you see the mug on the table"),
+        ("don't you see the mug on the table", "do you see the mug on the table"),
+        ("please, isn't the mug on the cloth?", "please, is the mug on the cloth?"),
+        ("Isn\u2019t the duck on the table?", "is the duck on the table?"),
+        ("aren't all toys on the table", "are all toys on the table"),
+    ],
+)
+def test_a_negative_question_asks_the_positive_statement(negative, positive):
+    assert understand(negative) == understand(positive)
+    assert "minus" not in str(parse(negative))
+    assert not understand(negative).note
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("is the mug not on the table?", Except(MUG, Related("on", MUG, TABLE))),
+        ("the duck isn't on the table, is it?", Except(DUCK, Related("on", DUCK, TABLE))),
+        ("is the mug not blue", Except(MUG, Thing("blue mug"))),
+        ("what isn't on the table", Except(ANY, Related("on", ANY, TABLE))),
+        ("what isn't red", Except(ANY, Colored("red", ANY))),
+        ("not on the table", Except(ANY, Related("on", ANY, TABLE))),
+    ],
+)
+def test_a_denial_leaves_out_of_what_it_names(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("on the table", Related("on", ANY, TABLE)),
+        ("left of the mug", Related("left of", ANY, MUG)),
+        ("next to the lamp", Related("next to", ANY, LAMP)),
+        ("around the apple", Related("next to", ANY, APPLE)),
+        ("beside the duck", Related("next to", ANY, DUCK)),
+        ("left of me", Related("left of", ANY, ME)),
+        ("in front of the camera", Related("in front of", ANY, ME)),
+        ("closest to the duck", Related("nearest to", ANY, DUCK)),
+        ("farthest from the duck", Related("farthest from", ANY, DUCK)),
+        ("look under the table", Related("under", ANY, TABLE)),
+        ("without the duck", Except(ANY, DUCK)),
+        ("all but the mug", Except(ANY, MUG)),
+        ("where's the mug at?", MUG),
+        ("where is mug at", MUG),
+        ("which corner is the lamp in", LAMP),
+        ("what does the lamp stand next to", Related("next to", ANY, LAMP)),
+        ("what does the lamp stand on", Related("under", ANY, LAMP)),
+        ("a mug on the cloth and left of the duck", Related("left of", Related("on", MUG, CLOTH), DUCK)),
+        ("mug that is on the cloth and next to the duck", Related("next to", Related("on", MUG, CLOTH), DUCK)),
+        ("mug near lamp or near duck", Both(Related("next to", MUG, LAMP), Related("next to", MUG, DUCK))),
+        ("mug on the cloth and not next to the duck", Except(ON_CLOTH, Related("next to", ON_CLOTH, DUCK))),
+        ("mug, left of the duck", Related("left of", MUG, DUCK)),
+        ("on the left", Pick("leftmost", ANY)),
+    ],
+)  # fmt: skip
+def test_a_place_alone_is_any_object_there_and_two_places_hold_for_one_thing(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("is the lamp on?", "on"),
+        ("mug on", "on"),
+        ("mug and", "and"),
+        ("and", "and"),
+        ("left of", "left of"),
+        ("when was the lamp turned on", "on"),
+        ("is there something in front of me that I could trip over", "over"),
+        ("left of what is the mug", "what"),
+        ("is near the mug something?", "is"),
+        ("mug on me", "me"),
+        ("mug and me", "me"),
+        ("...", "..."),
+        ("?", "?"),
+    ],
+)
+def test_what_stays_incomplete_is_one_plain_phrase_and_never_an_error(text, named):
+    understood = understand(text)
+    assert understood.phrase == Thing(text.rstrip("?") or text)
+    assert understood.unknown
+    assert understood.note.startswith(f'not understood ("{named}"')
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("the closest thing to the mug except the duck", Related("nearest to", Except(ANY, DUCK), MUG)),
+        ("the nearest toy to the duck other than the bear", Related("nearest to", Except(TOY, BEAR), DUCK)),
+        ("biggest thing other than the lamp", Pick("largest", NOT_LAMP)),
+        ("the biggest toy but the bear", Pick("largest", Except(TOY, BEAR))),
+        ("the tallest thing that is not the lamp", Pick("tallest", NOT_LAMP)),
+        ("the leftmost thing that isn't the lamp", Pick("leftmost", NOT_LAMP)),
+        ("the two biggest things except the lamp", Pick("largest", NOT_LAMP, 2)),
+        ("the tallest thing on the table except the lamp", Pick("tallest", Except(Related("on", ANY, TABLE), LAMP))),
+        ("the tallest thing that is not red", Pick("tallest", Except(ANY, Colored("red", ANY)))),
+        ("the tallest thing that is red", Pick("tallest", Colored("red", ANY))),
+        ("two things except the lamp", AtLeast(2, NOT_LAMP)),
+    ],
+)  # fmt: skip
+def test_an_exception_is_taken_off_before_the_superlative_picks(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("duck, mug and not the apple", Except(Both(DUCK, MUG), APPLE)),
+        ("toys, but not the duck and not the bear", Except(TOY, Both(DUCK, BEAR))),
+        ("is there a thing on the mug and a duck?", Together(Related("on", ANY, MUG), DUCK)),
+        ("plz find mug", MUG),
+        ("the mug of red color", Thing("red mug")),
+        ("everything red", Colored("red", ANY)),
+        ("everything green", Colored("green", ANY)),
+        ("how many things are yellow?", Colored("yellow", ANY)),
+        ("how many mugs are red?", Thing("red mug")),
+        ("how many toys are not yellow", Except(TOY, Colored("yellow", TOY))),
+        ("hey robot, bring me the mug", MUG),
+        ("robot, find the mug", MUG),
+        ("where is the mug, robot?", MUG),
+        ("Alexa, where is the mug", MUG),
+        ("is there still a mug", MUG),
+        ("sorry, where is the mug", MUG),
+        ("could you possibly tell me where the yellow duck might be?", Thing("yellow duck")),
+        ("where could the mug be", MUG),
+        ("where did the duck go", DUCK),
+        ("where has the duck gone", DUCK),
+        ("the object at the far left", Pick("leftmost", ANY)),
+        ("toy that is closest to the left", Pick("leftmost", TOY)),
+        ("things at the right", Pick("rightmost", ANY)),
+        ("everything besides the lamp", NOT_LAMP),
+        ("mug besides the duck", Related("next to", MUG, DUCK)),
+        ("what is next to the mug and the duck", Related("next to", Related("next to", ANY, MUG), DUCK)),
+        ("things next to the mug or the duck", Both(Related("next to", ANY, MUG), Related("next to", ANY, DUCK))),
+        ("what is near both the mug and the duck", Related("next to", Related("next to", ANY, MUG), DUCK)),
+        ("the widest thing", Pick("widest", ANY)),
+        ("the longest thing on the table", Pick("longest", Related("on", ANY, TABLE))),
+        ("where do I put flowers", Thing("something to put flowers in")),
+        ("exactly two mugs", AtLeast(2, MUG, 2)),
+        ("is there only one duck?", AtLeast(1, DUCK, 1)),
+        ("is there exactly one mug?", AtLeast(1, MUG, 1)),
+        ("is there just one lamp", AtLeast(1, LAMP, 1)),
+    ],
+)  # fmt: skip
+def test_what_people_say_around_a_thing_is_understood(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected", "told"),
+    [
+        ("how tall is the mug", MUG, "size"),
+        ("how big is the mug?", MUG, "size"),
+        ("what is the height of the mug?", MUG, "size"),
+        ("move the mug to the left", Pick("leftmost", MUG), '"move"'),
+        ("Go to the mug", MUG, '"Go"'),
+        ("turn to the mug", MUG, '"turn"'),
+        ("drive around the mug", MUG, '"drive"'),
+        ("can you please navigate to the mug", MUG, '"navigate"'),
+        ("what is in the corner of the table", InCorner(ANY), '"of the table"'),
+    ],
+)
+def test_what_a_question_asks_beside_the_thing_is_told(text, expected, told):
+    understood = understand(text)
+    assert understood.phrase == expected
+    assert told in understood.note
+    assert not understood.unknown
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("where should I put the mug?", "where"),
+        ("where do I put the mug?", "where"),
+        ("don't show me the mug", "don't"),
+        ("do not touch the mug", "do"),
+        ("turn left", "turn"),
+        ("where isn't the mug", "where"),
+        ("is on the table", "is"),
+        ("hasn't the duck a beak", "hasn't"),
+        ("turn on the lamp", "turn"),
+        ("Half of the mugs", "Half"),
+        ("WHY is it red", "WHY"),
+        ("at most two toys", "at"),
+        ("fewer than five apples", "fewer"),
+    ],
+)
+def test_a_note_on_what_is_not_understood_names_a_word_in_its_own_letters(text, told):
+    note = understand(text).note
+    assert note.startswith(f'not understood ("{told}"')
+    assert all(quoted in text for quoted in re.findall('"([^"]*)"', note))
+
+
+def test_typing_errors_and_sizes_are_quoted_in_their_own_letters():
+    assert understand("Whre is the mug").note.startswith('"Whre"')
+    assert understand("Small mug").note.startswith('"Small"')

@@ -1,0 +1,46 @@
+"""Notes of answers of the bundled scene, and questions that must not be turned round."""
+
+import pytest
+
+from lexsplat.scenes.answers import find_phrases
+from lexsplat.scenes.scene import open_scene
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return open_scene("demo", device="cpu")
+
+
+def test_a_phrase_that_the_encoder_cuts_is_told_in_the_note(demo):
+    assert "tokens" not in demo.understand("a mug with a blue handle").note
+    long = "a mug " + "that my brother and I have painted with very small flowers " * 5
+    assert "tokens are left out" in demo.understand(long).note
+    assert "tokens are left out" in demo.understand("mug " * 200).note
+
+
+@pytest.mark.parametrize(
+    ("question", "present", "names"),
+    [
+        ("isn't the duck on the table?", "yes", ["duck"]),
+        ("isn't the cat on the table", "no", []),
+        ("is the apple red or green?", "yes", ["apple"]),
+        ("the closest thing to the mug except the duck", "yes", ["apple"]),
+        ("the tallest thing that is not the lamp", "yes", ["teddy bear"]),
+        ("is there exactly one mug?", "yes", ["mug"]),
+        ("are there exactly two mugs?", "no", []),
+    ],
+)
+def test_negatives_exceptions_and_exact_numbers_are_answered_rightly(demo, question, present, names):
+    (answer,) = find_phrases(demo, question)["phrases"]
+    assert answer["present"] == present
+    assert [thing["name"].split()[-1] for thing in answer["instances"]] == [
+        name.split()[-1] for name in names
+    ]
+
+
+def test_one_phrase_that_is_no_words_leaves_the_others_of_a_batch_answered(demo):
+    mug, nothing, place, duck = find_phrases(demo, ["mug", "...", "is the lamp on?", "duck"])["phrases"]
+    assert (mug["present"], duck["present"]) == ("yes", "yes")
+    for answer in (nothing, place):
+        assert answer["present"] != "yes"
+        assert "not understood" in answer["note"]
