@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.boxes import upright_frame
 from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.contact import is_over, rests_on
 from lexsplat.queries.phrases import ORDERED, CornerName, PartName, RelationName
 from lexsplat.queries.selection import Selection, union
 
@@ -24,11 +25,6 @@ _CONE = 0.5
 """Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
 _NEAR = 0.5
 """Next to: the gap is at most this many diagonals of the smaller footprint (height does not count)."""
-_SUPPORT = 0.5
-"""On: the gap below is at most this many heights of the object. Selections often miss the foot of an object, which
-lies in its own shadow."""
-_OVER = 0.3
-"""Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
 _CORNER = 0.5
 """In a corner: at least this far out along both sides, from 0 (the middle) to 1."""
 _MIDDLE = 0.5
@@ -93,18 +89,19 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
     if relation in ("left of", "right of", "in front of", "behind"):
         return _sideways(relation, target, reference, frame)
     if relation == "on":
-        return _rests_on(target, reference, frame) or _stands_over(target, reference, frame)
+        return rests_on(target, reference, frame.up)
     if relation == "under":
-        return _rests_on(reference, target, frame) or _over(reference, target, frame)
+        carries = rests_on(reference, target, frame.up) or is_over(reference, target, frame.up)
+        return carries and not rests_on(target, reference, frame.up)
     if relation in ("above", "below"):
         upper, lower = (target, reference) if relation == "above" else (reference, target)
-        return _over(upper, lower, frame)
+        return is_over(upper, lower, frame.up)
     if relation == "inside":
         share = float(reference.box.contains(target.sample).mean())
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
-        return bool(distance(target, reference) <= _NEAR * smaller) and not _over(target, reference, frame)
+        return bool(distance(target, reference) <= _NEAR * smaller) and not is_over(target, reference, frame.up)
     raise ValueError(f"not a relation between two instances: {relation!r}")
 
 
@@ -275,56 +272,6 @@ def _sideways(relation: str, target: Selection, reference: Selection, frame: Fra
     along = float(level @ axis)
     reach = float((np.abs(reference.box.axes @ axis) * reference.box.half_sizes).sum())
     return along > 0.5 * reach and along >= _CONE * float(np.linalg.norm(level))
-
-
-def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
-    """Whether the support has a surface below the target, close to the bottom of the target.
-
-    No view may have seen the ground below an object, so its surroundings count: the part of the support within the
-    target's footprint, widened by half. The edge of a cloth is in there for an object beside the cloth as well, so
-    the footprints must overlap first.
-    """
-    if not _overlap(target, support):
-        return False
-    box, height = target.box, float(2 * target.box.half_sizes[2])
-    points = support.sample
-    local = (points - box.center) @ box.axes.T
-    below = (np.abs(local[:, :2]) <= 1.5 * box.half_sizes[:2]).all(1) & (local[:, 2] < 0)
-    if below.sum() < 5:
-        return False
-    gap = float(np.median(local[below, 2])) + float(
-        box.half_sizes[2]
-    )  # 0: the surface is at the bottom of the target
-    spacing = target._spacing()
-    higher = float((target.center - support.center) @ frame.up) > 0
-    surface = float(np.quantile(local[below, 2], 0.9)) + float(box.half_sizes[2])
-    return (higher or abs(surface) <= _SUPPORT * height) and min(abs(gap), abs(surface)) <= max(
-        _SUPPORT * height, 2 * spacing
-    )
-
-
-def _stands_over(target: Selection, support: Selection, frame: Frame) -> bool:
-    """Whether the target is over the support with its bottom at the support's top: on a table under a cloth."""
-    bottom = float(target.center @ frame.up) - float(target.box.half_sizes[2])
-    top = float(support.center @ frame.up) + float(support.box.half_sizes[2])
-    return _over(target, support, frame) and abs(bottom - top) <= _SUPPORT * float(
-        2 * target.box.half_sizes[2]
-    )
-
-
-def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
-    """Whether one object is higher than the other, and over it."""
-    rise = float((upper.center - lower.center) @ frame.up)
-    if rise < 0.8 * float(upper.box.half_sizes[2] + lower.box.half_sizes[2]):
-        return False
-    return _overlap(upper, lower)
-
-
-def _overlap(first: Selection, second: Selection) -> bool:
-    """Whether the footprints of two objects overlap, seen from above."""
-    small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
-    local = (small.sample - large.center) @ large.box.axes[:2].T
-    return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
 
 
 def _level(offset: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
