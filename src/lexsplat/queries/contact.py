@@ -30,6 +30,8 @@ _FEW = 30
 """With fewer points near the foot, the surface is hidden there (by a cloth), and all of it counts."""
 _BEYOND = 0.04
 """On each side of the middle of the foot lies at least this share of the surface: the foot is not beside it."""
+_TAIL = 0.004
+"""The same where the whole surface counts: fewer points than these are strays."""
 _OVER = 0.3
 """Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
 _SINK = 0.1
@@ -83,7 +85,7 @@ def rests_on(target: Selection, support: Selection, up: NDArray[np.float64]) -> 
         return _attached(upper, lower, normal) and not _supported(target, support, up)
     if not _is_higher(upper, lower):
         return False
-    gap, height = _gap(upper, lower)
+    gap, height = _gap(upper, lower, overlap(target, support))
     if gap > max(_SUPPORT * height, 2 * target._spacing()):
         return 0 < gap <= _COLUMN * height and _filled(target, upper, gap, up)
     return True
@@ -129,16 +131,18 @@ def _is_higher(upper: Body, lower: Body) -> bool:
     return _near(upper, *_disc(lower)).middle > lower.middle
 
 
-def _gap(upper: Body, lower: Body) -> tuple[float, float]:
+def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
     """The gap between a body and one below it, and the height of the upper one there.
 
-    The gap is infinite where the narrower one is beside the wider one.
+    The gap is infinite where the narrower one is beside the wider one. A cloth, a shadow or the thing itself may hide
+    the surface near the foot. Then all of a low surface counts: a table does, a wall or a chair does not.
     """
     if upper.width <= lower.width:
         (bottom, top), middle = upper.span(), upper.middle
         foot = upper.only(upper.heights <= bottom + _FOOT * (top - bottom))
         near = _near(lower.only(lower.heights <= middle), *_disc(foot))
-        if not _surrounds(near, foot):
+        low = float(np.quantile(lower.heights, 0.9)) <= middle
+        if not _surrounds(near, foot) and not (low and (overlapping or _surrounds(lower, foot, _TAIL))):
             return np.inf, top - bottom
         surfaces = np.quantile(near.heights, [0.5, 0.9])
     else:
@@ -153,13 +157,13 @@ def _gap(upper: Body, lower: Body) -> tuple[float, float]:
     return float(gaps[np.abs(gaps).argmin()]), top - bottom
 
 
-def _surrounds(surface: Body, part: Body) -> bool:
+def _surrounds(surface: Body, part: Body, beyond: float = _BEYOND) -> bool:
     """Whether the middle of a part lies within a surface, seen from above."""
     if len(surface.heights) < 5 or len(part.heights) == 0:
         return False
     sides = (surface.plan - np.median(part.plan, 0)) @ _SIDES > 0
     share = sides.mean(0)
-    return bool(np.minimum(share, 1 - share).min() >= _BEYOND)
+    return bool(np.minimum(share, 1 - share).min() >= beyond)
 
 
 def _filled(target: Selection, upper: Body, gap: float, up: NDArray[np.float64]) -> bool:

@@ -6,7 +6,7 @@ and "under" depend on gravity alone. Relations hold between instances, by their 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -21,8 +21,10 @@ from lexsplat.queries.selection import Selection, union
 
 _Ranked = TypeVar("_Ranked")
 
-_CONE = 0.5
+CONE = 0.5
 """Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
+REACH = 0.5
+"""Sideways: the centers are farther apart along the axis than this many times the half size of the other."""
 _NEAR = 0.5
 """Next to: the gap is at most this many diagonals of the smaller footprint (height does not count)."""
 _CORNER = 0.5
@@ -101,22 +103,58 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
-        return bool(distance(target, reference) <= _NEAR * smaller) and not is_over(target, reference, frame.up)
+        return bool(distance(target, reference) <= _NEAR * smaller) and not is_over(
+            target, reference, frame.up
+        )
     raise ValueError(f"not a relation between two instances: {relation!r}")
 
 
-def related(relation: RelationName, targets: Selection, references: Selection, frame: Frame) -> Selection:
-    """The instances of ``targets`` that stand in a relation to an instance of ``references``."""
+def related(
+    relation: RelationName,
+    targets: Selection,
+    references: Selection,
+    viewer: Frame | Callable[[Selection, Selection], Frame],
+) -> Selection:
+    """The instances of ``targets`` that stand in a relation to an instance of ``references``.
+
+    What lies below a support of the reference is not "under" it: under a mug is the table, not the floor.
+
+    Args:
+        relation: One that `holds` knows.
+        targets: What to choose from.
+        references: What they are related to.
+        viewer: Whose left it is, or whose for each pair (`lexsplat.queries.viewers`).
+    """
     pairs = [
-        target
+        (target, reference)
+        for reference in references.instances
         for target in targets.instances
-        if any(
-            holds(relation, target, _without(reference, target), frame)
-            for reference in references.instances
-            if not same(target, reference)
+        if not same(target, reference)
+    ]
+    held = []
+    for target, reference in pairs:
+        one, other = _disjoint(target, reference)
+        if one and other and holds(relation, one, other, viewer(one, other) if callable(viewer) else viewer):
+            held.append((target, reference))
+    if relation == "under" and len(held) > 1:
+        held = _not_below_supports(held, references.up.direction)
+    kept = {id(target) for target, _ in held}
+    return _union(targets, [target for target in targets.instances if id(target) in kept])
+
+
+def _not_below_supports(
+    pairs: Sequence[tuple[Selection, Selection]], up: NDArray[np.float64]
+) -> list[tuple[Selection, Selection]]:
+    """Pairs of a thing and what is above it, without the things below one that carries the same."""
+    carriers = [pair for pair in pairs if rests_on(*_disjoint(*pair)[::-1], up)]
+    return [
+        pair
+        for pair in pairs
+        if pair in carriers
+        or not any(
+            other is pair[1] and is_over(*_disjoint(carrier, pair[0]), up) for carrier, other in carriers
         )
     ]
-    return _union(targets, pairs)
 
 
 def nearest(
@@ -159,7 +197,7 @@ def between(targets: Selection, first: Selection, second: Selection) -> Selectio
             return False
         to_one, to_other = one.center - target.center, other.center - target.center
         lengths = np.linalg.norm(to_one) * np.linalg.norm(to_other)
-        return bool(lengths > 0 and to_one @ to_other <= -_CONE * lengths)
+        return bool(lengths > 0 and to_one @ to_other <= -CONE * lengths)
 
     pairs = [(one, other) for one in first.instances for other in second.instances]
     return _union(
@@ -188,7 +226,7 @@ def beside_viewer(
     else:
         axis, share = {
             "left of": (-frame.right, _BESIDE), "right of": (frame.right, _BESIDE),
-            "in front of": (frame.ahead, _CONE), "behind": (-frame.ahead, _CONE),
+            "in front of": (frame.ahead, CONE), "behind": (-frame.ahead, CONE),
         }.get(relation, (None, 0.0))  # fmt: skip
         if axis is None:
             raise ValueError(f"not a relation to a viewer: {relation!r}")
@@ -271,16 +309,18 @@ def _sideways(relation: str, target: Selection, reference: Selection, frame: Fra
     level = _level(offset, frame)
     along = float(level @ axis)
     reach = float((np.abs(reference.box.axes @ axis) * reference.box.half_sizes).sum())
-    return along > 0.5 * reach and along >= _CONE * float(np.linalg.norm(level))
+    return along > REACH * reach and along >= CONE * float(np.linalg.norm(level))
 
 
 def _level(offset: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
     return np.asarray(offset - (offset @ frame.up) * frame.up)
 
 
-def _without(reference: Selection, target: Selection) -> Selection:
-    """The reference without the Gaussians of the target: shared Gaussians support nothing."""
-    return reference - target if bool(reference.mask[target.indices].any()) else reference
+def _disjoint(first: Selection, second: Selection) -> tuple[Selection, Selection]:
+    """Two selections without the Gaussians of the smaller in the larger: shared Gaussians support nothing."""
+    if not bool(first.mask[second.indices].any()):
+        return first, second
+    return (first, second - first) if len(first) <= len(second) else (first - second, second)
 
 
 def same(first: Selection, second: Selection) -> bool:
