@@ -18,7 +18,7 @@ from lexsplat.queries.selection import FAINT, Selection
 _SUPPORT = 0.5
 """The gap below a thing is at most this many of its heights. Selections often miss the foot of a thing, which lies in
 its own shadow."""
-_COLUMN = 1.0
+_COLUMN = 2.0
 """A gap up to this many heights counts as well if Gaussians fill it from top to bottom: a stem of no selection."""
 _STEPS = 5
 """Number of layers of a gap that must each have Gaussians."""
@@ -144,7 +144,7 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
         low = float(np.quantile(lower.heights, 0.9)) <= middle
         if not _surrounds(near, foot) and not (low and (overlapping or _surrounds(lower, foot, _TAIL))):
             return np.inf, top - bottom
-        surfaces = np.quantile(near.heights, [0.5, 0.9])
+        surfaces = np.quantile(near.heights, [0.5, 0.9, 0.98])
     else:
         bottom, top = lower.span()
         head = lower.only(lower.heights >= top - _FOOT * (top - bottom))
