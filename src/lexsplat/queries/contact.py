@@ -32,6 +32,8 @@ _BEYOND = 0.04
 """On each side of the middle of the foot lies at least this share of the surface: the foot is not beside it."""
 _TAIL = 0.004
 """The same where the whole surface counts: fewer points than these are strays."""
+_LEVEL = 0.25
+"""A level surface: most of it is at most this high, relative to the median distance from its middle."""
 _OVER = 0.3
 """Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
 _SINK = 0.1
@@ -135,14 +137,14 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
     """The gap between a body and one below it, and the height of the upper one there.
 
     The gap is infinite where the narrower one is beside the wider one. A cloth, a shadow or the thing itself may hide
-    the surface near the foot. Then all of a low surface counts: a table does, a wall or a chair does not.
+    the surface near the foot. Then all of a level surface counts: a table does, a wall or a chair does not.
     """
     if upper.width <= lower.width:
         (bottom, top), middle = upper.span(), upper.middle
         foot = upper.only(upper.heights <= bottom + _FOOT * (top - bottom))
         near = _near(lower.only(lower.heights <= middle), *_disc(foot))
-        low = float(np.quantile(lower.heights, 0.9)) <= middle
-        if not _surrounds(near, foot) and not (low and (overlapping or _surrounds(lower, foot, _TAIL))):
+        level = _is_level(lower) and float(np.quantile(lower.heights, 0.9)) <= middle
+        if not _surrounds(near, foot) and not (level and (overlapping or _surrounds(lower, foot, _TAIL))):
             return np.inf, top - bottom
         surfaces = np.quantile(near.heights, [0.5, 0.9, 0.98])
     else:
@@ -155,6 +157,11 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
         bottom, top = near.span()
     gaps = bottom - surfaces
     return float(gaps[np.abs(gaps).argmin()]), top - bottom
+
+
+def _is_level(body: Body) -> bool:
+    low, high = body.span(0.1)
+    return high - low <= _LEVEL * body.width
 
 
 def _surrounds(surface: Body, part: Body, beyond: float = _BEYOND) -> bool:

@@ -131,28 +131,30 @@ def related(
         for target in targets.instances
         if not same(target, reference)
     ]
-    held = []
+    held, frame = [], None
     for target, reference in pairs:
         one, other = _disjoint(target, reference)
-        if one and other and holds(relation, one, other, viewer(one, other) if callable(viewer) else viewer):
+        frame = viewer(one, other) if callable(viewer) else viewer
+        if holds(relation, one, other, frame):
             held.append((target, reference))
-    if relation == "under" and len(held) > 1:
-        held = _not_below_supports(held, references.up.direction)
+    if relation == "under" and frame is not None and len(held) > 1:
+        held = _not_below_supports(held, frame)
     kept = {id(target) for target, _ in held}
     return _union(targets, [target for target in targets.instances if id(target) in kept])
 
 
 def _not_below_supports(
-    pairs: Sequence[tuple[Selection, Selection]], up: NDArray[np.float64]
+    pairs: Sequence[tuple[Selection, Selection]], frame: Frame
 ) -> list[tuple[Selection, Selection]]:
     """Pairs of a thing and what is above it, without the things below one that carries the same."""
-    carriers = [pair for pair in pairs if rests_on(*_disjoint(*pair)[::-1], up)]
+    carriers = [pair for pair in pairs if rests_on(*_disjoint(*pair)[::-1], frame.up)]
     return [
-        pair
-        for pair in pairs
-        if pair in carriers
+        (target, reference)
+        for target, reference in pairs
+        if (target, reference) in carriers
         or not any(
-            other is pair[1] and is_over(*_disjoint(carrier, pair[0]), up) for carrier, other in carriers
+            other is reference and holds("under", *_disjoint(target, carrier), frame)
+            for carrier, other in carriers
         )
     ]
 

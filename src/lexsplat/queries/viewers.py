@@ -41,12 +41,12 @@ class Viewers:
         the weight is taken, and without one that of the view with the largest weight; views all around a thing do not
         agree. The view returned is the heaviest one that gives this answer.
         """
-        up = self.like.up.direction
-        if self.chosen is not None:
-            return frame_of(self.chosen, up)
+        if self.chosen is not None or self.relation not in DIRECTED:
+            return self._one
         weights = np.minimum(self._shares(target), self._shares(reference))
         if len(weights) == 0 or not weights.any():
-            return frame_of(self.like.cameras.get(reference.best_view), up)
+            self._taken += [reference.best_view] * bool(reference.best_view)
+            return frame_of(self.like.cameras.get(reference.best_view), self.like.up.direction)
         answers = self._answers(target, reference)
         totals = np.bincount(answers + 1, weights, 3)
         if totals.max() > weights.sum() / 2:
@@ -65,6 +65,11 @@ class Viewers:
             return ""
         (name, _), *others = Counter(self._taken).most_common()
         return f"as seen from {'most views, such as ' if others else ''}{name}"
+
+    @cached_property
+    def _one(self) -> Frame:
+        """The only frame there is: that of the chosen viewer, or, of relations without a viewer, any."""
+        return frame_of(self.chosen, self.like.up.direction)
 
     @cached_property
     def _names(self) -> list[str]:
