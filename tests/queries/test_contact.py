@@ -51,7 +51,7 @@ def room(rng):
         ),
         "cloth": outside(slab(rng, (-0.7, 0.7), (-0.6, 0.6), 0.012, 3000), (0.0, 0.0, 0.25)),
         "mug": block(rng, (-0.2, 0.2), (-0.2, 0.2), (0.02, 0.45), 600),
-        "ring": ring + (1.2, -0.6, 0.0),
+        "ring": ring + np.array([1.2, -0.6, 0.0]),
         "banana": block(rng, (-0.3, 0.3), (-0.8, -0.7), (0.0, 0.15), 400),  # in front of the cloth
         "bottle": block(rng, (-1.7, -1.5), (0.75, 0.95), (0.0, 0.7), 400),  # near the edge
         "lamp": np.concatenate(  # the shade; its stem belongs to nothing
@@ -62,14 +62,15 @@ def room(rng):
         "floor": slab(rng, (-3, 3), (-2, 2), -2.0, 4000),
         "dog": block(rng, (-0.4, 0.4), (-0.2, 0.2), (-2.0, -1.5), 500),  # below the table
         "wall": np.concatenate([wall, rng.normal((0, 1.4, 0.3), (1.0, 0.4, 0.4), (90, 3))]),
-        "walls": np.concatenate([wall, side]) + (0.0, 0.0, 0.0),  # a corner
+        "walls": np.concatenate([wall, side]),  # a corner
         "picture": block(rng, (-1.0, -0.4), (1.96, 1.99), (0.9, 1.4), 400),
         "chest": block(rng, (1.0, 2.0), (1.5, 1.98), (-2.0, -1.2), 600),  # on the floor, at the wall
         "ball": block(rng, (-2.6, -2.2), (1.2, 1.6), (-2.0, -1.6), 400),  # on the floor, in the corner
         "bird": block(rng, (2.0, 2.3), (1.9, 2.1), (2.0, 2.4), 300),  # on top of the wall
         "seat": np.concatenate(
             [slab(rng, (2.3, 2.9), (-1.9, -1.3), -1.5, 600), block(rng, (2.3, 2.9), (-1.35, -1.3), (-1.5, -0.7), 600),
-             block(rng, (2.3, 2.35), (-1.9, -1.85), (-2, -1.5), 100), block(rng, (2.85, 2.9), (-1.9, -1.85), (-2, -1.5), 100)]
+             block(rng, (2.3, 2.35), (-1.9, -1.85), (-2, -1.5), 100),
+             block(rng, (2.85, 2.9), (-1.9, -1.85), (-2, -1.5), 100)]
         ),
         "bear": block(rng, (2.4, 2.8), (-1.8, -1.45), (-1.5, -0.9), 600),
     }  # fmt: skip

@@ -40,7 +40,8 @@ def asking(cameras, chosen=None, places=(NEAR, FAR)):
 def test_most_views_decide_and_one_of_them_is_named():
     ask = asking(around(-60, 20, 30, 40))
     found = ask("is the apple left of the mug?")
-    assert (found.present, found.note in {f"as seen from view_{angle}" for angle in ("+020", "+030", "+040")}) == ("yes", True)  # fmt: skip
+    assert found.present == "yes"
+    assert found.note in [f"as seen from view_{angle}" for angle in ("+020", "+030", "+040")]
     assert ask("is the apple right of the mug?").present == "no"
     assert ask("is the mug right of the apple?").present == "yes"
     assert ask("is the mug left of the apple?").present == "no"
