@@ -42,7 +42,8 @@ _SHEET = 0.25
 """An upright sheet, such as a wall: its middle half is at most this thick, relative to its width and height."""
 _ATTACHED = 0.15
 """On a wall: the gap is at most this share of the thing's largest extent."""
-_ANGLES = np.radians(np.arange(0.0, 180.0, 5.0))
+_POINTS = 1000
+_ANGLES = np.radians(np.arange(0.0, 180.0, 10.0))
 _SIDES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 """Horizontal directions ``[2, A]``."""
 
@@ -74,8 +75,9 @@ class Body(NamedTuple):
 
 
 def body_of(selection: Selection, up: NDArray[np.float64]) -> Body:
-    """The points of a selection by their place and height."""
-    local = selection.sample @ np.stack(upright_frame(up)).T
+    """Up to about a thousand points of a selection by their place and height."""
+    points = selection.sample
+    local = points[:: max(1, len(points) // _POINTS)] @ np.stack(upright_frame(up)).T
     return Body(local[:, :2], local[:, 2])
 
 
@@ -202,10 +204,13 @@ def _column(
 
 def _normal(body: Body) -> NDArray[np.float64] | None:
     """The horizontal direction through an upright sheet; None for another shape."""
-    low, high = np.quantile(body.plan @ _SIDES, [0.25, 0.75], axis=0)
+    bottom, top = body.span(0.25)
+    if top - bottom < _SHEET * body.width:
+        return None
+    places = len(body.heights) // 4, 3 * len(body.heights) // 4
+    low, high = np.partition((body.plan @ _SIDES).T, places, axis=1)[:, places].T
     thick = high - low
     thinnest = int(thick.argmin())
-    bottom, top = body.span(0.25)
     across = thick[(thinnest + len(_ANGLES) // 2) % len(_ANGLES)]
     if thick[thinnest] > _SHEET * min(float(across), top - bottom):
         return None
