@@ -138,7 +138,8 @@ class Tools:
         related = Related(relation, both[0].phrase, both[1].phrase)
         asked = Understood(related, notes, any(each.unknown for each in both))
         found = find_in(place, asked, place.camera(view) if view else None, None)
-        answer = {**found.to_dict(), "understood": str(related), "note": notes}
+        noted = "; ".join(filter(None, (notes, found.note)))
+        answer = {**found.to_dict(), "understood": str(related), "note": noted}
         holds = "Yes" if found.present == "yes" else "Perhaps" if found.present == "unsure" else "No"
         return Reply(
             f"{holds}: {sentence(answer, place.world.meters_per_unit)}", {"holds": holds.lower(), **answer}

@@ -45,6 +45,7 @@ from lexsplat.queries.relations import (
     same,
 )
 from lexsplat.queries.selection import PRESENCES, Presence, Selection, union
+from lexsplat.queries.viewers import DIRECTED, Viewers
 from lexsplat.queries.vocabulary import COLORS, NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
@@ -62,7 +63,8 @@ class Searched:
 
     Args:
         select: The selection of a thing, by its text.
-        viewer: The camera of whoever asks, given the reference of a direction; None asks for that of "me".
+        viewer: The camera of whoever asks, given the reference of a direction; None asks for that of "me". No camera
+            leaves a direction to the views (`lexsplat.queries.viewers`).
         objects: The objects of the scene with their names in ``phrase``: what "thing" can be.
         colors: The color words of an instance, the most frequent first (`lexsplat.queries.colors`).
     """
@@ -160,9 +162,10 @@ def _related(phrase: Related, searched: Searched) -> Selection:
         farthest = phrase.relation == "farthest from"
         found = nearest(targets, references, farthest=farthest, count=phrase.count, rank=phrase.rank)
     else:
-        directed = phrase.relation in ("left of", "right of", "in front of", "behind")
-        camera = searched.viewer(references) if directed and references else None
-        found = related(phrase.relation, targets, references, frame_of(camera, references.up.direction))
+        directed = phrase.relation in DIRECTED and bool(references)
+        viewers = Viewers(phrase.relation, references, searched.viewer(references) if directed else None)
+        found = related(phrase.relation, targets, references, viewers.frame)
+        found = replace(found, note=viewers.note if directed else found.note)
     return replace(found, present=min(found.present, references.present, key=PRESENCES.index))
 
 

@@ -6,7 +6,7 @@ and "under" depend on gravity alone. Relations hold between instances, by their 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -15,20 +15,18 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.boxes import upright_frame
 from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.contact import is_over, rests_on
 from lexsplat.queries.phrases import ORDERED, CornerName, PartName, RelationName
 from lexsplat.queries.selection import Selection, union
 
 _Ranked = TypeVar("_Ranked")
 
-_CONE = 0.5
+CONE = 0.5
 """Sideways: at least this share of the horizontal offset lies along the axis (within 60 degrees)."""
+REACH = 0.5
+"""Sideways: the centers are farther apart along the axis than this many times the half size of the other."""
 _NEAR = 0.5
 """Next to: the gap is at most this many diagonals of the smaller footprint (height does not count)."""
-_SUPPORT = 0.5
-"""On: the gap below is at most this many heights of the object. Selections often miss the foot of an object, which
-lies in its own shadow."""
-_OVER = 0.3
-"""Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
 _CORNER = 0.5
 """In a corner: at least this far out along both sides, from 0 (the middle) to 1."""
 _MIDDLE = 0.5
@@ -93,33 +91,72 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
     if relation in ("left of", "right of", "in front of", "behind"):
         return _sideways(relation, target, reference, frame)
     if relation == "on":
-        return _rests_on(target, reference, frame) or _stands_over(target, reference, frame)
+        return rests_on(target, reference, frame.up)
     if relation == "under":
-        return _rests_on(reference, target, frame) or _over(reference, target, frame)
+        carries = rests_on(reference, target, frame.up) or is_over(reference, target, frame.up)
+        return carries and not rests_on(target, reference, frame.up)
     if relation in ("above", "below"):
         upper, lower = (target, reference) if relation == "above" else (reference, target)
-        return _over(upper, lower, frame)
+        return is_over(upper, lower, frame.up)
     if relation == "inside":
         share = float(reference.box.contains(target.sample).mean())
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
-        return bool(distance(target, reference) <= _NEAR * smaller) and not _over(target, reference, frame)
+        return bool(distance(target, reference) <= _NEAR * smaller) and not is_over(
+            target, reference, frame.up
+        )
     raise ValueError(f"not a relation between two instances: {relation!r}")
 
 
-def related(relation: RelationName, targets: Selection, references: Selection, frame: Frame) -> Selection:
-    """The instances of ``targets`` that stand in a relation to an instance of ``references``."""
+def related(
+    relation: RelationName,
+    targets: Selection,
+    references: Selection,
+    viewer: Frame | Callable[[Selection, Selection], Frame],
+) -> Selection:
+    """The instances of ``targets`` that stand in a relation to an instance of ``references``.
+
+    What lies below a support of the reference is not "under" it: under a mug is the table, not the floor.
+
+    Args:
+        relation: One that `holds` knows.
+        targets: What to choose from.
+        references: What they are related to.
+        viewer: Whose left it is, or whose for each pair (`lexsplat.queries.viewers`).
+    """
     pairs = [
-        target
+        (target, reference)
+        for reference in references.instances
         for target in targets.instances
-        if any(
-            holds(relation, target, _without(reference, target), frame)
-            for reference in references.instances
-            if not same(target, reference)
+        if not same(target, reference)
+    ]
+    held, frame = [], None
+    for target, reference in pairs:
+        one, other = _disjoint(target, reference)
+        frame = viewer(one, other) if callable(viewer) else viewer
+        if holds(relation, one, other, frame):
+            held.append((target, reference))
+    if relation == "under" and frame is not None and len(held) > 1:
+        held = _not_below_supports(held, frame)
+    kept = {id(target) for target, _ in held}
+    return _union(targets, [target for target in targets.instances if id(target) in kept])
+
+
+def _not_below_supports(
+    pairs: Sequence[tuple[Selection, Selection]], frame: Frame
+) -> list[tuple[Selection, Selection]]:
+    """Pairs of a thing and what is above it, without the things below one that carries the same."""
+    carriers = [pair for pair in pairs if rests_on(*_disjoint(*pair)[::-1], frame.up)]
+    return [
+        (target, reference)
+        for target, reference in pairs
+        if (target, reference) in carriers
+        or not any(
+            other is reference and holds("under", *_disjoint(target, carrier), frame)
+            for carrier, other in carriers
         )
     ]
-    return _union(targets, pairs)
 
 
 def nearest(
@@ -162,7 +199,7 @@ def between(targets: Selection, first: Selection, second: Selection) -> Selectio
             return False
         to_one, to_other = one.center - target.center, other.center - target.center
         lengths = np.linalg.norm(to_one) * np.linalg.norm(to_other)
-        return bool(lengths > 0 and to_one @ to_other <= -_CONE * lengths)
+        return bool(lengths > 0 and to_one @ to_other <= -CONE * lengths)
 
     pairs = [(one, other) for one in first.instances for other in second.instances]
     return _union(
@@ -191,7 +228,7 @@ def beside_viewer(
     else:
         axis, share = {
             "left of": (-frame.right, _BESIDE), "right of": (frame.right, _BESIDE),
-            "in front of": (frame.ahead, _CONE), "behind": (-frame.ahead, _CONE),
+            "in front of": (frame.ahead, CONE), "behind": (-frame.ahead, CONE),
         }.get(relation, (None, 0.0))  # fmt: skip
         if axis is None:
             raise ValueError(f"not a relation to a viewer: {relation!r}")
@@ -274,66 +311,18 @@ def _sideways(relation: str, target: Selection, reference: Selection, frame: Fra
     level = _level(offset, frame)
     along = float(level @ axis)
     reach = float((np.abs(reference.box.axes @ axis) * reference.box.half_sizes).sum())
-    return along > 0.5 * reach and along >= _CONE * float(np.linalg.norm(level))
-
-
-def _rests_on(target: Selection, support: Selection, frame: Frame) -> bool:
-    """Whether the support has a surface below the target, close to the bottom of the target.
-
-    No view may have seen the ground below an object, so its surroundings count: the part of the support within the
-    target's footprint, widened by half. The edge of a cloth is in there for an object beside the cloth as well, so
-    the footprints must overlap first.
-    """
-    if not _overlap(target, support):
-        return False
-    box, height = target.box, float(2 * target.box.half_sizes[2])
-    points = support.sample
-    local = (points - box.center) @ box.axes.T
-    below = (np.abs(local[:, :2]) <= 1.5 * box.half_sizes[:2]).all(1) & (local[:, 2] < 0)
-    if below.sum() < 5:
-        return False
-    gap = float(np.median(local[below, 2])) + float(
-        box.half_sizes[2]
-    )  # 0: the surface is at the bottom of the target
-    spacing = target._spacing()
-    higher = float((target.center - support.center) @ frame.up) > 0
-    surface = float(np.quantile(local[below, 2], 0.9)) + float(box.half_sizes[2])
-    return (higher or abs(surface) <= _SUPPORT * height) and min(abs(gap), abs(surface)) <= max(
-        _SUPPORT * height, 2 * spacing
-    )
-
-
-def _stands_over(target: Selection, support: Selection, frame: Frame) -> bool:
-    """Whether the target is over the support with its bottom at the support's top: on a table under a cloth."""
-    bottom = float(target.center @ frame.up) - float(target.box.half_sizes[2])
-    top = float(support.center @ frame.up) + float(support.box.half_sizes[2])
-    return _over(target, support, frame) and abs(bottom - top) <= _SUPPORT * float(
-        2 * target.box.half_sizes[2]
-    )
-
-
-def _over(upper: Selection, lower: Selection, frame: Frame) -> bool:
-    """Whether one object is higher than the other, and over it."""
-    rise = float((upper.center - lower.center) @ frame.up)
-    if rise < 0.8 * float(upper.box.half_sizes[2] + lower.box.half_sizes[2]):
-        return False
-    return _overlap(upper, lower)
-
-
-def _overlap(first: Selection, second: Selection) -> bool:
-    """Whether the footprints of two objects overlap, seen from above."""
-    small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
-    local = (small.sample - large.center) @ large.box.axes[:2].T
-    return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
+    return along > REACH * reach and along >= CONE * float(np.linalg.norm(level))
 
 
 def _level(offset: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
     return np.asarray(offset - (offset @ frame.up) * frame.up)
 
 
-def _without(reference: Selection, target: Selection) -> Selection:
-    """The reference without the Gaussians of the target: shared Gaussians support nothing."""
-    return reference - target if bool(reference.mask[target.indices].any()) else reference
+def _disjoint(first: Selection, second: Selection) -> tuple[Selection, Selection]:
+    """Two selections without the Gaussians of the smaller in the larger: shared Gaussians support nothing."""
+    if not bool(first.mask[second.indices].any()):
+        return first, second
+    return (first, second - first) if len(first) <= len(second) else (first - second, second)
 
 
 def same(first: Selection, second: Selection) -> bool:

@@ -88,6 +88,23 @@ class Seen:
         self.complete_all()
         return {"shares": torch.from_numpy(self._shares).half(), "hidden": self.hidden.cpu()}
 
+    @property
+    def names(self) -> list[str]:
+        """The views, in the order of `covered`."""
+        return list(self._names)
+
+    def covered(self, indices: Tensor) -> NDArray[np.float64]:
+        """The share of each view ``[V]`` that some Gaussians ``[M]`` cover; see `complete`."""
+        labels, taken = self._taken(indices)
+        return np.asarray(taken @ self._shares[labels])
+
+    def _taken(self, indices: Tensor) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Segments and the part of their visible weight that some Gaussians have."""
+        found = indices.cpu().numpy()
+        labels, inverse = np.unique(self._labels[found], return_inverse=True)
+        mass = np.bincount(inverse, self._masses[found], len(labels))
+        return labels, mass / np.maximum(self._totals[labels], 1e-12)
+
     def shares(self, indices: Tensor, promising: Sequence[str] | None) -> list[tuple[str, float]]:
         """The views that show most of some Gaussians and the share of the image they cover there; best first.
 
@@ -95,11 +112,7 @@ class Seen:
             indices: The Gaussians ``[M]``.
             promising: The views to look at; None looks at all, which `complete` makes cheap.
         """
-        found = indices.cpu().numpy()
-        labels, inverse = np.unique(self._labels[found], return_inverse=True)
-        taken = np.bincount(inverse, self._masses[found], len(labels)) / np.maximum(
-            self._totals[labels], 1e-12
-        )
+        labels, taken = self._taken(indices)
         names = self._names if promising is None else [name for name in promising if name in self._cameras]
         shares = taken @ self._shares[labels] if promising is None else self._at(names, labels, taken)
         order = np.argsort(-shares, kind="stable")[:_BEST]

@@ -76,8 +76,8 @@ def find_in(
     Args:
         scene: The scene to ask.
         understood: The phrase.
-        camera: Where "left" and "me" refer to; None takes the view that shows the reference best, and for "me" the
-            camera in the middle of all.
+        camera: Where "left" and "me" refer to; None lets the views decide that show both things
+            (`lexsplat.queries.viewers`), and takes the camera in the middle of all for "me".
         threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians.
     """
     things = things_of(understood.phrase)
@@ -89,9 +89,7 @@ def find_in(
         return answers.selection(things.index(text))
 
     def viewer(reference: Selection | None) -> Camera | None:
-        if camera is not None or reference is None:
-            return camera or middle_camera(scene)
-        return scene.cameras.get(reference.best_view)
+        return camera or (middle_camera(scene) if reference is None else None)
 
     searched = Searched(select, viewer, lambda: scene.objects, lambda thing: object_colors(scene, thing))
     found = answer(understood.phrase, searched)

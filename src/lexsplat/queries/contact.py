@@ -1,0 +1,247 @@
+"""What carries what: contact between two selections, by their Gaussians near the place where they meet.
+
+Bounding boxes of flat things overlap, and Gaussians stray: everything here is a median or a quantile of the parts
+near the meeting place. The side that a thing is on follows from the medians alone, so two things never carry each
+other.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.geometry.boxes import upright_frame
+from lexsplat.queries.selection import FAINT, Selection
+
+_SUPPORT = 0.5
+"""The gap below a thing is at most this many of its heights. Selections often miss the foot of a thing, which lies in
+its own shadow."""
+_COLUMN = 2.0
+"""A gap up to this many heights counts as well if Gaussians fill it from top to bottom: a stem of no selection."""
+_STEPS = 5
+"""Number of layers of a gap that must each have Gaussians."""
+_FOOT = 0.3
+"""Share of a thing's height that is its foot, or its top."""
+_AROUND = 2.5
+"""What is within this many radii of the foot is near it."""
+_FEW = 30
+"""With fewer points near the foot, the surface is hidden there (by a cloth), and all of it counts."""
+_BEYOND = 0.04
+"""On each side of the middle of the foot lies at least this share of the surface: the foot is not beside it."""
+_TAIL = 0.004
+"""The same where the whole surface counts: fewer points than these are strays."""
+_LEVEL = 0.25
+"""A level surface: most of it is at most this high, relative to the median distance from its middle."""
+_OVER = 0.3
+"""Over: at least this share of the smaller object lies over, or under, the footprint of the other."""
+_SINK = 0.1
+"""Over: the two may sink into each other by this share of their heights."""
+_SHEET = 0.25
+"""An upright sheet, such as a wall: its middle half is at most this thick, relative to its width and height."""
+_ATTACHED = 0.15
+"""On a wall: the gap is at most this share of the thing's largest extent."""
+_POINTS = 1000
+_ANGLES = np.radians(np.arange(0.0, 180.0, 10.0))
+_SIDES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+"""Horizontal directions ``[2, A]``."""
+
+
+class Body(NamedTuple):
+    """Points of a thing seen from above ``[M, 2]`` and their heights ``[M]``."""
+
+    plan: NDArray[np.float64]
+    heights: NDArray[np.float64]
+
+    def only(self, kept: NDArray[np.bool_]) -> Body:
+        """Some of its points."""
+        return Body(self.plan[kept], self.heights[kept])
+
+    @property
+    def middle(self) -> float:
+        """Its median height."""
+        return float(np.median(self.heights))
+
+    @property
+    def width(self) -> float:
+        """The median distance from its middle, seen from above."""
+        return float(np.median(np.linalg.norm(self.plan - np.median(self.plan, 0), axis=1)))
+
+    def span(self, tail: float = 0.02) -> tuple[float, float]:
+        """The heights of its bottom and top without the outermost points."""
+        low, high = np.quantile(self.heights, [tail, 1 - tail])
+        return float(low), float(high)
+
+
+def body_of(selection: Selection, up: NDArray[np.float64]) -> Body:
+    """Up to about a thousand points of a selection by their place and height."""
+    points = selection.sample
+    local = points[:: max(1, len(points) // _POINTS)] @ np.stack(upright_frame(up)).T
+    return Body(local[:, :2], local[:, 2])
+
+
+def rests_on(target: Selection, support: Selection, up: NDArray[np.float64]) -> bool:
+    """Whether a thing stands or lies on another, or is attached to it if that is a wall."""
+    upper, lower = body_of(target, up), body_of(support, up)
+    normal = _normal(lower)
+    if normal is not None and upper.span()[0] < lower.span(0.1)[1]:
+        return _attached(upper, lower, normal) and not _supported(target, support, up)
+    if not _is_higher(upper, lower):
+        return False
+    gap, height = _gap(upper, lower, overlap(target, support))
+    if gap > max(_SUPPORT * height, 2 * target._spacing()):
+        return 0 < gap <= _COLUMN * height and _filled(target, upper, gap, up)
+    return True
+
+
+def is_over(upper: Selection, lower: Selection, up: NDArray[np.float64]) -> bool:
+    """Whether one object is higher than the other, and over it."""
+    above, below = body_of(upper, up), body_of(lower, up)
+    if not _is_higher(above, below):
+        return False
+    small, large = sorted((above, below), key=lambda each: each.width)
+    near = _near(large, *_disc(small))
+    above, below = (small, near) if small is above else (near, small)
+    (bottom, ceiling), (floor, top) = above.span(0.1), below.span(0.1)
+    return bottom >= top - _SINK * (ceiling - bottom + top - floor) and overlap(upper, lower)
+
+
+def overlap(first: Selection, second: Selection) -> bool:
+    """Whether the footprints of two objects overlap, seen from above."""
+    small, large = sorted((first, second), key=lambda s: float(np.prod(s.box.half_sizes[:2])))
+    local = (small.sample - large.center) @ large.box.axes[:2].T
+    return bool((np.abs(local) <= large.box.half_sizes[:2]).all(1).mean() >= _OVER)
+
+
+# The place where two bodies meet
+
+
+def _disc(body: Body) -> tuple[NDArray[np.float64], float]:
+    """The middle of a body seen from above, and the radius around what is near it."""
+    middle = np.median(body.plan, 0)
+    return middle, _AROUND * float(np.quantile(np.linalg.norm(body.plan - middle, axis=1), 0.8))
+
+
+def _near(body: Body, middle: NDArray[np.float64], radius: float) -> Body:
+    near = body.only(np.linalg.norm(body.plan - middle, axis=1) <= radius)
+    return near if len(near.heights) >= _FEW else body
+
+
+def _is_higher(upper: Body, lower: Body) -> bool:
+    """Whether the narrower body is above, or below, the parts of the wider one that are near it."""
+    if upper.width <= lower.width:
+        return upper.middle > _near(lower, *_disc(upper)).middle
+    return _near(upper, *_disc(lower)).middle > lower.middle
+
+
+def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
+    """The gap between a body and one below it, and the height of the upper one there.
+
+    The gap is infinite where the narrower one is beside the wider one. A cloth, a shadow or the thing itself may hide
+    the surface near the foot. Then all of a level surface counts: a table does, a wall or a chair does not.
+    """
+    if upper.width <= lower.width:
+        (bottom, top), middle = upper.span(), upper.middle
+        foot = upper.only(upper.heights <= bottom + _FOOT * (top - bottom))
+        near = _near(lower.only(lower.heights <= middle), *_disc(foot))
+        level = _is_level(lower) and float(np.quantile(lower.heights, 0.9)) <= middle
+        if not _surrounds(near, foot) and not (level and (overlapping or _surrounds(lower, foot, _TAIL))):
+            return np.inf, top - bottom
+        surfaces = np.quantile(near.heights, [0.5, 0.9, 0.98])
+    else:
+        bottom, top = lower.span()
+        head = lower.only(lower.heights >= top - _FOOT * (top - bottom))
+        near = _near(upper, *_disc(head))
+        if float(np.quantile(near.heights, 0.25)) < lower.middle or not _surrounds(near, head):
+            return np.inf, 0.0
+        surfaces = np.array([lower.middle, top])
+        bottom, top = near.span()
+    gaps = bottom - surfaces
+    return float(gaps[np.abs(gaps).argmin()]), top - bottom
+
+
+def _is_level(body: Body) -> bool:
+    low, high = body.span(0.1)
+    return high - low <= _LEVEL * body.width
+
+
+def _surrounds(surface: Body, part: Body, beyond: float = _BEYOND) -> bool:
+    """Whether the middle of a part lies within a surface, seen from above."""
+    if len(surface.heights) < 5 or len(part.heights) == 0:
+        return False
+    sides = (surface.plan - np.median(part.plan, 0)) @ _SIDES > 0
+    share = sides.mean(0)
+    return bool(np.minimum(share, 1 - share).min() >= beyond)
+
+
+def _filled(target: Selection, upper: Body, gap: float, up: NDArray[np.float64]) -> bool:
+    """Whether Gaussians fill the gap below a thing: its stem, which no selection has."""
+    bottom = upper.span()[0]
+    foot = upper.only(upper.heights <= bottom + _FOOT * (upper.span()[1] - bottom))
+    heights = _column(target, foot, bottom - gap, bottom, up)
+    layers = np.floor((heights - bottom + gap) / gap * _STEPS).astype(int)
+    return len(np.unique(layers.clip(0, _STEPS - 1))) == _STEPS
+
+
+def _column(
+    target: Selection, foot: Body, low: float, high: float, up: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The heights of the Gaussians between two heights below the middle of a foot."""
+    gaussians, axes = target.gaussians, np.stack(upright_frame(up))
+    means = gaussians.means.detach().cpu().numpy()
+    heights = means @ axes[2]
+    inside = np.flatnonzero((heights >= low) & (heights <= high))
+    middle = np.median(foot.plan, 0)
+    radius = float(np.median(np.linalg.norm(foot.plan - middle, axis=1)))
+    inside = inside[np.linalg.norm(means[inside] @ axes[:2].T - middle, axis=1) <= radius]
+    opaque = gaussians.opacity_logits.detach()[inside].sigmoid().cpu().numpy() >= FAINT
+    return np.asarray(heights[inside[opaque]], float)
+
+
+# Walls
+
+
+def _normal(body: Body) -> NDArray[np.float64] | None:
+    """The horizontal direction through an upright sheet; None for another shape."""
+    bottom, top = body.span(0.25)
+    if top - bottom < _SHEET * body.width:
+        return None
+    places = len(body.heights) // 4, 3 * len(body.heights) // 4
+    low, high = np.partition((body.plan @ _SIDES).T, places, axis=1)[:, places].T
+    thick = high - low
+    thinnest = int(thick.argmin())
+    across = thick[(thinnest + len(_ANGLES) // 2) % len(_ANGLES)]
+    if thick[thinnest] > _SHEET * min(float(across), top - bottom):
+        return None
+    return np.asarray(_SIDES[:, thinnest])
+
+
+def _attached(upper: Body, wall: Body, normal: NDArray[np.float64]) -> bool:
+    """Whether a thing touches a wall, within the area of the wall."""
+    along = np.array([-normal[1], normal[0]])
+    sideways, depth = upper.plan @ along, upper.plan @ normal
+    left, right = np.quantile(wall.plan @ along, [0.02, 0.98])
+    low, high = wall.span()
+    if not (left <= np.median(sideways) <= right and low <= upper.middle <= high):
+        return False
+    near, far = np.quantile(depth, [0.05, 0.95])
+    ends = np.quantile(sideways, [0.05, 0.95])
+    size = max(far - near, ends[1] - ends[0], upper.span()[1] - upper.span()[0])
+    if size >= max(right - left, high - low):
+        return False
+    surface = np.quantile(wall.plan @ normal, [0.25, 0.5, 0.75])
+    gap = max(near - surface[1], surface[1] - far, 0.0)
+    return bool(gap <= max(_ATTACHED * size, surface[2] - surface[0]))
+
+
+def _supported(target: Selection, wall: Selection, up: NDArray[np.float64]) -> bool:
+    """Whether a thing at a wall stands on something else."""
+    body = body_of(target, up)
+    bottom, top = body.span()
+    others = target.gaussians.means.detach().cpu().numpy()[~(target.mask | wall.mask).cpu().numpy()]
+    local = others @ np.stack(upright_frame(up)).T
+    local = local[np.abs(local[:, 2] - bottom + _ATTACHED * (top - bottom) / 2) <= _ATTACHED * (top - bottom)]
+    low, high = np.quantile(body.plan, [0.05, 0.95], axis=0)
+    below = Body(local[:, :2], local[:, 2]).only(((local[:, :2] >= low) & (local[:, :2] <= high)).all(1))
+    return len(below.heights) >= 5

@@ -1,0 +1,111 @@
+"""Whose left it is: the views that show two things decide, weighted by how much of them they show."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.phrases import RelationName
+from lexsplat.queries.relations import CONE, REACH, Frame, frame_of
+from lexsplat.queries.selection import Selection
+
+DIRECTED: tuple[RelationName, ...] = ("left of", "right of", "in front of", "behind")
+"""Relations that depend on the viewer."""
+
+
+@dataclass
+class Viewers:
+    """The viewers that may decide what is left of a thing, or behind it.
+
+    Args:
+        relation: One of `DIRECTED`.
+        like: Any selection of the scene, for its views, up and what the views show.
+        chosen: The one that was asked for; None lets the views decide.
+    """
+
+    relation: RelationName
+    like: Selection
+    chosen: Camera | None = None
+    _taken: list[str] = field(default_factory=list, init=False)
+
+    def frame(self, target: Selection, reference: Selection) -> Frame:
+        """The frame of the view that decides for two things.
+
+        Each view says whether the thing is to the left, to the right or neither (in front, behind or neither). Its
+        weight is the share of its image that the less visible of the two covers. The answer with more than half of
+        the weight is taken, and without one that of the view with the largest weight; views all around a thing do not
+        agree. The view returned is the heaviest one that gives this answer.
+        """
+        if self.chosen is not None or self.relation not in DIRECTED:
+            return self._one
+        weights = np.minimum(self._shares(target), self._shares(reference))
+        if len(weights) == 0 or not weights.any():
+            self._taken += [reference.best_view] * bool(reference.best_view)
+            return frame_of(self.like.cameras.get(reference.best_view), self.like.up.direction)
+        answers = self._answers(target, reference)
+        totals = np.bincount(answers + 1, weights, 3)
+        if totals.max() > weights.sum() / 2:
+            weights = np.where(answers + 1 == totals.argmax(), weights, 0.0)
+        best = int(weights.argmax())
+        self._taken.append(self._names[best])
+        return self._frames[best]
+
+    @property
+    def note(self) -> str:
+        """Whose left it is, for people: "as seen from view_012"."""
+        if self.chosen is not None:
+            names = [name for name, camera in self.like.cameras.items() if camera is self.chosen]
+            return f"as seen from {names[0]}" if names else ""
+        if not self._taken:
+            return ""
+        (name, _), *others = Counter(self._taken).most_common()
+        return f"as seen from {'most views, such as ' if others else ''}{name}"
+
+    @cached_property
+    def _one(self) -> Frame:
+        """The only frame there is: that of the chosen viewer, or, of relations without a viewer, any."""
+        return frame_of(self.chosen, self.like.up.direction)
+
+    @cached_property
+    def _names(self) -> list[str]:
+        seen = self.like.seen
+        return seen.names if seen is not None and seen.complete else list(self.like.cameras)
+
+    @cached_property
+    def _frames(self) -> list[Frame]:
+        return [frame_of(self.like.cameras[name], self.like.up.direction) for name in self._names]
+
+    @cached_property
+    def _axes(self) -> NDArray[np.float64]:
+        """The axis to the right of each view, or ahead of it ``[V, 3]``."""
+        sideways = self.relation in ("left of", "right of")
+        return np.array([frame.right if sideways else frame.ahead for frame in self._frames])
+
+    def _shares(self, one: Selection) -> NDArray[np.float64]:
+        """The share of each view that a thing covers ``[V]``; 1 or 0 where no rendering of the views is kept."""
+        seen = self.like.seen
+        if seen is not None and seen.complete:
+            return seen.covered(one.indices)
+        cameras = [self.like.cameras[name] for name in self._names]
+        return np.array([float(_shows(camera, one.center)) for camera in cameras])
+
+    def _answers(self, target: Selection, reference: Selection) -> NDArray[np.int64]:
+        """What each view says ``[V]``: -1 left or in front, 1 right or behind, 0 neither."""
+        up = self.like.up.direction
+        offset = target.center - reference.center
+        level = offset - (offset @ up) * up
+        along = self._axes @ level
+        reach = np.abs(self._axes @ reference.box.axes.T) @ reference.box.half_sizes
+        clear = (np.abs(along) > REACH * reach) & (np.abs(along) >= CONE * np.linalg.norm(level))
+        return np.asarray(np.where(clear, np.sign(along), 0), np.int64)
+
+
+def _shows(camera: Camera, point: NDArray[np.float64]) -> bool:
+    """Whether a point is inside the image of a camera; other things may hide it."""
+    x, y, depth = camera.K @ (camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3])
+    return bool(depth > 0 and 0 <= x <= depth * camera.width and 0 <= y <= depth * camera.height)
