@@ -7,7 +7,8 @@ other.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,8 @@ _SIDES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 """Horizontal directions ``[2, A]``."""
 
 
-class Body(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Body:
     """Points of a thing seen from above ``[M, 2]`` and their heights ``[M]``."""
 
     plan: NDArray[np.float64]
@@ -58,15 +60,36 @@ class Body(NamedTuple):
         """Some of its points."""
         return Body(self.plan[kept], self.heights[kept])
 
-    @property
+    @cached_property
     def middle(self) -> float:
         """Its median height."""
         return float(np.median(self.heights))
 
-    @property
+    @cached_property
     def width(self) -> float:
         """The median distance from its middle, seen from above."""
         return float(np.median(np.linalg.norm(self.plan - np.median(self.plan, 0), axis=1)))
+
+    @cached_property
+    def disc(self) -> tuple[NDArray[np.float64], float]:
+        """Its middle seen from above, and the radius around what is near it."""
+        middle = np.median(self.plan, 0)
+        return middle, _AROUND * float(np.quantile(np.linalg.norm(self.plan - middle, axis=1), 0.8))
+
+    @cached_property
+    def normal(self) -> NDArray[np.float64] | None:
+        """The horizontal direction through an upright sheet, such as a wall; None for another shape."""
+        bottom, top = self.span(0.25)
+        if top - bottom < _SHEET * self.width:
+            return None
+        places = len(self.heights) // 4, 3 * len(self.heights) // 4
+        low, high = np.partition((self.plan @ _SIDES).T, places, axis=1)[:, places].T
+        thick = high - low
+        thinnest = int(thick.argmin())
+        across = thick[(thinnest + len(_ANGLES) // 2) % len(_ANGLES)]
+        if thick[thinnest] > _SHEET * min(float(across), top - bottom):
+            return None
+        return np.asarray(_SIDES[:, thinnest])
 
     def span(self, tail: float = 0.02) -> tuple[float, float]:
         """The heights of its bottom and top without the outermost points."""
@@ -75,24 +98,30 @@ class Body(NamedTuple):
 
 
 def body_of(selection: Selection, up: NDArray[np.float64]) -> Body:
-    """Up to about a thousand points of a selection by their place and height."""
-    points = selection.sample
-    local = points[:: max(1, len(points) // _POINTS)] @ np.stack(upright_frame(up)).T
-    return Body(local[:, :2], local[:, 2])
+    """Up to about a thousand points of a selection by their place and height; kept with the selection."""
+    kept: dict[bytes, Body] = selection.__dict__.setdefault("_bodies", {})
+    key = np.asarray(up, np.float64).tobytes()
+    if key not in kept:
+        points = selection.sample
+        local = points[:: max(1, len(points) // _POINTS)] @ np.stack(upright_frame(up)).T
+        kept[key] = Body(local[:, :2], local[:, 2])
+    return kept[key]
 
 
 def rests_on(target: Selection, support: Selection, up: NDArray[np.float64]) -> bool:
     """Whether a thing stands or lies on another, or is attached to it if that is a wall."""
     upper, lower = body_of(target, up), body_of(support, up)
-    normal = _normal(lower)
+    normal = lower.normal
     if normal is not None and upper.span()[0] < lower.span(0.1)[1]:
         return _attached(upper, lower, normal) and not _supported(target, support, up)
     if not _is_higher(upper, lower):
         return False
     gap, height = _gap(upper, lower, overlap(target, support))
-    if gap > max(_SUPPORT * height, 2 * target._spacing()):
-        return 0 < gap <= _COLUMN * height and _filled(target, upper, gap, up)
-    return True
+    if gap <= _SUPPORT * height:
+        return True
+    if gap == np.inf:
+        return False
+    return gap <= 2 * target._spacing() or (gap <= _COLUMN * height and _filled(target, upper, gap, up))
 
 
 def is_over(upper: Selection, lower: Selection, up: NDArray[np.float64]) -> bool:
@@ -101,7 +130,7 @@ def is_over(upper: Selection, lower: Selection, up: NDArray[np.float64]) -> bool
     if not _is_higher(above, below):
         return False
     small, large = sorted((above, below), key=lambda each: each.width)
-    near = _near(large, *_disc(small))
+    near = _near(large, *small.disc)
     above, below = (small, near) if small is above else (near, small)
     (bottom, ceiling), (floor, top) = above.span(0.1), below.span(0.1)
     return bottom >= top - _SINK * (ceiling - bottom + top - floor) and overlap(upper, lower)
@@ -117,12 +146,6 @@ def overlap(first: Selection, second: Selection) -> bool:
 # The place where two bodies meet
 
 
-def _disc(body: Body) -> tuple[NDArray[np.float64], float]:
-    """The middle of a body seen from above, and the radius around what is near it."""
-    middle = np.median(body.plan, 0)
-    return middle, _AROUND * float(np.quantile(np.linalg.norm(body.plan - middle, axis=1), 0.8))
-
-
 def _near(body: Body, middle: NDArray[np.float64], radius: float) -> Body:
     near = body.only(np.linalg.norm(body.plan - middle, axis=1) <= radius)
     return near if len(near.heights) >= _FEW else body
@@ -131,8 +154,8 @@ def _near(body: Body, middle: NDArray[np.float64], radius: float) -> Body:
 def _is_higher(upper: Body, lower: Body) -> bool:
     """Whether the narrower body is above, or below, the parts of the wider one that are near it."""
     if upper.width <= lower.width:
-        return upper.middle > _near(lower, *_disc(upper)).middle
-    return _near(upper, *_disc(lower)).middle > lower.middle
+        return upper.middle > _near(lower, *upper.disc).middle
+    return _near(upper, *lower.disc).middle > lower.middle
 
 
 def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
@@ -144,7 +167,7 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
     if upper.width <= lower.width:
         (bottom, top), middle = upper.span(), upper.middle
         foot = upper.only(upper.heights <= bottom + _FOOT * (top - bottom))
-        near = _near(lower.only(lower.heights <= middle), *_disc(foot))
+        near = _near(lower.only(lower.heights <= middle), *foot.disc)
         level = _is_level(lower) and float(np.quantile(lower.heights, 0.9)) <= middle
         if not _surrounds(near, foot) and not (level and (overlapping or _surrounds(lower, foot, _TAIL))):
             return np.inf, top - bottom
@@ -152,7 +175,7 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
     else:
         bottom, top = lower.span()
         head = lower.only(lower.heights >= top - _FOOT * (top - bottom))
-        near = _near(upper, *_disc(head))
+        near = _near(upper, *head.disc)
         if float(np.quantile(near.heights, 0.25)) < lower.middle or not _surrounds(near, head):
             return np.inf, 0.0
         surfaces = np.array([lower.middle, top])
@@ -200,21 +223,6 @@ def _column(
 
 
 # Walls
-
-
-def _normal(body: Body) -> NDArray[np.float64] | None:
-    """The horizontal direction through an upright sheet; None for another shape."""
-    bottom, top = body.span(0.25)
-    if top - bottom < _SHEET * body.width:
-        return None
-    places = len(body.heights) // 4, 3 * len(body.heights) // 4
-    low, high = np.partition((body.plan @ _SIDES).T, places, axis=1)[:, places].T
-    thick = high - low
-    thinnest = int(thick.argmin())
-    across = thick[(thinnest + len(_ANGLES) // 2) % len(_ANGLES)]
-    if thick[thinnest] > _SHEET * min(float(across), top - bottom):
-        return None
-    return np.asarray(_SIDES[:, thinnest])
 
 
 def _attached(upper: Body, wall: Body, normal: NDArray[np.float64]) -> bool:
