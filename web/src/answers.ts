@@ -11,6 +11,8 @@ export interface Answer {
   phrase: string;
   /** What was mended or not understood; "" for nothing. */
   note: string;
+  /** Whether it has words that nothing here knows: then absence is not certain either. */
+  unknown: boolean;
   /** "dictionary", "text tower", "server", or "click" for what was clicked. */
   from: string;
   scores: Float32Array;
@@ -34,7 +36,7 @@ export type Found = Pick<Answer, "phrase" | "from" | "scores" | "presence" | "th
 
 /** An answer as it is first shown. */
 export function answered(prompt: string, color: string, found: Found): Answer {
-  const fresh = { note: "", hidden: false, anyway: false, places: null, members: null, place: 0, asked: null };
+  const fresh = { note: "", unknown: false, hidden: false, anyway: false, places: null, members: null, place: 0, asked: null };
   return { ...fresh, prompt, color, automatic: found.threshold, ...found };
 }
 
@@ -70,7 +72,7 @@ export function painted(answer: Answer): boolean {
 
 /** What an answer says, in words. */
 export function spoken(answer: Answer): string {
-  if (answer.presence === "no") return "not in this scene";
+  if (answer.presence === "no") return answer.unknown ? "not found" : "not in this scene";
   const count = answer.places?.length;
   const doubt = answer.presence === "unsure" ? "perhaps " : "";
   if (count === undefined) return `${doubt}here`;
