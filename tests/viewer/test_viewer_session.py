@@ -163,9 +163,7 @@ def test_edits_are_those_of_the_editor_and_can_be_undone_and_redone(session, sce
 
 
 @pytest.mark.parametrize("action", ["delete", "keep", "recolor", "move", "duplicate"])
-def test_a_preview_applies_to_what_the_edit_does_with_hidden_gaussians(
-    session, action, monkeypatch
-):
+def test_a_preview_applies_to_what_the_edit_does_with_hidden_gaussians(session, action, monkeypatch):
     inside = session.scene.select("ball 2").mask.clone()
     inside[inside.nonzero()[::3]] = False
     monkeypatch.setattr(type(session.scene), "hidden", property(lambda _: inside))

@@ -142,7 +142,7 @@ export function card(answer: Answer, host: CardHost): HTMLElement {
   }
   const element = h("li", { class: "card" }, head, row, answer.note !== "" && h("p", { class: "fine", text: answer.note }));
   if (painted(answer)) element.append(thresholdRow(answer, host));
-  const further = count > 0 ? host.further(answer) : null;
+  const further = count > 0 && answer.presence !== "no" ? host.further(answer) : null;
   if (further) element.append(further);
   return element;
 }

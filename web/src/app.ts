@@ -249,6 +249,7 @@ export class App {
 
   async #refine(answer: Answer): Promise<void> {
     await (await this.answering).refine(answer);
+    if (answer.presence === "no" && answer.anyway && !answer.places?.length) answer.places = this.geometry.best(answer.scores);
     this.#paint();
     this.#refreshKeepingFocus();
   }
@@ -337,6 +338,8 @@ export class App {
   toggleHeat(): boolean {
     this.#mode = this.#mode === "heat" ? "marks" : "heat";
     this.#paint();
+    const each = this.answers.filter(painted).length > 1 ? "each prompt in its own color, " : "";
+    this.note(this.#mode === "heat" ? `Heat: ${each}brighter where the words fit better.` : "");
     return this.#mode === "heat";
   }
 
