@@ -66,7 +66,7 @@ def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, vie
 
 def test_a_card_tells_how_a_question_was_understood_and_what_was_not(page):
     ask(page, "where can I find the ball 4 next to the ball 0?")
-    assert page.locator(".card .understood").inner_text() == 'as “("ball 4" next to "ball 0")”'
+    assert page.locator(".card .understood").inner_text() == "as “ball 4 next to ball 0”"
     ask(page, "why is ball 2 so round")
     assert 'not understood ("why")' in page.locator(".card .fine").first.inner_text()
     assert page.locator(".card .understood").count() == 0, "asked in these words"

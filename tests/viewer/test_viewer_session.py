@@ -227,3 +227,19 @@ def test_steps_are_kept_in_the_journal_of_the_edit_command(built, tmp_path):
         journal.write('{"undo": true}\n')
     with pytest.raises(SceneFolderError, match="another program"):
         session.edit("undo", Asked(), {})
+
+
+@pytest.mark.slow
+def test_deleting_an_apple_is_previewed_with_what_is_hidden_inside_it():
+    from lexsplat.scenes.scene import open_scene
+
+    scene = open_scene("demo")
+    session = Session(scene, 1_000_000, History())
+    session.editor.journal = None
+    asked = Asked("red apple")
+    reply = session.preview("delete", asked)
+    (count,) = struct.unpack_from("<I", reply)
+    shown = session.details(asked)["gaussians"]
+    session.edit("delete", asked, {})
+    assert shown < count == int(session.editor.steps[0].mask.sum())
+    assert sum(reply[4:]) == count

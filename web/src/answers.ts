@@ -104,8 +104,9 @@ export function card(answer: Answer, host: CardHost): HTMLElement {
     },
   });
   const state = h("span", { class: `state ${answer.presence}`, text: spoken(answer) });
-  const other = answer.phrase.toLowerCase() !== answer.prompt.trim().toLowerCase();
-  const understood = other && h("span", { class: "understood", text: `as “${answer.phrase}”` });
+  const plain = answer.phrase.replace(/^\((.*)\)$/, "$1").replaceAll('"', "");
+  const other = plain.toLowerCase() !== answer.prompt.trim().toLowerCase();
+  const understood = other && h("span", { class: "understood", text: `as “${plain}”` });
   const head = h(
     "div",
     { class: "head" },
