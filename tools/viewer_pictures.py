@@ -18,7 +18,7 @@ from lexsplat.viewer.server import ViewerConfig, ViewerServer
 
 PROMPTS = "red apple, rubber duck, teddy bear"
 START_VIEW = "view_033.jpg"
-SIZE = {"width": 1120, "height": 620}
+SIZE = {"width": 1400, "height": 640}  # wide enough that the cards cover nothing that is marked
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 
 
@@ -37,6 +37,7 @@ def main() -> None:
         page.evaluate("lexsplat.app.ask('apple next to the banana', false, false)")
         page.locator(".bench summary").click()
         page.get_by_label("Edit apple next to the banana").select_option("recolor")
+        page.locator(".taken", has_text="Gaussians").wait_for()
         save(page, folder / "viewer_edit.jpg")
         browser.close()
     viewer.stop()

@@ -156,6 +156,7 @@ class Site:
 def main() -> None:
     """Write the site; an earlier one is replaced when the new one is whole."""
     from lexsplat import open_scene
+    from lexsplat.scenes.folder import BUNDLED_SCENE
     from lexsplat.scenes.publishing import PublishOptions, publish
 
     output = Path(sys.argv[1])
@@ -167,7 +168,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as work:
         whole = Path(work) / "site"
         pages = Site(whole).write()
-        publish(open_scene("demo"), whole / DEMO, PublishOptions(title="A table top"))
+        publish(open_scene(BUNDLED_SCENE), whole / DEMO, PublishOptions(title="A table top"))
         shutil.rmtree(output, ignore_errors=True)
         whole.rename(output)
     print(

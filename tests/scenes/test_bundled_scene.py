@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from lexsplat import cli, open_scene
 from lexsplat.captures.images.reading import read_mask
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.encoders import load_clip
-from lexsplat.scenes.folder import BUNDLED_SCENE
+from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
 
 
@@ -76,8 +78,18 @@ def test_the_command_line_writes_to_the_working_folder_and_not_to_the_package(tm
     assert snapshot() == before
 
 
-def test_a_folder_named_demo_takes_precedence(tmp_path, monkeypatch, capsys):
+def test_a_scene_named_demo_takes_precedence_and_another_folder_does_not(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     os.mkdir("demo")
-    assert cli.main(["info", "demo"]) == 1
-    assert "no scene.json in it" in capsys.readouterr().err
+    assert SceneFolder.open("demo").is_bundled
+    shutil.copy(BUNDLED_SCENE / "scene.json", "demo")
+    assert not SceneFolder.open("demo").is_bundled
+
+
+def test_a_missing_language_file_is_told_by_its_name(tmp_path):
+    folder = tmp_path / "scene"
+    shutil.copytree(BUNDLED_SCENE, folder)
+    (folder / "language.safetensors").unlink()
+    with pytest.raises(SceneFolderError, match=r"found no language\.safetensors") as told:
+        open_scene(folder)
+    assert "finished stages" not in str(told.value)

@@ -305,6 +305,60 @@ def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_t
         page.close()
 
 
+def test_the_best_guess_for_what_is_absent_marks_the_place_with_the_best_scores(page):
+    ask(page, "zebra")
+    page.get_by_role("button", name="Show the best guess").click()
+    splats = until(page, "lexsplat.app.answers[0].places?.flatMap((place) => place.splats)")
+    scores = np.array(page.evaluate("[...lexsplat.app.answers[0].scores]"))
+    assert 0 < len(splats) < 0.05 * len(scores)
+    assert scores[splats].mean() > np.quantile(scores, 0.99)
+    assert page.locator(".card .state").inner_text() == "not in this scene"
+    page.keyboard.press("Escape")
+
+
+def test_in_heat_two_prompts_keep_their_colors_and_the_page_says_so(browser, address):
+    page = open_page(browser, address, *SIZE)
+    page.evaluate("lexsplat.app.ask('red apple, banana', false, false)")
+    page.keyboard.press("h")
+    assert "each prompt in its own color" in page.locator(".status").inner_text()
+    page.evaluate(
+        "document.querySelectorAll('.bar, .tools').forEach((e) => { e.style.visibility = 'hidden'; })"
+    )
+    image = picture(page)
+    orange = (image[..., 0] > image[..., 2] + 90).mean()  # the first color of Okabe and Ito
+    blue = (image[..., 2] > image[..., 0] + 60).mean()  # the second
+    assert orange > 5e-4
+    assert blue > 5e-4
+    page.close()
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [("red aple", "red apple"), ("redd aple", "red apple"), ("bananna", "banana"), ("red appl", "red apple")],
+)
+def test_enter_mends_typing_errors_as_python_does_and_says_so(page, demo, typed, meant):
+    ask(page, typed)
+    answer = page.evaluate(
+        "(({ phrase, presence, note }) => ({ phrase, presence, note }))(lexsplat.app.answers[0])"
+    )
+    assert str(demo.understand(typed).phrase) == f'"{meant}"'
+    assert (answer["phrase"], answer["presence"]) == (meant, demo.find(typed).present) == (meant, "yes")
+    wrong = [word for word in typed.split() if word not in meant.split()]
+    assert all(f"“{word}” may be a typing error" in answer["note"] for word in wrong)
+    assert answer["note"] in page.locator(".card .fine").first.inner_text()
+
+
+def test_words_that_nobody_knows_are_named_and_well_spelled_words_stay(page, demo):
+    ask(page, "blue xqzt mug")
+    assert "not “xqzt”" in page.locator(".card .fine").first.inner_text()
+    assert page.evaluate("lexsplat.app.answers[0].presence") in ("unsure", "no")
+    assert "in this scene" not in page.locator(".card .state").inner_text()
+    spelling = "lexsplat.app.source.spelling"
+    for phrase in ("the handle of that blue mug", "wing", "hat", "cone you see at road works"):
+        assert page.evaluate(f"{spelling}.meant('{phrase}')") == [], phrase
+        assert page.evaluate(f"{spelling}.strange('{phrase}')") == [], phrase
+
+
 @pytest.mark.parametrize("ending", ["ply", "spz", "sog"])
 def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_page, monkeypatch, ending):
     if ending != "ply":

@@ -66,7 +66,7 @@ def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, vie
 
 def test_a_card_tells_how_a_question_was_understood_and_what_was_not(page):
     ask(page, "where can I find the ball 4 next to the ball 0?")
-    assert page.locator(".card .understood").inner_text() == 'as “("ball 4" next to "ball 0")”'
+    assert page.locator(".card .understood").inner_text() == "as “ball 4 next to ball 0”"
     ask(page, "why is ball 2 so round")
     assert 'not understood ("why")' in page.locator(".card .fine").first.inner_text()
     assert page.locator(".card .understood").count() == 0, "asked in these words"
@@ -117,10 +117,21 @@ def test_an_edit_is_shown_before_it_is_done_and_undone_and_redone(page, viewer):
     ask(page, "ball 2")
     page.locator(".bench summary").click()
     page.get_by_label("Edit ball 2").select_option("delete")
+    until(page, "document.querySelector('.taken').textContent.includes('300 Gaussians')")
     page.evaluate("lexsplat.app.stage.settled()")
     assert viewer.session.version == 1, "a preview changes nothing"
-    page.get_by_role("button", name="Apply").click()
+    said, inert = page.evaluate(
+        """() => {
+            [...document.querySelectorAll("button")].find((one) => one.textContent === "Apply").click();
+            const inert = [".search", ".answers", ".tools"].map((name) => document.querySelector(name).inert);
+            return [document.querySelector(".status").textContent, inert];
+        }"""
+    )
+    assert said == "Deleting …"
+    assert inert == [True, True, True]
+    page.keyboard.press("z")  # nothing else is done meanwhile
     until(page, "lexsplat.app.server.entry.version === 2")
+    until(page, "document.querySelector('.status').textContent.startsWith('Done: deleted')")
     assert viewer.session.editor.steps[0].phrase == "ball 2"
     until(page, "lexsplat.app.answers[0]?.places !== undefined")
     assert page.evaluate("lexsplat.app.geometry.count") == 1200
@@ -167,6 +178,7 @@ def test_a_page_that_shows_an_earlier_scene_is_told_and_shows_the_present_one(pa
     page.keyboard.press("Enter")
     until(page, "lexsplat.app.server.entry.version === 2")
     assert page.evaluate("lexsplat.app.geometry.count") == 1200
+    until(page, "document.querySelector('.status')?.textContent.includes('edited in another page')")
 
 
 def test_objects_are_listed_and_other_colors_shown(page, viewer):

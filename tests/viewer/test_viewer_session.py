@@ -162,6 +162,31 @@ def test_edits_are_those_of_the_editor_and_can_be_undone_and_redone(session, sce
     assert session.edit("keep", Asked("ball 4"), {})["scene"]["gaussians"] == 300
 
 
+@pytest.mark.parametrize("action", ["delete", "keep", "recolor", "move", "duplicate"])
+def test_a_preview_applies_to_what_the_edit_does_with_hidden_gaussians(session, action, monkeypatch):
+    inside = session.scene.select("ball 2").mask.clone()
+    inside[inside.nonzero()[::3]] = False
+    monkeypatch.setattr(type(session.scene), "hidden", property(lambda _: inside))
+    reply = session.preview(action, Asked("ball 2"))
+    assert (session.version, session.editor.steps) == (1, [])
+    session.edit(action, Asked("ball 2"), {"color": [1, 0, 0], "by": [0, 0, 5]})
+    (step,) = session.editor.steps
+    assert struct.unpack_from("<I", reply)[0] == int(step.mask.sum())
+    assert np.array_equal(np.frombuffer(reply, np.uint8, offset=4), step.mask.numpy())
+
+
+def test_a_preview_of_no_edit_is_refused(session):
+    with pytest.raises(QueryError):
+        session.preview("undo", Asked("ball 2"))
+
+
+def test_steps_are_called_by_the_words_of_the_visitor(session):
+    asked = "ball 4 next to ball 0"
+    assert session.edit("recolor", Asked(asked), {"color": [1, 0, 0]})["server"]["steps"] == [
+        f"recolor {asked} (300 Gaussians)"
+    ]
+
+
 @pytest.mark.parametrize(
     ("action", "values"),
     [("recolor", {"color": [2, 0, 0]}), ("move", {"scale": -1}), ("move", {"by": [float("nan"), 0, 0]}),
@@ -202,3 +227,19 @@ def test_steps_are_kept_in_the_journal_of_the_edit_command(built, tmp_path):
         journal.write('{"undo": true}\n')
     with pytest.raises(SceneFolderError, match="another program"):
         session.edit("undo", Asked(), {})
+
+
+@pytest.mark.slow
+def test_deleting_an_apple_is_previewed_with_what_is_hidden_inside_it():
+    from lexsplat.scenes.scene import open_scene
+
+    scene = open_scene("demo")
+    session = Session(scene, 1_000_000, History())
+    session.editor.journal = None
+    asked = Asked("red apple")
+    reply = session.preview("delete", asked)
+    (count,) = struct.unpack_from("<I", reply)
+    shown = session.details(asked)["gaussians"]
+    session.edit("delete", asked, {})
+    assert shown < count == int(session.editor.steps[0].mask.sum())
+    assert sum(reply[4:]) == count

@@ -11,6 +11,8 @@ export interface Answer {
   phrase: string;
   /** What was mended or not understood; "" for nothing. */
   note: string;
+  /** Whether it has words that nothing here knows: then absence is not certain either. */
+  unknown: boolean;
   /** "dictionary", "text tower", "server", or "click" for what was clicked. */
   from: string;
   scores: Float32Array;
@@ -34,7 +36,7 @@ export type Found = Pick<Answer, "phrase" | "from" | "scores" | "presence" | "th
 
 /** An answer as it is first shown. */
 export function answered(prompt: string, color: string, found: Found): Answer {
-  const fresh = { note: "", hidden: false, anyway: false, places: null, members: null, place: 0, asked: null };
+  const fresh = { note: "", unknown: false, hidden: false, anyway: false, places: null, members: null, place: 0, asked: null };
   return { ...fresh, prompt, color, automatic: found.threshold, ...found };
 }
 
@@ -70,7 +72,7 @@ export function painted(answer: Answer): boolean {
 
 /** What an answer says, in words. */
 export function spoken(answer: Answer): string {
-  if (answer.presence === "no") return "not in this scene";
+  if (answer.presence === "no") return answer.unknown ? "not found" : "not in this scene";
   const count = answer.places?.length;
   const doubt = answer.presence === "unsure" ? "perhaps " : "";
   if (count === undefined) return `${doubt}here`;
@@ -102,8 +104,9 @@ export function card(answer: Answer, host: CardHost): HTMLElement {
     },
   });
   const state = h("span", { class: `state ${answer.presence}`, text: spoken(answer) });
-  const other = answer.phrase.toLowerCase() !== answer.prompt.trim().toLowerCase();
-  const understood = other && h("span", { class: "understood", text: `as “${answer.phrase}”` });
+  const plain = answer.phrase.replace(/^\((.*)\)$/, "$1").replaceAll('"', "");
+  const other = plain.toLowerCase() !== answer.prompt.trim().toLowerCase();
+  const understood = other && h("span", { class: "understood", text: `as “${plain}”` });
   const head = h(
     "div",
     { class: "head" },
@@ -140,7 +143,7 @@ export function card(answer: Answer, host: CardHost): HTMLElement {
   }
   const element = h("li", { class: "card" }, head, row, answer.note !== "" && h("p", { class: "fine", text: answer.note }));
   if (painted(answer)) element.append(thresholdRow(answer, host));
-  const further = count > 0 ? host.further(answer) : null;
+  const further = count > 0 && answer.presence !== "no" ? host.further(answer) : null;
   if (further) element.append(further);
   return element;
 }

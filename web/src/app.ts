@@ -4,19 +4,21 @@ import * as THREE from "three";
 import { Budget } from "./budget";
 import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
 import { h, save } from "./dom";
+import { Edits } from "./edits";
 import type { Geometry, Place } from "./geometry";
 import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./manifest";
 import { Measure } from "./measure";
 import { Overlay } from "./overlay";
 import { Notes } from "./notes";
 import { objectsPanel, titleOf, viewsPanel } from "./panels";
-import { MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
+import { type Change, MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
 import { Server } from "./server";
 import { type Stage, pose } from "./stage";
 import { readState, writeState } from "./state";
 import { Tables } from "./tables";
 import { toolbar } from "./tools";
+import { vantage } from "./vantage";
 import { workbench } from "./workbench";
 
 const MOST_AT_ONCE = 200_000; // splats; in larger scenes, colors come before places
@@ -31,6 +33,7 @@ export class App {
   source: Source | null = null;
   readonly answering: Promise<Source>;
   readonly budget: Budget | null;
+  readonly edits: Edits | null;
   readonly #painter: Painter;
   readonly #overlay: Overlay;
   readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
@@ -71,10 +74,13 @@ export class App {
     this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#list);
     this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
     this.#sheet.append(this.#notes.element);
+    const tools = toolbar(this, this.#life.signal);
+    const waiting = [this.search.element, this.#list, this.#tries, tools, this.objects.element];
+    this.edits = server && new Edits(server, waiting, (text) => this.note(text), (work) => this.run(work));
     root.append(
       h("div", { class: "bar" }, this.search.element, this.#sheet),
       titleOf(manifest),
-      toolbar(this, this.#life.signal),
+      tools,
       this.views.element,
       this.objects.element,
       ...(this.server ? [this.views.figure] : []),
@@ -105,7 +111,8 @@ export class App {
   /** Do something; what fails is told in one line. */
   run(work: () => Promise<void>): void {
     work().catch((error: unknown) => {
-      this.note(error instanceof PageError ? error.message : `That failed: ${String(error)}`);
+      // An edit may have put another page of the scene in the place of this one.
+      (window.lexsplat.app ?? this).note(error instanceof PageError ? error.message : `That failed: ${String(error)}`);
       if (!(error instanceof PageError)) console.error(error);
     });
   }
@@ -190,28 +197,7 @@ export class App {
 
   #flyTo(answer: Answer): void {
     const place = answer.places?.[answer.place];
-    if (place) this.stage.flyTo(place, this.#vantage(place));
-  }
-
-  /** Where to look at a place from: the photo that shows it free and near the middle; else where we are. */
-  #vantage(place: Place): THREE.Vector3 {
-    const offset = new THREE.Vector3();
-    const scored = this.manifest.views.map((view) => {
-      const { position, forward } = pose(view);
-      offset.copy(place.center).sub(position);
-      const depth = offset.dot(forward);
-      const angle = offset.angleTo(forward) / Math.atan(Math.min(view.width / view.focal[0], view.height / view.focal[1]) / 2);
-      const turn = offset.angleTo(place.center.clone().sub(this.stage.camera.position));
-      return { position, score: depth > 0 ? angle + 0.8 * turn : Infinity };
-    });
-    const best = scored.sort((a, b) => a.score - b.score).slice(0, this.geometry.count > 300_000 ? 2 : 6);
-    const free = best.find(({ position }) => {
-      offset.copy(place.center).sub(position);
-      const distance = offset.length();
-      const hit = this.geometry.hit(new THREE.Ray(position, offset.normalize()));
-      return hit !== null && Math.abs(hit.depth - distance) < Math.max(place.radius * 1.5, distance * 0.05);
-    });
-    return (free ?? best[0])?.position ?? this.stage.camera.position.clone();
+    if (place) this.stage.flyTo(place, vantage(place, this.manifest.views, this.stage.camera.position, this.geometry));
   }
 
   #paint(): void {
@@ -263,6 +249,7 @@ export class App {
 
   async #refine(answer: Answer): Promise<void> {
     await (await this.answering).refine(answer);
+    if (answer.presence === "no" && answer.anyway && !answer.places?.length) answer.places = this.geometry.best(answer.scores);
     this.#paint();
     this.#refreshKeepingFocus();
   }
@@ -283,6 +270,7 @@ export class App {
         const view = this.manifest.views.find((one) => one.name === name);
         if (view) this.jump(view);
       },
+      edit: (action: Change, values: object) => this.edits?.do(action, values),
       run: (work: () => Promise<void>) => this.run(work),
     };
   }
@@ -344,12 +332,14 @@ export class App {
     const place: Place = { center: new THREE.Vector3(...center), radius: Math.hypot(...size) / 2, splats: [] };
     this.#overlay.show([place.center]);
     this.note(`${name}: ${this.measure.sides(size)}`);
-    this.stage.flyTo(place, this.#vantage(place));
+    this.stage.flyTo(place, vantage(place, this.manifest.views, this.stage.camera.position, this.geometry));
   }
 
   toggleHeat(): boolean {
     this.#mode = this.#mode === "heat" ? "marks" : "heat";
     this.#paint();
+    const each = this.answers.filter(painted).length > 1 ? "each prompt in its own color, " : "";
+    this.note(this.#mode === "heat" ? `Heat: ${each}brighter where the words fit better.` : "");
     return this.#mode === "heat";
   }
 

@@ -140,6 +140,14 @@ export class Geometry {
       .map(({ splats }) => this.place(splats));
   }
 
+  /** The place where scores are best, however low they are. */
+  best(scores: Float32Array): Place[] {
+    const { evidence_share, evidence_count } = this.rule;
+    const firm = Array.from(scores.keys()).filter((i) => this.opacities[i] >= this.rule.evidence_faint);
+    const chosen = largest(scores, firm, Math.max(evidence_count, Math.floor(evidence_share * firm.length)));
+    return chosen.length ? this.places(scores, Math.max(1e-4, scores[chosen.at(-1)!])).slice(0, 1) : [];
+  }
+
   /**
    * Splats that are linked: nearer than 2.5 times the usual distance to the sixth neighbor. Faint splats, and of large
    * selections those that are not in a sample, join the cluster of a linked one nearby.

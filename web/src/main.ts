@@ -10,6 +10,7 @@ import { Files, type Manifest, PageError } from "./manifest";
 import { failure } from "./notes";
 import { Segments } from "./segments";
 import { Server } from "./server";
+import { Spelling } from "./spelling";
 import { Stage } from "./stage";
 import { Tables } from "./tables";
 import { firstTheme, ground } from "./theme";
@@ -71,9 +72,11 @@ async function show(files: Files, manifest: Manifest, stage: Stage, root: HTMLEl
 async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: Geometry): Promise<Tables> {
   const { scene, words } = manifest;
   const language = manifest.language!;
-  const [phrases, codes, table, segments, members] = await Promise.all([
+  const { english } = words;
+  const [phrases, codes, table, segments, members, letters] = await Promise.all([
     files.read(words.phrases), files.read(language.codes), files.read(words.table!),
     language.segments ? files.read(language.segments) : null, files.read(language.objects),
+    english ? files.read(english.file) : null,
   ]);
   if (codes.length !== 8 * scene.gaussians) {
     throw new PageError(`${language.codes}: expected codes of ${scene.gaussians} Gaussians, found ${codes.length / 8}; publish the scene again.`);
@@ -83,7 +86,8 @@ async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: 
   const whole = segments && new Segments(segments, scene.gaussians, language.segment_rule!);
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
   const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes);
-  return new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds);
+  const spelling = english && letters ? new Spelling(letters, english.things) : null;
+  return new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds, spelling, english?.only ?? false);
 }
 
 const root = document.getElementById("page")!;

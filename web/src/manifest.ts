@@ -122,7 +122,13 @@ export interface Manifest {
     num_codes: number;
     method: string;
   } | null;
-  words: { phrases: string; table: string | null; count: number };
+  words: {
+    phrases: string;
+    table: string | null;
+    count: number;
+    /** The filter of English words, what typing errors may mean, and whether the encoder knows nothing else. */
+    english?: { file: string; things: string[]; only: boolean } | null;
+  };
   objects: ObjectEntry[] | null;
   /** Places in the list of objects for each kind of things ("toy") that the scene holds. */
   kinds: Record<string, number[]> | null;

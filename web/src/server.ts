@@ -87,6 +87,15 @@ export class Server implements Source {
     await this.reload(await this.#json<Manifest>("edit", { ...values, action }));
   }
 
+  /** The splats that an edit would apply to, and how many of the scene they are. */
+  async preview(action: string, asked: object): Promise<{ splats: number[]; count: number }> {
+    const content = new Uint8Array(await (await this.#post("preview", { ...asked, action })).arrayBuffer());
+    const count = new DataView(content.buffer).getUint32(0, true);
+    const splats: number[] = [];
+    content.subarray(4).forEach((edited, i) => edited && splats.push(i));
+    return { splats, count };
+  }
+
   async setVocabulary(phrases: string[]): Promise<string[]> {
     return (this.entry.vocabulary = await this.#json<string[]>("vocabulary", { phrases }));
   }

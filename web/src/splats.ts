@@ -68,7 +68,9 @@ export const VERTEX = `
         if (score > best) {
           best = score;
           float strength = smoothstep(0.0, 1.0, score / max(0.05, prompt.w + 0.3));
-          marked = mix(rest * 0.6, lexsplatHeat(clamp(score, 0.0, 1.0)) * (0.55 + 0.7 * light), 0.15 + 0.75 * strength);
+          // Of several prompts, each keeps its color.
+          vec3 tone = prompted > 1 ? prompt.rgb * (0.15 + 0.85 * score) : lexsplatHeat(clamp(score, 0.0, 1.0));
+          marked = mix(rest * 0.6, tone * (0.55 + 0.7 * light), 0.15 + 0.75 * strength);
         }
         continue;
       }

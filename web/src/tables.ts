@@ -7,6 +7,7 @@ import { type Language, shownSplats } from "./language";
 import { type Presence, hasColor, isPart, peakOf, presenceOf } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
+import type { Spelling } from "./spelling";
 import type { Stage } from "./stage";
 import type { Description } from "./tower";
 import type { TowerLoader } from "./tower-loader";
@@ -23,6 +24,10 @@ export class Tables implements Source {
     readonly dictionary: Dictionary,
     readonly loader: TowerLoader | null,
     readonly kinds: Kinds,
+    /** Null in pages that were published without English words. */
+    readonly spelling: Spelling | null,
+    /** Whether the encoder knows English words alone. */
+    readonly englishOnly: boolean,
   ) {
     this.#shown = shownSplats(geometry.opacities, geometry.rule.evidence_faint);
     dictionary.rank(language, this.#shown);
@@ -34,21 +39,37 @@ export class Tables implements Source {
   }
 
   async answer(prompt: string, color: string): Promise<Answer | null> {
-    const plain = await this.#plain(prompt, color);
-    const kind = singulars(normalize(prompt)).find((form) => this.kinds.has(form));
+    if (!this.spelling || this.dictionary.find(prompt) >= 0) return this.#asked(prompt, prompt, color);
+    const phrase = normalize(prompt);
+    for (const { phrase: meant, note } of this.spelling.meant(phrase)) {
+      const answer = await this.#asked(meant, prompt, color);
+      if (answer && answer.presence !== "no") return { ...answer, note };
+    }
+    const answer = await this.#asked(prompt, prompt, color);
+    const strange = this.englishOnly ? this.spelling.strange(phrase) : [];
+    if (!answer || strange.length === 0) return answer;
+    const listed = strange.slice(0, 3).map((word) => `“${word.slice(0, 40)}”`).join(", ");
+    const note = `the bundled encoder knows English words alone, not ${listed}`;
+    return { ...answer, note, unknown: true, presence: answer.presence === "yes" ? "unsure" : answer.presence };
+  }
+
+  /** The answer to a text, for what was typed. */
+  async #asked(text: string, prompt: string, color: string): Promise<Answer | null> {
+    const plain = await this.#plain(text, prompt, color);
+    const kind = singulars(normalize(text)).find((form) => this.kinds.has(form));
     return kind && plain ? this.kinds.answer(kind, plain) : plain;
   }
 
   /** The answer to a phrase by its own relevancy. */
-  async #plain(prompt: string, color: string): Promise<Answer | null> {
-    const known = this.dictionary.find(prompt);
+  async #plain(text: string, prompt: string, color: string): Promise<Answer | null> {
+    const known = this.dictionary.find(text);
     if (known >= 0) {
       const own = this.language.scores(this.dictionary.table(known));
       const presence = this.dictionary.presence(known);
       const phrase = this.dictionary.phrases[known];
       return answered(prompt, color, { phrase, from: "dictionary", ...this.#whole(own, presence) });
     }
-    const phrase = normalize(prompt);
+    const phrase = normalize(text);
     const described = (await (await this.loader?.load())?.describe(phrase)) ?? null;
     if (!described) return null;
     const own = this.language.scores(described.table);

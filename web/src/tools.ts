@@ -21,8 +21,8 @@ export function toolbar(app: App, signal: AbortSignal): HTMLElement {
   if (server) {
     const colors = iconButton("colors", "Language, codes, uncertainty", () => app.run(async () => press(colors, await app.nextColors())), "c");
     const { steps, undone } = server.entry;
-    const undo = iconButton("undo", steps.length ? `Undo: ${steps.at(-1)!}` : "Nothing to undo", () => app.run(() => server.edit("undo", {})), "z");
-    const redo = iconButton("redo", undone ? "Redo" : "Nothing to redo", () => app.run(() => server.edit("redo", {})), "y");
+    const undo = iconButton("undo", steps.length ? `Undo: ${steps.at(-1)!}` : "Nothing to undo", () => app.edits?.do("undo", {}), "z");
+    const redo = iconButton("redo", undone ? "Redo" : "Nothing to redo", () => app.edits?.do("redo", {}), "y");
     undo.disabled = steps.length === 0;
     redo.disabled = undone === 0;
     press(colors, false);
@@ -46,7 +46,7 @@ function key(event: KeyboardEvent, app: App, buttons: Record<string, HTMLButtonE
   const typing =
     target instanceof HTMLTextAreaElement || target instanceof HTMLSelectElement ||
     (target instanceof HTMLInputElement && !["range", "color", "checkbox"].includes(target.type));
-  if (typing || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+  if (typing || app.edits?.busy || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
   if (event.key === "/") {
     event.preventDefault();
     app.search.input.focus();

@@ -10,6 +10,7 @@ import type { Server } from "./server";
 export interface BenchHost {
   preview(preview: Preview | null): void;
   jump(view: string): void;
+  edit(action: Change, values: object): void;
   /** Run something that may fail with a line for the visitor. */
   run(work: () => Promise<void>): void;
 }
@@ -77,7 +78,10 @@ function editor(
     h("option", { value: "", text: "Edit …" }),
     ...CHANGES.map((name) => h("option", { value: name, text: LABELS[name] })),
   );
-  const apply = h("button", { type: "button", text: "Apply", onclick: () => host.run(() => server.edit(change.value, values())) });
+  const apply = h("button", { type: "button", text: "Apply", onclick: () => host.edit(change.value as Change, values()) });
+  const taken = h("p", { class: "fine taken", "aria-live": "polite" });
+  /** What the last change that was chosen would apply to. */
+  let planned: { kind: Change; splats: number[]; light: number } | null = null;
   const amount = (field: HTMLInputElement, least = -Infinity): number => {
     const value = Number(field.value);
     return Number.isFinite(value) && value > least ? value : Number(field.defaultValue);
@@ -95,14 +99,22 @@ function editor(
     moving.hidden = kind !== "move" && kind !== "duplicate";
     color.hidden = kind !== "recolor";
     apply.hidden = kind === "";
+    taken.hidden = kind === "";
     if (kind === "") return host.preview(null);
-    const only = instance();
-    const splats = only === null ? answer.places!.flatMap((place) => place.splats) : answer.places![only].splats;
+    if (planned?.kind !== kind) {
+      taken.textContent = "Looking for what it takes along …";
+      return host.run(async () => {
+        const { splats, count } = await server.preview(kind, { ...answer.asked, instance: instance() });
+        planned = { kind, splats, light: geometry.light(splats) };
+        taken.textContent = told(kind, count);
+        if (change.value === kind) show();
+      });
+    }
     host.preview({
       change: kind,
-      splats,
+      splats: planned.splats,
       color: color.value,
-      light: geometry.light(splats),
+      light: planned.light,
       by: new THREE.Vector3(...by.map((field) => amount(field))),
       pivot: axes.middle,
       turn: new THREE.Quaternion().setFromAxisAngle(axes.up, THREE.MathUtils.degToRad(amount(turn))),
@@ -110,5 +122,11 @@ function editor(
     });
   };
   color.hidden = apply.hidden = true;
-  return h("div", {}, h("div", { class: "row" }, change, color, apply), moving);
+  return h("div", {}, h("div", { class: "row" }, change, color, apply), moving, taken);
+}
+
+/** What an edit applies to, in words; hidden parts count too. */
+function told(kind: Change, count: number): string {
+  const hole = kind === "delete" ? " The surface under it is closed when you apply." : "";
+  return `${count.toLocaleString("en")} Gaussians with the hidden ones inside it.${hole}`;
 }

@@ -320,6 +320,17 @@ class Editor:
 
     # -- inside
 
+    def planned_mask(self, kind: Kind, chosen: Selection) -> Tensor:
+        """The Gaussians that a step would apply to ``[N]`` bool; it changes nothing."""
+        return self._whole(chosen, fill=kind == "delete").mask
+
+    def _whole(self, chosen: Selection, fill: bool) -> Selection:
+        """A selection with what a step takes along; with ``fill``, also what is hidden inside its things."""
+        whole = whole_things(chosen, self.scene.hidden, self.scene.field.segments)
+        if not fill:
+            return whole
+        return replace(whole, mask=whole.mask | hidden_inside(whole, self.scene.hidden))
+
     def _do(self, kind: Kind, chosen: Selection, **values: Any) -> None:
         if len(chosen.mask) != len(self.scene.gaussians):
             raise ValueError("the selection was made before the last edit: select again")
@@ -330,9 +341,8 @@ class Editor:
                 found="nothing",
                 remedy="try other words or a lower threshold",
             )
-        whole = whole_things(chosen, self.scene.hidden, self.scene.field.segments)
+        whole = self._whole(chosen, "fill" in values)
         if "fill" in values:
-            whole = replace(whole, mask=whole.mask | hidden_inside(whole, self.scene.hidden))
             fill = fill_for(whole)
             values = {} if fill is None else {"fill": fill.to_json()}
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)

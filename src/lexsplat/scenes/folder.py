@@ -95,7 +95,7 @@ class SceneFolder:
         Raises:
             SceneFolderError: If it is not a scene folder.
         """
-        if str(root) == "demo" and not Path(root).exists():
+        if str(root) == "demo" and not (Path(root) / "scene.json").is_file():
             root = BUNDLED_SCENE
         if not (Path(root) / "scene.json").is_file():
             found = "no scene.json in it" if Path(root).is_dir() else "a file" if Path(root).exists() else ""

@@ -68,10 +68,11 @@ def _read_content(folder: SceneFolder, device: str) -> SceneContent:
     """
     if "language" not in folder.record["stages"] or not folder.language_path.exists():
         finished = ", ".join(folder.record["stages"]) or "none"
+        lost = "language" in folder.record["stages"]
         raise SceneFolderError(
             folder.root,
             expected="a scene with language",
-            found=f"finished stages: {finished}",
+            found=f"no {folder.language_path.name}" if lost else f"finished stages: {finished}",
             remedy="run the build again to finish it",
         )
     views, gaussians = folder.read_cameras(), folder.read_gaussians()

@@ -43,6 +43,11 @@ def make_app(session: Session) -> Starlette:
             _posted("/details", session, lambda s, data: JSONResponse(s.details(Asked.from_json(data)))),
             _posted("/download", session, _download),
             _posted("/edit", session, _edit),
+            _posted(
+                "/preview",
+                session,
+                lambda s, data: _bytes(s.preview(str(data.get("action")), Asked.from_json(data))),
+            ),
             _posted("/colors", session, lambda s, data: _bytes(s.colors(str(data.get("mode"))))),
             _posted("/objects", session, lambda s, _: JSONResponse(s.objects())),
             _posted(

@@ -234,7 +234,9 @@ class Session:
             if action in ("undo", "redo"):
                 getattr(self.editor, action)()
             else:
-                self._change(action, self._chosen(asked), values)
+                chosen = self._chosen(asked)
+                named = chosen.described(phrase=asked.prompt) if asked.prompt else chosen
+                self._change(action, named, values)
         except ValueError as error:  # numbers that have no meaning for these Gaussians
             raise QueryError(
                 action, expected="Gaussians that can be drawn afterwards", found=str(error)
@@ -244,6 +246,18 @@ class Session:
         self.version += 1
         self.content = self._make_content()
         return self.content.manifest
+
+    def preview(self, action: str, asked: Asked) -> bytes:
+        """What `edit` would apply to: the number of Gaussians as four bytes, then 1 or 0 for each drawn Gaussian.
+
+        Raises:
+            QueryError: If nothing is selected, or the action is none of `CHANGES`.
+        """
+        if action not in CHANGES:
+            raise QueryError("action", expected=", ".join(CHANGES), found=action[:40])
+        mask = self.editor.planned_mask(action, self._chosen(asked)).cpu()  # type: ignore[arg-type]
+        drawn = mask[self.content.drawn].to(torch.uint8).numpy()
+        return struct.pack("<I", int(mask.sum())) + drawn.tobytes()
 
     def _change(self, action: str, chosen: Selection, values: Mapping[str, Any]) -> None:
         left = {"delete": len(chosen.mask) - len(chosen), "keep": len(chosen)}.get(action, len(chosen.mask))

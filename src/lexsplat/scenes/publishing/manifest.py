@@ -63,7 +63,7 @@ def scene_manifest(
         "selection_rule": selection_rule(),
         "server": None,
         "language": None,
-        "words": {"phrases": "words.txt", "table": None, "count": 0},
+        "words": {"phrases": "words.txt", "table": None, "count": 0, "english": None},
         "text": None,
         "objects": None,
         "kinds": None,

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.scoring import form_used
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.formats.language import stored_language
+from lexsplat.scenes.publishing.english import english_file
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file, single_index
 from lexsplat.scenes.publishing.manifest import (
     DRAWN_SPLATS,
@@ -206,6 +208,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     tables, presences = phrase_answers(scene, list(phrases))
     (folder / "words.txt").write_bytes(words_file(phrases, presences))
     (folder / "words.bin").write_bytes(tables.numpy().tobytes())
+    (folder / "english.bin").write_bytes(english_file())
     text = None
     if not options.words_only:
         text = write_text_tower(scene, folder / "text.safetensors", folder / "tokenizer.json")
@@ -223,7 +226,16 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
             "num_codes": scene.field.codebook.num_codes,
             "method": scene.field.method,
         },
-        "words": {"phrases": "words.txt", "table": "words.bin", "count": len(phrases)},
+        "words": {
+            "phrases": "words.txt",
+            "table": "words.bin",
+            "count": len(phrases),
+            "english": {
+                "file": "english.bin",
+                "things": words_of_things(scene.clip),
+                "only": scene.clip == "bundled",
+            },
+        },
         "text": text,
         "objects": object_entries(objects),
         "kinds": kind_entries(objects),

@@ -1,0 +1,35 @@
+"""The English words for the page, which tells typing errors from words: a Bloom filter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+HASHES = 5
+"""Bits of each word. With eight bits of the filter for a word, 2 % of other texts count as words."""
+
+
+def english_file() -> bytes:
+    """A Bloom filter of the English words of `lexsplat.queries.spelling.is_word`.
+
+    Bit ``(a + n b) mod m`` of the m bits is set for each word and each n below `HASHES`; a is the 32-bit FNV-1a hash
+    of the word, and b that of the word and a zero byte, made odd. Bit k is bit ``k mod 8`` of byte ``k // 8``.
+    """
+    from simplemma.strategies.dictionaries.dictionary_factory import DefaultDictionaryFactory
+
+    entries = DefaultDictionaryFactory().get_dictionary("en")
+    texts = (key.decode() if isinstance(key, bytes) else key for key in entries)
+    words = sorted({text.lower() for text in texts if text.isascii() and text.isalpha()})
+    letters = np.array(words, dtype="S").view(np.uint8).reshape(len(words), -1)
+    first = np.full(len(words), 2166136261, np.uint64)
+    for column in letters.T:
+        first = np.where(column > 0, _hashed(first, column), first)
+    second = _hashed(first, np.zeros_like(first)) | np.uint64(1)
+    filled = np.zeros(8 * len(words), np.uint8)
+    for n in range(HASHES):
+        filled[(first + np.uint64(n) * second) % np.uint64(len(filled))] = 1
+    return np.packbits(filled, bitorder="little").tobytes()
+
+
+def _hashed(before: np.ndarray, letter: np.ndarray) -> np.ndarray:
+    """A step of FNV-1a."""
+    return (before ^ letter.astype(np.uint64)) * np.uint64(16777619) & np.uint64(0xFFFFFFFF)
