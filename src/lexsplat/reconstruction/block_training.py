@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from lexsplat.geometry.cameras import Camera
     from lexsplat.rendering import Rendering
 
-ROUNDS = 32
+ROUNDS = 16
 """Rounds in which all blocks are visited, at least."""
 ROUND_STEPS = 500
 """Steps of a round at most; longer trainings have more rounds."""
