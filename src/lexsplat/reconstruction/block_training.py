@@ -1,8 +1,9 @@
 """Reconstruction by blocks, for captures whose Gaussians do not fit into the memory of one reconstruction.
 
-The training of the whole is cut into visits: in each round, every block is loaded from disk once, trained on some of
-its views, and written back, with Adam's moments. Steps, learning rates and density control are those of one piece;
-only the order of the views differs. Blocks that train no cell in common are visited side by side.
+The training of the whole is cut into visits: in each round, every block is loaded from disk once, most of them
+together with a neighbor, trained on some of its views, and written back, with Adam's moments. Steps, learning rates
+and density control are those of one piece; the order of the views differs. Visits that train no cell in common run
+side by side.
 """
 
 from __future__ import annotations
