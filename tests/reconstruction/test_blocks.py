@@ -18,8 +18,15 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction import Reconstructor, block_training
 from lexsplat.reconstruction.block_files import BETAS, CellState, idle, plan
-from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks
-from lexsplat.reconstruction.blocks import cut_blocks, ground_axes, in_sight, number_of_blocks
+from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks, thinned
+from lexsplat.reconstruction.blocks import (
+    CELLS_OF_PAIR,
+    cut_blocks,
+    ground_axes,
+    number_of_blocks,
+    side_by_side,
+    sizes_in_view,
+)
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.runtime.errors import CaptureError, MemoryBudgetError, WorkersError
 from lexsplat.runtime.workers import open_workers
@@ -99,24 +106,59 @@ def test_a_block_of_a_street_trains_the_cells_in_front_of_its_views(capture):
 def test_blocks_that_are_trained_side_by_side_have_no_cell_in_common(capture):
     made, places = street(capture)
     cut = cut_blocks(made, places, ground_axes(UP), 6)
-    assert len(cut.phases) < 6
-    for phase in cut.phases:
-        cells = [cell for block in phase for cell in block.trained]
+    groups = side_by_side(cut.blocks)
+    assert len(groups) < 6
+    assert sorted(index for group in groups for index in group) == list(range(6))
+    for group in groups:
+        cells = [cell for index in group for cell in cut.blocks[index].trained]
         assert len(cells) == len(set(cells))
 
 
+def test_blocks_are_paired_with_each_neighbor_in_turn(capture):
+    made, places = street(capture)
+    cut = cut_blocks(made, places, ground_axes(UP), 6)
+    partners: dict[int, set[int]] = {number: set() for number in range(6)}
+    for turn in range(20):
+        pairs = cut.pairs(turn)
+        assert sorted(number for pair in pairs for number in pair) == list(range(6))
+        for pair in pairs:
+            block = cut.joined(pair)
+            assert sorted(block.views) == sorted(name for n in pair for name in cut.blocks[n].views)
+            assert set(block.owned) <= set(block.trained) == {c for n in pair for c in cut.blocks[n].trained}
+            assert not set(block.trained) & set(block.shown)
+            assert len(block.trained) <= CELLS_OF_PAIR
+            for number in pair:
+                partners[number] |= set(pair) - {number}
+    assert all(others for others in partners.values())
+    assert max(len(others) for others in partners.values()) > 1
+
+
+@pytest.mark.parametrize("pairs", [False, True])
 @pytest.mark.parametrize(("iterations", "rounds"), [(100, 4), (101, 7), (5, 3)])
-def test_visits_have_all_steps_of_the_training_once_and_each_block_its_share(iterations, rounds, capture):
+def test_visits_have_all_steps_of_the_training_once_and_each_block_its_share(
+    iterations, rounds, pairs, capture
+):
     made, places = street(capture)
     cut = cut_blocks(made, places, ground_axes(UP), 3)
-    visits = [visit for group in plan(cut, iterations, rounds) for visit in group]
+    visits = [visit for group in plan(cut, iterations, rounds, pairs=pairs) for visit in group]
     assert [visit.start for visit in visits] == [0, *(visit.end for visit in visits[:-1])]
     assert visits[-1].end == iterations
+    assert len(visits) == (2 if pairs else 3) * rounds
+    for visit in visits:
+        assert len(visit.views(0)) == visit.end - visit.start == sum(steps for _, _, steps in visit.parts)
     for block in cut.blocks:
-        own = [visit for visit in visits if visit.block is block]
-        steps = np.cumsum([0, *(visit.end - visit.start for visit in own)])
-        assert [visit.first for visit in own] == steps[:-1].tolist()
+        own = [part for visit in visits for part in visit.parts if part[0] is block]
+        steps = np.cumsum([0, *(steps for _, _, steps in own)])
+        assert [first for _, first, _ in own] == steps[:-1].tolist()
         assert abs(steps[-1] - iterations * len(block.views) / len(made.views)) <= 1
+
+
+def test_every_view_is_used_equally_often(capture):
+    made, places = street(capture)
+    cut = cut_blocks(made, places, ground_axes(UP), 3)
+    visits = [visit for group in plan(cut, 5 * len(made.views), 4) for visit in group]
+    names = [name for visit in visits for name in visit.views(0)]
+    assert sorted(names) == sorted(5 * list(made.views))
 
 
 def test_idle_steps_are_those_of_adam_without_gradients():
@@ -144,14 +186,15 @@ def test_idle_steps_are_those_of_adam_without_gradients():
     torch.testing.assert_close(state.moments["exp_avg_sq/means"], optimizer.state[parameter]["exp_avg_sq"])
 
 
-def test_balls_that_a_camera_shows_are_in_sight(capture):
+def test_gaussians_that_reach_into_an_image_have_a_size_in_it(capture):
     made, _ = street(capture)
     camera = made.views["08.0"].camera
     places = np.random.default_rng(0).uniform((-10, -6, -5), (30, 9, 8), (500, 3)).astype(np.float32)
     local = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     surface = np.random.default_rng(1).normal(size=(2000, 3))
     surface /= np.linalg.norm(surface, axis=1, keepdims=True)
-    found, radius = in_sight(camera, places, np.full(500, 0.7, np.float32)), 0.7
+    radius = 0.7
+    found = sizes_in_view(camera, places, np.full(500, radius / 3, np.float32)) > 0
     assert 0 < found.sum() < 400
     for center in local[~found]:
         x, y, z = (center + radius * surface).T
@@ -191,6 +234,35 @@ def test_gaussians_of_other_cells_are_drawn_and_stay_as_they_are(capture, points
     assert len(trainer.gaussians()) == half
 
 
+def test_small_gaussians_of_other_cells_are_thinned_and_keep_their_area(capture):
+    made, _ = street(capture)
+    rng = np.random.default_rng(0)
+    count = 4000
+    places = np.column_stack([rng.uniform(-2, 2, count), rng.uniform(8, 12, count), rng.uniform(1, 2, count)])
+    gaussians = Gaussians(
+        torch.from_numpy(places).float() + torch.tensor([8.0, 0.0, 0.0]),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count, 3), float(np.log(0.1))),  # half a pixel at a distance of ten meters
+        torch.zeros(count),
+        torch.zeros(count, 1, 3),
+        torch.zeros(count, 0, 3),
+    )
+    cameras = [made.views["08.0"].camera]
+    found = thinned(gaussians, cameras, rng)
+    assert count / 40 < len(found) < count / 8
+    areas = [float(each.scales[:, :2].prod(1).sum()) for each in (gaussians, found)]
+    assert areas[1] == pytest.approx(areas[0], rel=0.15)
+    large = gaussians.map(torch.clone)
+    large.log_scales += float(np.log(10.0))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(large.tensors().values(), thinned(large, cameras, rng).tensors().values())
+    )
+    behind = gaussians.map(torch.clone)
+    behind.means[:, 1] -= 30.0
+    assert len(thinned(behind, cameras, rng)) == 0
+
+
 def test_blocks_that_no_view_sees_are_refused(capture):
     made, places = street(capture)
     behind = places.copy()
@@ -212,8 +284,8 @@ def test_auto_takes_as_few_blocks_as_fit():
     config = ReconstructionConfig(max_gaussians=1_000_000)
     need = 2 * 1_000_000 * 1_700
     assert number_of_blocks("auto", config, "cpu", need) == 1
-    assert number_of_blocks("auto", config, "cpu", need - 1) == 5, "a block trains up to four cells"
-    assert number_of_blocks("auto", config, "cpu", need // 4) == 16
+    assert number_of_blocks("auto", config, "cpu", need - 1) == 7, "two blocks train up to six cells"
+    assert number_of_blocks("auto", config, "cpu", need // 4) == 24
     assert number_of_blocks("none", config, "cpu", 1) == 1
     for wrong in ("0", "-1", "2.5", "many", "", "100000"):
         with pytest.raises(ValueError, match="blocks must be auto, none or a number"):
@@ -223,7 +295,7 @@ def test_auto_takes_as_few_blocks_as_fit():
 def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_same_result(
     capture, points, tmp_path, monkeypatch
 ):
-    config = dataclasses.replace(CONFIG, iterations=24, densify_min_every=2, densify_every=2)
+    config = dataclasses.replace(CONFIG, iterations=36, densify_min_every=2, densify_every=2)
     visit, events = block_training._visit, []
 
     def killed(left):
@@ -236,7 +308,7 @@ def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_sa
         return some
 
     run = BlockRun("cpu", 0, 1 << 30, tmp_path / "whole", "key", listener=events.append)
-    whole = reconstruct_blocks(capture, config, points, UP, 2, run)
+    whole = reconstruct_blocks(capture, config, points, UP, 3, run)
     done = [event.done for event in events if event.stage == "blocks"]
     assert done == list(range(1, len(done) + 1))
     assert len(done) == events[-1].total > 4
@@ -245,12 +317,12 @@ def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_sa
     for _ in range(len(done)):
         monkeypatch.setattr(block_training, "_visit", killed([2]))
         try:
-            again = reconstruct_blocks(capture, config, points, UP, 2, run)
+            again = reconstruct_blocks(capture, config, points, UP, 3, run)
             break
         except KeyboardInterrupt:
             continue
     assert all(torch.equal(a, b) for a, b in zip(whole.tensors().values(), again.tensors().values()))
-    assert len(list((tmp_path / "killed").glob("*.safetensors"))) <= 3, (
+    assert len(list((tmp_path / "killed").glob("*.safetensors"))) <= 4, (
         "files that no state needs are deleted"
     )
 
@@ -339,7 +411,7 @@ def test_stray_points_far_away_do_not_change_what_a_block_trains(capture):
 def test_blocks_on_ray_have_the_bits_of_one_process(capture, points, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    config = dataclasses.replace(CONFIG, iterations=24, densify_min_every=2, densify_every=2)
+    config = dataclasses.replace(CONFIG, iterations=36, densify_min_every=2, densify_every=2)
     run = BlockRun("cpu", 0, 256 << 20, tmp_path / "here", "key")
     here = reconstruct_blocks(capture, config, points, UP, 2, run)
     with open_workers("ray", (capture.root,)) as workers:

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import correlate
 
 from lexsplat.reconstruction import image_loss_kernels, image_losses
 from lexsplat.reconstruction.image_losses import SSIMTarget, photometric_loss, ssim_target
@@ -35,6 +36,19 @@ def test_ssim_equals_torchmetrics(height, width):
     assert float(ssim(image, ssim_target(photo))) == pytest.approx(
         float(torchmetrics_ssim(image, photo)), abs=1e-6
     )
+
+
+@pytest.mark.parametrize(("height", "width"), [(6, 6), (7, 40), (40, 7), (33, 61)])
+def test_the_moments_of_a_photo_are_those_of_a_gaussian_window_in_float64(height, width):
+    _, photo = two_images(height, width)
+    weights = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    window = np.outer(weights, weights)[:, :, None] / weights.sum() ** 2
+    exact = photo.double().numpy()
+    mean = correlate(exact, window, mode="mirror")
+    variance = correlate(exact**2, window, mode="mirror") - mean**2
+    target = ssim_target(photo)
+    np.testing.assert_allclose(target.mean, mean, rtol=1e-7)
+    np.testing.assert_allclose(target.variance, variance, rtol=1e-6, atol=1e-14)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0, 1.1])

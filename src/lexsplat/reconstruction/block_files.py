@@ -1,8 +1,8 @@
 """The state of a reconstruction by blocks, on disk: the Gaussians of each cell with their moments and statistics.
 
-A visit trains the views of one block for some steps. Its file has the cells that it trained, complete and as they
-were after it. The present state of a cell is in the file of the last visit that trained it. All visits are planned
-before the first, so a run that was killed knows from the files alone where to go on.
+A visit trains the views of one block, or of two, for some steps. Its file has the cells that it trained, complete and
+as they were after it. The present state of a cell is in the file of the last visit that trained it. All visits are
+planned before the first, so a run that was killed knows from the files alone where to go on.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import TENSORS, Gaussians
-from lexsplat.reconstruction.blocks import Block, Blocks
+from lexsplat.reconstruction.blocks import Block, Blocks, side_by_side
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_json, write_json, write_tensors
 
@@ -80,44 +81,69 @@ class CellState:
 
 @dataclass(frozen=True)
 class Visit:
-    """A part of the training: some steps on the views of one block.
+    """A part of the training: some steps on the views of one block, or of two.
 
     Args:
         number: Index among all visits.
         round: Round of density control that begins with it.
-        block: The block.
+        block: The block, or the two as one.
+        parts: Of each of them: the block, the number of steps on its views before this visit, and in it.
         start: Number of steps of the whole training before it.
         end: The same after it.
-        first: Number of steps before it on views of this block.
         round_steps: Number of steps of a round.
     """
 
     number: int
     round: int
     block: Block
+    parts: tuple[tuple[Block, int, int], ...]
     start: int
     end: int
-    first: int
     round_steps: int
 
+    def views(self, seed: int) -> list[str]:
+        """Names of the views of its steps.
 
-def plan(blocks: Blocks, iterations: int, rounds: int) -> list[list[Visit]]:
-    """The visits of the whole training, in groups that can run side by side."""
-    views = sum(len(block.views) for block in blocks.blocks)
-    phases, groups, step, number = blocks.phases, [], 0, 0
-    done = [0] * len(blocks.blocks)
+        Each block goes through random permutations of its views, over all its visits; the views of two are mixed.
+        """
+        names = []
+        for block, first, steps in self.parts:
+            for turn, place in (divmod(step, len(block.views)) for step in range(first, first + steps)):
+                order = np.random.default_rng([seed, block.number, turn]).permutation(len(block.views))
+                names.append(block.views[int(order[place])])
+        if len(self.parts) > 1:
+            np.random.default_rng([seed, self.number]).shuffle(names)
+        return names
+
+
+def plan(blocks: Blocks, iterations: int, rounds: int, *, pairs: bool = True) -> list[list[Visit]]:
+    """The visits of the whole training, in groups that can run side by side.
+
+    Args:
+        blocks: The blocks.
+        iterations: Number of steps of the whole training.
+        rounds: How often each block is visited.
+        pairs: Visit two blocks together where they share cells.
+    """
+    views, count = sum(len(block.views) for block in blocks.blocks), len(blocks.blocks)
+    groups, step, number, done = [], 0, 0, [0] * count
     # Rounding is done on the blocks in order, so that the visits add up to the iterations.
-    before = [sum(len(b.views) for b in blocks.blocks[:n]) / views for n in range(len(blocks.blocks) + 1)]
+    before = [sum(len(b.views) for b in blocks.blocks[:n]) / views for n in range(count + 1)]
     for index in range(rounds):
         ends = [round((index + 1) * iterations / rounds * share) for share in before]
-        for phase in phases:
+        sets = blocks.pairs(index) if pairs else [(n,) for n in range(count)]
+        joined = [blocks.joined(numbers) for numbers in sets]
+        for indices in side_by_side(joined):
             group = []
-            for block in phase:
-                first = done[block.number]
-                steps = ends[block.number + 1] - ends[block.number] - first
-                done[block.number] += steps
-                group.append(Visit(number, index, block, step, step + steps, first, iterations // rounds))
-                step, number = step + steps, number + 1
+            for place in indices:
+                parts = tuple(
+                    (blocks.blocks[n], done[n], ends[n + 1] - ends[n] - done[n]) for n in sets[place]
+                )
+                for block, first, steps in parts:
+                    done[block.number] = first + steps
+                end = step + sum(steps for _, _, steps in parts)
+                group.append(Visit(number, index, joined[place], parts, step, end, iterations // rounds))
+                step, number = end, number + 1
             groups.append(group)
     return groups
 

@@ -1,14 +1,15 @@
 """Reconstruction by blocks, for captures whose Gaussians do not fit into the memory of one reconstruction.
 
-The training of the whole is cut into visits: in each round, every block is loaded from disk once, trained on some of
-its views, and written back, with Adam's moments. Steps, learning rates and density control are those of one piece;
-only the order of the views differs. Blocks that train no cell in common are visited side by side.
+The training of the whole is cut into visits: in each round, every block is loaded from disk once, most of them
+together with a neighbor, trained on some of its views, and written back, with Adam's moments. Steps, learning rates
+and density control are those of one piece; the order of the views differs. Visits that train no cell in common run
+side by side.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,7 +32,7 @@ from lexsplat.reconstruction.block_files import (
     merged,
     plan,
 )
-from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes, in_sight
+from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes, sizes_in_view
 from lexsplat.reconstruction.densification import DensityControl
 from lexsplat.reconstruction.optimizers import adam, load_optimizer_tensors
 from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, ReconstructionConfig
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
     from lexsplat.geometry.cameras import Camera
     from lexsplat.rendering import Rendering
 
-ROUNDS = 32
+ROUNDS = 16
 """Rounds in which all blocks are visited, at least."""
 ROUND_STEPS = 500
 """Steps of a round at most; longer trainings have more rounds."""
@@ -59,6 +60,10 @@ FIXED_BYTES = 1_000
 CALM = (0.7, 0.1)
 """From the first share of the iterations on, all learning rates fall, exponentially, to the second share of them at
 the end: the views of the last visits would otherwise count for more than the others."""
+
+SMALL = 2.0
+"""Geometric mean of the two largest standard deviations in pixels below which only some of the Gaussians that are not
+trained take part."""
 
 _NEVER = 1 << 40
 
@@ -126,7 +131,7 @@ class VisitReconstructor(Reconstructor):
         seed: int,
         **options: Any,
     ) -> None:
-        self._visit, self._state, self._seed = visit, state, seed
+        self._visit, self._state, self._order_of_views = visit, state, visit.views(seed)
         # Gaussians are added and removed between the visits.
         config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
         own = _seed(seed, visit.number)
@@ -184,7 +189,7 @@ class VisitReconstructor(Reconstructor):
             self._exposures.load_state_tensors(tensors)
 
     def _next_view(self) -> int:
-        return self._names.index(_view_of(self._visit, self.steps_done, self._seed))
+        return self._names.index(self._order_of_views[self.steps_done - self._visit.start])
 
     def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
         return super()._render(gaussians if self._fixed is None else merged([gaussians, self._fixed]), camera)
@@ -195,13 +200,6 @@ class VisitReconstructor(Reconstructor):
         if means2d.grad is not None:
             own.grad = means2d.grad.view(-1, *means2d.shape[-2:])[..., :count, :]
         super()._control_density(own, radii[:count], image_size)
-
-
-def _view_of(visit: Visit, step: int, seed: int) -> str:
-    """Name of the view of a step: random permutations of those of the block, over all its visits."""
-    views = visit.block.views
-    turn, place = divmod(visit.first + step - visit.start, len(views))
-    return views[int(np.random.default_rng([seed, visit.block.number, turn]).permutation(len(views))[place])]
 
 
 def calm_factor(config: ReconstructionConfig, step: int) -> float:
@@ -241,14 +239,16 @@ def reconstruct_blocks(
     none = capture.points[:0]  # workers get the capture with every group of visits, and need its views only
     capture = replace(capture, points=none, point_colors=capture.point_colors[:0])
     cap = config.cap(torch.device(run.device))
+    rounds = max(ROUNDS, math.ceil(config.iterations / ROUND_STEPS))
+    rounds = max(1, min(rounds, config.iterations // (FEWEST_STEPS * count)))
+    # The exposures of a block are kept with its visits, so that it is visited alone.
+    groups = plan(blocks, config.iterations, rounds, pairs=not config.exposure)
     if run.device == "cpu":
-        trained = math.ceil(cap / count * max(len(block.trained) for block in blocks.blocks))
+        trained = math.ceil(cap / count * max(len(v.block.trained) for group in groups for v in group))
         need = 2 * trained * budget.GAUSSIAN_BYTES
         budget.require(
             "reconstruct", need, run.memory, f"{trained:,} Gaussians of a block", "a larger --blocks"
         )
-    rounds = max(ROUNDS, math.ceil(config.iterations / ROUND_STEPS))
-    groups = plan(blocks, config.iterations, max(1, min(rounds, config.iterations // (FEWEST_STEPS * count))))
     total, listener, workers = sum(map(len, groups)), run.listener, run.workers
     needs = Needs(memory=run.memory, gpu=run.device == "cuda")
     own = replace(run, workers=IN_PROCESS, listener=silent)
@@ -394,18 +394,28 @@ def _refined(state: CellState, control: DensityControl, step: int, steps: int) -
 
 def _fixed(shared: _Shared, visit: Visit, latest: Mapping[str, tuple[int, int]]) -> Gaussians | None:
     """The Gaussians of the cells that a visit does not train, as far as its views show them."""
-    names = {_view_of(visit, step, shared.run.seed) for step in range(visit.start, visit.end)}
-    cameras = [shared.capture.views[name].camera for name in sorted(names)]
+    rng = np.random.default_rng([shared.run.seed, visit.number])
+    cameras = [shared.capture.views[name].camera for name in sorted(set(visit.views(shared.run.seed)))]
     parts = []
     for cell in visit.block.shown:
         gaussians = shared.files.gaussians(latest[str(cell)][0], cell, shared.config.antialiased)
-        centers = gaussians.means.numpy()
-        radii = 3.0 * gaussians.scales.max(1).values.numpy()
-        seen = np.zeros(len(centers), bool)
-        for camera in cameras:
-            seen |= in_sight(camera, centers, radii)
-        parts.append(gaussians.select(torch.from_numpy(seen)))
+        parts.append(thinned(gaussians, cameras, rng))
     return merged(parts) if sum(map(len, parts)) else None
+
+
+def thinned(gaussians: Gaussians, cameras: Sequence[Camera], rng: np.random.Generator) -> Gaussians:
+    """The Gaussians that cameras show; of those that are small in all images (`SMALL`) a random choice.
+
+    A Gaussian is chosen with the share that its area has of that of the smallest one which always takes part, and
+    enlarged to that area. The number in an image thus depends on what it shows, not on the size of the capture.
+    """
+    centers = gaussians.means.numpy()
+    longest, middle, _ = gaussians.scales.sort(1, descending=True).values.numpy().T
+    sizes = np.max([sizes_in_view(camera, centers, longest) for camera in cameras], axis=0)
+    shares = np.minimum(1.0, sizes**2 * (middle / longest) / SMALL**2)
+    chosen = torch.from_numpy(np.flatnonzero(rng.random(len(shares)) < shares))
+    part, kept = gaussians.select(chosen), torch.from_numpy(shares).float()[chosen]
+    return replace(part, log_scales=part.log_scales - 0.5 * kept.log()[:, None])
 
 
 def _seed(*numbers: int) -> int:

@@ -9,7 +9,9 @@ view belongs to one block and is used as a whole, so that all blocks together dr
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
 
 CELLS_TRAINED = 4
 """Cells that a block trains at most, if every other cell is trained by another block."""
+
+CELLS_OF_PAIR = 6
+"""Cells that two blocks train at most when they are visited together."""
 
 _COVERED = 0.95
 """Share of the pixels of a block's views that the cells which it trains show, as far as `CELLS_TRAINED` allows."""
@@ -93,18 +98,53 @@ class Blocks:
         """Share of each cell ``[B]`` in a view: of the points that it shows, each by its area in the image."""
         return _shares(view, points, self.cells, self.axes)
 
-    @property
-    def phases(self) -> list[list[Block]]:
-        """The blocks in groups that train no cell in common, so that a group can be trained side by side."""
-        phases: list[list[Block]] = []
-        for block in self.blocks:
-            free = (p for p in phases if not any(set(block.trained) & set(other.trained) for other in p))
-            phase = next(free, None)
-            if phase is None:
-                phases.append([block])
-            else:
-                phase.append(block)
-        return phases
+    def joined(self, numbers: Sequence[int]) -> Block:
+        """Blocks as one, under the number of the first."""
+        chosen = [self.blocks[number] for number in numbers]
+        trained = {cell for block in chosen for cell in block.trained}
+        owned = {cell for block in chosen for cell in block.owned}
+        shown = {cell for block in chosen for cell in block.shown} - trained
+        views = tuple(name for block in chosen for name in block.views)
+        return Block(numbers[0], views, *(tuple(sorted(cells)) for cells in (trained, owned, shown)))
+
+    def pairs(self, turn: int) -> list[tuple[int, ...]]:
+        """The blocks in pairs that together train at most `CELLS_OF_PAIR` cells, and others alone.
+
+        Which ones are paired is drawn anew with each ``turn``, so that views are mixed with those of all neighbors.
+        """
+        left = set(range(len(self.blocks)))
+        found: list[tuple[int, ...]] = []
+        for index in np.random.default_rng(turn).permutation(len(self._neighbors)):
+            pair = self._neighbors[index]
+            if left.issuperset(pair):
+                left.difference_update(pair)
+                found.append(pair)
+        return sorted([*found, *((number,) for number in left)])
+
+    @cached_property
+    def _neighbors(self) -> list[tuple[int, int]]:
+        """The blocks that may be visited together."""
+        cells = [set(block.trained) for block in self.blocks]
+        return [
+            (first, second)
+            for second in range(len(cells))
+            for first in range(second)
+            if cells[first] & cells[second] and len(cells[first] | cells[second]) <= CELLS_OF_PAIR
+        ]
+
+
+def side_by_side(blocks: Sequence[Block]) -> list[list[int]]:
+    """Indices of blocks in groups that train no cell in common, so that a group can be trained side by side."""
+    groups: list[list[int]] = []
+    for index, block in enumerate(blocks):
+        cells = set(block.trained)
+        free = (g for g in groups if not any(cells & set(blocks[other].trained) for other in g))
+        group = next(free, None)
+        if group is None:
+            groups.append([index])
+        else:
+            group.append(index)
+    return groups
 
 
 def number_of_blocks(blocks: str, config: ReconstructionConfig, device: str, memory: int) -> int:
@@ -121,7 +161,7 @@ def number_of_blocks(blocks: str, config: ReconstructionConfig, device: str, mem
     """
     if blocks == "auto":
         need = 2 * config.cap(torch.device(device)) * budget.GAUSSIAN_BYTES
-        return 1 if device != "cpu" or need <= memory else math.ceil(CELLS_TRAINED * need / memory)
+        return 1 if device != "cpu" or need <= memory else math.ceil(CELLS_OF_PAIR * need / memory)
     if blocks == "none":
         return 1
     if not blocks.isdecimal() or not 1 <= int(blocks) <= _MOST_BLOCKS:
@@ -224,17 +264,23 @@ def _shown(camera: Camera, points: NDArray[np.float32]) -> tuple[NDArray[np.int6
     return shown, depth[shown]
 
 
-def in_sight(camera: Camera, centers: NDArray[np.floating], radii: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which balls ``[N]`` reach into the image of a camera; some that are just outside of it too."""
+def sizes_in_view(
+    camera: Camera, centers: NDArray[np.floating], deviations: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """Standard deviations ``[N]`` in pixels of Gaussians in the image of a camera; 0 outside of it.
+
+    They reach three deviations far. Some that are just outside are counted too.
+    """
     local = centers @ camera.viewmat[:3, :3].T.astype(np.float32) + camera.viewmat[:3, 3].astype(np.float32)
-    depth = np.maximum(local[:, 2], 1e-3)
+    depth, radii = np.maximum(local[:, 2], 1e-3), 3 * deviations
     found = local[:, 2] > -radii
     for axis, size in enumerate((camera.width, camera.height)):
         focal, middle = camera.K[axis, axis], camera.K[axis, 2]
         place = focal * local[:, axis] / depth + middle
         reach = 1.5 * focal * radii / depth + 2
         found &= (place > -reach) & (place < size + reach)
-    return found | (np.linalg.norm(local, axis=1) < radii)
+    found |= np.linalg.norm(local, axis=1) < radii
+    return np.where(found, max(camera.K[0, 0], camera.K[1, 1]) * deviations / depth, 0.0)
 
 
 def _cut(ground: NDArray[np.float64], count: int) -> list[tuple[NDArray, NDArray]]:

@@ -66,6 +66,28 @@ def photometric(
     return float(differences.sum(dtype=np.float64)), float(scores.sum(dtype=np.float64)), gradient
 
 
+def moments(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Local mean and variance of a photo under the window of SSIM, its borders reflected.
+
+    Sums are in float64, because rounding of the squares would swamp the variance of bright, flat areas.
+
+    Args:
+        image: ``[H, W3]`` float32.
+
+    Returns:
+        Two arrays ``[H, W3]`` float32.
+    """
+    mean, variance = np.empty_like(image), np.empty_like(image)
+    grain = max(1, PIXELS_PER_PIECE // image.shape[1])
+    parallel(_moments, len(image), grain, image, _weights(), mean, variance)
+    return mean, variance
+
+
+def _weights() -> np.ndarray:
+    weights = np.array([math.exp(-((k - RADIUS) ** 2) / (2 * 1.5**2)) for k in range(TAPS)])
+    return weights / weights.sum()
+
+
 def reflected_taps(length: int) -> tuple[np.ndarray, np.ndarray]:
     """Taps of a Gaussian blur (sigma 1.5) of a line that is reflected at its ends, and of its transpose.
 
@@ -76,8 +98,7 @@ def reflected_taps(length: int) -> tuple[np.ndarray, np.ndarray]:
         Two ``[length, 11]`` float32 arrays: entry ``(i, k)`` weighs sample ``i + k - 5`` in the result at
         ``i``; samples outside weigh nothing.
     """
-    weights = np.array([math.exp(-((k - RADIUS) ** 2) / (2 * 1.5**2)) for k in range(TAPS)])
-    weights /= weights.sum()
+    weights = _weights()
     forward = np.zeros((length, TAPS))
     transposed = np.zeros((length, TAPS))
     for i in range(length):
@@ -88,6 +109,40 @@ def reflected_taps(length: int) -> tuple[np.ndarray, np.ndarray]:
             forward[i, source - i + RADIUS] += weights[k]
             transposed[source, i - source + RADIUS] += weights[k]
     return forward.astype(np.float32), transposed.astype(np.float32)
+
+
+@kernel
+def _moments(
+    start: int, stop: int, image: np.ndarray, weights: np.ndarray, mean: np.ndarray, variance: np.ndarray
+) -> None:
+    height, width3 = image.shape
+    pad = 3 * RADIUS
+    sums = np.empty(width3 + 2 * pad, np.float64)
+    squares = np.empty(width3 + 2 * pad, np.float64)
+    for y in range(start, stop):
+        sums[:] = 0.0
+        squares[:] = 0.0
+        for k in range(TAPS):
+            source = abs(y + k - RADIUS)
+            if source >= height:
+                source = 2 * (height - 1) - source
+            weight = weights[k]
+            for i in range(width3):
+                value = np.float64(image[source, i])
+                sums[i + pad] += weight * value
+                squares[i + pad] += weight * value * value
+        for j in range(1, RADIUS + 1):
+            for c in range(3):
+                low, high = pad + c, pad + width3 - 3 + c
+                sums[low - 3 * j], squares[low - 3 * j] = sums[low + 3 * j], squares[low + 3 * j]
+                sums[high + 3 * j], squares[high + 3 * j] = sums[high - 3 * j], squares[high - 3 * j]
+        for i in range(width3):
+            total, square = 0.0, 0.0
+            for k in range(TAPS):
+                total += weights[k] * sums[i + 3 * k]
+                square += weights[k] * squares[i + 3 * k]
+            mean[y, i] = total
+            variance[y, i] = max(square - total * total, 0.0)
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 SSIM uses an 11x11 Gaussian window with sigma 1.5 and reflects the image at its borders, as torchmetrics does, so
 that every pixel contributes. The moments of a photo are constant during a training, so `SSIMTarget` stores them. On a
-CPU one kernel returns the loss and its analytic gradient; elsewhere the same formula runs in torch.
+CPU kernels return the moments, and the loss with its analytic gradient; elsewhere the same formulas run in torch.
 """
 
 from __future__ import annotations
@@ -46,6 +46,12 @@ def ssim_target(image: Tensor) -> SSIMTarget:
             f"image must be [H, W, 3] with sides of at least {SMALLEST_SIDE}, got {list(image.shape)}"
         )
     image = image.detach().contiguous()
+    if image.device.type == "cpu" and image.dtype == torch.float32:
+        from lexsplat.reconstruction.image_loss_kernels import moments
+
+        height, width, _ = image.shape
+        found = moments(image.numpy().reshape(height, width * 3))
+        return SSIMTarget(image, *(torch.from_numpy(each).view(height, width, 3) for each in found))
     mean, variance = torch.empty_like(image), torch.empty_like(image)
     for channel in range(3):  # one at a time: a float64 convolution unfolds its input eleven times
         # In float64, because rounding of the squares would swamp the variance of bright, flat areas.
