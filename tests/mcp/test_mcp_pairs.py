@@ -65,9 +65,11 @@ def test_of_several_things_the_nearest_pair_is_measured_and_named(server, points
     nearest = min(pairs, key=lambda pair: gap(points[pair[0]], points[pair[1]]))
     assert (document["first"]["name"], document["second"]["name"]) == nearest
     assert document["note"] == (
-        f'"fruit" fits 2 things and "toy" fits 3; measured is the nearest pair, {nearest[0]} and {nearest[1]}'
+        f'"fruit" fits 2 and "toy" fits 3 things; measured is the nearest pair, {nearest[0]} and {nearest[1]}'
     )
     assert document["note"] in text
+    note = ask(server, "measure", first="mug", second="toy")[0].structured_content["note"]
+    assert note.startswith('"toy" fits 3 things; measured is the nearest pair, mug and ')
     assert ask(server, "measure", first="apple", second="mug")[0].structured_content["note"] == ""
 
 
@@ -89,7 +91,7 @@ def test_a_thing_is_nearest_to_another_of_the_kind_that_it_is_of(server, points)
         )
     reply, text = ask(server, "nearest", target="fruit", to="apple")
     assert text.startswith("banana is nearest to apple: ")
-    assert 'the only other thing that fits "fruit"' in text
+    assert 'the only other one for "fruit"' in text
     assert ask(server, "nearest", target="apple", to="fruit")[1].startswith("apple is nearest to banana: ")
 
 
@@ -101,6 +103,6 @@ def test_the_thing_that_the_nearest_is_nearest_to_is_named(server):
     assert document["note"] in text
     reply, text = ask(server, "nearest", target="thing", to="lamp")
     assert (reply.structured_content["among"], reply.structured_content["note"]) == (13, "")
-    assert "of 13 things that fit any object" in text
+    assert "of 13 for any object" in text
     point = ask(server, "nearest", target="fruit", point=[-0.5, -1.3, 0.2])[0].structured_content
     assert (point["to"], point["among"]) == (None, 2)

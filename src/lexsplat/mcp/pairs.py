@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lexsplat.queries.relations import distance, same
 from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.serving import shortened
 
 
 class Pair(NamedTuple):
@@ -50,6 +52,37 @@ def nearest_pair(firsts: Sequence[Selection], seconds: Sequence[Selection]) -> P
         key = (pair.gap, float(apart[row, column]), pair)
         best = key if best is None or key[:2] < best[:2] else best
     return None if best is None else best[2]
+
+
+def different(firsts: Sequence[Selection], seconds: Sequence[Selection], asked: str) -> Pair:
+    """`nearest_pair`, which must exist.
+
+    Raises:
+        QueryError: If there is only one thing; its subject is ``asked``.
+    """
+    pair = nearest_pair(firsts, seconds)
+    if pair is None:
+        raise QueryError(
+            asked,
+            expected="two different things",
+            found=f"one thing alone, {called(firsts[0], firsts)}",
+            remedy='name another target, such as "thing" for any object',
+        )
+    return pair
+
+
+def measured(*ends: tuple[Selection, Sequence[Selection], dict[str, Any]]) -> str:
+    """A note on the pair that was taken; "" where each phrase fits one thing.
+
+    Args:
+        ends: What was taken, of which things, and how their phrase was understood.
+    """
+    fits = [(shortened(asked["understood"]), len(things)) for _, things, asked in ends if len(things) > 1]
+    if not fits:
+        return ""
+    said = " and ".join(f"{text} fits {count}" for text, count in dict.fromkeys(fits))
+    names = " and ".join(called(one, things) for one, things, _ in ends)
+    return f"{said} things; measured is the nearest pair, {names}"
 
 
 def others(things: Sequence[Selection], than: Sequence[Selection]) -> list[Selection]:

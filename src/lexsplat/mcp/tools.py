@@ -13,7 +13,7 @@ from pydantic import Field
 
 from lexsplat.mcp import answers
 from lexsplat.mcp.arguments import NOT_BLANK, nearest
-from lexsplat.mcp.pairs import Pair, called, nearest_pair, others, view_of
+from lexsplat.mcp.pairs import called, different, measured, others, view_of
 from lexsplat.mcp.pictures import picture
 from lexsplat.queries.phrases import Related, RelationName, Understood, Viewer
 from lexsplat.queries.selection import PRESENCES, Selection
@@ -194,7 +194,7 @@ class Tools:
         else:
             ends, reference = _found(place, to)
             candidates = others(things, ends) or things
-            gap, best, end = _different(candidates, ends, target, "nearest")
+            gap, best, end = different(candidates, ends, target[:60])
             asked = _both(asked, reference, "nearest to", view_of(best, end))
             where = called(end, ends)
             if len(ends) > 1:
@@ -208,8 +208,8 @@ class Tools:
             "to": end.geometry() if end else None,
             "among": len(candidates),
         }
-        only = f"the only {'other ' if len(things) > 1 else ''}thing that fits {understood}"
-        among = only if len(candidates) == 1 else f"of {len(candidates)} things that fit {understood}"
+        only = f"the only {'other ' if len(things) > 1 else ''}one for {understood}"
+        among = only if len(candidates) == 1 else f"of {len(candidates)} for {understood}"
         said = f"{called(best, things)} is nearest to {where}: {_length(place, gap)} away, {among}."
         return Reply(qualified(said, asked), document)
 
@@ -219,17 +219,9 @@ class Tools:
         """Measure between two things: center to center, the gap between their surfaces, the difference in height."""
         place = self._scene(scene)
         (ones, first_asked), (ends, also) = _found(place, first), _found(place, second)
-        gap, one, other = _different(ones, ends, f"{first[:60]} and {second[:60]}", "measure")
+        gap, one, other = different(ones, ends, f"{first[:60]} and {second[:60]}")
         asked = _both(first_asked, also, "and", view_of(one, other))
-        several = [
-            f"{shortened(each['understood'])} fits {len(things)}{'' if number else ' things'}"
-            for number, (each, things) in enumerate(((first_asked, ones), (also, ends)))
-            if len(things) > 1
-        ]
-        if several:
-            names = f"{called(one, ones)} and {called(other, ends)}"
-            told = f"{' and '.join(several)}; measured is the nearest pair, {names}"
-            asked["note"] = _joined(asked["note"], told)
+        asked["note"] = _joined(asked["note"], measured((one, ones, first_asked), (other, ends, also)))
         offset = other.center - one.center
         rise = float(offset @ np.asarray(one.up.direction))
         lengths = {"centers": float(np.linalg.norm(offset)), "gap": gap, "height": rise}
@@ -409,23 +401,6 @@ def _both(first: dict[str, Any], second: dict[str, Any], link: str, view: str) -
         "threshold": min(first["threshold"], second["threshold"]),
         "best_view": view,
     }
-
-
-def _different(firsts: list[Selection], seconds: list[Selection], asked: str, what: str) -> Pair:
-    """The nearest two different things.
-
-    Raises:
-        QueryError: If there is only one.
-    """
-    pair = nearest_pair(firsts, seconds)
-    if pair is None:
-        raise QueryError(
-            asked,
-            expected="two different things",
-            found=f"one thing: {called(firsts[0], firsts)}",
-            remedy='name another target, such as "thing" for any object' if what == "nearest" else "",
-        )
-    return pair
 
 
 def _seen_from(scene: Scene, relation: RelationName, reference: Understood, view: str) -> str | None:
