@@ -53,7 +53,7 @@ def test_a_pixel_is_answered_with_the_place_of_the_thing(server):
 
 @pytest.mark.parametrize("relation", ["left of", "right of", "in front of", "behind"])
 def test_the_view_that_left_and_right_are_seen_from_is_named(server, relation):
-    given = {"first": "thing", "relation": relation, "second": "teddy bear"}
+    given = {"first": "bottle", "relation": relation, "second": "teddy bear"}
     reply, text = ask(server, "relate", **given)
     view = reply.structured_content["seen_from"]
     assert view in open_scene("demo").views

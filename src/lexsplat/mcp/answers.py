@@ -105,7 +105,7 @@ class RelateAnswer(World, Answer):
     holds: Literal["yes", "perhaps", "no"]
     seen_from: Annotated[
         str | None,
-        Field(description="The view that left, right, front and behind refer to; null for other relations."),
+        Field(description="The views that left, right, front and behind refer to; null for other relations."),
     ]
 
 

@@ -15,6 +15,7 @@ from lexsplat.mcp import answers
 from lexsplat.mcp.arguments import NOT_BLANK, nearest
 from lexsplat.mcp.pairs import called, different, measured, others, view_of
 from lexsplat.mcp.pictures import picture
+from lexsplat.queries.patterns import VIEWER
 from lexsplat.queries.phrases import Related, RelationName, Understood, Viewer
 from lexsplat.queries.selection import PRESENCES, Selection
 from lexsplat.runtime.errors import LexsplatError, QueryError
@@ -41,8 +42,8 @@ _FARTHEST = 1e9
 """Largest coordinate of a point, in scene units."""
 _LISTED = 100
 """Scenes of a library that are listed, at most."""
-_DIRECTED: tuple[RelationName, ...] = ("left of", "right of", "in front of", "behind")
-"""Relations that depend on the viewer."""
+_SEEN_FROM = "as seen from "
+"""How the note of a relation begins that depends on the viewer (`lexsplat.queries.viewers`)."""
 
 
 class Reply(NamedTuple):
@@ -140,27 +141,27 @@ class Tools:
     ) -> Annotated[Reply, answers.RelateAnswer]:
         """Tell whether things stand in a relation to others, and which do. Left and right are those of the view."""
         place = self._scene(scene)
-        both = place.understand(first), place.understand(second)
+        viewer = VIEWER.match(second.strip())
+        both = place.understand(first), Understood(Viewer()) if viewer else place.understand(second)
         related = Related(relation, both[0].phrase, both[1].phrase)
         asked = Understood(related, "", any(each.unknown for each in both))
         found = find_in(place, asked, place.camera(view) if view else None, None)
-        notes = _joined(both[0].note, both[1].note, found.note)
+        seen_from = _seen_from(place, found, both[1], view)
+        viewed = f"{_SEEN_FROM}{seen_from}" if seen_from else ""
         holds = {"yes": "Yes", "unsure": "Perhaps", "no": "No"}[found.present]
         answer = {
             **place.world.to_json(),
             **found.to_dict(),
             "understood": str(related),
-            "note": notes,
+            "note": _joined(both[0].note, both[1].note, found.note, viewed),
             "holds": holds.lower(),
-            "seen_from": _seen_from(place, relation, both[1], view),
+            "seen_from": seen_from,
         }
         said = sentence(answer, place.world.meters_per_unit)
         if found.present == "no":
             said = said.replace("Not here", "No", 1)
         elif found.present == "yes":
             said = f"Yes: {said}"
-        if answer["seen_from"]:
-            said = f"{said} As seen from {answer['seen_from']}."
         return Reply(said, answer)
 
     def nearest(
@@ -403,16 +404,14 @@ def _both(first: dict[str, Any], second: dict[str, Any], link: str, view: str) -
     }
 
 
-def _seen_from(scene: Scene, relation: RelationName, reference: Understood, view: str) -> str | None:
-    """The view that left, right, in front and behind are seen from; None for other relations."""
-    if view:
-        return scene.view(view).name if relation in _DIRECTED else None
-    if isinstance(reference.phrase, Viewer):
-        camera = middle_camera(scene)
-        return next((name for name, each in scene.cameras.items() if each is camera), None)
-    if relation not in _DIRECTED:
+def _seen_from(scene: Scene, found: Selection, reference: Understood, view: str) -> str | None:
+    """The views that left, right, in front and behind are seen from; None for other relations."""
+    if found.note.startswith(_SEEN_FROM):
+        return found.note.removeprefix(_SEEN_FROM)
+    if not isinstance(reference.phrase, Viewer):
         return None
-    return find_in(scene, reference, None, None).best_view or None
+    camera = scene.camera(view) if view else middle_camera(scene)
+    return next((name for name, each in scene.cameras.items() if each is camera), None)
 
 
 def _lengths(scene: Scene, value: float) -> dict[str, float | None]:
