@@ -89,7 +89,7 @@ def test_a_library_is_searched_and_its_scenes_are_asked_by_name(tmp_path):
     tools = talk(server, lambda client: client.list_tools()).tools
     assert {tool.name for tool in tools} == {*READING, "search_library"}
     reply, text = ask(server, "search_library", phrase="is there a red apple?")
-    assert "In 1 of 1 scene: demo: present: yes. 1 found" in text
+    assert "In 1 of 1 scenes: demo: present: yes. 1 found" in text
     document = reply.structured_content
     (hit,) = document["hits"]
     assert (hit["scene"], hit["present"], hit["count"]) == ("demo", "yes", 1)

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from lexsplat.mcp import answers
-from lexsplat.mcp.tools import PhraseText, Reply, Tools, many
+from lexsplat.mcp.tools import PhraseText, Reply, Tools
 
 
 class LibraryTools(Tools):
@@ -23,11 +23,7 @@ class LibraryTools(Tools):
             raise ValueError("there is no library")
         found = self.library.search(phrase, limit)
         listed = "; ".join(map(repr, found.hits))
-        said = (
-            f"In {len(found.hits)} of {many(found.scenes, 'scene')}: {listed}"
-            if found.hits
-            else "In no scene."
-        )
-        more = f" {many(found.unopened, 'more scene')} may hold it." if found.unopened else ""
-        skipped = f" {many(len(found.skipped), 'scene')} could not be asked." if found.skipped else ""
+        said = f"In {len(found.hits)} of {found.scenes} scenes: {listed}" if found.hits else "In no scene."
+        more = f" {found.unopened} more scenes may hold it." if found.unopened else ""
+        skipped = f" {len(found.skipped)} scenes could not be asked." if found.skipped else ""
         return Reply(said + more + skipped, found.to_dict())

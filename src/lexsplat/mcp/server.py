@@ -23,7 +23,7 @@ from lexsplat import __version__
 from lexsplat.mcp.arguments import check_names, nearest, wrong_value
 from lexsplat.mcp.library import LibraryTools
 from lexsplat.mcp.lines import messages
-from lexsplat.mcp.tools import Reply, Tools, check_scene
+from lexsplat.mcp.tools import Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.runtime.listening import listen
@@ -253,7 +253,7 @@ def _add_prompts(server: MCPServer, tools: Tools) -> None:
         if not scene:
             return "this place"
         try:
-            check_scene(tools, scene)
+            tools._scene(scene)
             return f"the place {scene}"
         except LexsplatError as error:
             raise _protocol_error(error) from error

@@ -24,7 +24,7 @@ from lexsplat.scenes.finding import find_in, middle_camera
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.serving import MAX_LINE, OpenScene, placed, qualified, sentence, shortened
+from lexsplat.scenes.serving import MAX_LINE, OpenScene, counted, placed, qualified, sentence, shortened
 
 SceneName = Annotated[str, Field(description="Name from list_scenes; may be left out if there is one scene.")]
 PhraseText = Annotated[
@@ -72,11 +72,13 @@ class Tools:
         names = [
             f"{each['name']} ({each['problem']})" if "problem" in each else each["name"] for each in listed
         ]
-        said = f"{many(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
+        said = f"{counted(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
         if self.library is not None:
             names = self.library.names()
             document["library"] = {"scenes": len(names), "names": names[:_LISTED]}
-            said = f"{said} A library of {many(len(names), 'scene')}: {', '.join(names[:_LISTED])}.".strip()
+            said = (
+                f"{said} A library of {counted(len(names), 'scene')}: {', '.join(names[:_LISTED])}.".strip()
+            )
         return Reply(said, document)
 
     def describe_scene(self, scene: SceneName = "") -> Annotated[Reply, answers.SceneAnswer]:
@@ -94,13 +96,13 @@ class Tools:
         }
         unit = place.world.meters_per_unit
         scale = f"one unit is {unit:.3g} m" if unit else "the length of a unit in meters is unknown"
-        return Reply(f"{many(len(names), 'known thing')}: {', '.join(names)}; {scale}.", document)
+        return Reply(f"{counted(len(names), 'known thing')}: {', '.join(names)}; {scale}.", document)
 
     def list_objects(self, scene: SceneName = "") -> Annotated[Reply, answers.ListAnswer]:
         """List everything that a place holds, with names, colors, places and sizes."""
         document = list_document(self._scene(scene))
         named = (f"{' '.join(thing['colors'])} {thing['name']}" for thing in document["objects"])
-        return Reply(f"{many(len(document['objects']), 'object')}: {', '.join(named)}.", document)
+        return Reply(f"{counted(len(document['objects']), 'object')}: {', '.join(named)}.", document)
 
     def find(
         self,
@@ -310,26 +312,17 @@ class Tools:
     def _scene(self, name: str) -> Scene:
         if not name and len(self.scenes) == 1:
             return next(iter(self.scenes.values())).scene
-        check_scene(self, name)
-        if name not in self.scenes and self.library is not None:
+        if name not in self.scenes and self.library is not None and name in self.library.names():
             return self.library.scene(name)
+        if name not in self.scenes:
+            known = [*self.scenes, *(self.library.names() if self.library else [])]
+            raise QueryError(
+                f"scene {name[:60]!r}",
+                expected=f"one of {', '.join(known)[:200]}",
+                found="no such name",
+                remedy=nearest(name, known, "list_scenes has the names"),
+            )
         return self.scenes[name].scene
-
-
-def check_scene(tools: Tools, name: str) -> None:
-    """Refuse a name of no scene.
-
-    Raises:
-        QueryError: With the nearest name as its remedy.
-    """
-    known = [*tools.scenes, *(tools.library.names() if tools.library else [])]
-    if name not in known:
-        raise QueryError(
-            f"scene {name[:60]!r}",
-            expected=f"one of {', '.join(known)[:200]}",
-            found="no such name",
-            remedy=nearest(name, known, "list_scenes has the names"),
-        )
 
 
 def _one_of(arguments: dict[str, Any]) -> None:
@@ -422,8 +415,3 @@ def _lengths(scene: Scene, value: float) -> dict[str, float | None]:
 def _length(scene: Scene, value: float) -> str:
     unit = scene.world.meters_per_unit
     return f"{value:.3g} scene units" if unit is None else f"{value * unit:.3g} m"
-
-
-def many(count: int, what: str) -> str:
-    """A number of things in words: "1 scene", "2 scenes"."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -12,12 +12,12 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from lexsplat.mcp import answers
-from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools, asked_of, many
+from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools, asked_of
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene
 from lexsplat.scenes.library import Library
-from lexsplat.scenes.serving import OpenScene, qualified, sentence, shortened
+from lexsplat.scenes.serving import OpenScene, counted, qualified, sentence, shortened
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
 
@@ -45,7 +45,9 @@ class WritingTools(Tools):
         with _writing(path):
             files = export_scene(place, path, found=[replace(found, phrase=phrase)])
         written = [str(each) for each in files]
-        said = f"{many(len(found), 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
+        said = (
+            f"{counted(len(found), 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
+        )
         return Reply(
             qualified(said, asked),
             {**place.world.to_json(), **asked, "files": written, "gaussians": len(found)},
@@ -97,7 +99,7 @@ class WritingTools(Tools):
             "gaussians": len(found),
         }
         what = f"{shortened(asked['understood'])}{' (unsure)' if asked['present'] == 'unsure' else ''}"
-        said = f"{action} {what}: {many(len(found), 'Gaussian')}; the result is the scene {saved.root}."
+        said = f"{action} {what}: {counted(len(found), 'Gaussian')}; the result is the scene {saved.root}."
         return Reply(said + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
     def _new(self, argument: str, name: str) -> Path:

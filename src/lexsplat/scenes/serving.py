@@ -137,6 +137,11 @@ def shortened(text: str, length: int = 200) -> str:
     return text if len(text) <= length else f"{text[:length]}..."
 
 
+def counted(count: int, what: str) -> str:
+    """A number of things for a sentence: "1 scene", "2 scenes"."""
+    return f"{count:,} {what}" + ("" if count == 1 else "s")
+
+
 def lines_of(stream: TextIO) -> Iterator[str]:
     """The lines of a stream; of one that is longer than `MAX_LINE`, its beginning, so that memory is bounded."""
     while line := stream.readline(MAX_LINE + 1):
