@@ -96,7 +96,7 @@ def test_a_library_is_searched_and_its_scenes_are_asked_by_name(tmp_path):
     validated("library", {"library": "x", "phrases": [document]})
     assert ask(server, "count", phrase="red apple", scene=hit["scene"])[0].structured_content["count"] == 1
     assert "In no scene." in ask(server, "search_library", phrase="unicorn")[1]
-    assert "library of 1 scenes: demo" in ask(server, "list_scenes")[1]
+    assert "library of 1 scene: demo" in ask(server, "list_scenes")[1]
     for wrong in ({"phrase": ""}, {"phrase": "mug", "limit": 0}, {"phrase": "mug", "limit": 1e9}, {}):
         assert ask(server, "search_library", **wrong)[0].is_error
 

@@ -67,9 +67,12 @@ class Mcp:
                 "lexsplat mcp", expected="the package mcp", found="none", remedy='pip install "lexsplat[mcp]"'
             )
         from lexsplat.mcp.server import make_server, serve_http
+        from lexsplat.mcp.writing import check_output
         from lexsplat.scenes.library import open_library
         from lexsplat.scenes.serving import open_scenes
 
+        if self.allow_write:
+            check_output(self.output.resolve())
         libraries = [path for path in self.scenes if (Path(path) / "library.json").is_file()]
         if len(libraries) > 1:
             raise LibraryError(libraries[1], expected="one library", found=str(len(libraries)))

@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 from typing_extensions import NotRequired, TypedDict
 
+from lexsplat.queries.selection import Selection
+
 Present = Annotated[
     Literal["yes", "unsure", "no"],
     Field(description='"no": the scene does not hold it, and nothing is listed.'),
@@ -44,27 +46,48 @@ class Instance(TypedDict):
     best_view: View
 
 
-class Asked(TypedDict):
+class Certainty(TypedDict):
+    """Whether the scene holds something, and where it is seen best."""
+
+    present: Present
+    threshold: Annotated[
+        float, Field(description="Relevancy from which a Gaussian matches; of two phrases, the lower one.")
+    ]
+    best_view: View
+
+
+def certainty(found: Selection) -> Certainty:
+    """The facts of a selection, as `Selection.to_dict` has them."""
+    return {
+        "present": found.present,
+        "threshold": round(float(found.threshold), 4),
+        "best_view": found.best_view if found and found.present != "no" else "",
+    }
+
+
+class Asked(Certainty):
     """How phrases were understood, and whether the scene holds what they name."""
 
     understood: str
-    note: Annotated[str, Field(description="What was not understood or mended; empty if nothing.")]
-    present: Present
+    note: Annotated[
+        str,
+        Field(description="What was not understood, mended, or chosen among several; empty if nothing."),
+    ]
 
 
-class Counted(Asked):
+class Counted(World, Asked):
     """How many."""
 
     phrase: str
     count: Count
 
 
-class Answer(Counted):
+class Answer(Asked):
     """The things of one phrase."""
 
+    phrase: str
+    count: Count
     gaussians: Count
-    threshold: Annotated[float, Field(description="Relevancy from which a Gaussian matches.")]
-    best_view: View
     instances: list[Instance]
 
 
@@ -76,10 +99,14 @@ class FindAnswer(World):
     phrases: list[Answer]
 
 
-class RelateAnswer(Answer):
+class RelateAnswer(World, Answer):
     """The things that stand in the relation."""
 
     holds: Literal["yes", "perhaps", "no"]
+    seen_from: Annotated[
+        str | None,
+        Field(description="The views that left, right, front and behind refer to; null for other relations."),
+    ]
 
 
 class Name(TypedDict):
@@ -164,11 +191,12 @@ class NearestAnswer(World, Asked):
 
     distance: Length
     nearest: Instance
+    to: Annotated[Instance | None, Field(description="The thing it is nearest to; null for a point.")]
     among: Annotated[int, Field(description="Number of things compared.")]
 
 
 class MeasureAnswer(World, Asked):
-    """Lengths between two things."""
+    """Lengths between two different things; of several, between the nearest pair."""
 
     first: Instance
     second: Instance
@@ -177,7 +205,7 @@ class MeasureAnswer(World, Asked):
     height: Annotated[Length, Field(description="How much higher the second is.")]
 
 
-class PixelAnswer(TypedDict):
+class PixelAnswer(World, Certainty):
     """The thing at a pixel."""
 
     name: Annotated[str, Field(description="Empty if no known thing is there.")]
@@ -193,10 +221,9 @@ class Heat(Asked):
 
     phrase: str
     peak: float
-    threshold: float
 
 
-class RenderAnswer(TypedDict):
+class RenderAnswer(World):
     """What the picture shows."""
 
     view: str
@@ -232,14 +259,14 @@ class LibraryAnswer(TypedDict):
     skipped: list[dict[str, str]]
 
 
-class ExportAnswer(Asked):
+class ExportAnswer(World, Asked):
     """The files that were written."""
 
     files: list[str]
     gaussians: Count
 
 
-class EditAnswer(Asked):
+class EditAnswer(World, Asked):
     """The scene that was written."""
 
     scene: str

@@ -61,8 +61,13 @@ def check_names(what: str, name: str, arguments: Mapping[str, Any], schemas: Map
             remedy=_described(missing[0], known[missing[0]]),
         )
     for key, value in arguments.items():  # numbers would be made of them
-        if isinstance(value, bool) and "boolean" not in str(known[key]):
+        if "boolean" in str(known[key]):
+            continue
+        if isinstance(value, bool):
             raise _wrong(key, known[key], value)
+        for place, each in enumerate(value if isinstance(value, list) and "items" in known[key] else ()):
+            if isinstance(each, bool):
+                raise _wrong(key, known[key], each, [place])
 
 
 def wrong_value(error: ValidationError, schema: Schema) -> QueryError:

@@ -11,6 +11,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.mcp.answers import certainty
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.scoring import render_gaussian_scores
@@ -59,9 +60,8 @@ def _heat(scene: Scene, camera: Camera, phrase: str) -> tuple[dict[str, Any], np
         "phrase": phrase,
         "understood": str(understood.phrase),
         "note": understood.note,
-        "present": found.present,
+        **certainty(found),
         "peak": round(float(heat.max()), 3),
-        "threshold": round(float(found.threshold), 4),
     }
     return entry, heat.cpu().numpy()
 

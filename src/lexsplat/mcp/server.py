@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 from mcp.server import MCPServer
-from mcp.server.mcpserver.exceptions import ToolError, UnexpectedToolError
+from mcp.server.mcpserver.exceptions import ResourceNotFoundError, ToolError, UnexpectedToolError
 from mcp.server.stdio import stdio_server
 from mcp.server.transport_security import TransportSecuritySettings
 from mcp.shared.exceptions import MCPError
@@ -20,7 +20,7 @@ from mcp_types import INVALID_PARAMS, CallToolResult, ImageContent, TextContent,
 from pydantic import ValidationError
 
 from lexsplat import __version__
-from lexsplat.mcp.arguments import check_names, wrong_value
+from lexsplat.mcp.arguments import check_names, nearest, wrong_value
 from lexsplat.mcp.library import LibraryTools
 from lexsplat.mcp.lines import messages
 from lexsplat.mcp.tools import Reply, Tools
@@ -34,6 +34,7 @@ log = logging.getLogger("lexsplat")
 
 MAX_BODY = 1 << 20
 """Size limit of an HTTP request in bytes."""
+RESOURCES = ("lexsplat://scenes", "lexsplat://scene/{name}", "lexsplat://scene/{name}/view/{view}")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 INSTRUCTIONS = (
@@ -66,7 +67,7 @@ def make_server(
                 _tool(getattr(writing, name)), name=name, annotations=ToolAnnotations(read_only_hint=False)
             )
     _add_resources(server, tools)
-    _add_prompts(server)
+    _add_prompts(server, tools)
     return server
 
 
@@ -101,6 +102,18 @@ class _Server(MCPServer):
             if not isinstance(error.__cause__, ValidationError):
                 raise
             return _refusal(wrong_value(error.__cause__, schemas[name]))
+
+    async def read_resource(self, uri: Any, context: Any = None) -> Any:
+        try:
+            return await super().read_resource(uri, context)
+        except ResourceNotFoundError as error:
+            unknown = QueryError(
+                f"resource {str(uri)[:60]!r}",
+                expected=f"one of {', '.join(RESOURCES)}",
+                found="no such resource",
+                remedy=nearest(str(uri), RESOURCES[:1], "lexsplat://scenes has the names"),
+            )
+            raise _protocol_error(unknown) from error
 
     async def get_prompt(
         self, name: str, arguments: dict[str, Any] | None = None, context: Any = None
@@ -213,12 +226,12 @@ def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
 
 
 def _add_resources(server: MCPServer, tools: Tools) -> None:
-    @server.resource("lexsplat://scenes", mime_type="application/json")
+    @server.resource(RESOURCES[0], mime_type="application/json")
     def scenes() -> str:
         """The names and facts of all scenes."""
         return json.dumps(tools.list_scenes().document)
 
-    @server.resource("lexsplat://scene/{name}", mime_type="application/json")
+    @server.resource(RESOURCES[1], mime_type="application/json")
     def facts(name: str) -> str:
         """What describe_scene tells."""
         try:
@@ -226,7 +239,7 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
         except LexsplatError as error:
             raise _protocol_error(error) from error
 
-    @server.resource("lexsplat://scene/{name}/view/{view}", mime_type="image/png")
+    @server.resource(RESOURCES[2], mime_type="image/png")
     def view(name: str, view: str) -> bytes:
         """A view as PNG."""
         try:
@@ -235,12 +248,21 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
             raise _protocol_error(error) from error
 
 
-def _add_prompts(server: MCPServer) -> None:
+def _add_prompts(server: MCPServer, tools: Tools) -> None:
+    def named(scene: str) -> str:
+        if not scene:
+            return "this place"
+        try:
+            tools._scene(scene)
+            return f"the place {scene}"
+        except LexsplatError as error:
+            raise _protocol_error(error) from error
+
     @server.prompt(name="inventory", title="Inventory this room")
     def inventory(scene: str = "") -> str:
         """List what a place holds, with places and sizes."""
         return (
-            f"Make an inventory of the place {scene}. Call describe_scene and list_objects, then find for things "
+            f"Make an inventory of {named(scene)}. Call describe_scene and list_objects, then find for things "
             "that you expect in such a place but do not see in the list. Give a table of names, counts, places "
             "in words and sizes. Name what is unsure, and leave out what is not present."
         )
@@ -248,7 +270,12 @@ def _add_prompts(server: MCPServer) -> None:
     @server.prompt(name="where_is", title="Where did I leave it?")
     def where_is(thing: str, scene: str = "") -> str:
         """Find a lost thing and tell where it is in words."""
+        if not thing.strip():
+            expected, found = "a word or phrase", "an empty text"
+            raise _protocol_error(
+                QueryError("thing", expected=expected, found=found, remedy="name what was lost")
+            )
         return (
-            f"Find {thing} in the place {scene} with find. If it is present, describe its place by what is near it "
+            f"Find {thing} in {named(scene)} with find. If it is present, describe its place by what is near it "
             "(relate, nearest) and show it with render(look_at=...). If it is not, say so and name what is similar."
         )

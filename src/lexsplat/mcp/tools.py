@@ -13,17 +13,18 @@ from pydantic import Field
 
 from lexsplat.mcp import answers
 from lexsplat.mcp.arguments import NOT_BLANK, nearest
+from lexsplat.mcp.pairs import called, different, measured, others, view_of
 from lexsplat.mcp.pictures import picture
-from lexsplat.queries.phrases import Related, RelationName, Understood
-from lexsplat.queries.relations import distance, same
+from lexsplat.queries.patterns import VIEWER
+from lexsplat.queries.phrases import Related, RelationName, Understood, Viewer
 from lexsplat.queries.selection import PRESENCES, Selection
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.scenes.answers import find_phrases
-from lexsplat.scenes.finding import find_in
+from lexsplat.scenes.finding import find_in, middle_camera
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.serving import MAX_LINE, OpenScene, qualified, sentence, shortened
+from lexsplat.scenes.serving import MAX_LINE, OpenScene, counted, placed, qualified, sentence, shortened
 
 SceneName = Annotated[str, Field(description="Name from list_scenes; may be left out if there is one scene.")]
 PhraseText = Annotated[
@@ -41,6 +42,8 @@ _FARTHEST = 1e9
 """Largest coordinate of a point, in scene units."""
 _LISTED = 100
 """Scenes of a library that are listed, at most."""
+_SEEN_FROM = "as seen from "
+"""How the note of a relation begins that depends on the viewer (`lexsplat.queries.viewers`)."""
 
 
 class Reply(NamedTuple):
@@ -69,11 +72,13 @@ class Tools:
         names = [
             f"{each['name']} ({each['problem']})" if "problem" in each else each["name"] for each in listed
         ]
-        said = f"{len(listed)} scenes: {', '.join(names)}." if listed or not self.library else ""
+        said = f"{counted(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
         if self.library is not None:
             names = self.library.names()
             document["library"] = {"scenes": len(names), "names": names[:_LISTED]}
-            said = f"{said} A library of {len(names)} scenes: {', '.join(names[:_LISTED])}.".strip()
+            said = (
+                f"{said} A library of {counted(len(names), 'scene')}: {', '.join(names[:_LISTED])}.".strip()
+            )
         return Reply(said, document)
 
     def describe_scene(self, scene: SceneName = "") -> Annotated[Reply, answers.SceneAnswer]:
@@ -91,13 +96,13 @@ class Tools:
         }
         unit = place.world.meters_per_unit
         scale = f"one unit is {unit:.3g} m" if unit else "the length of a unit in meters is unknown"
-        return Reply(f"{len(names)} known things: {', '.join(names)}; {scale}.", document)
+        return Reply(f"{counted(len(names), 'known thing')}: {', '.join(names)}; {scale}.", document)
 
     def list_objects(self, scene: SceneName = "") -> Annotated[Reply, answers.ListAnswer]:
         """List everything that a place holds, with names, colors, places and sizes."""
         document = list_document(self._scene(scene))
         named = (f"{' '.join(thing['colors'])} {thing['name']}" for thing in document["objects"])
-        return Reply(f"{len(document['objects'])} objects: {', '.join(named)}.", document)
+        return Reply(f"{counted(len(document['objects']), 'object')}: {', '.join(named)}.", document)
 
     def find(
         self,
@@ -115,8 +120,13 @@ class Tools:
 
     def count(self, phrase: PhraseText, scene: SceneName = "") -> Annotated[Reply, answers.Counted]:
         """Count things by words, such as "apples" or "toys on the table"."""
-        answer = self.find(phrase, scene).document["phrases"][0]
-        document = {key: answer[key] for key in ("phrase", "understood", "note", "present", "count")}
+        found = self.find(phrase, scene).document
+        (answer,) = found["phrases"]
+        document = {
+            key: value
+            for key, value in {**found, **answer}.items()
+            if key in answers.Counted.__required_keys__
+        }
         if not answer["count"]:
             return Reply(sentence(answer), document)
         return Reply(
@@ -133,17 +143,28 @@ class Tools:
     ) -> Annotated[Reply, answers.RelateAnswer]:
         """Tell whether things stand in a relation to others, and which do. Left and right are those of the view."""
         place = self._scene(scene)
-        both = place.understand(first), place.understand(second)
-        notes = "; ".join(filter(None, (each.note for each in both)))
+        viewer = VIEWER.match(second.strip())
+        both = place.understand(first), Understood(Viewer()) if viewer else place.understand(second)
         related = Related(relation, both[0].phrase, both[1].phrase)
-        asked = Understood(related, notes, any(each.unknown for each in both))
+        asked = Understood(related, "", any(each.unknown for each in both))
         found = find_in(place, asked, place.camera(view) if view else None, None)
-        noted = "; ".join(filter(None, (notes, found.note)))
-        answer = {**found.to_dict(), "understood": str(related), "note": noted}
-        holds = "Yes" if found.present == "yes" else "Perhaps" if found.present == "unsure" else "No"
-        return Reply(
-            f"{holds}: {sentence(answer, place.world.meters_per_unit)}", {"holds": holds.lower(), **answer}
-        )
+        seen_from = _seen_from(place, found, both[1], view)
+        viewed = f"{_SEEN_FROM}{seen_from}" if seen_from else ""
+        holds = {"yes": "Yes", "unsure": "Perhaps", "no": "No"}[found.present]
+        answer = {
+            **place.world.to_json(),
+            **found.to_dict(),
+            "understood": str(related),
+            "note": _joined(both[0].note, both[1].note, found.note, viewed),
+            "holds": holds.lower(),
+            "seen_from": seen_from,
+        }
+        said = sentence(answer, place.world.meters_per_unit)
+        if found.present == "no":
+            said = said.replace("Not here", "No", 1)
+        elif found.present == "yes":
+            said = f"Yes: {said}"
+        return Reply(said, answer)
 
     def nearest(
         self,
@@ -170,33 +191,29 @@ class Tools:
             if goal.shape != (3,) or not (np.abs(goal) <= _FARTHEST).all():
                 expected = f"three finite numbers, none beyond {_FARTHEST:g}"
                 raise QueryError("point", expected=expected, found=repr(point)[:60])
-            gaps = [(float(np.linalg.norm(one.center - goal)), one) for one in things]
-            where = f"({', '.join(f'{value:.2f}' for value in point)})"
+            best = min(things, key=lambda one: float(np.linalg.norm(one.center - goal)))
+            gap = float(np.linalg.norm(best.center - goal))
+            where, end, candidates = f"({', '.join(f'{value:.2f}' for value in point)})", None, things
         else:
-            others, reference = _found(place, to)
-            asked, where = _both(asked, reference, "nearest to"), shortened(reference["understood"])
-            gaps = [
-                (min(distance(one, other) for other in others), one)
-                for one in things
-                if not any(same(one, other) for other in others)
-            ]
-        if not gaps:
-            raise QueryError(
-                target[:60],
-                expected=f"more than what is near: something beside {where}",
-                found=f"{understood} alone",
-                remedy='name another target, such as "thing" for any object',
-            )
-        gap, best = min(gaps, key=lambda entry: entry[0])
+            ends, reference = _found(place, to)
+            candidates = others(things, ends) or things
+            gap, best, end = different(candidates, ends, target[:60])
+            asked = _both(asked, reference, "nearest to", view_of(best, end))
+            where = called(end, ends)
+            if len(ends) > 1:
+                fits = f"{shortened(reference['understood'])} fits {len(ends)} things"
+                asked["note"] = _joined(asked["note"], f"{fits}; taken is the nearest one, {where}")
         document = {
             **place.world.to_json(),
             **asked,
             "distance": _lengths(place, gap),
             "nearest": best.geometry(),
-            "among": len(gaps),
+            "to": end.geometry() if end else None,
+            "among": len(candidates),
         }
-        among = f"the only {understood}" if len(gaps) == 1 else f"of {len(gaps)} for {understood}"
-        said = f"{best.phrase} is nearest to {where}, {among}: {_length(place, gap)} away."
+        only = f"the only {'other ' if len(things) > 1 else ''}one for {understood}"
+        among = only if len(candidates) == 1 else f"of {len(candidates)} for {understood}"
+        said = f"{called(best, things)} is nearest to {where}: {_length(place, gap)} away, {among}."
         return Reply(qualified(said, asked), document)
 
     def measure(
@@ -204,16 +221,13 @@ class Tools:
     ) -> Annotated[Reply, answers.MeasureAnswer]:
         """Measure between two things: center to center, the gap between their surfaces, the difference in height."""
         place = self._scene(scene)
-        (one, *_), asked = _found(place, first)
-        (other, *_), also = _found(place, second)
-        asked = _both(asked, also, "and")
+        (ones, first_asked), (ends, also) = _found(place, first), _found(place, second)
+        gap, one, other = different(ones, ends, f"{first[:60]} and {second[:60]}")
+        asked = _both(first_asked, also, "and", view_of(one, other))
+        asked["note"] = _joined(asked["note"], measured((one, ones, first_asked), (other, ends, also)))
         offset = other.center - one.center
         rise = float(offset @ np.asarray(one.up.direction))
-        lengths = {
-            "centers": float(np.linalg.norm(offset)),
-            "gap": distance(one, other),
-            "height": rise,
-        }
+        lengths = {"centers": float(np.linalg.norm(offset)), "gap": gap, "height": rise}
         document = {
             **place.world.to_json(),
             **asked,
@@ -244,7 +258,10 @@ class Tools:
         ]
         share, best = max(shares, key=lambda entry: entry[0], default=(0.0, hit))
         name = best.phrase if share > 0.3 else ""
+        shown = best if name else hit
         document = {
+            **place.world.to_json(),
+            **answers.certainty(shown),
             "name": name,
             "view": view,
             "x": x,
@@ -252,7 +269,9 @@ class Tools:
             "surface": hit.geometry(),
             "thing": best.geometry() if name else None,
         }
-        return Reply(f"{name or 'Something without a known name'} is there.", document)
+        named = {**shown.geometry(), "name": name or "something without a known name"}
+        there = placed(named, place.world.meters_per_unit, " is there, at ")
+        return Reply(qualified(f"{there}.", document), document)
 
     def render(
         self,
@@ -280,7 +299,7 @@ class Tools:
             name = best.best_view
         name = name or next(iter(place.views))
         legend, png = picture(place, name, phrases)
-        document = {"view": name, "look_at": looked_at, "legend": legend}
+        document = {**place.world.to_json(), "view": name, "look_at": looked_at, "legend": legend}
         shown = f"{name} shows {shortened(looked_at['understood'])} best." if looked_at else f"{name}."
         heat = (
             f"Heat for {each['understood']}: present {each['present']}, peak {each['peak']}."
@@ -352,7 +371,7 @@ def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
         QueryError: If the scene does not hold it.
     """
     understood, found = scene.understand(phrase), scene.find(phrase)
-    noted = "; ".join(filter(None, (understood.note, found.note)))
+    noted = _joined(understood.note, found.note)
     if found.present == "no" or not found:
         note = f" ({noted})" if noted else ""
         raise QueryError(
@@ -360,17 +379,32 @@ def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
             expected="something that the scene holds",
             found=f"not here: nothing fits {shortened(str(understood.phrase))}{note}",
         )
-    present = {"understood": str(understood.phrase), "note": noted, "present": found.present}
-    return found, present
+    return found, {"understood": str(understood.phrase), "note": noted, **answers.certainty(found)}
 
 
-def _both(first: dict[str, Any], second: dict[str, Any], link: str) -> dict[str, Any]:
+def _joined(*notes: str) -> str:
+    return "; ".join(dict.fromkeys(filter(None, notes)))
+
+
+def _both(first: dict[str, Any], second: dict[str, Any], link: str, view: str) -> dict[str, Any]:
     """How two phrases were understood; together they are as present as the less certain one."""
     return {
         "understood": f"{first['understood']} {link} {second['understood']}",
-        "note": "; ".join(dict.fromkeys(filter(None, (first["note"], second["note"])))),
+        "note": _joined(first["note"], second["note"]),
         "present": min(first["present"], second["present"], key=PRESENCES.index),
+        "threshold": min(first["threshold"], second["threshold"]),
+        "best_view": view,
     }
+
+
+def _seen_from(scene: Scene, found: Selection, reference: Understood, view: str) -> str | None:
+    """The views that left, right, in front and behind are seen from; None for other relations."""
+    if found.note.startswith(_SEEN_FROM):
+        return found.note.removeprefix(_SEEN_FROM)
+    if not isinstance(reference.phrase, Viewer):
+        return None
+    camera = scene.camera(view) if view else middle_camera(scene)
+    return next((name for name, each in scene.cameras.items() if each is camera), None)
 
 
 def _lengths(scene: Scene, value: float) -> dict[str, float | None]:

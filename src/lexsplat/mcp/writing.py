@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import os
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +17,7 @@ from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene
 from lexsplat.scenes.library import Library
-from lexsplat.scenes.serving import OpenScene, qualified, sentence, shortened
+from lexsplat.scenes.serving import OpenScene, counted, qualified, sentence, shortened
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
 
@@ -40,11 +42,16 @@ class WritingTools(Tools):
         place, path = self._scene(scene), self._new("file", file)
         ending_of(path)
         found, asked = asked_of(place, phrase)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        files = export_scene(place, path, found=[replace(found, phrase=phrase)])
+        with _writing(path):
+            files = export_scene(place, path, found=[replace(found, phrase=phrase)])
         written = [str(each) for each in files]
-        said = f"{len(found)} Gaussians of {shortened(asked['understood'])} written to {written[0]}."
-        return Reply(qualified(said, asked), {**asked, "files": written, "gaussians": len(found)})
+        said = (
+            f"{counted(len(found), 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
+        )
+        return Reply(
+            qualified(said, asked),
+            {**place.world.to_json(), **asked, "files": written, "gaussians": len(found)},
+        )
 
     def edit(
         self,
@@ -77,22 +84,29 @@ class WritingTools(Tools):
                 found=sentence({**found.to_dict(), **asked}, place.world.meters_per_unit).rstrip("."),
                 remedy="look at it with render, then edit with confirm=true, or name it in other words",
             )
-        path.parent.mkdir(parents=True, exist_ok=True)
         editor = Editor(place)
         if action == "recolor":
             editor.recolor(found, color)
         else:
             getattr(editor, action)(found)
-        saved = editor.save(path)
-        document = {**asked, "scene": str(saved.root), "action": action, "gaussians": len(found)}
+        with _writing(path):
+            saved = editor.save(path)
+        document = {
+            **place.world.to_json(),
+            **asked,
+            "scene": str(saved.root),
+            "action": action,
+            "gaussians": len(found),
+        }
         what = f"{shortened(asked['understood'])}{' (unsure)' if asked['present'] == 'unsure' else ''}"
-        said = f"{action} {what}: {len(found)} Gaussians; the result is the scene {saved.root}."
+        said = f"{action} {what}: {counted(len(found), 'Gaussian')}; the result is the scene {saved.root}."
         return Reply(said + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
     def _new(self, argument: str, name: str) -> Path:
         path = self.output / name
         if (
             not name
+            or name != name.strip()
             or Path(name).name != name
             or name.startswith(".")
             or not name.isprintable()
@@ -106,3 +120,38 @@ class WritingTools(Tools):
                 path, expected="a new name", found="a file that exists", remedy="give another name"
             )
         return path
+
+
+def check_output(output: Path) -> None:
+    """Refuse a folder of new files that cannot be one.
+
+    Raises:
+        SceneFolderError: If it, or what is to hold it, is a file, or nothing may be written there.
+    """
+    existing = next(path for path in (output, *output.parents) if path.exists())
+    if not existing.is_dir():
+        raise SceneFolderError(
+            existing, expected="a folder", found="a file", remedy="give another folder to --output"
+        )
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise SceneFolderError(
+            existing,
+            expected="a folder that can be written",
+            found="no permission",
+            remedy="give another folder to --output",
+        )
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Make the folder of a new file; what the disk refuses there is an error with a remedy."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise SceneFolderError(
+            error.filename or path,
+            expected="a place that can be written",
+            found=error.strerror or repr(error)[:80],
+            remedy="make room or mend its permissions, or start the server with another --output",
+        ) from error

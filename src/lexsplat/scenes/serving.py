@@ -112,7 +112,7 @@ def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) ->
     elif not answer["instances"]:
         said = f"Nothing reaches the threshold {answer['threshold']:g} for {understood}."
     else:
-        things = "; ".join(_place(thing, meters_per_unit) for thing in answer["instances"][:8])
+        things = "; ".join(placed(thing, meters_per_unit) for thing in answer["instances"][:8])
         more = f"; and {answer['count'] - 8} more" if answer["count"] > 8 else ""
         said = f"{answer['count']} found for {understood}: {things}{more}."
         return qualified(said, answer)
@@ -125,15 +125,21 @@ def qualified(said: str, answer: Mapping[str, Any]) -> str:
     return f"{said} Note: {answer['note']}." if answer.get("note") else said
 
 
-def _place(thing: Mapping[str, Any], meters_per_unit: float | None) -> str:
+def placed(thing: Mapping[str, Any], meters_per_unit: float | None, link: str = " at ") -> str:
+    """A thing (`Selection.geometry`) with its place and best view, for a sentence."""
     scale, unit = (meters_per_unit, "m") if meters_per_unit else (1.0, "scene units")
     center = ", ".join(f"{value * scale:.2f}" for value in thing["center"])
-    return f"{shortened(thing['name'], 60)} at ({center}) {unit}, best seen in {thing['best_view']}"
+    return f"{shortened(thing['name'], 60)}{link}({center}) {unit}, best seen in {thing['best_view']}"
 
 
 def shortened(text: str, length: int = 200) -> str:
     """A text for a sentence."""
     return text if len(text) <= length else f"{text[:length]}..."
+
+
+def counted(count: int, what: str) -> str:
+    """A number of things for a sentence: "1 scene", "2 scenes"."""
+    return f"{count:,} {what}" + ("" if count == 1 else "s")
 
 
 def lines_of(stream: TextIO) -> Iterator[str]:

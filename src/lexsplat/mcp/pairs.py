@@ -1,0 +1,110 @@
+"""Two different things of those that two phrases fit: which are nearest to each other, and what to tell of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lexsplat.queries.relations import distance, same
+from lexsplat.queries.selection import Selection
+from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.serving import shortened
+
+
+class Pair(NamedTuple):
+    """Two different things.
+
+    Args:
+        gap: The distance between their surfaces, world units.
+        first: One thing.
+        second: Another thing.
+    """
+
+    gap: float
+    first: Selection
+    second: Selection
+
+
+def nearest_pair(firsts: Sequence[Selection], seconds: Sequence[Selection]) -> Pair | None:
+    """The two different things with the smallest gap; of equal gaps, with the nearest centers.
+
+    Args:
+        firsts: What the first one is chosen from.
+        seconds: What the second one is chosen from; it may share things with ``firsts``.
+
+    Returns:
+        The pair; None if there is only one thing.
+    """
+    centers = [np.array([one.center for one in things]).reshape(-1, 3) for things in (firsts, seconds)]
+    reaches = [np.array([_reach(one) for one in things]) for things in (firsts, seconds)]
+    apart = np.linalg.norm(centers[0][:, None] - centers[1][None], axis=2)
+    least = np.maximum(apart - reaches[0][:, None] - reaches[1][None], 0)
+    best: tuple[float, float, Pair] | None = None
+    for number in np.lexsort((apart.ravel(), least.ravel())):  # none after a larger bound can be nearer
+        row, column = divmod(int(number), len(seconds))
+        if best is not None and least[row, column] > best[0]:
+            break
+        if same(firsts[row], seconds[column]):
+            continue
+        pair = Pair(distance(firsts[row], seconds[column]), firsts[row], seconds[column])
+        key = (pair.gap, float(apart[row, column]), pair)
+        best = key if best is None or key[:2] < best[:2] else best
+    return None if best is None else best[2]
+
+
+def different(firsts: Sequence[Selection], seconds: Sequence[Selection], asked: str) -> Pair:
+    """`nearest_pair`, which must exist.
+
+    Raises:
+        QueryError: If there is only one thing; its subject is ``asked``.
+    """
+    pair = nearest_pair(firsts, seconds)
+    if pair is None:
+        raise QueryError(
+            asked,
+            expected="two different things",
+            found=f"one thing alone, {called(firsts[0], firsts)}",
+            remedy='name another target, such as "thing" for any object',
+        )
+    return pair
+
+
+def measured(*ends: tuple[Selection, Sequence[Selection], dict[str, Any]]) -> str:
+    """A note on the pair that was taken; "" where each phrase fits one thing.
+
+    Args:
+        ends: What was taken, of which things, and how their phrase was understood.
+    """
+    fits = [(shortened(asked["understood"]), len(things)) for _, things, asked in ends if len(things) > 1]
+    if not fits:
+        return ""
+    said = " and ".join(f"{text} fits {count}" for text, count in dict.fromkeys(fits))
+    names = " and ".join(called(one, things) for one, things, _ in ends)
+    return f"{said} things; measured is the nearest pair, {names}"
+
+
+def others(things: Sequence[Selection], than: Sequence[Selection]) -> list[Selection]:
+    """The things that are none of some others."""
+    return [one for one in things if not any(same(one, each) for each in than)]
+
+
+def called(one: Selection, among: Sequence[Selection]) -> str:
+    """What to call a thing: its name, with its place if another has the same name."""
+    if sum(each.phrase == one.phrase for each in among) < 2:
+        return one.phrase
+    return f"{one.phrase} at ({', '.join(f'{value:.2f}' for value in one.center)})"
+
+
+def view_of(first: Selection, second: Selection) -> str:
+    """The view that shows two things best: the larger the less visible one is, the better."""
+    shares = dict(first.view_shares), dict(second.view_shares)
+    both = {name: min(share, shares[1][name]) for name, share in shares[0].items() if name in shares[1]}
+    name = max(both, key=lambda each: both[each], default="")
+    return name if both.get(name) else (first | second).best_view
+
+
+def _reach(one: Selection) -> float:
+    """The distance of its farthest point from its center."""
+    return float(np.linalg.norm(one.sample - one.center, axis=1).max())
