@@ -22,7 +22,14 @@ from lexsplat.runtime.files import locked
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
-from lexsplat.scenes.library.identity import in_use, library_name, make_library, telling_errors
+from lexsplat.scenes.library.found import Found
+from lexsplat.scenes.library.identity import (
+    in_use,
+    library_name,
+    listed_records,
+    make_library,
+    telling_errors,
+)
 from lexsplat.scenes.library.mending import mended, problems_of
 from lexsplat.scenes.library.records import (
     BUNDLED,
@@ -36,7 +43,7 @@ from lexsplat.scenes.library.records import (
     stamp_of,
     state_of,
 )
-from lexsplat.scenes.library.searching import Found, search
+from lexsplat.scenes.library.searching import search
 from lexsplat.scenes.library.server import Server
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.scene import Scene, open_scene
@@ -88,7 +95,10 @@ class Library:
         return cls(root, device, index)
 
     def __repr__(self) -> str:
-        return f"Library({str(self.root)!r}, scenes={len(self.names())})"
+        try:
+            return f"Library({str(self.root)!r}, scenes={len(self.names())})"
+        except LibraryError:
+            return f"Library({str(self.root)!r}, gone)"
 
     # -- what it holds
 
@@ -98,9 +108,16 @@ class Library:
         return self.root / "scenes"
 
     def names(self) -> list[str]:
-        """The names of all scenes, in order, whether their records can be read or not."""
-        listed = os.listdir(self.stage) if self.stage.is_dir() else []
-        return sorted(file[:-5] for file in listed if file.endswith(".json") and file[0] != ".")
+        """The names of all scenes, in order, whether their records can be read or not.
+
+        Raises:
+            LibraryError: If the folder of the library was moved or deleted since it was opened.
+        """
+        return [entry.name[:-5] for entry in self._listed()]
+
+    def _listed(self) -> list[os.DirEntry[str]]:
+        """The files of the records, in order."""
+        return listed_records(self.root, new=not self._records)
 
     def record(self, name: str) -> Record | None:
         """The record of a scene; None if it cannot be read (`damaged`)."""
@@ -123,12 +140,8 @@ class Library:
             return None
 
     def records(self) -> list[Record]:
-        """The records of all scenes that can be read."""
-        if not self.stage.is_dir():
-            return []
-        with os.scandir(self.stage) as listed:
-            entries = [each for each in listed if each.name.endswith(".json") and each.name[0] != "."]
-        records = (self._record(each.name[:-5], each) for each in sorted(entries, key=lambda each: each.name))
+        """The records of all scenes that can be read; raises as `names`."""
+        records = (self._record(each.name[:-5], each) for each in self._listed())
         return [record for record in records if record is not None]
 
     def groups(self) -> set[str]:
