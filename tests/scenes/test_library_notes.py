@@ -61,6 +61,16 @@ def test_a_word_that_is_mended_without_success_is_told_with_what_was_searched(ro
     assert library.search('"pinao"').note == ""  # in quotation marks: as it is
 
 
+def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_told(tmp_path):
+    library = Library.create(tmp_path / "library")
+    library.add(write_scene(tmp_path / "office", OTHERS))
+    library.add("demo")
+    found = library.search("clock or 🍎🦆")
+    assert [hit.scene for hit in found.hits] == ["office"]
+    unknown = 'the bundled encoder knows English words alone, not "🍎🦆"'
+    assert found.note == f'nothing fits "🍎🦆"; {unknown}'
+
+
 def test_a_note_that_holds_for_some_scenes_alone_names_them(rooms):
     found = Library(rooms / "library").search("mug or candle")
     assert [hit.scene for hit in found.hits] == ["kitchen", "office"]

@@ -47,6 +47,7 @@ from lexsplat.scenes.library.searching import search
 from lexsplat.scenes.library.server import Server
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.scene import Scene, open_scene
+from lexsplat.scenes.serving import counted
 
 COMPARED = (*everyday_words(), *CANONICAL_PHRASES)
 """Texts that every question is compared with."""
@@ -113,11 +114,7 @@ class Library:
         Raises:
             LibraryError: If the folder of the library was moved or deleted since it was opened.
         """
-        return [entry.name[:-5] for entry in self._listed()]
-
-    def _listed(self) -> list[os.DirEntry[str]]:
-        """The files of the records, in order."""
-        return listed_records(self.root, new=not self._records)
+        return [entry.name[:-5] for entry in listed_records(self.root, new=not self._records)]
 
     def record(self, name: str) -> Record | None:
         """The record of a scene; None if it cannot be read (`damaged`)."""
@@ -141,7 +138,8 @@ class Library:
 
     def records(self) -> list[Record]:
         """The records of all scenes that can be read; raises as `names`."""
-        records = (self._record(each.name[:-5], each) for each in self._listed())
+        entries = listed_records(self.root, new=not self._records)
+        records = (self._record(each.name[:-5], each) for each in entries)
         return [record for record in records if record is not None]
 
     def groups(self) -> set[str]:
@@ -402,7 +400,7 @@ class Library:
             f"scene {scene[:80]!r}",
             expected="the name or folder of a scene in the library",
             found="no such scene",
-            remedy=f"it has {len(names)} scenes: {known}" if names else "the library is empty",
+            remedy=f"it has {counted(len(names), 'scene')}: {known}" if names else "the library is empty",
         )
 
     # -- asking it
