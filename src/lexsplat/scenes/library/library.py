@@ -109,10 +109,10 @@ class Library:
         return self.root / "scenes"
 
     def names(self) -> list[str]:
-        """The names of all scenes, in order, whether their records can be read or not.
+        """The names of all scenes, in order, also of those whose records cannot be read.
 
         Raises:
-            LibraryError: If the folder of the library was moved or deleted since it was opened.
+            LibraryError: If the library was moved or deleted since it was opened.
         """
         return [entry.name[:-5] for entry in listed_records(self.root, new=not self._records)]
 
@@ -138,8 +138,8 @@ class Library:
 
     def records(self) -> list[Record]:
         """The records of all scenes that can be read; raises as `names`."""
-        entries = listed_records(self.root, new=not self._records)
-        records = (self._record(each.name[:-5], each) for each in entries)
+        listed = listed_records(self.root, new=not self._records)
+        records = (self._record(each.name[:-5], each) for each in listed)
         return [record for record in records if record is not None]
 
     def groups(self) -> set[str]:
@@ -222,8 +222,7 @@ class Library:
         if record is None:
             raise self.damaged.get(name) or self._unknown(name)
         path = self.folder(record)
-        folder = SceneFolder.open(path)
-        key = (name, str(path), state_of(folder))
+        key = (name, str(path), state_of(SceneFolder.open(path)))
         return self._scenes.get_or_make(key, lambda: self._open(path))
 
     def _open(self, path: Path) -> Scene:
