@@ -64,10 +64,10 @@ def test_all_actions_answer_in_their_schema(rooms, capsys):
 
 def test_people_read_where_things_are(rooms, capsys, tmp_path):
     said = run(capsys, "search", rooms, "mug", "--thumbnails", tmp_path / "found")
-    assert "mug: in 1 of 2 scenes" in said
+    assert "mug: present: yes, in 1 of 2 scenes" in said
     assert '1. kitchen: present: yes. 1 found for "mug": mug at (0.9' in said
     assert str(tmp_path / "found" / "kitchen" / "mug.jpg") in said
-    assert "2 scenes, 1 encoders" in run(capsys, "list", rooms)
+    assert "2 scenes, 1 encoder\n" in run(capsys, "list", rooms)
     assert "2 scenes are sound" in run(capsys, "verify", rooms)
 
 
@@ -122,7 +122,7 @@ def test_an_answer_is_given_where_its_pictures_cannot_be_written(rooms, capsys, 
     def refused(*_):
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr("lexsplat.scenes.library.searching.atomic_path", refused)
+    monkeypatch.setattr("lexsplat.scenes.library.found.atomic_path", refused)
     assert cli.main(["library", "search", str(rooms / "library"), "mug"]) == 0
     assert "1. kitchen: present: yes" in capsys.readouterr().out
     assert f"no pictures, {os.strerror(code)}; give --thumbnails FOLDER or none" in caplog.text

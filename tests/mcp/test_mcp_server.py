@@ -89,13 +89,13 @@ def test_a_library_is_searched_and_its_scenes_are_asked_by_name(tmp_path):
     tools = talk(server, lambda client: client.list_tools()).tools
     assert {tool.name for tool in tools} == {*READING, "search_library"}
     reply, text = ask(server, "search_library", phrase="is there a red apple?")
-    assert "In 1 of 1 scenes: demo: present: yes. 1 found" in text
+    assert "In 1 of 1 scene: demo: present: yes. 1 found" in text
     document = reply.structured_content
     (hit,) = document["hits"]
     assert (hit["scene"], hit["present"], hit["count"]) == ("demo", "yes", 1)
     validated("library", {"library": "x", "phrases": [document]})
     assert ask(server, "count", phrase="red apple", scene=hit["scene"])[0].structured_content["count"] == 1
-    assert "In no scene." in ask(server, "search_library", phrase="unicorn")[1]
+    assert ask(server, "search_library", phrase="unicorn")[1] == 'In no scene: nothing fits "unicorn".'
     assert "library of 1 scene: demo" in ask(server, "list_scenes")[1]
     for wrong in ({"phrase": ""}, {"phrase": "mug", "limit": 0}, {"phrase": "mug", "limit": 1e9}, {}):
         assert ask(server, "search_library", **wrong)[0].is_error

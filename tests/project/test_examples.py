@@ -73,8 +73,8 @@ def test_06_asks_while_it_moves(run):
 
 def test_07_tells_which_scenes_hold_a_thing(run, tmp_path):
     output = run("07_library.py")
-    assert "red apple: in 1 of 1 scenes" in output
-    assert "fire extinguisher: in 0 of 1 scenes" in output
+    assert "red apple: present: yes, in 1 of 1 scene" in output
+    assert "fire extinguisher: present: no, in 0 of 1 scene" in output
     assert "phrase | scene | present | count | x | y | z | width | depth | height | view" in output
     assert "red apple | demo | yes | 1" in output
     assert (tmp_path / "output" / "examples" / "found" / "demo" / "red_apple.jpg").stat().st_size > 1000

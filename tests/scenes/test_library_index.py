@@ -247,7 +247,9 @@ def test_equal_scenes_have_equal_bytes(demo):
 def test_an_answer_is_read_by_people_and_by_programs(rooms):
     found = lexsplat.open_library(rooms / "library").search("mug")
     said = repr(found)
-    assert said.startswith("mug: in 1 of 2 scenes\n  1. kitchen: present: yes. 1 found")
+    assert said.startswith(
+        'mug: present: yes, in 1 of 2 scenes (understood as "mug")\n  1. kitchen: present: yes. 1 found'
+    )
     assert "Size: 0." in said
     assert "best seen in view" in said
     (row,) = found.rows()

@@ -134,6 +134,7 @@ class LibraryCommand:
 
     def _list(self, library: Library) -> dict[str, Any]:
         from lexsplat.scenes.library.mending import orphans
+        from lexsplat.scenes.serving import counted
 
         records = library.records()
         for record in records:
@@ -141,16 +142,20 @@ class LibraryCommand:
         problems = {**orphans(library), **{name: str(error) for name, error in library.damaged.items()}}
         for problem in problems.values():
             self._say(f"damaged: {problem}")
-        self._say(f"{len(records)} scenes, {len({record.group for record in records})} encoders")
+        encoders = counted(len({record.group for record in records}), "encoder")
+        self._say(f"{counted(len(records), 'scene')}, {encoders}")
         damaged = [{"scene": name, "problem": problem} for name, problem in problems.items()]
         return {"scenes": [dataclasses.asdict(record) for record in records], "skipped": damaged}
 
     def _verify(self, library: Library) -> dict[str, Any]:
+        from lexsplat.scenes.serving import counted
+
         problems = library.verify(self.repair)
         for name, problem in problems.items():
             self._say(f"{name}: {problem}")
         if not problems:
-            self._say(f"{len(library.names())} scenes are sound")
+            count = len(library.names())
+            self._say(f"{counted(count, 'scene')} {'is' if count == 1 else 'are'} sound")
         return {"problems": [{"scene": name, "problem": problem} for name, problem in problems.items()]}
 
     def _search(self, library: Library) -> dict[str, Any]:

@@ -156,10 +156,11 @@ class SceneFacts(TypedDict):
 
 
 class LibraryFacts(TypedDict):
-    """The first names of a library."""
+    """The first names of a library, or why there are none."""
 
-    scenes: Count
-    names: list[str]
+    scenes: NotRequired[Count]
+    names: NotRequired[list[str]]
+    problem: NotRequired[Annotated[str, Field(description="Why it cannot be asked.")]]
 
 
 class ScenesAnswer(TypedDict):
@@ -239,6 +240,8 @@ class Hit(World):
     encoder: str
     bound: Annotated[float, Field(description="Upper bound of the strength of presence.")]
     source: Annotated[Literal["index", "scene"], Field(description="What answered.")]
+    understood: str
+    note: str
     present: Literal["yes", "unsure"]
     count: Count
     gaussians: Count
@@ -247,16 +250,32 @@ class Hit(World):
     instances: list[Instance]
 
 
+class Problem(TypedDict):
+    """What is wrong with a scene of a library."""
+
+    scene: str
+    problem: str
+
+
 class LibraryAnswer(TypedDict):
     """One phrase of ``lexsplat library search --json``."""
 
     phrase: str
-    understood: str
+    understood: Annotated[str, Field(description="What was searched, with typing errors mended.")]
+    note: Annotated[str, Field(description="What was not understood or mended; empty if nothing.")]
+    present: Annotated[
+        Literal["yes", "unsure", "no"],
+        Field(description='"no": each scene was asked or ruled out, and none holds it.'),
+    ]
     scenes: Count
     opened: Count
     unopened: Annotated[int, Field(description="Scenes that may hold it and were not opened.")]
     hits: list[Hit]
-    skipped: list[dict[str, str]]
+    skipped: Annotated[list[Problem], Field(description="Scenes that could not be asked.")]
+    rebuilt: Annotated[
+        list[Problem], Field(description="Scenes that were built again since they were added.")
+    ]
+    encoders: list[str]
 
 
 class ExportAnswer(World, Asked):

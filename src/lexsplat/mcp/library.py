@@ -8,6 +8,7 @@ from pydantic import Field
 
 from lexsplat.mcp import answers
 from lexsplat.mcp.tools import PhraseText, Reply, Tools
+from lexsplat.scenes.serving import counted, shortened
 
 
 class LibraryTools(Tools):
@@ -22,8 +23,15 @@ class LibraryTools(Tools):
         if self.library is None:
             raise ValueError("there is no library")
         found = self.library.search(phrase, limit)
-        listed = "; ".join(map(repr, found.hits))
-        said = f"In {len(found.hits)} of {found.scenes} scenes: {listed}" if found.hits else "In no scene."
-        more = f" {found.unopened} more scenes may hold it." if found.unopened else ""
-        skipped = f" {len(found.skipped)} scenes could not be asked." if found.skipped else ""
-        return Reply(said + more + skipped, found.to_dict())
+        if found.hits:
+            listed = "; ".join(hit.without_note() for hit in found.hits)
+            said = f"In {len(found.hits)} of {counted(found.scenes, 'scene')}: {listed}"
+        elif not found.scenes and not found.skipped:
+            said = "The library holds no scene."
+        else:
+            where = "no scene that could be asked" if found.present == "unsure" else "no scene"
+            said = f"In {where}: nothing fits {shortened(found.understood)}."
+        note = f" Note: {found.note}." if found.note else ""
+        more = f" {counted(found.unopened, 'more scene')} may hold it." if found.unopened else ""
+        skipped = f" {counted(len(found.skipped), 'scene')} could not be asked." if found.skipped else ""
+        return Reply(said + note + more + skipped, found.to_dict())

@@ -229,7 +229,10 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
     @server.resource(RESOURCES[0], mime_type="application/json")
     def scenes() -> str:
         """The names and facts of all scenes."""
-        return json.dumps(tools.list_scenes().document)
+        try:
+            return json.dumps(tools.list_scenes().document)
+        except LexsplatError as error:
+            raise _protocol_error(error) from error
 
     @server.resource(RESOURCES[1], mime_type="application/json")
     def facts(name: str) -> str:

@@ -74,7 +74,13 @@ class Tools:
         ]
         said = f"{counted(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
         if self.library is not None:
-            names = self.library.names()
+            try:
+                names = self.library.names()
+            except LexsplatError as error:
+                if not listed:
+                    raise
+                document["library"] = {"problem": str(error)}
+                return Reply(f"{said} A library that cannot be asked ({error}).", document)
             document["library"] = {"scenes": len(names), "names": names[:_LISTED]}
             said = (
                 f"{said} A library of {counted(len(names), 'scene')}: {', '.join(names[:_LISTED])}.".strip()
@@ -312,10 +318,11 @@ class Tools:
     def _scene(self, name: str) -> Scene:
         if not name and len(self.scenes) == 1:
             return next(iter(self.scenes.values())).scene
-        if name not in self.scenes and self.library is not None and name in self.library.names():
-            return self.library.scene(name)
         if name not in self.scenes:
-            known = [*self.scenes, *(self.library.names() if self.library else [])]
+            kept = self.library.names() if self.library is not None else []
+            known = [*self.scenes, *kept]
+            if self.library is not None and (name in kept or (not name and len(known) == 1)):
+                return self.library.scene(name or known[0])
             raise QueryError(
                 f"scene {name[:60]!r}",
                 expected=f"one of {', '.join(known)[:200]}",

@@ -53,12 +53,25 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
 
     found = with_things(understood.phrase, mend)
     notes = [*filter(None, (understood.note, mended_note(mended)))]
-    unknown = [word for text in things_of(found) for word in strange(text, vocabulary)]
-    if scene.clip == "bundled" and unknown:
-        listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])
-        notes.append(f"the bundled encoder knows English words alone, not {listed}")
-        return Understood(found, "; ".join(notes), unknown=True)
-    return Understood(found, "; ".join(notes))
+    unknown = unknown_note(found, scene.clip)
+    return Understood(found, "; ".join(filter(None, (*notes, unknown))), unknown=bool(unknown))
+
+
+def unknown_note(phrase: Phrase, clip: str) -> str:
+    """A note on the words of a phrase that an encoder does not know; "" if there are none.
+
+    Args:
+        phrase: The phrase.
+        clip: Name of the encoder.
+    """
+    if clip != "bundled":
+        return ""
+    vocabulary = words_of_things(clip)
+    unknown = [word for text in things_of(phrase) for word in strange(text, vocabulary)]
+    if not unknown:
+        return ""
+    listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])
+    return f"the bundled encoder knows English words alone, not {listed}"
 
 
 def _tokens_over(scene: Scene, text: str) -> int:

@@ -11,7 +11,7 @@ asked themselves (`Scene.find`), so that a library and its scenes never disagree
 
 from __future__ import annotations
 
+from lexsplat.scenes.library.found import Found, Hit
 from lexsplat.scenes.library.library import Library, open_library
-from lexsplat.scenes.library.searching import Found, Hit
 
 __all__ = ["Found", "Hit", "Library", "open_library"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import uuid
 from collections.abc import Iterator
@@ -92,6 +93,32 @@ def in_use(root: Path, holder: str) -> LibraryError:
         found=f"process {holder} at work",
         remedy="run the command again when it is done",
     )
+
+
+def listed_records(root: Path, new: bool) -> list[os.DirEntry[str]]:
+    """The files of the records of an open library, in order.
+
+    Args:
+        root: The folder of the library.
+        new: Whether no record has been read yet: a new library has no folder of them.
+
+    Raises:
+        LibraryError: If the folder was moved or deleted.
+    """
+    stage = root / "scenes"
+    try:
+        with os.scandir(stage) as listed:
+            found = [each for each in listed if each.name.endswith(".json") and each.name[0] != "."]
+    except (FileNotFoundError, NotADirectoryError) as error:
+        if new and (root / "library.json").is_file():
+            return []
+        raise LibraryError(
+            (stage if root.is_dir() else root).absolute(),
+            expected="the library that was opened",
+            found="no such folder: it was moved or deleted",
+            remedy="put it back, or start again with its new place",
+        ) from error
+    return sorted(found, key=lambda each: each.name[:-5])
 
 
 @contextlib.contextmanager

@@ -22,7 +22,14 @@ from lexsplat.runtime.files import locked
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
-from lexsplat.scenes.library.identity import in_use, library_name, make_library, telling_errors
+from lexsplat.scenes.library.found import Found
+from lexsplat.scenes.library.identity import (
+    in_use,
+    library_name,
+    listed_records,
+    make_library,
+    telling_errors,
+)
 from lexsplat.scenes.library.mending import mended, problems_of
 from lexsplat.scenes.library.records import (
     BUNDLED,
@@ -36,10 +43,11 @@ from lexsplat.scenes.library.records import (
     stamp_of,
     state_of,
 )
-from lexsplat.scenes.library.searching import Found, search
+from lexsplat.scenes.library.searching import search
 from lexsplat.scenes.library.server import Server
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.scene import Scene, open_scene
+from lexsplat.scenes.serving import counted
 
 COMPARED = (*everyday_words(), *CANONICAL_PHRASES)
 """Texts that every question is compared with."""
@@ -88,7 +96,10 @@ class Library:
         return cls(root, device, index)
 
     def __repr__(self) -> str:
-        return f"Library({str(self.root)!r}, scenes={len(self.names())})"
+        try:
+            return f"Library({str(self.root)!r}, scenes={len(self.names())})"
+        except LibraryError:
+            return f"Library({str(self.root)!r}, gone)"
 
     # -- what it holds
 
@@ -98,9 +109,12 @@ class Library:
         return self.root / "scenes"
 
     def names(self) -> list[str]:
-        """The names of all scenes, in order, whether their records can be read or not."""
-        listed = os.listdir(self.stage) if self.stage.is_dir() else []
-        return sorted(file[:-5] for file in listed if file.endswith(".json") and file[0] != ".")
+        """The names of all scenes, in order, also of those whose records cannot be read.
+
+        Raises:
+            LibraryError: If the library was moved or deleted since it was opened.
+        """
+        return [entry.name[:-5] for entry in listed_records(self.root, new=not self._records)]
 
     def record(self, name: str) -> Record | None:
         """The record of a scene; None if it cannot be read (`damaged`)."""
@@ -123,12 +137,9 @@ class Library:
             return None
 
     def records(self) -> list[Record]:
-        """The records of all scenes that can be read."""
-        if not self.stage.is_dir():
-            return []
-        with os.scandir(self.stage) as listed:
-            entries = [each for each in listed if each.name.endswith(".json") and each.name[0] != "."]
-        records = (self._record(each.name[:-5], each) for each in sorted(entries, key=lambda each: each.name))
+        """The records of all scenes that can be read; raises as `names`."""
+        listed = listed_records(self.root, new=not self._records)
+        records = (self._record(each.name[:-5], each) for each in listed)
         return [record for record in records if record is not None]
 
     def groups(self) -> set[str]:
@@ -211,8 +222,7 @@ class Library:
         if record is None:
             raise self.damaged.get(name) or self._unknown(name)
         path = self.folder(record)
-        folder = SceneFolder.open(path)
-        key = (name, str(path), state_of(folder))
+        key = (name, str(path), state_of(SceneFolder.open(path)))
         return self._scenes.get_or_make(key, lambda: self._open(path))
 
     def _open(self, path: Path) -> Scene:
@@ -389,7 +399,7 @@ class Library:
             f"scene {scene[:80]!r}",
             expected="the name or folder of a scene in the library",
             found="no such scene",
-            remedy=f"it has {len(names)} scenes: {known}" if names else "the library is empty",
+            remedy=f"it has {counted(len(names), 'scene')}: {known}" if names else "the library is empty",
         )
 
     # -- asking it

@@ -1,0 +1,74 @@
+"""What a library did not understand of a phrase, and what it searched in other words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from lexsplat.queries.grammar import thing_of
+from lexsplat.queries.kinds import words_of_things
+from lexsplat.queries.phrases import Phrase, Thing, Understood, with_things
+from lexsplat.queries.spelling import corrected
+from lexsplat.scenes.finding import unknown_note
+from lexsplat.scenes.library.found import Hit
+from lexsplat.scenes.serving import shortened
+
+_NAMED = 3
+"""Scenes that a note names, at most."""
+
+
+def note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) -> str:
+    """What the notes of the hits tell, each once, and what encoders without a hit do not know.
+
+    What does not hold for all hits is told with the scenes for which it holds.
+
+    Args:
+        asked: The phrase as it was parsed.
+        hits: The scenes that hold it, the best first.
+        encoders: Names of the encoders of all scenes.
+
+    Returns:
+        "" if everything was understood and found.
+    """
+    scenes: dict[str, list[str]] = {}
+    for hit in hits:
+        told = hit.answer["note"].split("; ") if hit.answer["note"] else []
+        if hit.answer["understood"] != hits[0].answer["understood"]:
+            told.append(f"understood as {shortened(hit.answer['understood'])}")
+        for part in dict.fromkeys(told):
+            scenes.setdefault(part, []).append(hit.scene)
+    notes = [
+        part if len(named) == len(hits) else f"{part} (in {_listed(named)})" for part, named in scenes.items()
+    ]
+    if not hits and asked.note:
+        notes.append(asked.note)
+    answered = {hit.clip for hit in hits}
+    for clip in encoders if not asked.unknown else ():
+        if clip not in answered:
+            notes += _not_heard(asked.phrase, clip, mended=not hits)
+    return "; ".join(dict.fromkeys(notes))
+
+
+def _not_heard(phrase: Phrase, clip: str, mended: bool) -> Iterator[str]:
+    """What is to be told of an encoder without a hit.
+
+    Args:
+        phrase: What was asked for.
+        clip: Name of the encoder.
+        mended: Whether to tell what was searched in place of typing errors.
+    """
+    known = words_of_things(clip)
+
+    def mend(thing: Thing) -> Phrase:
+        right = thing.text if thing.exact else corrected(thing.text, known)
+        return thing if right == thing.text else thing_of(right)
+
+    searched = with_things(phrase, mend)
+    if mended and searched != phrase:
+        yield f"also searched as {shortened(str(searched))}"
+    if note := unknown_note(searched, clip):
+        yield note
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
