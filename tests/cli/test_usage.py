@@ -235,6 +235,9 @@ def test_a_folder_that_hides_a_bundled_scene_is_noted(tmp_path, monkeypatch, cap
     assert cli.main(["info", "demo"]) == 0
     assert capsys.readouterr().err == ""
     (tmp_path / "demo").mkdir()
+    assert cli.main(["info", "demo"]) == 0, "an empty folder hides no scene"
+    assert capsys.readouterr().err == ""
+    (tmp_path / "demo" / "scene.json").write_text("{}")
     assert cli.main(["info", "demo"]) == 1
     assert (
         capsys.readouterr()

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from lexsplat.cli.options import Device, SceneArgument, note_hidden
+from lexsplat.cli.options import Device, SceneArgument, note_hidden_demo
 
 Phrases = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...")]]
 
@@ -47,7 +47,7 @@ class Ask:
         from lexsplat.scenes.answers import find_phrase
         from lexsplat.scenes.serving import OpenScene, answer_line, json_line, lines_of, sentence
 
-        note_hidden("demo", self.scene)
+        note_hidden_demo(self.scene)
         # Where a terminal has other letters, "\\u1f34e" stands for an apple; lone surrogates stay valid JSON.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         served = OpenScene(self.scene, self.device, self.clip)

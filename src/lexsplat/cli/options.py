@@ -51,7 +51,7 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 
 def open_scene(path: str, device: str, clip: str | None) -> Scene:
     """Open the scene of a command with its encoders."""
-    note_hidden("demo", path)
+    note_hidden_demo(path)
     with without_collection():
         from lexsplat.scenes import scene as search
 
@@ -62,11 +62,17 @@ def open_scene(path: str, device: str, clip: str | None) -> Scene:
 
 def open_folder(path: str) -> SceneFolder:
     """Open the scene folder of a command that needs no encoder."""
-    note_hidden("demo", path)
+    note_hidden_demo(path)
     with without_collection():
         from lexsplat.scenes.folder import SceneFolder
 
     return SceneFolder.open(Path(path))
+
+
+def note_hidden_demo(given: str) -> None:
+    """State on standard error that a scene of the working directory hides the bundled one."""
+    if (Path(given) / "scene.json").is_file():
+        note_hidden("demo", given)
 
 
 def note_hidden(word: str, given: str) -> None:
