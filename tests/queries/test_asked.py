@@ -161,7 +161,6 @@ def test_an_exception_is_taken_off_before_the_superlative_picks(text, expected):
         ("robot, find the mug", MUG),
         ("where is the mug, robot?", MUG),
         ("Alexa, where is the mug", MUG),
-        ("is there still a mug", MUG),
         ("sorry, where is the mug", MUG),
         ("could you possibly tell me where the yellow duck might be?", Thing("yellow duck")),
         ("where could the mug be", MUG),
@@ -236,3 +235,46 @@ def test_a_note_on_what_is_not_understood_names_a_word_in_its_own_letters(text, 
 def test_typing_errors_and_sizes_are_quoted_in_their_own_letters():
     assert understand("Whre is the mug").note.startswith('"Whre"')
     assert understand("Small mug").note.startswith('"Small"')
+
+
+@pytest.mark.parametrize(
+    ("question", "expected"),
+    [
+        ("is the largest toy on the cloth?", Related("on", Pick("largest", TOY), CLOTH)),
+        ("isn't the largest toy on the cloth?", Related("on", Pick("largest", TOY), CLOTH)),
+        ("which is the largest toy on the cloth?", Pick("largest", Related("on", TOY, CLOTH))),
+        ("does the biggest toy lie next to the apple?", Related("next to", Pick("largest", TOY), APPLE)),
+        ("is the rightmost toy left of the duck?", Related("left of", Pick("rightmost", TOY), DUCK)),
+        ("toys on the table but left of the mug", Related("left of", Related("on", TOY, TABLE), MUG)),
+    ],
+)  # fmt: skip
+def test_a_statement_is_about_the_one_that_is_picked_and_but_adds_a_place(question, expected):
+    assert parse(question) == expected
+    assert not understand(question).unknown
+
+
+@pytest.mark.parametrize(
+    ("question", "word"),
+    [
+        ("is everything on the table green?", "green"),
+        ("are all the toys on the table red?", "red"),
+        ("is the fruit nearest to the mug yellow?", "yellow"),
+        ("is only the duck on the table?", "only"),
+        ("is just the mug on the cloth?", "just"),
+        ("show me the toys but only the red ones", "only"),
+    ],
+)
+def test_a_statement_that_the_grammar_cannot_check_is_said(question, word):
+    understood = understand(question)
+    assert understood.unknown
+    assert f'not understood ("{word}")' in understood.note
+
+
+def test_a_scene_is_one_moment():
+    now = understand("is the duck still on the table?")
+    assert now.phrase == parse("is the duck on the table?")
+    assert now.note == '"still" is left out: a scene is one moment'
+    assert understand("is there still a mug").phrase == MUG
+    assert parse("is there a still life?") == Thing("still life")
+    assert not understand("are all toys red?").unknown
+    assert not understand("is there only one mug?").unknown

@@ -34,7 +34,6 @@ from __future__ import annotations
 import re
 import string
 from dataclasses import replace
-from typing import Any
 
 from lexsplat.queries import patterns
 from lexsplat.queries.phrases import (
@@ -56,8 +55,11 @@ from lexsplat.queries.phrases import (
     Understood,
     Viewer,
     has_stray_viewer,
+    in_place_of,
+    loosened,
     mended_note,
     numbered,
+    of_the_picked,
     parts_of,
     placed,
     things_of,
@@ -68,10 +70,12 @@ from lexsplat.queries.questions import (
     as_phrase,
     asks_for_all,
     asks_yes_or_no,
+    at_one_moment,
     command_note,
     in_full,
     not_in_answer,
     not_understood,
+    says_more,
     states,
     with_asking_words,
 )
@@ -124,7 +128,7 @@ def understand(text: str) -> Understood:
     if not plain:
         raise QueryError("phrase", expected="words", found="nothing", remedy='such as "red mug"')
     mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
-    asked = in_full(mended_text)
+    asked, moment = at_one_moment(in_full(mended_text))
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
     aside = not_in_answer(asked)
     unknown = aside.startswith('"')
@@ -136,7 +140,13 @@ def understand(text: str) -> Understood:
         note = f'not understood ("{quote}"): asked for as one thing, in these words'
     else:
         unknown = unknown or (bool(parser.notes) and parser.stated)  # is the mug big?
-        told = (mended_note(mended), *dict.fromkeys(parser.notes + parser.asides), command_note(asked), aside)
+        told = (
+            mended_note(mended),
+            *dict.fromkeys(parser.notes + parser.asides),
+            command_note(asked),
+            aside,
+            moment,
+        )
         note = in_own_letters("; ".join(filter(None, told)), plain)
     return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
 
@@ -177,7 +187,7 @@ class _Parser:
     def question(self, asked: str) -> Phrase:
         """A question or a phrase, with the words around the thing."""
         if found := patterns.WHICH_OF.match(asked):
-            these = _loosened(self.phrase(re.sub(r"\bor\b", "and", found["these"])), together=True)
+            these = loosened(self.phrase(re.sub(r"\bor\b", "and", found["these"])), together=True)
             if found["near"] or found["far"]:
                 to = self.phrase(found["to"] or found["from"] or "me")
                 return Related("nearest to" if found["near"] else "farthest from", these, to)
@@ -186,9 +196,11 @@ class _Parser:
             )
         if self.stated and is_place(as_phrase(asked)):  # is on the table
             raise _IncompleteError(asked.split()[0])
-        parsed = _loosened(self.phrase(as_phrase(asked)), self.together)
+        if self.stated and (word := says_more(asked)):
+            raise _IncompleteError(word)
+        parsed = loosened(self.phrase(as_phrase(asked)), self.together)
         if not asks_for_all(asked):
-            return parsed
+            return of_the_picked(parsed) if self.stated else parsed
         return Every(parsed) if "target" in parts_of(parsed) else Thing(asked)
 
     def phrase(self, words: str, depth: int = 0) -> Phrase:
@@ -238,6 +250,10 @@ class _Parser:
         parts = patterns.EXCEPT.split(f" {words} ", maxsplit=1)
         if len(parts) < 2:
             return None
+        if is_place(parts[1]) and patterns.BUT.search(f" {words} "[len(parts[0]) :]):  # but left of the mug
+            return self.phrase(f"{parts[0]} and {parts[1]}", depth)
+        if patterns.ONLY.match(parts[1]):
+            raise _IncompleteError(parts[1].split()[0])
         if parts[1].strip().lower() in ("one", "two"):  # the largest but one
             return Thing(words)
         named = parts[0].strip()
@@ -282,7 +298,7 @@ class _Parser:
         if self.stated and isinstance(first, Related) and isinstance(second, (Thing, Both, Together)):
             second = replace(first, reference=second)  # is the mug on the table or the cloth?
         elif not is_placed and (self.stated or (self.together and together)):
-            first = _in_place_of(second, first)  # are the mug and the duck on the table?
+            first = in_place_of(second, first)  # are the mug and the duck on the table?
         return (Together if together else Both)(first, second)
 
     def second_place(self, first: Phrase, place: Phrase, joint: str) -> Phrase:
@@ -427,20 +443,3 @@ class _Parser:
         if not words:
             raise _IncompleteError("")
         return thing_of(words if " to " in words or not_understood(words) else singular(words))
-
-
-def _in_place_of(second: Phrase, first: Phrase) -> Phrase:
-    """The first thing with the place of the second, if that has one."""
-    return (
-        replace(second, target=first) if isinstance(second, (Related, Between, InCorner, InPart)) else first
-    )
-
-
-def _loosened(phrase: Phrase, together: bool) -> Phrase:
-    """The phrase with the union in place of `Together`, but where a whole question asks for both."""
-    parts = parts_of(phrase)
-    keeps = together and isinstance(phrase, Together)
-    changed: dict[str, Any] = {name: _loosened(part, keeps) for name, part in parts.items()}
-    if isinstance(phrase, Together) and not keeps:
-        return Both(**changed)
-    return replace(phrase, **changed) if changed else phrase

@@ -88,6 +88,8 @@ EXCEPT = re.compile(
     r"(?:(?:that|which) )?(?:is|are) not(?= (?:the|a|an|my) (?!left|right)))\s",
     re.IGNORECASE,
 )
+BUT = re.compile(r"^\sbut\s(?!not\s)", re.IGNORECASE)
+ONLY = re.compile(rf"^(?:only|just) (?!(?:\d|(?:{'|'.join(NUMBERS)})\b))", re.IGNORECASE)
 NOT = re.compile(r"^(?:what is |things? that (?:is|are) )?not (?=(?:the|a|an|my) )", re.IGNORECASE)
 BOTH = re.compile(
     r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with|&|\+)\s|\s*,\s*", re.IGNORECASE

@@ -293,3 +293,33 @@ def with_things(phrase: Phrase, change: Callable[[Thing], Phrase]) -> Phrase:
         return change(phrase)
     changed: dict[str, Any] = {name: with_things(part, change) for name, part in parts_of(phrase).items()}
     return replace(phrase, **changed)
+
+
+def in_place_of(second: Phrase, first: Phrase) -> Phrase:
+    """The first thing with the place of the second, if that has one."""
+    return (
+        replace(second, target=first) if isinstance(second, (Related, Between, InCorner, InPart)) else first
+    )
+
+
+def loosened(phrase: Phrase, together: bool) -> Phrase:
+    """The phrase with the union in place of `Together`, but where a whole question asks for both."""
+    parts = parts_of(phrase)
+    keeps = together and isinstance(phrase, Together)
+    changed: dict[str, Any] = {name: loosened(part, keeps) for name, part in parts.items()}
+    if isinstance(phrase, Together) and not keeps:
+        return Both(**changed)
+    return replace(phrase, **changed) if changed else phrase
+
+
+def of_the_picked(phrase: Phrase) -> Phrase:
+    """ "Largest (toy on the cloth)" in a statement: whether the largest toy is on the cloth."""
+    if not isinstance(phrase, Pick):
+        return phrase
+    places, among = (Related, Between, InCorner, InPart), phrase.target
+    if isinstance(among, places):
+        return replace(among, target=replace(phrase, target=among.target))
+    if isinstance(among, Except) and isinstance(among.second, places) and among.second.target == among.first:
+        one = replace(phrase, target=among.first)
+        return Except(one, replace(among.second, target=one))
+    return phrase

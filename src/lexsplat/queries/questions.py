@@ -199,6 +199,18 @@ _YES_OR_NO = re.compile(
     re.IGNORECASE,
 )
 _STATED = re.compile(r"^(?:is|are|was|were|do|does|did) (?!there\b|you\b|i\b|we\b)", re.IGNORECASE)
+_MOMENT = re.compile(
+    r"\s(still(?! life)|already|currently|presently|again|now|yet|anymore)(?=\s|$)", re.IGNORECASE
+)
+_ONLY = re.compile(
+    r"\b(only|just|merely|solely) (?!(?:\d|one|two|three|four|five|six|seven|eight|nine|ten)\b)",
+    re.IGNORECASE,
+)
+_PICKED = re.compile(
+    r"\b(?:(?:larg|bigg|small|tini|tall|short|high|low|wid|long|near|clos|farth|furth)est|(?:left|right)most)\b",
+    re.IGNORECASE,
+)
+_PLACED = re.compile(_PLACE.replace(r"(?=\S)", ""), re.IGNORECASE)
 _ALL_OF = re.compile(
     r"^(?:is|are|was|were|do|does|did) (?:all(?: of)?(?: the| my| these| those)?|every|each|everything)\b",
     re.IGNORECASE,
@@ -294,6 +306,27 @@ def command_note(words: str) -> str:
     """A note on a command to move, which a search does not do; "" if there is none."""
     found = _COMMAND.match(words)
     return f'"{found[1]}" is not done, only looked for' if found else ""
+
+
+def at_one_moment(words: str) -> tuple[str, str]:
+    """A question without "still", "already" and the like, and a note on it: a scene is one moment."""
+    found = _MOMENT.search(words) if asks_yes_or_no(words) else None
+    if found is None:
+        return words, ""
+    return _MOMENT.sub("", words), f'"{found[1]}" is left out: a scene is one moment'
+
+
+def says_more(statement: str) -> str:
+    """The word by which a statement says more than the grammar can check; "" if there is none.
+
+    "Is only the duck on the table?"; "are all things on the table red?" and "is the largest toy on the table red?".
+    """
+    if found := _ONLY.search(statement):
+        return found[1]
+    last = _LAST_QUALITIES.match(statement)
+    if last and _PLACED.search(f"{last[1]} ") and (asks_for_all(statement) or _PICKED.search(last[1])):
+        return last[2]
+    return ""
 
 
 def states(words: str) -> bool:
