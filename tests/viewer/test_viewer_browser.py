@@ -75,9 +75,9 @@ def test_a_card_tells_how_a_question_was_understood_and_what_was_not(page):
 
 
 def test_an_error_of_the_server_is_told_in_one_line(page):
-    page.fill(".search input", "ball 1 on me")
+    page.fill(".search input", 'ball "1')
     page.keyboard.press("Enter")
-    until(page, "document.querySelector('.status')?.textContent.includes('expected a place')")
+    until(page, "document.querySelector('.status')?.textContent.includes('quotation marks in pairs')")
 
 
 def test_a_threshold_by_hand_is_asked_of_the_server(page, viewer):
@@ -105,7 +105,7 @@ def test_a_selection_is_described_and_downloaded(page, viewer, tmp_path):
     page.locator(".bench summary").click()
     until(page, "document.querySelector('.bench .examples')?.textContent.includes('view')")
     size = viewer.scene.select("ball 3").size
-    assert f"{size[0]:.3g}"[:4] in page.locator(".bench .fine").inner_text()
+    assert f"{size[0]:.3g}"[:4] in page.locator(".bench .fine:not(.taken)").inner_text()
     with page.expect_download() as started:
         page.get_by_role("button", name="Download").click()
     started.value.save_as(tmp_path / started.value.suggested_filename)
