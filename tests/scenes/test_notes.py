@@ -44,3 +44,13 @@ def test_one_phrase_that_is_no_words_leaves_the_others_of_a_batch_answered(demo)
     for answer in (nothing, place):
         assert answer["present"] != "yes"
         assert "not understood" in answer["note"]
+
+
+@pytest.mark.parametrize(
+    "phrase", ["leftmost toy", "mug at the back", "toy in the back left corner", "toy closest to me"]
+)
+def test_where_somebody_stands_is_told_where_the_answer_depends_on_it(demo, phrase):
+    name = next(iter(demo.cameras))
+    assert demo.find(phrase, view=name).note == f"as seen from {name}"
+    assert demo.find(phrase).note.startswith("as seen from view_")
+    assert demo.find("largest toy").note == ""

@@ -45,7 +45,7 @@ from lexsplat.queries.relations import (
     same,
 )
 from lexsplat.queries.selection import PRESENCES, Presence, Selection, union
-from lexsplat.queries.viewers import DIRECTED, Viewers
+from lexsplat.queries.viewers import DIRECTED, Viewers, seen_from
 from lexsplat.queries.vocabulary import COLORS, NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
@@ -156,7 +156,8 @@ def _related(phrase: Related, searched: Searched) -> Selection:
                 remedy='such as "closest to me" or "in front of me"',
             )
         frame = frame_of(camera, targets.up.direction)
-        return beside_viewer(phrase.relation, targets, camera, frame, count=phrase.count, rank=phrase.rank)
+        found = beside_viewer(phrase.relation, targets, camera, frame, count=phrase.count, rank=phrase.rank)
+        return _seen(found, searched)
     references = answer(phrase.reference, searched)
     if phrase.relation in ORDERED:
         farthest = phrase.relation == "farthest from"
@@ -177,7 +178,8 @@ def _between(phrase: Between, searched: Searched) -> Selection:
 
 def _corner(phrase: InCorner, searched: Searched) -> Selection:
     targets = answer(phrase.target, searched)
-    return in_corner(targets, _anything(Anything(), searched), phrase.corner, _frame(searched, targets))
+    found = in_corner(targets, _anything(Anything(), searched), phrase.corner, _frame(searched, targets))
+    return _seen(found, searched) if phrase.corner else found
 
 
 def _part(phrase: InPart, searched: Searched) -> Selection:
@@ -188,7 +190,8 @@ def _part(phrase: InPart, searched: Searched) -> Selection:
         held = [related(relation, targets, reference, frame).parts for relation in _HELD_BY]
         targets = _joined(targets, (*held[0], *(each for each in held[1] if each not in held[0])))
     found = in_part(targets, reference, phrase.part, frame)
-    return replace(found, present=min(found.present, reference.present, key=PRESENCES.index))
+    found = replace(found, present=min(found.present, reference.present, key=PRESENCES.index))
+    return found if phrase.part in ("middle", "edge") else _seen(found, searched)
 
 
 def _both(phrase: Both | Together, searched: Searched) -> Selection:
@@ -257,7 +260,8 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
         "rightmost": lambda each: float(each.center @ right),
     }[phrase.which]
     ranked = sorted(targets.instances, key=measure, reverse=True)
-    return _joined(targets, tuple(in_order(ranked, phrase.count, phrase.rank)))
+    found = _joined(targets, tuple(in_order(ranked, phrase.count, phrase.rank)))
+    return _seen(found, searched) if phrase.which in ("leftmost", "rightmost") else found
 
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
@@ -300,6 +304,12 @@ def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | N
     return replace(
         like, mask=union(like.mask, parts), scores=scores, parts=parts, present=present or like.present
     )
+
+
+def _seen(found: Selection, searched: Searched) -> Selection:
+    """An answer that depends on where somebody stands, with a note that says where."""
+    notes = (found.note, seen_from(searched.viewer(None), found.cameras))
+    return replace(found, note="; ".join(dict.fromkeys(filter(None, notes))))
 
 
 def _frame(searched: Searched, targets: Selection) -> Frame:

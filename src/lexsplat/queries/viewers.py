@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -16,6 +17,12 @@ from lexsplat.queries.selection import Selection
 
 DIRECTED: tuple[RelationName, ...] = ("left of", "right of", "in front of", "behind")
 """Relations that depend on the viewer."""
+
+
+def seen_from(viewer: Camera | None, cameras: Mapping[str, Camera]) -> str:
+    """Whose left it is, for people: "as seen from view_012"; "" where the viewer is no view of the scene."""
+    name = next((name for name, camera in cameras.items() if camera is viewer), "")
+    return name and f"as seen from {name}"
 
 
 @dataclass
@@ -59,8 +66,7 @@ class Viewers:
     def note(self) -> str:
         """Whose left it is, for people: "as seen from view_012"."""
         if self.chosen is not None:
-            names = [name for name, camera in self.like.cameras.items() if camera is self.chosen]
-            return f"as seen from {names[0]}" if names else ""
+            return seen_from(self.chosen, self.like.cameras)
         if not self._taken:
             return ""
         (name, _), *others = Counter(self._taken).most_common()
