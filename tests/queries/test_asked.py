@@ -278,3 +278,16 @@ def test_a_scene_is_one_moment():
     assert parse("is there a still life?") == Thing("still life")
     assert not understand("are all toys red?").unknown
     assert not understand("is there only one mug?").unknown
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        "is every lemon yellow?",  # its end is no "on"
+        "is the mug just behind the duck?",
+        "is the only mug on the table?",
+    ],
+)
+def test_a_statement_that_the_grammar_can_check_is_checked(question):
+    assert not understand(question).unknown
+    assert not understand(question).note

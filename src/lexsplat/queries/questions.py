@@ -203,14 +203,13 @@ _MOMENT = re.compile(
     r"\s(still(?! life)|already|currently|presently|again|now|yet|anymore)(?=\s|$)", re.IGNORECASE
 )
 _ONLY = re.compile(
-    r"\b(only|just|merely|solely) (?!(?:\d|one|two|three|four|five|six|seven|eight|nine|ten)\b)",
-    re.IGNORECASE,
+    rf"(?<!\bthe )\b(only|just|merely|solely) (?!(?:\d|(?:{'|'.join(NUMBERS)})\b)|{_PLACE})", re.IGNORECASE
 )
 _PICKED = re.compile(
     r"\b(?:(?:larg|bigg|small|tini|tall|short|high|low|wid|long|near|clos|farth|furth)est|(?:left|right)most)\b",
     re.IGNORECASE,
 )
-_PLACED = re.compile(_PLACE.replace(r"(?=\S)", ""), re.IGNORECASE)
+_PLACED = re.compile(rf"\b{_PLACE}", re.IGNORECASE)
 _ALL_OF = re.compile(
     r"^(?:is|are|was|were|do|does|did) (?:all(?: of)?(?: the| my| these| those)?|every|each|everything)\b",
     re.IGNORECASE,
@@ -324,7 +323,7 @@ def says_more(statement: str) -> str:
     if found := _ONLY.search(statement):
         return found[1]
     last = _LAST_QUALITIES.match(statement)
-    if last and _PLACED.search(f"{last[1]} ") and (asks_for_all(statement) or _PICKED.search(last[1])):
+    if last and _PLACED.search(last[1]) and (asks_for_all(statement) or _PICKED.search(last[1])):
         return last[2]
     return ""
 
