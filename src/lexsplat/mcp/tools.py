@@ -20,7 +20,7 @@ from lexsplat.queries.phrases import Related, RelationName, Understood, Viewer
 from lexsplat.queries.selection import PRESENCES, Selection
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.scenes.answers import find_phrases
-from lexsplat.scenes.finding import find_in, middle_camera
+from lexsplat.scenes.finding import find_in
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
@@ -42,8 +42,6 @@ _FARTHEST = 1e9
 """Largest coordinate of a point, in scene units."""
 _LISTED = 100
 """Scenes of a library that are listed, at most."""
-_SEEN_FROM = "as seen from "
-"""How the note of a relation begins that depends on the viewer (`lexsplat.queries.viewers`)."""
 
 
 class Reply(NamedTuple):
@@ -154,16 +152,14 @@ class Tools:
         related = Related(relation, both[0].phrase, both[1].phrase)
         asked = Understood(related, "", any(each.unknown for each in both))
         found = find_in(place, asked, place.camera(view) if view else None, None)
-        seen_from = _seen_from(place, found, both[1], view)
-        viewed = f"{_SEEN_FROM}{seen_from}" if seen_from else ""
         holds = {"yes": "Yes", "unsure": "Perhaps", "no": "No"}[found.present]
         answer = {
             **place.world.to_json(),
             **found.to_dict(),
             "understood": str(related),
-            "note": _joined(both[0].note, both[1].note, found.note, viewed),
+            "note": _joined(both[0].note, both[1].note, found.note),
             "holds": holds.lower(),
-            "seen_from": seen_from,
+            "seen_from": found.seen_from or None,
         }
         said = sentence(answer, place.world.meters_per_unit)
         if found.present == "no":
@@ -402,16 +398,6 @@ def _both(first: dict[str, Any], second: dict[str, Any], link: str, view: str) -
         "threshold": min(first["threshold"], second["threshold"]),
         "best_view": view,
     }
-
-
-def _seen_from(scene: Scene, found: Selection, reference: Understood, view: str) -> str | None:
-    """The views that left, right, in front and behind are seen from; None for other relations."""
-    if found.note.startswith(_SEEN_FROM):
-        return found.note.removeprefix(_SEEN_FROM)
-    if not isinstance(reference.phrase, Viewer):
-        return None
-    camera = scene.camera(view) if view else middle_camera(scene)
-    return next((name for name, each in scene.cameras.items() if each is camera), None)
 
 
 def _lengths(scene: Scene, value: float) -> dict[str, float | None]:

@@ -45,7 +45,7 @@ from lexsplat.queries.relations import (
     same,
 )
 from lexsplat.queries.selection import PRESENCES, Presence, Selection, union
-from lexsplat.queries.viewers import DIRECTED, Viewers, seen_from
+from lexsplat.queries.viewers import DIRECTED, Viewers, view_name
 from lexsplat.queries.vocabulary import COLORS, NAMES, SURFACES
 from lexsplat.runtime.errors import QueryError
 
@@ -157,7 +157,7 @@ def _related(phrase: Related, searched: Searched) -> Selection:
             )
         frame = frame_of(camera, targets.up.direction)
         found = beside_viewer(phrase.relation, targets, camera, frame, count=phrase.count, rank=phrase.rank)
-        return _seen(found, searched)
+        return _seen(found, view_name(camera, targets.cameras))
     references = answer(phrase.reference, searched)
     if phrase.relation in ORDERED:
         farthest = phrase.relation == "farthest from"
@@ -166,7 +166,8 @@ def _related(phrase: Related, searched: Searched) -> Selection:
         directed = phrase.relation in DIRECTED and bool(references)
         viewers = Viewers(phrase.relation, references, searched.viewer(references) if directed else None)
         found = related(phrase.relation, targets, references, viewers.frame)
-        found = replace(found, note=viewers.note if directed else found.note)
+        if directed:
+            found = _seen(replace(found, note=""), viewers.seen_from)
     return replace(found, present=min(found.present, references.present, key=PRESENCES.index))
 
 
@@ -179,7 +180,7 @@ def _between(phrase: Between, searched: Searched) -> Selection:
 def _corner(phrase: InCorner, searched: Searched) -> Selection:
     targets = answer(phrase.target, searched)
     found = in_corner(targets, _anything(Anything(), searched), phrase.corner, _frame(searched, targets))
-    return _seen(found, searched) if phrase.corner else found
+    return _seen(found, _view(searched, targets)) if phrase.corner else found
 
 
 def _part(phrase: InPart, searched: Searched) -> Selection:
@@ -191,7 +192,7 @@ def _part(phrase: InPart, searched: Searched) -> Selection:
         targets = _joined(targets, (*held[0], *(each for each in held[1] if each not in held[0])))
     found = in_part(targets, reference, phrase.part, frame)
     found = replace(found, present=min(found.present, reference.present, key=PRESENCES.index))
-    return found if phrase.part in ("middle", "edge") else _seen(found, searched)
+    return found if phrase.part in ("middle", "edge") else _seen(found, _view(searched, targets))
 
 
 def _both(phrase: Both | Together, searched: Searched) -> Selection:
@@ -261,7 +262,7 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
     }[phrase.which]
     ranked = sorted(targets.instances, key=measure, reverse=True)
     found = _joined(targets, tuple(in_order(ranked, phrase.count, phrase.rank)))
-    return _seen(found, searched) if phrase.which in ("leftmost", "rightmost") else found
+    return _seen(found, _view(searched, targets)) if phrase.which in ("leftmost", "rightmost") else found
 
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
@@ -306,10 +307,14 @@ def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | N
     )
 
 
-def _seen(found: Selection, searched: Searched) -> Selection:
+def _seen(found: Selection, view: str) -> Selection:
     """An answer that depends on where somebody stands, with a note that says where."""
-    notes = (found.note, seen_from(searched.viewer(None), found.cameras))
-    return replace(found, note="; ".join(dict.fromkeys(filter(None, notes))))
+    notes = (found.note, view and f"as seen from {view}")
+    return replace(found, note="; ".join(dict.fromkeys(filter(None, notes))), seen_from=view)
+
+
+def _view(searched: Searched, targets: Selection) -> str:
+    return view_name(searched.viewer(None), targets.cameras)
 
 
 def _frame(searched: Searched, targets: Selection) -> Frame:

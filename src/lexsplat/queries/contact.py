@@ -44,6 +44,7 @@ _SHEET = 0.25
 _ATTACHED = 0.15
 """On a wall: the gap is at most this share of the thing's largest extent."""
 _POINTS = 1000
+"""About as many points of a thing are compared."""
 _ANGLES = np.radians(np.arange(0.0, 180.0, 10.0))
 _SIDES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 """Horizontal directions ``[2, A]``."""
@@ -66,15 +67,24 @@ class Body:
         return float(np.median(self.heights))
 
     @cached_property
+    def center(self) -> NDArray[np.float64]:
+        """Its median place, seen from above ``[2]``."""
+        return np.asarray(np.median(self.plan, 0))
+
+    @cached_property
+    def radii(self) -> NDArray[np.float64]:
+        """The distances of its points from its center, seen from above ``[M]``."""
+        return np.asarray(np.linalg.norm(self.plan - self.center, axis=1))
+
+    @cached_property
     def width(self) -> float:
-        """The median distance from its middle, seen from above."""
-        return float(np.median(np.linalg.norm(self.plan - np.median(self.plan, 0), axis=1)))
+        """Its median radius."""
+        return float(np.median(self.radii))
 
     @cached_property
     def disc(self) -> tuple[NDArray[np.float64], float]:
-        """Its middle seen from above, and the radius around what is near it."""
-        middle = np.median(self.plan, 0)
-        return middle, _AROUND * float(np.quantile(np.linalg.norm(self.plan - middle, axis=1), 0.8))
+        """Its center, and the radius around what is near it."""
+        return self.center, _AROUND * float(np.quantile(self.radii, 0.8))
 
     @cached_property
     def normal(self) -> NDArray[np.float64] | None:
@@ -193,7 +203,7 @@ def _surrounds(surface: Body, part: Body, beyond: float = _BEYOND) -> bool:
     """Whether the middle of a part lies within a surface, seen from above."""
     if len(surface.heights) < 5 or len(part.heights) == 0:
         return False
-    sides = (surface.plan - np.median(part.plan, 0)) @ _SIDES > 0
+    sides = (surface.plan - part.center) @ _SIDES > 0
     share = sides.mean(0)
     return bool(np.minimum(share, 1 - share).min() >= beyond)
 
@@ -215,9 +225,7 @@ def _column(
     means = gaussians.means.detach().cpu().numpy()
     heights = means @ axes[2]
     inside = np.flatnonzero((heights >= low) & (heights <= high))
-    middle = np.median(foot.plan, 0)
-    radius = float(np.median(np.linalg.norm(foot.plan - middle, axis=1)))
-    inside = inside[np.linalg.norm(means[inside] @ axes[:2].T - middle, axis=1) <= radius]
+    inside = inside[np.linalg.norm(means[inside] @ axes[:2].T - foot.center, axis=1) <= foot.width]
     opaque = gaussians.opacity_logits.detach()[inside].sigmoid().cpu().numpy() >= FAINT
     return np.asarray(heights[inside[opaque]], float)
 

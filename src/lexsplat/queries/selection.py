@@ -65,7 +65,8 @@ class Selection:
         parts: Its instances where they are known, such as objects that touch each other; () takes clusters.
         names: Its likeliest names and their probabilities, if it is an object of `Scene.objects`.
         seen: What the views show of the scene's segments; None renders the views.
-        note: What of the question nothing fits; "" if nothing.
+        note: What of the question nothing fits, and whose left is meant; "" if nothing.
+        seen_from: The view that left, right, front and behind refer to; "" where the answer depends on none.
     """
 
     gaussians: Gaussians
@@ -80,6 +81,7 @@ class Selection:
     names: tuple[tuple[str, float], ...] = ()
     seen: Seen | None = None
     note: str = ""
+    seen_from: str = ""
 
     def __post_init__(self) -> None:
         shape = (len(self.gaussians),)

@@ -19,10 +19,9 @@ DIRECTED: tuple[RelationName, ...] = ("left of", "right of", "in front of", "beh
 """Relations that depend on the viewer."""
 
 
-def seen_from(viewer: Camera | None, cameras: Mapping[str, Camera]) -> str:
-    """Whose left it is, for people: "as seen from view_012"; "" where the viewer is no view of the scene."""
-    name = next((name for name, camera in cameras.items() if camera is viewer), "")
-    return name and f"as seen from {name}"
+def view_name(viewer: Camera | None, cameras: Mapping[str, Camera]) -> str:
+    """The name of the view where a viewer stands; "" where it is no view of the scene."""
+    return next((name for name, camera in cameras.items() if camera is viewer), "")
 
 
 @dataclass
@@ -63,14 +62,14 @@ class Viewers:
         return self._frames[best]
 
     @property
-    def note(self) -> str:
-        """Whose left it is, for people: "as seen from view_012"."""
+    def seen_from(self) -> str:
+        """Whose left it was, for people: "view_012", or "most views, such as view_012"."""
         if self.chosen is not None:
-            return seen_from(self.chosen, self.like.cameras)
+            return view_name(self.chosen, self.like.cameras)
         if not self._taken:
             return ""
         (name, _), *others = Counter(self._taken).most_common()
-        return f"as seen from {'most views, such as ' if others else ''}{name}"
+        return f"most views, such as {name}" if others else name
 
     @cached_property
     def _one(self) -> Frame:
