@@ -29,14 +29,6 @@ def _encoders(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> Library:
-    """A library of the bundled scene; read-only."""
-    library = Library.create(tmp_path_factory.mktemp("demo") / "library")
-    library.add("demo")
-    return library
-
-
-@pytest.fixture(scope="module")
 def rooms(tmp_path_factory) -> Path:
     """Two scenes of five balls, each of them a segment, and a library of them; read-only."""
     root = tmp_path_factory.mktemp("rooms")
@@ -71,7 +63,7 @@ def closed(library: Library) -> Library:
 
 
 @pytest.mark.slow
-def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo):
+def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo_library):
     scene = open_scene("demo")
     colored = ["green apple", "red apple", "yellow banana", "white vase", "mug handle", "toy", "fruit"]
     words = list(dict.fromkeys([*default_vocabulary("bundled"), *everyday_words()[::9], *colored]))
@@ -79,7 +71,7 @@ def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo)
     presences, counts, apart, sizes = [], [], [], []
     for word in words:
         expected = find_phrase(scene, word)
-        hits = demo.search(word).hits
+        hits = demo_library.search(word).hits
         found = hits[0].answer if hits else {"present": "no", "count": 0, "instances": []}
         presences.append(found["present"] == expected["present"])
         if hits and hits[0].source == "index":
@@ -142,8 +134,8 @@ def test_a_picture_frames_the_thing_without_opening_the_scene(rooms, tmp_path):
     assert hit.write_picture(tmp_path) == tmp_path / "kitchen" / "mug.jpg"
 
 
-def test_kinds_are_answered_by_the_names_of_objects(demo):
-    (hit,) = closed(demo).search("toy").hits
+def test_kinds_are_answered_by_the_names_of_objects(demo_library):
+    (hit,) = closed(demo_library).search("toy").hits
     expected = find_phrase(open_scene("demo"), "toy")
     assert hit.count == expected["count"]
     assert [one["name"] for one in hit.answer["instances"]] == [one["name"] for one in expected["instances"]]
@@ -235,9 +227,9 @@ def test_damaged_objects_are_refused_and_repaired(copy, harm):
     assert [hit.source for hit in Library(library.root).search("mug").hits] == ["index"]
 
 
-def test_equal_scenes_have_equal_bytes(demo):
+def test_equal_scenes_have_equal_bytes(demo_library):
     first, second = (Contents.of(open_scene(BUNDLED_SCENE)) for _ in range(2))
-    assert first.content() == second.content() == demo.record("demo").contents
+    assert first.content() == second.content() == demo_library.record("demo").contents
     assert all(torch.equal(first.tensors()[name], value) for name, value in second.tensors().items())
 
 

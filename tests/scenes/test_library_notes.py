@@ -22,14 +22,6 @@ def _encoders(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> Library:
-    """A library of the bundled scene; read-only."""
-    library = Library.create(tmp_path_factory.mktemp("demo") / "library")
-    library.add("demo")
-    return library
-
-
-@pytest.fixture(scope="module")
 def rooms(tmp_path_factory) -> Path:
     """A kitchen with a mug and a banana, an office with neither, and a library of them; read-only."""
     root = tmp_path_factory.mktemp("rooms")
@@ -42,8 +34,8 @@ def rooms(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("phrase", QUESTIONS)
-def test_a_library_of_one_scene_tells_of_a_phrase_what_the_scene_tells(demo, phrase):
-    expected, found = find_phrase(open_scene("demo"), phrase), demo.search(phrase).to_dict()
+def test_a_library_of_one_scene_tells_of_a_phrase_what_the_scene_tells(demo_library, phrase):
+    expected, found = find_phrase(open_scene("demo"), phrase), demo_library.search(phrase).to_dict()
     validated("library", {"library": "x", "phrases": [found]})
     told = ("present", "understood", "note")
     assert {key: found[key] for key in told} == {key: expected[key] for key in told}
@@ -90,7 +82,7 @@ def test_no_is_said_only_if_all_scenes_were_asked_or_ruled_out(rooms, tmp_path):
     assert (found.present, found.hits, list(found.skipped)) == ("unsure", (), ["kitchen"])
 
 
-def test_people_read_presence_and_what_was_understood(rooms, demo, capsys):
+def test_people_read_presence_and_what_was_understood(rooms, demo_library, capsys):
     library = str(rooms / "library")
     assert cli.main(["library", "search", library, "bananna", "mug", "--thumbnails", "none"]) == 0
     said = capsys.readouterr().out
@@ -98,12 +90,12 @@ def test_people_read_presence_and_what_was_understood(rooms, demo, capsys):
     assert '"bananna" may be a typing error: asked for "banana"' in said
     assert said.count("typing error") == 1
     assert 'mug: present: yes, in 1 of 2 scenes (understood as "mug")\n' in said
-    assert cli.main(["library", "search", str(demo.root), "🍎🦆", "--json"]) == 0
+    assert cli.main(["library", "search", str(demo_library.root), "🍎🦆", "--json"]) == 0
     (answer,) = json.loads(capsys.readouterr().out)["phrases"]
     assert (answer["present"], answer["understood"]) == ("no", '"🍎🦆"')
     assert "English words alone" in answer["note"]
-    assert "in 0 of 1 scene (" in repr(demo.search("🍎🦆"))
-    assert "English words alone" in repr(demo.search("🍎🦆"))
+    assert "in 0 of 1 scene (" in repr(demo_library.search("🍎🦆"))
+    assert "English words alone" in repr(demo_library.search("🍎🦆"))
 
 
 @pytest.mark.parametrize("gone", ["library", "library/scenes"])

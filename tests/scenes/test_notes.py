@@ -54,3 +54,32 @@ def test_where_somebody_stands_is_told_where_the_answer_depends_on_it(demo, phra
     assert demo.find(phrase, view=name).note == f"as seen from {name}"
     assert demo.find(phrase).note.startswith("as seen from view_")
     assert demo.find("largest toy").note == ""
+
+
+@pytest.mark.parametrize(
+    ("question", "present"),
+    [
+        ("is the ring on the table?", "yes"),
+        ("is the ring under the table?", "no"),
+        ("is the table on the ring?", "no"),
+        ("is the cloth on the table?", "yes"),
+        ("is the table on the cloth?", "no"),
+        ("is the cloth under the table?", "no"),
+        ("is the banana under the cloth?", "no"),
+        ("is the bottle on the table?", "yes"),
+        ("is the lamp on the wall?", "no"),
+        ("isn't the duck on the table?", "yes"),
+        ("isn't the cat on the table?", "no"),
+        ("is the largest toy on the cloth?", "no"),
+        ("is there an apple and a cat?", "no"),
+    ],
+)
+def test_what_carries_what_is_answered_in_one_direction(demo, question, present):
+    found = demo.find(question)
+    assert found.present == present
+    assert bool(found.count) == (present != "no")
+
+
+def test_everything_on_the_table_is_on_it_and_the_floor_is_under_it(demo):
+    assert demo.find("is everything on the table?").count == 14
+    assert [each.phrase for each in demo.find("what is under the table?").instances] == ["floor"]

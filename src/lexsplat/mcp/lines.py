@@ -22,7 +22,7 @@ async def messages(received: Any, sent: Any) -> AsyncIterator[SessionMessage]:
     """The messages of a client.
 
     Args:
-        received: Messages, and the errors of lines that are none (`mcp.server.stdio.stdio_server`).
+        received: What `mcp.server.stdio.stdio_server` reads: messages, and an error for each line it cannot read.
         sent: Where the answers to these lines go.
     """
     async with received:

@@ -86,7 +86,7 @@ def measured(*ends: tuple[Selection, Sequence[Selection], dict[str, Any]]) -> st
 
 
 def others(things: Sequence[Selection], than: Sequence[Selection]) -> list[Selection]:
-    """The things that are none of some others."""
+    """The things that are not among some others."""
     return [one for one in things if not any(same(one, each) for each in than)]
 
 

@@ -117,7 +117,7 @@ def related(
 ) -> Selection:
     """The instances of ``targets`` that stand in a relation to an instance of ``references``.
 
-    What lies below a support of the reference is not "under" it: under a mug is the table, not the floor.
+    A thing below the support of the reference is not "under" it: the table is under a mug, the floor is not.
 
     Args:
         relation: One that `holds` knows.

@@ -1,4 +1,4 @@
-"""The socket of a server: bound before anything else starts, so that a taken port is told in one line."""
+"""The socket that a server listens on. It is bound first, so that a port in use ends in one line."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def counted(count: int, what: str) -> str:
 
 
 def lines_of(stream: TextIO) -> Iterator[str]:
-    """The lines of a stream; of one that is longer than `MAX_LINE`, its beginning, so that memory is bounded."""
+    """The lines of a stream. A line longer than `MAX_LINE` is cut there, which bounds memory."""
     while line := stream.readline(MAX_LINE + 1):
         yield line
         while line and not line.endswith("\n"):

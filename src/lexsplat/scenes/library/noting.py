@@ -19,7 +19,7 @@ _NAMED = 3
 def note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) -> str:
     """What the notes of the hits tell, each once, and what encoders without a hit do not know.
 
-    What does not hold for all hits is told with the scenes for which it holds.
+    A note that holds for some hits only names their scenes.
 
     Args:
         asked: The phrase as it was parsed.
