@@ -65,6 +65,16 @@ def test_scalars_indices_and_explicit_copies_mix(gpu):
     assert there.tolist() == [5, 9, 7, 8]
 
 
+def test_a_list_as_an_index_takes_the_rows_that_it_names(gpu):
+    host = torch.arange(12.0).reshape(4, 3)
+    on_gpu = host.to("cuda")
+    for rows in ([2], [0, 3], [True, False, True, False]):
+        assert torch.equal(on_gpu[rows].cpu(), host[rows])
+    assert torch.equal(on_gpu[:, [2, 0]].cpu(), host[:, [2, 0]])
+    on_gpu[[1, 2]] = torch.zeros(2, 3, device="cuda")
+    assert on_gpu.cpu()[:, 0].tolist() == [0.0, 0.0, 0.0, 9.0]
+
+
 @pytest.mark.parametrize("read", [lambda t: t.numpy(), np.asarray, lambda t: np.array(t) + 1])
 def test_conversion_to_numpy_requires_a_copy_to_the_host(gpu, read):
     with pytest.raises(TypeError, match="can't convert cuda:0 device type tensor to numpy"):

@@ -82,6 +82,12 @@ class PretendedTensor(torch.Tensor):
     def get_device(self) -> int:
         return 0
 
+    def __getitem__(self, index: Any) -> torch.Tensor:
+        return super().__getitem__(_listless(index))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        super().__setitem__(_listless(index), value)
+
     def to(self, *args: Any, **kwargs: Any) -> torch.Tensor:
         """Like `torch.Tensor.to`; returns the tensor itself if no conversion is required."""
         places = [getattr(a, "device", a) for a in (*args, kwargs.get("device"))]
@@ -123,6 +129,13 @@ class PretendedTensor(torch.Tensor):
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return execute(func, args, kwargs or {})
+
+
+def _listless(index: Any) -> Any:
+    """An index whose lists are tensors; torch's C++ code would put them on "meta", where they have no values."""
+    if isinstance(index, list):
+        return torch.tensor(index)
+    return tuple(map(_listless, index)) if isinstance(index, tuple) else index
 
 
 def _is_cuda(device: Any) -> bool:
