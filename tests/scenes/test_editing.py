@@ -14,9 +14,10 @@ from support.language_scene import make_scene
 from lexsplat.language.fields import CodeField
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
-from lexsplat.scenes.editing import Editor, Motion, Step, recolored
+from lexsplat.scenes.editing import Editor, Motion, recolored
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.journal import Step
 from lexsplat.scenes.scene import Scene, open_scene
 
 
@@ -200,6 +201,27 @@ def test_a_refused_edit_leaves_the_scene_unchanged(base, tmp_path):
     editor.delete(choose(editor, 0))
     with pytest.raises(ValueError, match="select again"):
         editor.delete(old)
+
+
+def test_a_step_that_cannot_be_journaled_is_not_done(base, tmp_path, monkeypatch):
+    scene, _ = base
+    journal = tmp_path / "edits.jsonl"
+    editor = Editor(scene, journal)
+    editor.delete(choose(editor, 0))
+    before, content = editor.scene, journal.read_bytes()
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", full)
+        for change in (lambda: editor.delete(choose(editor, 1)), editor.undo):
+            with pytest.raises(OSError, match="No space"):
+                change()
+    assert same(editor.scene, before)
+    assert (len(editor.steps), editor.undone, journal.read_bytes()) == (1, [], content)
+    editor.delete(choose(editor, 1))
+    assert same(Editor(scene, journal).scene, editor.scene)
 
 
 def test_a_step_survives_json(base):

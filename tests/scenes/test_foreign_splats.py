@@ -228,6 +228,15 @@ def test_compressed_files_of_lexsplat_keep_order_flag_and_values(tmp_path, endin
     assert differences["rotations"] < 5e-5
 
 
+@pytest.mark.parametrize(("far", "warned"), [(10.0, False), (1e6, True)])
+def test_spz_that_rounds_centers_more_than_they_bear_says_so(tmp_path, caplog, far, warned):
+    g = tame(50, 0)
+    g.means[3] = far
+    write_spz(g, tmp_path / "g.spz")
+    assert ("coarse for these Gaussians" in caplog.text) == warned
+    assert not warned or "rounded to 0.125 units" in caplog.text
+
+
 def test_spz_of_both_versions_holds_the_same_bytes_in_other_containers(tmp_path):
     import gzip
 

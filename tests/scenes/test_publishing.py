@@ -110,6 +110,18 @@ def test_small_scenes_are_a_ply_without_loss_and_large_ones_the_smaller_of_spz_a
     assert sizes[".spz"] >= min(sizes.values())
 
 
+@pytest.mark.parametrize("far", [1e6, 1e8])
+def test_one_far_gaussian_does_not_make_the_others_coarse(balls, tmp_path, monkeypatch, far):
+    monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
+    gaussians = balls.gaussians.map(torch.clone)
+    gaussians.means[7, 0] = far
+    path, _ = splat_file.write_splats(gaussians, tmp_path)
+    found = read_splats(path).means
+    others = torch.arange(len(gaussians)) != 7
+    assert (found - gaussians.means)[others].abs().max() < 0.1 * gaussians.scales.median()
+    assert found[7, 0] == pytest.approx(far, rel=1e-2)
+
+
 def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, small_dictionary):
     gaussians = balls.gaussians.map(torch.clone)
     gaussians.log_scales[1::2] -= 3

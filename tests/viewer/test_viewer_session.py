@@ -11,6 +11,7 @@ from plyfile import PlyData
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.scenes.journal import Journal
 from lexsplat.viewer.history import History
 from lexsplat.viewer.requests import Asked
 from lexsplat.viewer.session import Session
@@ -199,6 +200,39 @@ def test_edits_without_meaning_are_refused_and_change_nothing(session, action, v
     assert session.editor.steps == []
 
 
+@pytest.mark.parametrize("by", [1e6, 1e8])
+def test_things_can_be_moved_far_away_and_back(session, by):
+    session.edit("move", Asked("ball 1"), {"by": [by, 0, 0]})
+    assert session.content.manifest["server"]["version"] == session.version == 2
+    session.edit("undo", Asked(""), {})
+    assert (session.editor.steps, session.version) == ([], 3)
+
+
+@pytest.mark.parametrize("action", ["recolor", "undo", "redo"])
+def test_an_edit_whose_page_cannot_be_written_changes_nothing(session, tmp_path, monkeypatch, action):
+    from lexsplat.viewer import session as module
+
+    session.editor.journal = Journal(tmp_path / "edits.jsonl", session.scene)
+    session.edit("recolor", Asked("ball 1"), {"color": [1, 0, 0]})
+    session.edit("recolor", Asked("ball 2"), {"color": [1, 0, 0]})
+    session.edit("undo", Asked(""), {})
+
+    def state():
+        steps = [str(step) for step in (*session.editor.steps, *session.editor.undone)]
+        return steps, session.version, session.content, (tmp_path / "edits.jsonl").read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    before = state()
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "write_splats", full)
+        with pytest.raises(SceneFolderError, match=r"No space left on device; nothing was changed"):
+            session.edit(action, Asked("ball 3"), {"color": [0, 1, 0]})
+    assert state() == before
+    assert session.edit(action, Asked("ball 3"), {"color": [0, 1, 0]})["server"]["version"] == before[1] + 1
+
+
 def test_a_scene_is_never_edited_to_nothing(session, scene_and_balls, monkeypatch):
     everything = scene_and_balls[0].select("ball 1")
     everything = everything | ~everything
@@ -223,7 +257,7 @@ def test_steps_are_kept_in_the_journal_of_the_edit_command(built, tmp_path):
     session._journal_size = session._journal_bytes()
     again = Session(open_scene(folder), 1_000_000, History())
     assert len(again.content.manifest["server"]["steps"]) == 1
-    with Editor(open_scene(folder), folder / "edits.jsonl").journal.open("a") as journal:
+    with Editor(open_scene(folder), folder / "edits.jsonl").journal.path.open("a") as journal:
         journal.write('{"undo": true}\n')
     with pytest.raises(SceneFolderError, match="another program"):
         session.edit("undo", Asked(), {})

@@ -114,7 +114,8 @@ class Edit:
 
     def run(self) -> None:
         """Do one action and print the steps and the size of the edited scene."""
-        from lexsplat.scenes.editing import Editor, journal_of
+        from lexsplat.scenes.editing import Editor
+        from lexsplat.scenes.journal import journal_of
         from lexsplat.scenes.previous import require_current
 
         scene = open_scene(self.scene, self.device, self.clip)

@@ -1,22 +1,18 @@
-"""Editing a scene: delete, keep, recolor, move, duplicate; undo, redo; a journal on disk.
+"""Editing a scene: delete, keep, recolor, move, duplicate; undo, redo.
 
-The built scene is never changed. An `Editor` holds the steps since then and appends each to a journal as one line of
-JSON, so that an edit can be continued, replayed on a copy or discarded. `Editor.save` makes a new scene folder. The
-rows of the language field follow their Gaussians, and view-dependent colors rotate with them.
+The built scene is never changed. An `Editor` holds the steps since then and keeps them in a journal
+(`lexsplat.scenes.journal`), so that an edit can be continued, replayed on a copy or discarded. `Editor.save` makes a
+new scene folder. The rows of the language field follow their Gaussians, and view-dependent colors rotate with them.
 """
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
-import logging
-import os
-import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,75 +28,14 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.filling import Fill, fill_for, hidden_inside
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.journal import Journal, Kind, Step
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import transformed
 
-Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-JOURNAL_VERSION = 1
 MAX_GROWTH = 16
 """Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
-_DEFLATE = 1032
-"""Largest compression ratio of DEFLATE."""
-_RENAMED_KINDS = {"recolour": "recolor"}
-"""Steps of journals that were written before the renames, and their present names."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """One edit.
-
-    Args:
-        kind: The operation.
-        mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
-        values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
-            "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`).
-        phrase: What was asked for, for display.
-    """
-
-    kind: Kind
-    mask: Tensor
-    values: dict[str, Any] = field(default_factory=dict)
-    phrase: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.kind} {self.phrase or 'a selection'} ({int(self.mask.sum())} Gaussians)"
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data; the mask as compressed bits."""
-        bits = zlib.compress(np.packbits(self.mask.cpu().numpy()).tobytes(), 6)
-        return {
-            "step": self.kind,
-            "phrase": self.phrase,
-            "gaussians": len(self.mask),
-            "mask": base64.b64encode(bits).decode("ascii"),
-            **self.values,
-        }
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Step:
-        """The inverse of `to_json`.
-
-        Raises:
-            ValueError: If the data are not a step.
-        """
-        try:
-            count, kind = data["gaussians"], _RENAMED_KINDS.get(data["step"], data["step"])
-            raw = base64.b64decode(data["mask"])
-            if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
-                raise ValueError(
-                    f"not a step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100]
-                )
-            packed = zlib.decompressobj().decompress(raw, count // 8 + 1)
-            bits = np.unpackbits(np.frombuffer(packed, np.uint8))[:count]
-        except (KeyError, TypeError, binascii.Error, zlib.error) as error:
-            raise ValueError(f"not a step: {error!r}") from error
-        if kind not in get_args(Kind) or len(bits) != count:
-            raise ValueError(f"not a step: {kind!r}")
-        known = ("color", "strength", "rotation", "scale", "translation", "center", "fill")
-        values = {name: data[name] for name in known if name in data}
-        return cls(kind, torch.from_numpy(bits.astype(bool)), values, str(data.get("phrase", "")))
 
 
 def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Gaussians, LanguageField]:
@@ -212,24 +147,28 @@ class Editor:
     Args:
         scene: The scene as it was built.
         journal: File of the steps, whose steps are replayed if it exists; None keeps steps in memory only.
+        accept: Called after each change, before it is kept; if it raises, nothing has changed.
 
     Raises:
         FileFormatError: If the journal is damaged.
         SceneFolderError: If it belongs to another reconstruction.
     """
 
-    def __init__(self, scene: Scene, journal: Path | None = None) -> None:
-        self.original, self.journal = scene, journal
+    def __init__(
+        self, scene: Scene, journal: Path | None = None, accept: Callable[[], None] = lambda: None
+    ) -> None:
+        self.original, self._accept = scene, accept
+        self.journal = None if journal is None else Journal(journal, scene)
         self.steps: list[Step] = []
         self.undone: list[Step] = []
         self.scene = scene
-        if journal is not None and journal.exists():
-            self._read(journal)
+        if self.journal is not None and self.journal.path.exists():
+            self.steps, self.undone = self.journal.read()
             try:
                 self._replay()
             except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise FileFormatError(
-                    journal,
+                    self.journal.path,
                     expected="steps that can be replayed",
                     found=repr(error)[:200],
                     remedy="discard the edit",
@@ -274,17 +213,17 @@ class Editor:
         """Undo the last step; False if there is none."""
         if not self.steps:
             return False
-        self.undone.append(self.steps.pop())
-        self._replay()
-        self._write({"undo": True})
+        with self._change({"undo": True}):
+            self.undone.append(self.steps.pop())
+            self._replay()
         return True
 
     def redo(self) -> bool:
         """Redo the last undone step; False if there is none."""
         if not self.undone:
             return False
-        self._advance(self.undone.pop())
-        self._write({"redo": True})
+        with self._change({"redo": True}):
+            self._advance(self.undone.pop())
         return True
 
     def save(self, output: Path) -> SceneFolder:
@@ -346,9 +285,22 @@ class Editor:
             fill = fill_for(whole)
             values = {} if fill is None else {"fill": fill.to_json()}
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
-        self._advance(step)
-        self.undone.clear()
-        self._write(step.to_json())
+        with self._change(step.to_json()):
+            self._advance(step)
+            self.undone.clear()
+
+    @contextmanager
+    def _change(self, entry: dict[str, Any]) -> Iterator[None]:
+        """A change that is journaled as a whole, or not made at all."""
+        before = self.scene, [*self.steps], [*self.undone]
+        try:
+            yield
+            self._accept()
+            if self.journal is not None:
+                self.journal.append(entry)
+        except BaseException:
+            self.scene, self.steps, self.undone = before
+            raise
 
     def _advance(self, step: Step) -> None:
         if len(self.scene.gaussians) > MAX_GROWTH * max(len(self.original.gaussians), 1):
@@ -360,69 +312,3 @@ class Editor:
         steps, self.steps, self.scene = self.steps, [], self.original
         for step in steps:
             self._advance(step)
-
-    def _header(self) -> dict[str, Any]:
-        folder = self.original.folder
-        reconstruction = folder.record["stages"].get("reconstruct", {}).get("fingerprint") if folder else None
-        return {
-            "journal": JOURNAL_VERSION,
-            "gaussians": len(self.original.gaussians),
-            "reconstruction": reconstruction,
-        }
-
-    def _write(self, entry: dict[str, Any]) -> None:
-        """Append a line and wait until it is on the disk, so that a later crash does not lose it."""
-        if self.journal is None:
-            return
-        self.journal.parent.mkdir(parents=True, exist_ok=True)
-        lines = [entry] if self.journal.exists() else [self._header(), entry]
-        with open(self.journal, "a", encoding="utf-8") as file:
-            file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-            file.flush()
-            os.fsync(file.fileno())
-
-    def _read(self, path: Path) -> None:
-        try:
-            lines = path.read_text(encoding="utf-8").split("\n")
-        except (OSError, UnicodeDecodeError) as error:
-            raise FileFormatError(
-                path, expected="a readable journal", found=str(error), remedy="discard the edit"
-            ) from error
-        if lines[-1]:
-            logging.getLogger("lexsplat").warning("%s: the last line is cut off and ignored", path)
-            path.write_text("\n".join([*lines[:-1], ""]), encoding="utf-8")
-        for number, line in enumerate(lines[:-1], start=1):
-            try:
-                entry = json.loads(line)
-                if number == 1:
-                    self._check(entry, path)
-                elif entry.get("undo"):
-                    self.undone.append(self.steps.pop())
-                elif entry.get("redo"):
-                    self.steps.append(self.undone.pop())
-                else:
-                    self.steps.append(Step.from_json(entry))
-                    self.undone.clear()
-            except (ValueError, IndexError, AttributeError, RecursionError) as error:
-                raise FileFormatError(
-                    path,
-                    expected="steps of an edit",
-                    found=f"line {number}: {error}"[:200],
-                    remedy="discard the edit",
-                ) from error
-
-    def _check(self, header: dict[str, Any], path: Path) -> None:
-        if header != self._header():
-            raise SceneFolderError(
-                path,
-                expected="edits of this reconstruction",
-                found="edits of another one",
-                remedy="the scene was built again: discard the edits",
-            )
-
-
-def journal_of(scene: Scene) -> Path:
-    """File of the steps of an edit; the bundled scene is never written to."""
-    if scene.folder is None or scene.folder.is_bundled:
-        return Path("demo_edits.jsonl")
-    return scene.folder.root / "edits.jsonl"

@@ -24,8 +24,9 @@ from lexsplat.queries.relevancy import probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import file_name
-from lexsplat.scenes.editing import Editor, Motion, journal_of
+from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.exporting import export_gaussians
+from lexsplat.scenes.journal import journal_of
 from lexsplat.scenes.publishing.manifest import checksums, listed_objects, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
@@ -74,12 +75,13 @@ class Session:
         self.lock = threading.RLock()
         self.history, self._splats = history, splats
         writable = scene.folder is not None and os.access(journal_of(scene).absolute().parent, os.W_OK)
-        self.editor = Editor(scene, journal_of(scene) if writable else None)
+        self.editor = Editor(scene, journal_of(scene) if writable else None, self._prepare)
         self.version = 1
         self.closed = False
         """Ends `warm_up`."""
         self._journal_size = self._journal_bytes()
-        self.content = self._make_content()
+        self.content = self._make_content(self.version)
+        self._prepared = self.content
 
     @property
     def scene(self) -> Scene:
@@ -219,13 +221,14 @@ class Session:
 
         Raises:
             QueryError: If nothing is selected, or the result could not be drawn.
-            SceneFolderError: If another program has changed the steps.
+            SceneFolderError: If another program has changed the steps, or a file could not be written. Whatever is
+                raised, nothing has changed.
         """
         if action not in (*CHANGES, "undo", "redo"):
             raise QueryError("action", expected=", ".join((*CHANGES, "undo", "redo")), found=action[:40])
         if self._journal_bytes() != self._journal_size:
             raise SceneFolderError(
-                self.editor.journal or "edits",
+                self._journal_path() or "edits",
                 expected="the steps of this viewer",
                 found="steps of another program",
                 remedy="start lexsplat view again",
@@ -241,11 +244,22 @@ class Session:
             raise QueryError(
                 action, expected="Gaussians that can be drawn afterwards", found=str(error)
             ) from error
+        except OSError as error:
+            raise SceneFolderError(
+                error.filename or self._journal_path() or tempfile.gettempdir(),
+                expected="a file that can be written",
+                found=error.strerror or str(error),
+                remedy="nothing was changed: make room and try again",
+            ) from error
         finally:
             self._journal_size = self._journal_bytes()
-        self.version += 1
-        self.content = self._make_content()
+        self.content = self._prepared
+        self.version = self.content.manifest["server"]["version"]
         return self.content.manifest
+
+    def _prepare(self) -> None:
+        """What pages load after a change, made before the change is kept."""
+        self._prepared = self._make_content(self.version + 1)
 
     def preview(self, action: str, asked: Asked) -> bytes:
         """What `edit` would apply to: the number of Gaussians as four bytes, then 1 or 0 for each drawn Gaussian.
@@ -272,17 +286,21 @@ class Session:
         else:
             getattr(self.editor, action)(chosen)
 
+    def _journal_path(self) -> Path | None:
+        return self.editor.journal.path if self.editor.journal else None
+
     def _journal_bytes(self) -> int:
-        journal = self.editor.journal
+        journal = self._journal_path()
         return journal.stat().st_size if journal is not None and journal.exists() else 0
 
     # -- content
 
-    def _make_content(self) -> Content:
+    def _make_content(self, version: int) -> Content:
         scene = self.scene
         if len(scene.gaussians) < 2 or (damage := scene.gaussians.find_invalid()):
             found = str(len(scene.gaussians)) if len(scene.gaussians) < 2 else damage
-            raise QueryError("scene", expected="at least 2 finite Gaussians", found=found)
+            remedy = 'undo the last edit with "lexsplat edit SCENE undo"' if self.editor.steps else ""
+            raise QueryError("scene", expected="at least 2 finite Gaussians", found=found, remedy=remedy)
         drawn = most_visible(scene.gaussians, max(MOST_SPLATS, self._splats))
         gaussians = scene.gaussians.select(drawn.to(scene.gaussians.device)).to("cpu")
         with tempfile.TemporaryDirectory() as folder:
@@ -291,7 +309,7 @@ class Session:
         manifest = scene_manifest(scene, gaussians, path.name, rotation, "", self._splats)
         manifest["words"]["count"] = files["words.txt"].count(b"\n")
         manifest["server"] = {
-            "version": self.version,
+            "version": version,
             "steps": [str(step) for step in self.editor.steps],
             "undone": len(self.editor.undone),
             "examples": list(dict.fromkeys([*self.history.prompts[:4], *self.history.vocabulary]))[:4],

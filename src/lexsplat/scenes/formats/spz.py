@@ -40,6 +40,8 @@ _ANTIALIASED, _EXTENSIONS = 1, 2
 _COLOR_SCALE = 0.15
 _MOST_FRACTIONAL_BITS = 30
 _FIXED_LIMIT = (1 << 23) - 1
+_COARSE = 0.25
+"""Largest step of centers, as a share of the standard deviation of a Gaussian."""
 _ROUGH_BITS = {1: 5, 2: 4, 3: 4, 4: 4}
 """Bits kept of the spherical harmonics of each degree, as Niantic's writer does: the rest compresses away."""
 
@@ -166,6 +168,8 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
         path: The file.
         version: 4, or 3 for programs that read no newer one.
 
+    Centers share one step, which the farthest of them decides; one that is too coarse is told as a warning.
+
     Raises:
         ValueError: If a value is NaN or infinite, a center is farther than 8,388,607 units from the origin, or the
             version is neither 3 nor 4.
@@ -175,12 +179,18 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
     g = transformed(gaussians.detach().to("cpu"), rotation=HALF_TURN)
     if not all(bool(torch.isfinite(tensor).all()) for tensor in g.tensors().values()):
         raise ValueError("the Gaussians contain NaN or infinity")
-    farthest = max(float(g.means.abs().max()) if len(g) else 0.0, 1e-6)
+    farthest = _farthest(g)
     if farthest > _FIXED_LIMIT:
         raise ValueError(
             f"SPZ holds centers up to {_FIXED_LIMIT:,} units from the origin, got {farthest:,.0f}"
         )
-    bits = min(math.floor(math.log2(_FIXED_LIMIT / farthest)), 23)
+    bits = _fractional_bits(farthest)
+    if is_coarse(g):
+        logger.warning(
+            "%s: centers are rounded to %.3g units, which is coarse for these Gaussians, because one is %.3g units "
+            "away; write .ply or .sog, or delete what is far away",
+            path, math.ldexp(1, -bits), farthest,
+        )  # fmt: skip
     streams = {name: array.tobytes() for name, array in _packed(g, bits).items()}
     fields = (_MAGIC, version, len(g), g.sh_degree, bits, _ANTIALIASED if g.antialiased else 0)
     if version == 3:
@@ -191,6 +201,25 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
     table = b"".join(struct.pack("<QQ", len(packed[name]), len(data)) for name, data in streams.items())
     header = _HEADER_4.pack(*fields, len(streams), _HEADER_4.size)
     path.write_bytes(header + table + b"".join(packed.values()))
+
+
+def is_coarse(gaussians: Gaussians) -> bool:
+    """Whether SPZ rounds centers by more than a quarter of the size of half of the Gaussians, or cannot hold them."""
+    if len(gaussians) == 0:
+        return False
+    farthest = _farthest(gaussians)
+    size = float(gaussians.scales.median(1).values.median())
+    return farthest > _FIXED_LIMIT or math.ldexp(1, -_fractional_bits(farthest)) > _COARSE * size
+
+
+def _farthest(gaussians: Gaussians) -> float:
+    """Largest coordinate of a center."""
+    return max(float(gaussians.means.abs().max()) if len(gaussians) else 0.0, 1e-6)
+
+
+def _fractional_bits(farthest: float) -> int:
+    """Bits behind the point with which 24 bits hold the farthest coordinate."""
+    return min(math.floor(math.log2(_FIXED_LIMIT / farthest)), 23)
 
 
 def _packed(g: Gaussians, bits: int) -> dict[str, NDArray]:

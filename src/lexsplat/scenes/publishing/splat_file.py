@@ -10,7 +10,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.sog_writing import write_sog
-from lexsplat.scenes.formats.spz import write_spz
+from lexsplat.scenes.formats.spz import is_coarse, write_spz
 
 NAME = "scene"
 """Name of the file in the page's folder, without its ending."""
@@ -28,7 +28,8 @@ _HALF_TURN: Rotation = (1.0, 0.0, 0.0, 0.0)
 def write_splats(gaussians: Gaussians, folder: Path, shrink: bool = False) -> tuple[Path, Rotation]:
     """Write the splats into a folder, in the order given.
 
-    Small scenes become a PLY, others an SPZ 3 (the page's renderer reads no newer version).
+    Small scenes become a PLY, others an SPZ 3 (the page's renderer reads no newer version), or a SOG where a far
+    Gaussian makes SPZ too coarse for the others.
 
     Args:
         gaussians: The splats.
@@ -41,6 +42,10 @@ def write_splats(gaussians: Gaussians, folder: Path, shrink: bool = False) -> tu
     if sum(tensor.nbytes for tensor in gaussians.tensors().values()) <= SMALL_BYTES:
         path = folder / f"{NAME}.ply"
         write_ply(gaussians, path)
+        return path, _NONE
+    if is_coarse(gaussians):
+        path = folder / f"{NAME}.sog"
+        write_sog(gaussians, path)
         return path, _NONE
     path = folder / f"{NAME}.spz"
     write_spz(gaussians, path, version=3)

@@ -243,7 +243,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
             "page.js": "Apache-2.0 and those of LICENSES.txt",
             "words.txt": "Apache-2.0",
             "text.safetensors": "Apache-2.0" if scene.clip == "bundled" else f"that of {scene.clip}",
-            "scene": "not stated",
+            "scene": "Apache-2.0" if scene.folder and scene.folder.is_bundled else "not stated",
         },
     }
     manifest["files"] = {path.name: checksums(path.read_bytes()) for path in sorted(folder.iterdir())}

@@ -1,0 +1,183 @@
+"""The journal of an edit: its steps in a file, one line of JSON each, the newest last."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import logging
+import os
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.scenes.scene import Scene
+
+Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
+JOURNAL_VERSION = 1
+_DEFLATE = 1032
+"""Largest compression ratio of DEFLATE."""
+_RENAMED_KINDS = {"recolour": "recolor"}
+"""Steps of journals that were written before the renames, and their present names."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One edit.
+
+    Args:
+        kind: The operation.
+        mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
+        values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
+            "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`).
+        phrase: What was asked for, for display.
+    """
+
+    kind: Kind
+    mask: Tensor
+    values: dict[str, Any] = field(default_factory=dict)
+    phrase: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.phrase or 'a selection'} ({int(self.mask.sum())} Gaussians)"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data; the mask as compressed bits."""
+        bits = zlib.compress(np.packbits(self.mask.cpu().numpy()).tobytes(), 6)
+        return {
+            "step": self.kind,
+            "phrase": self.phrase,
+            "gaussians": len(self.mask),
+            "mask": base64.b64encode(bits).decode("ascii"),
+            **self.values,
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Step:
+        """The inverse of `to_json`.
+
+        Raises:
+            ValueError: If the data are not a step.
+        """
+        try:
+            count, kind = data["gaussians"], _RENAMED_KINDS.get(data["step"], data["step"])
+            raw = base64.b64decode(data["mask"])
+            if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
+                raise ValueError(
+                    f"not a step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100]
+                )
+            packed = zlib.decompressobj().decompress(raw, count // 8 + 1)
+            bits = np.unpackbits(np.frombuffer(packed, np.uint8))[:count]
+        except (KeyError, TypeError, binascii.Error, zlib.error) as error:
+            raise ValueError(f"not a step: {error!r}") from error
+        if kind not in get_args(Kind) or len(bits) != count:
+            raise ValueError(f"not a step: {kind!r}")
+        known = ("color", "strength", "rotation", "scale", "translation", "center", "fill")
+        values = {name: data[name] for name in known if name in data}
+        return cls(kind, torch.from_numpy(bits.astype(bool)), values, str(data.get("phrase", "")))
+
+
+class Journal:
+    """A file of steps.
+
+    Args:
+        path: The file.
+        scene: The scene as it was built; the file belongs to its reconstruction.
+    """
+
+    def __init__(self, path: Path, scene: Scene) -> None:
+        self.path, self._scene = path, scene
+
+    def append(self, entry: dict[str, Any]) -> None:
+        """Append a line and wait until it is on the disk, so that a later crash does not lose it.
+
+        Raises:
+            OSError: If it cannot be written; the file then has no part of it.
+        """
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        size = self.path.stat().st_size if self.path.exists() else 0
+        lines = [entry] if size else [self._header(), entry]
+        try:
+            with open(self.path, "a", encoding="utf-8") as file:
+                file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            if size:
+                os.truncate(self.path, size)
+            else:
+                self.path.unlink(missing_ok=True)
+            raise
+
+    def read(self) -> tuple[list[Step], list[Step]]:
+        """The steps, and those that were undone, the latest undone last.
+
+        Raises:
+            FileFormatError: If the file is damaged. A last line that is cut off is ignored, with a warning.
+            SceneFolderError: If it belongs to another reconstruction.
+        """
+        steps: list[Step] = []
+        undone: list[Step] = []
+        for number, line in enumerate(self._lines(), start=1):
+            try:
+                entry = json.loads(line)
+                if number == 1:
+                    self._check(entry)
+                elif entry.get("undo"):
+                    undone.append(steps.pop())
+                elif entry.get("redo"):
+                    steps.append(undone.pop())
+                else:
+                    steps.append(Step.from_json(entry))
+                    undone.clear()
+            except (ValueError, IndexError, AttributeError, RecursionError) as error:
+                raise FileFormatError(
+                    self.path,
+                    expected="steps of an edit",
+                    found=f"line {number}: {error}"[:200],
+                    remedy="discard the edit",
+                ) from error
+        return steps, undone
+
+    def _lines(self) -> list[str]:
+        try:
+            lines = self.path.read_text(encoding="utf-8").split("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileFormatError(
+                self.path, expected="a readable journal", found=str(error), remedy="discard the edit"
+            ) from error
+        if lines[-1]:
+            logging.getLogger("lexsplat").warning("%s: the last line is cut off and ignored", self.path)
+            self.path.write_text("\n".join([*lines[:-1], ""]), encoding="utf-8")
+        return lines[:-1]
+
+    def _header(self) -> dict[str, Any]:
+        folder = self._scene.folder
+        reconstruction = folder.record["stages"].get("reconstruct", {}).get("fingerprint") if folder else None
+        return {
+            "journal": JOURNAL_VERSION,
+            "gaussians": len(self._scene.gaussians),
+            "reconstruction": reconstruction,
+        }
+
+    def _check(self, header: dict[str, Any]) -> None:
+        if header != self._header():
+            raise SceneFolderError(
+                self.path,
+                expected="edits of this reconstruction",
+                found="edits of another one",
+                remedy="the scene was built again: discard the edits",
+            )
+
+
+def journal_of(scene: Scene) -> Path:
+    """File of the steps of an edit; the bundled scene is never written to."""
+    if scene.folder is None or scene.folder.is_bundled:
+        return Path("demo_edits.jsonl")
+    return scene.folder.root / "edits.jsonl"
