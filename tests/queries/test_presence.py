@@ -10,7 +10,7 @@ from lexsplat.language.segments import Segments
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.presence import NO, YES, Evidence, PresenceClassifier
 from lexsplat.queries.relevancy import Question, gaussian_relevancy
-from lexsplat.queries.vocabulary import is_part
+from lexsplat.queries.vocabulary import is_part, thing_of_part
 
 unit = torch.nn.functional.normalize
 
@@ -135,7 +135,7 @@ def test_objects_are_judged_and_not_their_parts(judge):
     assert strength(judge, "3") < NO, "a stripe of the ball"
 
 
-def test_parts_need_the_strength_of_objects_and_colors_more(judge, monkeypatch):
+def test_compounds_need_the_strength_of_objects_and_colors_more(judge, monkeypatch):
     from lexsplat.queries import presence
 
     monkeypatch.setattr(presence, "is_part", lambda phrase: phrase == "3")
@@ -143,6 +143,26 @@ def test_parts_need_the_strength_of_objects_and_colors_more(judge, monkeypatch):
     found = judge.evidence(phrases, Words()(phrases), torch.zeros(3, 500))
     assert [evidence.yes for evidence in found] == [0.62, 0.62, 0.82]
     assert Evidence(0.7, 0.7, found[0].yes).presence == "yes"
+
+
+@pytest.mark.parametrize(
+    ("thing", "presence"),
+    [
+        ("2 3", "yes"),  # the ball, which is described at its stripe, too
+        ("0", "no"),  # elsewhere in the scene
+        ("3", "no"),  # described there, but no object of the scene
+        ("5", "no"),  # nowhere
+    ],
+)
+def test_a_part_is_there_only_with_its_thing(judge, monkeypatch, thing, presence):
+    from lexsplat.queries import presence as module
+
+    monkeypatch.setattr(module, "is_part", lambda phrase: phrase == "3 handle")
+    monkeypatch.setattr(module, "thing_of_part", lambda phrase: thing if phrase == "3 handle" else "")
+    (found,) = judge.evidence(["3 handle"], Words()(["3"]), torch.zeros(1, 500))
+    assert found.presence == presence
+    assert found.strength == (pytest.approx(1, abs=0.1) if presence == "yes" else 0)
+    assert found.yes == module.YES_PART < module.NO
 
 
 def test_a_color_is_that_of_the_thing(judge):
@@ -187,3 +207,14 @@ def test_the_wrong_color_is_less_relevant_at_a_thing(judge):
 )  # fmt: skip
 def test_a_part_is_named_behind_its_thing(phrase, part):
     assert is_part(phrase) == part
+
+
+@pytest.mark.parametrize(
+    ("phrase", "thing"),
+    [
+        ("mug handle", "mug"), ("Red mug handles", "red mug"), ("teddy bear nose", "teddy bear"), ("table leg", "table"),
+        ("candle holder", ""), ("phone charger", ""), ("nose", ""), ("big nose", ""), ("table lamp", ""), ("", ""),
+    ],
+)  # fmt: skip
+def test_the_thing_of_a_part_is_what_stands_before_it(phrase, thing):
+    assert thing_of_part(phrase) == thing

@@ -29,9 +29,13 @@ export interface EverydayRule {
   /** Borders of "yes" for what is judged at segments and for phrases with a color; words that tell which is which. */
   yes_segment: number;
   yes_colored: number;
+  /** "Yes" for a part where its thing is described, and from which strength it is. */
+  yes_part: number;
+  at_thing: number;
   names: string[];
   qualities: string[];
   colors: string[];
+  parts: string[];
 }
 
 /** The constants of lexsplat.queries by which surfaces, instances and evidence are found. */

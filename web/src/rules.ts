@@ -49,6 +49,14 @@ export function isPart(phrase: string, rule: EverydayRule): boolean {
   return !rule.names.includes(last) && !rule.qualities.includes(last) && words.some((word) => rule.names.includes(word));
 }
 
+/** The thing of which a phrase names a part; empty if it names none of the rule's parts. */
+export function thingOfPart(phrase: string, rule: EverydayRule): string {
+  const words = phrase.toLowerCase().split(/\s+/);
+  const bare = words.map((word) => word.replace(/s$/, ""));
+  if (!isPart(phrase, rule) || !rule.parts.includes(bare.at(-1)!)) return "";
+  return words.slice(0, bare.slice(0, -1).findLastIndex((word) => rule.names.includes(word)) + 1).join(" ");
+}
+
 export function hasColor(phrase: string, rule: EverydayRule): boolean {
   return phrase.toLowerCase().split(/\s+/).some((word) => rule.colors.includes(word));
 }
@@ -59,16 +67,22 @@ export function peakOf(scores: Float32Array, language: Language, shown: Uint32Ar
   return language.distribution(largest(scores, shown, count));
 }
 
-/** Whether the scene holds a phrase: how well it describes the best of some places, distributions [V, K]. */
-export function presenceOf(heights: Heights, places: Float32Array, best: Float32Array, rule: EverydayRule, yes: number): Presence {
+/** How well a phrase describes each of some places, distributions [V, K]. */
+export function strengthsOf(heights: Heights, places: Float32Array, best: Float32Array, rule: EverydayRule): number[] {
   const count = heights.length;
-  let strength = 0;
+  const strengths: number[] = [];
   for (let start = 0; start < places.length; start += count) {
     const place = places.subarray(start, start + count);
     const reached = dot(place, heights);
     const ratio = Math.max(0, reached / Math.max(dot(place, best), LEAST));
-    strength = Math.max(strength, Math.sqrt(ratio * Math.max(0, Math.min(ratio, reached / rule.peak))));
+    strengths.push(Math.sqrt(ratio * Math.max(0, Math.min(ratio, reached / rule.peak))));
   }
+  return strengths;
+}
+
+/** Whether the scene holds a phrase, from how well it describes each of some places. */
+export function presenceOf(strengths: number[], rule: EverydayRule, yes: number): Presence {
+  const strength = strengths.reduce((most, value) => Math.max(most, value), 0);
   return strength >= yes ? "yes" : strength < rule.no ? "no" : "unsure";
 }
 

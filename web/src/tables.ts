@@ -4,7 +4,7 @@ import { type Answer, type Clicked, type Source, answered, painted } from "./ans
 import { Dictionary, normalize, singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
 import { type Language, shownSplats } from "./language";
-import { type Presence, hasColor, isPart, peakOf, presenceOf } from "./rules";
+import { type Presence, hasColor, isPart, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
 import type { Spelling } from "./spelling";
@@ -70,26 +70,34 @@ export class Tables implements Source {
       return answered(prompt, color, { phrase, from: "dictionary", ...this.#whole(own, presence) });
     }
     const phrase = normalize(text);
-    const described = (await (await this.loader?.load())?.describe(phrase)) ?? null;
-    if (!described) return null;
+    const tower = await this.loader?.load();
+    if (!tower) return null;
+    const described = tower.describe(phrase);
     const own = this.language.scores(described.table);
-    const presence = this.#presence(phrase, own, described);
+    const thing = thingOfPart(phrase, described.rule);
+    const presence = this.#presence(phrase, own, described, thing ? tower.describe(thing) : null);
     return answered(prompt, color, { phrase, from: "text tower", ...this.#whole(own, presence) });
   }
 
   /** As `lexsplat.queries.presence` has it: parts at segments, all else at objects. */
-  #presence(phrase: string, own: Float32Array, { heights, best, rule, places, colored }: Description): Presence {
+  #presence(phrase: string, own: Float32Array, described: Description, thing: Description | null): Presence {
+    const { heights, best, rule, places, colored } = described;
     if (this.#shown.length === 0) return "no";
     if (!this.segments || !places || !colored) {
-      return presenceOf(heights, peakOf(own, this.language, this.#shown, this.geometry.rule), best, rule, rule.yes);
+      const peak = peakOf(own, this.language, this.#shown, this.geometry.rule);
+      return presenceOf(strengthsOf(heights, peak, best, rule), rule, rule.yes);
     }
     if (isPart(phrase, rule)) {
       this.#parts ??= this.segments.distributions(this.language);
-      return presenceOf(heights, this.#parts, best, rule, rule.yes_segment);
+      const strengths = strengthsOf(heights, this.#parts, best, rule);
+      if (!thing) return presenceOf(strengths, rule, rule.yes_segment);
+      const held = strengthsOf(thing.heights, places, thing.compared, rule).some((value) => value >= rule.no);
+      const there = strengthsOf(thing.heights, this.#parts, thing.compared, rule);
+      return presenceOf(held ? strengths.filter((_, place) => there[place] >= rule.at_thing) : [], rule, rule.yes_part);
     }
     return hasColor(phrase, rule)
-      ? presenceOf(heights, places, colored, rule, rule.yes_colored)
-      : presenceOf(heights, places, best, rule, rule.yes_segment);
+      ? presenceOf(strengthsOf(heights, places, colored, rule), rule, rule.yes_colored)
+      : presenceOf(strengthsOf(heights, places, best, rule), rule, rule.yes_segment);
   }
   #parts: Float32Array | null = null;
 

@@ -10,6 +10,8 @@ export interface Description {
   table: Table;
   heights: Heights;
   best: Float32Array;
+  /** The heights that the phrase is compared with: `best`, or `colored` for a phrase with a color. */
+  compared: Float32Array;
   rule: EverydayRule;
   /** Distributions of the scene's objects, and the best heights for phrases with a color; null without segments. */
   places: Float32Array | null;
@@ -94,7 +96,7 @@ export class TextTower {
     const heights = heightsOf(codewords, embedding, mean, everyday);
     const [places, colored] = ["places", "best_colored"].map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
     const compared = colored && hasColor(phrase, everyday) && !isPart(phrase, everyday) ? colored : best;
-    return { table: relevancyOf(heights, compared, everyday), heights, best, rule: everyday, places, colored };
+    return { table: relevancyOf(heights, compared, everyday), heights, best, compared, rule: everyday, places, colored };
   }
 
   /** The embedding of a phrase, of unit length. */

@@ -26,6 +26,10 @@ _QUALITIES = """
     big, small, large, little, tall, open, closed, empty, full, broken, wet, dry, old, new, dark, bright,
     transparent, colorful, dirty, clean
 """
+_PARTS = """
+    handle, lid, cap, spout, neck, rim, knob, stem, leaf, petal, shade, cord, string, flame, wick, spine, page, button,
+    sole, lace, wing, beak, nose, ear, eye, mouth, tail, paw, foot, leg, arm
+"""
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
     plastic, stone, brick, leaves, ground, window, door, curtain, fence, shelf, bed, hand, wheel
@@ -46,6 +50,8 @@ NAMES = frozenset(entry.split(" of ")[0].split()[-1] for entry in words(_EVERYDA
     "metal",
 }
 """The nouns of all everyday names."""
+PARTS = frozenset(words(_PARTS))
+"""Nouns that name a part behind its thing, which compounds such as "candle holder" do not."""
 COLORS = frozenset(words(_COLORS))
 """Words of colors."""
 QUALITIES = frozenset(words(_QUALITIES)) | COLORS
@@ -61,6 +67,15 @@ def is_part(phrase: str) -> bool:
     """Whether a phrase names a part of a thing: the everyday name of the thing, and then another word."""
     *before, last = (word.removesuffix("s") for word in phrase.lower().split() or [""])
     return last not in NAMES | QUALITIES and not NAMES.isdisjoint(before)
+
+
+def thing_of_part(phrase: str) -> str:
+    """The thing of which a phrase names a part: "red mug" of "red mug handle"; empty if it names none of `PARTS`."""
+    *before, last = phrase.lower().split() or [""]
+    if not is_part(phrase) or last.removesuffix("s") not in PARTS:
+        return ""
+    end = max(place for place, word in enumerate(before) if word.removesuffix("s") in NAMES)
+    return " ".join(before[: end + 1])
 
 
 def default_vocabulary(clip: str = "") -> list[str]:

@@ -23,7 +23,8 @@ from torch import Tensor
 
 from lexsplat.queries.everyday import OFFSET
 from lexsplat.queries.phrases import Anything, Both, Except, Phrase, Thing, Viewer, parts_of
-from lexsplat.queries.presence import NO
+from lexsplat.queries.presence import NO, YES_PART
+from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.runtime.device import one_thread
 from lexsplat.scenes.library.entries import Codes
 
@@ -84,7 +85,8 @@ def phrase_bound(phrase: Phrase, of_thing: Mapping[str, FloatArray]) -> FloatArr
     A relation holds where all of its parts are present, a union where one is.
     """
     if isinstance(phrase, Thing):
-        return of_thing[phrase.text]
+        lower = NO / YES_PART if thing_of_part(phrase.text) else 1.0  # a part is held from `YES_PART`
+        return lower * of_thing[phrase.text]
     if isinstance(phrase, (Anything, Viewer)):
         return CERTAIN
     parts = [phrase_bound(part, of_thing) for part in parts_of(phrase).values()]

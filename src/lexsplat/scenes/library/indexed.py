@@ -34,7 +34,7 @@ from lexsplat.queries.presence import DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.spelling import corrected, strange
-from lexsplat.queries.vocabulary import NAMES, STUFF
+from lexsplat.queries.vocabulary import NAMES, STUFF, thing_of_part
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.library.contents import Contents, projected
 
@@ -153,6 +153,8 @@ def decidable(phrase: str, clip: str) -> Thing | None:
     understood = understand(phrase)
     thing = understood.phrase
     if not isinstance(thing, Thing) or understood.note or (clip == "bundled" and not phrase.isascii()):
+        return None
+    if thing_of_part(thing.text):  # judged where its thing is described
         return None
     known = words_of_things(clip)
     if clip == "bundled" and strange(thing.text, known):

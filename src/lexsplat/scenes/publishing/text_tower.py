@@ -12,7 +12,7 @@ from torch import Tensor
 from lexsplat.features.clip import ClipEncoder
 from lexsplat.features.encoders import load_clip
 from lexsplat.queries import everyday, presence
-from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
+from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES
 from lexsplat.runtime.files import save_tensors
 from lexsplat.scenes.scene import Scene
 
@@ -67,9 +67,12 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
             "no": presence.NO,
             "yes_segment": presence.YES_SEGMENT,
             "yes_colored": presence.YES_COLORED,
+            "yes_part": presence.YES_PART,
+            "at_thing": presence.AT_THING,
             "names": sorted(NAMES),
             "qualities": sorted(QUALITIES),
             "colors": sorted(COLORS),
+            "parts": sorted(PARTS),
         },
     }
 
