@@ -17,7 +17,7 @@ import lexsplat
 from lexsplat import open_scene
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.presence import NO
+from lexsplat.queries.presence import NO, YES_PART
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.runtime.errors import FileFormatError, LibraryError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, read_tensors, write_json, write_tensors
@@ -25,7 +25,7 @@ from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.library import Library
-from lexsplat.scenes.library.bounds import phrase_bound, presence_bounds
+from lexsplat.scenes.library.bounds import SURELY_NOT, phrase_bound, presence_bounds
 from lexsplat.scenes.library.entries import Codes, map_codes
 from lexsplat.scenes.library.records import read_record, write_record
 from lexsplat.scenes.library.searching import spellings_of
@@ -139,6 +139,14 @@ def test_bounds_are_those_of_a_loop_in_float64():
 def test_the_bound_of_a_phrase_follows_from_those_of_its_things(phrase, bound):
     known = {"mug": np.array([0.9]), "table": np.array([0.5]), "dog": np.array([0.1])}
     assert np.max(phrase_bound(understand(phrase).phrase, known)) == pytest.approx(bound)
+
+
+def test_a_scene_is_not_ruled_out_for_a_part_that_it_may_hold():
+    for text, strength in (("mug handle", YES_PART), ("mug", NO), ("candle holder", NO)):
+        held, missing = (np.array([strength + change]) for change in (0.0, -0.02))
+        phrase = understand(text).phrase
+        assert float(phrase_bound(phrase, {text: held})[0]) >= SURELY_NOT
+        assert float(phrase_bound(phrase, {text: missing})[0]) < SURELY_NOT
 
 
 def test_a_kind_is_compared_by_the_names_of_its_members_as_the_scenes_answer_it():

@@ -33,6 +33,9 @@ PROMPTS = (
     "something to drink from",
     "the handle of that blue mug",  # in no dictionary
     "Café's über-mug, 42!",  # accents, marks and digits
+    "green apple stem",  # judged where its thing is
+    "red mug handle",  # of a thing in another color
+    "giraffe nose",
     "blue tea mug",  # compared with other things with a color
     "zebra",  # not in the scene
     "qwzx blorp",

@@ -217,7 +217,10 @@ class PresenceClassifier:
 
     def _at_thing(self, thing: str, places: Tensor) -> Tensor:
         """The places ``[V', K]`` where a thing is described; none where the scene does not hold it."""
-        heights, best = self.scale.heights(self.language.codebook.clip, self._embed([thing])), self._best(thing)
+        heights, best = (
+            self.scale.heights(self.language.codebook.clip, self._embed([thing])),
+            self._best(thing),
+        )
         at_objects, at_places = (
             _strength(*self._compared(heights, each, best))[:, 0]
             for each in (self.places.distributions, places)
