@@ -9,9 +9,10 @@ describes that place, on the scale of everyday words (`lexsplat.queries.everyday
 
 Places are the objects of the scene (`lexsplat.queries.objects`), found with everyday words: a stripe of a ball may
 resemble a book, the ball does not. What names a part of a thing, such as "mug handle", is judged at segments of all
-levels, only where the mug is described too, and is absent with the mug. A phrase with a color, such as "red apple", is compared with the colors and names of the scene's objects: at a
-red mug, "red mug" describes more than "red apple". A scene without segments is judged at the Gaussians that score
-best. ``benchmarks/selection.py`` measures the decisions.
+levels, only where the mug is described too, and is absent with the mug. A phrase with a color, such as "red apple",
+is compared with the colors and names of the scene's objects: at a red mug, "red mug" describes more than "red apple".
+A scene without segments is judged at the Gaussians that score best. ``benchmarks/selection.py`` measures the
+decisions.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from lexsplat.queries.vocabulary import COLORS, has_color, is_part, thing_of_par
 YES, NO = 0.74, FITS
 """Strengths from which the answer is "yes", and below which it is "no"."""
 YES_SEGMENT, YES_COLORED, YES_PART = 0.62, 0.82, 0.52
-"""The former at objects, whose means are lower than peaks; for phrases with a color, which share the color or the name
-with most of what they are confused with; and for parts where their thing is described. Chosen on the second scene,
-with the bundled encoder and three of ``benchmarks/web_like.py``."""
+"""The former at objects, whose means are lower than peaks; for phrases with a color, which share the color or the
+name with most of what they are confused with; and for parts where their thing is described. Chosen on the second
+scene, with the bundled encoder and three of ``benchmarks/web_like.py``."""
 AT_THING = 0.3
 """Strength of its thing at a place that may be a part of it."""
 

@@ -27,8 +27,8 @@ _QUALITIES = """
     transparent, colorful, dirty, clean
 """
 _PARTS = """
-    handle, lid, cap, spout, neck, rim, knob, stem, leaf, petal, shade, cord, string, flame, wick, spine, page, button,
-    sole, lace, wing, beak, nose, ear, eye, mouth, tail, paw, foot, leg, arm
+    handle, lid, cap, spout, neck, rim, knob, stem, leaf, petal, shade, cord, string, flame, wick, spine, page,
+    button, sole, lace, wing, beak, nose, ear, eye, mouth, tail, paw, foot, leg, arm
 """
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
