@@ -269,6 +269,18 @@ def test_a_damaged_folder_is_refused(copy, content):
         refused(copy, "an empty folder")
 
 
+def test_a_clone_without_its_large_files_is_told(copy):
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 598641023\n"
+    (copy / "model.safetensors").write_text(pointer)
+    refused(copy, "model.safetensors", "a pointer of Git LFS", f"git -C {copy} lfs pull")
+
+
+def test_an_empty_name_is_not_the_working_directory(clip_folder, monkeypatch):
+    monkeypatch.chdir(clip_folder)
+    for name in ("", " "):
+        refused(name, "a folder or a model name", "nothing", "--clip bundled")
+
+
 def test_a_model_of_the_other_kind_is_refused(clip_folder):
     refused(clip_folder, "vision transformer", load=load_dino)
     refused(hub.BUNDLED_ENCODERS / "dino", "tokenizer")

@@ -50,6 +50,9 @@ def model_folder(name: str, tower: str) -> Path:
     """
     if name in ("bundled", "embedded"):  # "embedded" is an alias
         return BUNDLED_ENCODERS / tower
+    if not name.strip():  # as a path, it is the working directory
+        expected = "a folder or a model name"
+        raise ModelError("model", expected=expected, found="nothing", remedy=_choices(tower))
     folder = Path(name).expanduser()
     if folder.is_dir():
         lacking = missing_part(folder, tower)

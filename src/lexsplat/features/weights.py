@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 from collections.abc import Collection, Iterable
@@ -112,7 +113,21 @@ def _safetensors(path: Path, name: str) -> dict[str, Tensor]:
     try:
         return load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
+        if _is_pointer(path):
+            raise ModelError(
+                f"model {name}: {path.name}",
+                expected="safetensors",
+                found="a pointer of Git LFS",
+                remedy=f"fetch the large files: git -C {path.parent} lfs pull",
+            ) from error
         raise _damaged(path, name, "safetensors", error) from error
+
+
+def _is_pointer(path: Path) -> bool:
+    """Whether a file was cloned without Git LFS."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        return file.read(24) == b"version https://git-lfs."
+    return False
 
 
 def _pickled(path: Path, name: str) -> dict[str, Tensor]:
