@@ -16,18 +16,18 @@ from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.reconstruction import Reconstructor, block_training
+from lexsplat.reconstruction import Reconstructor, block_training, surroundings
 from lexsplat.reconstruction.block_files import BETAS, CellState, idle, plan
-from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks, thinned
+from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks
 from lexsplat.reconstruction.blocks import (
     CELLS_OF_PAIR,
     cut_blocks,
     ground_axes,
     number_of_blocks,
     side_by_side,
-    sizes_in_view,
 )
 from lexsplat.reconstruction.settings import ReconstructionConfig
+from lexsplat.reconstruction.surroundings import Surroundings, shares_in_image, sizes_in_view
 from lexsplat.runtime.errors import CaptureError, MemoryBudgetError, WorkersError
 from lexsplat.runtime.workers import open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -218,49 +218,71 @@ def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, mo
         assert torch.equal(tensor, trainer.gaussians().tensors()[name])
 
 
-def test_gaussians_of_other_cells_are_drawn_and_stay_as_they_are(capture, points):
+def test_gaussians_of_other_cells_are_drawn_and_stay_as_they_are(capture, points, monkeypatch):
+    monkeypatch.setattr(surroundings, "SMALL", 1e-3)  # none is thinned
     cut = cut_blocks(capture, points.points, ground_axes(UP), 1)
     (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)
     gaussians = Reconstructor(capture, CONFIG, points).gaussians().map(torch.clone)
     half = len(gaussians) // 2
     own, fixed = gaussians.select(slice(0, half)), gaussians.select(slice(half, None))
-    trainer = VisitReconstructor(capture, CONFIG, visit, CellState.untrained(own), fixed, 0)
+    around = Surroundings(fixed, surroundings.extents_of(fixed), np.zeros(len(fixed), np.float32))
+    trainer = VisitReconstructor(capture, CONFIG, visit, CellState.untrained(own), around, 0)
     camera = capture.train_views[0].camera
     drawn = trainer._render(trainer._as_gaussians(), camera).image
     torch.testing.assert_close(drawn, Reconstructor(capture, CONFIG, points)._render(gaussians, camera).image)
     before = fixed.means.clone()
     trainer.step()
-    assert torch.equal(trainer._fixed.means, before)
+    assert torch.equal(trainer._around.gaussians.means, before)
     assert len(trainer.gaussians()) == half
+
+
+def cloud(places, deviation: float) -> Gaussians:
+    """Round Gaussians of one size."""
+    count = len(places)
+    return Gaussians(
+        torch.from_numpy(places).float(),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count, 3), float(np.log(deviation))),
+        torch.zeros(count),
+        torch.zeros(count, 1, 3),
+        torch.zeros(count, 0, 3),
+    )
 
 
 def test_small_gaussians_of_other_cells_are_thinned_and_keep_their_area(capture):
     made, _ = street(capture)
     rng = np.random.default_rng(0)
     count = 4000
-    places = np.column_stack([rng.uniform(-2, 2, count), rng.uniform(8, 12, count), rng.uniform(1, 2, count)])
-    gaussians = Gaussians(
-        torch.from_numpy(places).float() + torch.tensor([8.0, 0.0, 0.0]),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count, 3), float(np.log(0.1))),  # half a pixel at a distance of ten meters
-        torch.zeros(count),
-        torch.zeros(count, 1, 3),
-        torch.zeros(count, 0, 3),
-    )
-    cameras = [made.views["08.0"].camera]
-    found = thinned(gaussians, cameras, rng)
+    places = np.column_stack([rng.uniform(6, 10, count), rng.uniform(8, 12, count), rng.uniform(1, 2, count)])
+    gaussians = cloud(places, 0.1)  # half a pixel at a distance of ten meters
+    camera = made.views["08.0"].camera
+    found = Surroundings.seen([gaussians], [camera], rng).in_image(camera)
     assert count / 40 < len(found) < count / 8
     areas = [float(each.scales[:, :2].prod(1).sum()) for each in (gaussians, found)]
     assert areas[1] == pytest.approx(areas[0], rel=0.15)
-    large = gaussians.map(torch.clone)
-    large.log_scales += float(np.log(10.0))
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(large.tensors().values(), thinned(large, cameras, rng).tensors().values())
-    )
-    behind = gaussians.map(torch.clone)
-    behind.means[:, 1] -= 30.0
-    assert len(thinned(behind, cameras, rng)) == 0
+    large = cloud(places, 1.0)
+    same = Surroundings.seen([large], [camera], rng).in_image(camera)
+    assert all(torch.equal(a, b) for a, b in zip(large.tensors().values(), same.tensors().values()))
+    behind = cloud(places - [0.0, 30.0, 0.0], 0.1)
+    assert len(Surroundings.seen([behind], [camera], rng)) == 0
+
+
+def test_gaussians_are_thinned_by_the_image_and_not_by_the_nearest_view_of_the_visit(capture):
+    made, _ = street(capture)
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.uniform(6, 10, 4000), rng.uniform(1, 12, 4000), rng.uniform(1, 2, 4000)])
+    near = made.views["08.0"].camera
+    pose = near.viewmat.copy()
+    pose[2, 3] += 40.0
+    far = dataclasses.replace(near, viewmat=pose)
+    both = Surroundings.seen([cloud(places, 0.1), cloud(places + 0.01, 0.1)], [near, far], rng)
+    alone, other = len(both.in_image(near)), len(both.in_image(far))
+    assert 0 < 20 * other < alone, "a view from afar shows few of those that the near one shows"
+    assert alone <= len(both) <= alone + other
+    # The same by hand: the share of a Gaussian is its area over that of one of SMALL pixels.
+    expected = (50 * 0.1 / (places[:, 1] + 40.0) / surroundings.SMALL) ** 2
+    extents = np.column_stack([places, np.full((4000, 2), 0.1)]).astype(np.float32)
+    np.testing.assert_allclose(shares_in_image(far, extents), expected, rtol=1e-3)
 
 
 def test_blocks_that_no_view_sees_are_refused(capture):

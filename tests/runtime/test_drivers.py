@@ -1,5 +1,6 @@
 """Commands that use a real Ray from outside, and commands that are killed while their workers are at work."""
 
+import json
 import os
 import signal
 import socket
@@ -94,3 +95,38 @@ def test_a_command_that_is_killed_goes_on_when_it_is_run_again_and_builds_the_sa
 
 def features_in(cache):
     return {path.name: path.stat().st_mtime_ns for path in cache.glob("*.safetensors")}
+
+
+@pytest.mark.slow
+def test_nodes_killed_while_blocks_are_trained_change_no_byte_of_the_gaussians(nodes, tiny_capture, tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "lexsplat",
+        "reconstruct",
+        str(tiny_capture),
+        *QUICK_BUILD,
+        "--blocks",
+        "3",
+    ]
+    here, there = tmp_path / "here", tmp_path / "there"
+    subprocess.run([*command, "--output", str(here)], check=True, capture_output=True, timeout=300)
+    environment = {**os.environ, "RAY_ADDRESS": nodes.address}
+    driver = subprocess.Popen(
+        [*command, "--output", str(there), "--workers", "ray", "--progress", "json"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    kills = 0
+    for line in driver.stdout:
+        event = json.loads(line)
+        if event["stage"] == "blocks" and event["done"] in (1, 4, 7) and event["done"] < event["total"]:
+            for node in range(2):  # the next visit is on one of them
+                nodes.replace(node)
+                kills += 1
+    errors = driver.communicate(timeout=60)[1]
+    assert driver.returncode == 0, errors
+    assert kills == 6
+    assert (there / "gaussians.ply").read_bytes() == (here / "gaussians.ply").read_bytes()

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import re
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import torch
+
+from lexsplat.runtime.memory import give_back_freed
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -46,7 +46,7 @@ def forget_peak_memory() -> bool:
     next measurement.
     """
     gc.collect()
-    _give_back_freed()
+    give_back_freed()
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     try:
@@ -54,9 +54,3 @@ def forget_peak_memory() -> bool:
     except OSError:
         return False
     return True
-
-
-def _give_back_freed() -> None:
-    """Call glibc's ``malloc_trim`` where it exists (not macOS, Windows, musl)."""
-    with suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)

@@ -9,7 +9,7 @@ side by side.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,10 +32,11 @@ from lexsplat.reconstruction.block_files import (
     merged,
     plan,
 )
-from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes, sizes_in_view
+from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes
 from lexsplat.reconstruction.densification import DensityControl
 from lexsplat.reconstruction.optimizers import adam, load_optimizer_tensors
 from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, ReconstructionConfig
+from lexsplat.reconstruction.surroundings import Surroundings
 from lexsplat.reconstruction.trainer import Reconstructor, initial_gaussians
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import WorkersError
@@ -60,10 +61,6 @@ FIXED_BYTES = 1_000
 CALM = (0.7, 0.1)
 """From the first share of the iterations on, all learning rates fall, exponentially, to the second share of them at
 the end: the views of the last visits would otherwise count for more than the others."""
-
-SMALL = 2.0
-"""Geometric mean of the two largest standard deviations in pixels below which only some of the Gaussians that are not
-trained take part."""
 
 _NEVER = 1 << 40
 
@@ -116,7 +113,7 @@ class VisitReconstructor(Reconstructor):
         config: Settings of the whole.
         visit: The visit.
         state: The Gaussians that are trained, as they are before it.
-        fixed: Gaussians that take part with fixed values; None if there are none.
+        around: Gaussians that take part with fixed values; None if there are none.
         seed: Seed of the whole training.
         options: Device, memory and the extent of the whole capture, as in `Reconstructor`.
     """
@@ -127,7 +124,7 @@ class VisitReconstructor(Reconstructor):
         config: ReconstructionConfig,
         visit: Visit,
         state: CellState,
-        fixed: Gaussians | None,
+        around: Surroundings | None,
         seed: int,
         **options: Any,
     ) -> None:
@@ -136,7 +133,7 @@ class VisitReconstructor(Reconstructor):
         config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
         own = _seed(seed, visit.number)
         super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
-        self._fixed = None if fixed is None else fixed.to(self.device)
+        self._around = None if around is None else around.to(self.device)
         self.steps_done = visit.start
         self.rate_factor = 1.0  # sets the learning rates of this step
         self._load_moments()
@@ -192,7 +189,9 @@ class VisitReconstructor(Reconstructor):
         return self._names.index(self._order_of_views[self.steps_done - self._visit.start])
 
     def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
-        return super()._render(gaussians if self._fixed is None else merged([gaussians, self._fixed]), camera)
+        if self._around is not None:
+            gaussians = merged([gaussians, self._around.in_image(camera)])
+        return super()._render(gaussians, camera)
 
     def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
         count = len(self._parameters["means"])
@@ -329,9 +328,9 @@ def _visit(shared: _Shared, visit: Visit) -> int:
         return sum(len(files.gaussians(visit.number, cell, False)) for cell in block.trained)
     states = {cell: _present(shared, visit, cell, *latest[str(cell)]) for cell in block.trained}
     homes = np.repeat(list(states), [len(state) for state in states.values()])
-    fixed = _fixed(shared, visit, latest)
+    around = _surroundings(shared, visit, latest)
     if run.device == "cpu":
-        others = 0 if fixed is None else len(fixed)
+        others = 0 if around is None else len(around)
         need = len(homes) * budget.GAUSSIAN_BYTES + others * FIXED_BYTES
         what = f"{len(homes):,} Gaussians of a block and {others:,} that its views show"
         budget.require("reconstruct", need, run.memory, what, "a larger --blocks")
@@ -340,7 +339,7 @@ def _visit(shared: _Shared, visit: Visit) -> int:
     own = {name: shared.capture.views[name] for name in block.views}
     part = replace(shared.capture, views=own, train_names=block.views, test_names=())
     options = {"device": run.device, "memory": run.memory, "extent": shared.extent}
-    trainer = VisitReconstructor(part, shared.config, visit, state, fixed, run.seed, **options)
+    trainer = VisitReconstructor(part, shared.config, visit, state, around, run.seed, **options)
     before = latest.get(f"{EXPOSURES}{block.number}")
     if before is not None:
         trainer.load_exposures(files.read(before[0], EXPOSURES))
@@ -350,6 +349,8 @@ def _visit(shared: _Shared, visit: Visit) -> int:
     cells = np.where(np.isin(cells, block.trained), cells, homes)
     after = {cell: state.select(torch.from_numpy(cells == cell)) for cell in block.trained}
     files.write(visit.number, after, exposures)
+    del trainer, around, state, after
+    budget.give_back_freed()  # what the next visit gets would otherwise lie beside it
     return len(cells)
 
 
@@ -392,30 +393,17 @@ def _refined(state: CellState, control: DensityControl, step: int, steps: int) -
     return CellState(found, moments, statistics)
 
 
-def _fixed(shared: _Shared, visit: Visit, latest: Mapping[str, tuple[int, int]]) -> Gaussians | None:
+def _surroundings(
+    shared: _Shared, visit: Visit, latest: Mapping[str, tuple[int, int]]
+) -> Surroundings | None:
     """The Gaussians of the cells that a visit does not train, as far as its views show them."""
+    if not visit.block.shown:
+        return None
     rng = np.random.default_rng([shared.run.seed, visit.number])
     cameras = [shared.capture.views[name].camera for name in sorted(set(visit.views(shared.run.seed)))]
-    parts = []
-    for cell in visit.block.shown:
-        gaussians = shared.files.gaussians(latest[str(cell)][0], cell, shared.config.antialiased)
-        parts.append(thinned(gaussians, cameras, rng))
-    return merged(parts) if sum(map(len, parts)) else None
-
-
-def thinned(gaussians: Gaussians, cameras: Sequence[Camera], rng: np.random.Generator) -> Gaussians:
-    """The Gaussians that cameras show; of those that are small in all images (`SMALL`) a random choice.
-
-    A Gaussian is chosen with the share that its area has of that of the smallest one which always takes part, and
-    enlarged to that area. The number in an image thus depends on what it shows, not on the size of the capture.
-    """
-    centers = gaussians.means.numpy()
-    longest, middle, _ = gaussians.scales.sort(1, descending=True).values.numpy().T
-    sizes = np.max([sizes_in_view(camera, centers, longest) for camera in cameras], axis=0)
-    shares = np.minimum(1.0, sizes**2 * (middle / longest) / SMALL**2)
-    chosen = torch.from_numpy(np.flatnonzero(rng.random(len(shares)) < shares))
-    part, kept = gaussians.select(chosen), torch.from_numpy(shares).float()[chosen]
-    return replace(part, log_scales=part.log_scales - 0.5 * kept.log()[:, None])
+    antialiased = shared.config.antialiased
+    cells = (shared.files.gaussians(latest[str(n)][0], n, antialiased) for n in visit.block.shown)
+    return Surroundings.seen(cells, cameras, rng)
 
 
 def _seed(*numbers: int) -> int:

@@ -264,25 +264,6 @@ def _shown(camera: Camera, points: NDArray[np.float32]) -> tuple[NDArray[np.int6
     return shown, depth[shown]
 
 
-def sizes_in_view(
-    camera: Camera, centers: NDArray[np.floating], deviations: NDArray[np.floating]
-) -> NDArray[np.floating]:
-    """Standard deviations ``[N]`` in pixels of Gaussians in the image of a camera; 0 outside of it.
-
-    They reach three deviations far. Some that are just outside are counted too.
-    """
-    local = centers @ camera.viewmat[:3, :3].T.astype(np.float32) + camera.viewmat[:3, 3].astype(np.float32)
-    depth, radii = np.maximum(local[:, 2], 1e-3), 3 * deviations
-    found = local[:, 2] > -radii
-    for axis, size in enumerate((camera.width, camera.height)):
-        focal, middle = camera.K[axis, axis], camera.K[axis, 2]
-        place = focal * local[:, axis] / depth + middle
-        reach = 1.5 * focal * radii / depth + 2
-        found &= (place > -reach) & (place < size + reach)
-    found |= np.linalg.norm(local, axis=1) < radii
-    return np.where(found, max(camera.K[0, 0], camera.K[1, 1]) * deviations / depth, 0.0)
-
-
 def _cut(ground: NDArray[np.float64], count: int) -> list[tuple[NDArray, NDArray]]:
     """Halve the plane across the longer side of its places until there are ``count`` cells of equal numbers."""
     cells: list[tuple[NDArray, NDArray]] = []

@@ -7,8 +7,10 @@ is not included in these numbers.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import re
+from contextlib import suppress
 
 from lexsplat.runtime.errors import MemoryBudgetError
 
@@ -181,3 +183,9 @@ def parse_bytes(text: str) -> int:
     if match is None or float(match[1]) == 0:
         raise ValueError(f"memory must be a size like 4GB or 512MB, got {text!r}")
     return int(float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " "))
+
+
+def give_back_freed() -> None:
+    """Return freed memory to the system, which glibc otherwise keeps; nothing on macOS, Windows and musl."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
