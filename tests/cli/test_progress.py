@@ -1,6 +1,7 @@
 """Progress on standard error: rate and time left, in bars and in lines."""
 
 import io
+import json
 
 import pytest
 from rich.console import Console
@@ -46,6 +47,38 @@ def test_bars_in_a_terminal_state_rate_and_time_left(monkeypatch):
             bars(Event("reconstruct", done, 100, {"psnr": 20.0}))
     assert "3/100" in screen.getvalue()
     assert "psnr 20" in screen.getvalue()
+
+
+def test_a_stage_of_the_next_scene_starts_anew(clock, monkeypatch, capsys):
+    screen = io.StringIO()
+
+    def events(bars):
+        for _ in range(2):
+            for done in range(0, 101, 10):
+                clock[0] += 10
+                bars(Event("features", done, 100))
+                yield
+
+    with ProgressBars() as bars:
+        list(events(bars))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines.count("features: 100/100 1.0/s") == 2
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
+    )
+    with ProgressBars() as bars:
+        for number, _ in enumerate(events(bars)):
+            if number in (10, 15):
+                assert bars._progress.tasks[0].finished == (number == 10)
+
+
+def test_what_ray_prints_is_not_among_the_lines_of_json(capsys):
+    with progress.shown_progress("json") as listener:
+        listener(Event("blocks", 1, 4))
+        print("(raylet) Raylet is terminated.")
+    said = capsys.readouterr()
+    assert [json.loads(line)["stage"] for line in said.out.splitlines()] == ["blocks"]
+    assert said.err == "(raylet) Raylet is terminated.\n"
 
 
 def test_rates_and_durations_in_words():

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from types import TracebackType
 
 from rich.console import Console
@@ -93,6 +94,8 @@ class ProgressBars:
     def _draw(self, event: Event, text: str) -> None:
         if event.stage not in self._tasks:
             self._tasks[event.stage] = self._progress.add_task(event.stage, total=event.total, metrics="")
+        if event.done < self._progress.tasks[self._tasks[event.stage]].completed:  # that of the next scene
+            self._progress.reset(self._tasks[event.stage])
         self._progress.update(self._tasks[event.stage], completed=event.done, total=event.total, metrics=text)
 
     def _print_line(self, event: Event, text: str) -> None:
@@ -116,9 +119,10 @@ def shown_progress(form: str) -> Iterator[Listener]:
         with ProgressBars() as bars:
             yield bars
         return
-    pace = Pace()
+    pace, output = Pace(), sys.stdout
 
     def tell(event: Event) -> None:
-        print(json.dumps(pace.record(event)), flush=True)
+        print(json.dumps(pace.record(event)), file=output, flush=True)
 
-    yield tell
+    with redirect_stdout(sys.stderr):  # Ray prints there when a node is lost
+        yield tell

@@ -64,7 +64,7 @@ def extract_on_workers(
                 with atomic_path(cache.path / name) as temporary:
                     temporary.write_bytes(content)
             done += len(missing[outcome.name])
-            listener(Event("features", done, len(capture.views)))
+            listener(Event("features", done, len(capture.views), workers.metrics))
     raise_failures(failed)
 
 
@@ -124,6 +124,14 @@ class SceneTask:
     until: str = "language"
 
 
+@dataclass(frozen=True)
+class _Scenes:
+    """What all scenes share: their folder, and who is told of their stages."""
+
+    folder: SharedFolder
+    listener: Listener
+
+
 def scene_tasks(
     sources: Mapping[Path, BuildConfig], output: Path, until: str = "language"
 ) -> dict[str, SceneTask]:
@@ -156,7 +164,7 @@ def build_scenes(
         tasks: From `scene_tasks`.
         output: Folder of all scenes, which every worker must see.
         workers: Where they run.
-        listener: Receives an event of stage "scenes" after every scene.
+        listener: Receives an event of stage "scenes" after every scene; in this process, those of its stages too.
 
     Yields:
         The outcomes in the order of the tasks.
@@ -164,20 +172,23 @@ def build_scenes(
     memory = max((parse_bytes(task.config.memory) for task in tasks.values()), default=0)
     needs = Needs(memory=memory + LIBRARIES_BYTES, gpu=any(t.config.device != "cpu" for t in tasks.values()))
     with SharedFolder.offered(output) as folder:
-        for done, outcome in enumerate(workers.map(_build_scene, folder, tasks, needs), start=1):
+        listener(Event("scenes", 0, len(tasks)))
+        shared = _Scenes(folder, silent if workers.distributed else listener)
+        for done, outcome in enumerate(workers.map(_build_scene, shared, tasks, needs), start=1):
             yield outcome
-            listener(Event("scenes", done, len(tasks)))
+            listener(Event("scenes", done, len(tasks), workers.metrics))
 
 
-def _build_scene(folder: SharedFolder, task: SceneTask) -> list[str]:
+def _build_scene(shared: _Scenes, task: SceneTask) -> list[str]:
     """Build a scene; returns the names of its stages."""
     from lexsplat.pipeline.build import build
 
-    if not folder.is_visible:
+    if not shared.folder.is_visible:
         raise WorkersError(
-            folder.path,
+            shared.folder.path,
             expected="a folder that every worker sees",
             found="no such folder on one of them",
             remedy="give an --output on a file system that every node mounts at the same path",
         )
-    return list(build(task.source, task.output, task.config, until=task.until).record["stages"])
+    built = build(task.source, task.output, task.config, until=task.until, listener=shared.listener)
+    return list(built.record["stages"])

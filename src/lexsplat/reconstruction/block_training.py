@@ -269,7 +269,7 @@ def reconstruct_blocks(
             for done, size in enumerate(
                 results(workers.map(_visit, shared, items, needs)), group[0].number + 1
             ):
-                listener(Event("blocks", done, total, {"gaussians": float(size)}))
+                listener(Event("blocks", done, total, {"gaussians": float(size), **workers.metrics}))
             files.remove_old(index + 1)
         latest = files.latest(len(groups))
         parts = [files.gaussians(latest[str(cell)][0], cell, config.antialiased) for cell in range(count)]

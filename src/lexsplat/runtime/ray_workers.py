@@ -87,6 +87,14 @@ class RayWorkers:
 
     distributed = True
 
+    def __init__(self) -> None:
+        self._running = 0
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """See `Workers.metrics`."""
+        return {"workers": float(self._running)}
+
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
     ) -> Iterator[Outcome]:
@@ -109,6 +117,7 @@ class RayWorkers:
                 while todo and len(running) < 2 * cores:
                     name, item = todo.popleft()
                     running.append((name, task.remote(work, everyone, item)))
+                self._running = min(cores, len(running))
                 name, reference = running.popleft()
                 yield _outcome(name, reference)
         except (ConnectionError, ray.exceptions.RaySystemError) as error:

@@ -60,6 +60,10 @@ class Workers(Protocol):
     def distributed(self) -> bool:
         """Whether tasks run in other processes."""
 
+    @property
+    def metrics(self) -> dict[str, float]:
+        """What progress tells of them: the number of tasks that run at a time, as "workers"."""
+
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
     ) -> Iterator[Outcome]:
@@ -80,6 +84,11 @@ class InProcess:
     """The engine without workers: one task after the other."""
 
     distributed = False
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """See `Workers.metrics`."""
+        return {}
 
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE

@@ -226,7 +226,7 @@ def average_features(
             if columns.start == 0:
                 totals += weights.to(sums.device)
             done += views
-            listener(Event("average", done, len(ranges) * len(names)))
+            listener(Event("average", done, len(ranges) * len(names), workers.metrics))
         for start in range(0, count, ROWS):
             rows = slice(start, start + ROWS)
             mean = sums[rows] / totals[rows, None].clamp_min(1e-12)
