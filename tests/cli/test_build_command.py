@@ -103,3 +103,20 @@ def test_a_second_process_on_one_output_folder_is_refused(tiny_capture, tmp_path
         for arguments in (["poses", str(tiny_capture / "images")], ["build", str(tiny_capture), *QUICK]):
             arguments += ["--output", str(tmp_path / "out")]
             fails_in_one_line(capsys, arguments, f"process {os.getpid()} at work", "another --output")
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("build", ["--test-views", "a.png"]),
+        ("language", ["--splats", "x.ply"]),
+        ("language", ["--test-views", "a"]),
+    ],
+)
+def test_options_of_one_capture_are_refused_for_several_as_wrong_usage(command, option, capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([command, "room", "hall", "--output", str(tmp_path / "scenes"), *option])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.strip() == (
+        "error: --test-views and --splats belong to one CAPTURE: build the scenes one by one"
+    )

@@ -45,6 +45,11 @@ class Build:
     unused: ClassVar[tuple[str, ...]] = ("keep_floaters",)
     until: ClassVar[Literal["reconstruct", "language"]] = "language"
 
+    def check(self) -> None:
+        """Refuse invalid options."""
+        if self.more and (self.test_views or getattr(self, "splats", None) is not None):
+            raise ValueError("--test-views and --splats belong to one CAPTURE: build the scenes one by one")
+
     def run(self) -> None:
         """Build up to the last stage of this command."""
         from lexsplat.cli.progress import shown_progress
@@ -78,8 +83,6 @@ class Build:
         from lexsplat.pipeline.distribution import build_scenes, scene_tasks
         from lexsplat.runtime.workers import open_workers
 
-        if self.test_views or getattr(self, "splats", None) is not None:
-            raise ValueError("--test-views and --splats belong to one CAPTURE: build the scenes one by one")
         sources = dict(capture_and_settings(name, self.settings) for name in (self.capture, *self.more))
         tasks = scene_tasks(sources, self.output, self.until)
         failed = 0
@@ -139,6 +142,7 @@ class Language(Build):
 
     def check(self) -> None:
         """Refuse invalid options."""
+        super().check()
         if self.splats is not None and self.settings.spelled_out().joint:
             raise ValueError("joint training makes its own Gaussians: give --splats or --joint, not both")
         if self.splats is None and not self.capture:
