@@ -4,8 +4,8 @@ python tools/demo_scene/street.py output/street
 python benchmarks/blocks.py output/street --blocks 9 --iterations 2560 --max-gaussians 12000 --save output/nine.ply
 
 Every eighth view is held out. The memory is the peak of the process less what it has after a tiny reconstruction, so
-without libraries and compiled kernels. ``--pictures FOLDER`` writes photo and rendering, side by side, of held-out
-views that show a seam.
+without libraries and compiled kernels. ``--pictures FOLDER`` writes held-out views that show a seam: the photo, the
+rendering, and the rendering in the colors of the cells, side by side.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from PIL import Image
 from lexsplat.captures import Capture, View, load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.evaluation.memory import forget_peak_memory, peak_memory
-from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.geometry.world import World
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
@@ -74,10 +74,7 @@ def main() -> None:
         given.save.parent.mkdir(parents=True, exist_ok=True)
         write_ply(gaussians, given.save)
     if given.pictures is not None:
-        given.pictures.mkdir(parents=True, exist_ok=True)
-        for view in _views_of_seams(capture, points, max(9, given.blocks)):
-            pair = np.concatenate([view.load_image(), _image(gaussians, view)], 1)
-            Image.fromarray(np.round(255 * pair).astype(np.uint8)).save(given.pictures / f"{view.stem}.png")
+        _write_pictures(gaussians, capture, points, given.blocks if given.blocks > 1 else 9, given.pictures)
     json.dump(result, sys.stdout)
     print()
 
@@ -91,15 +88,24 @@ def _psnr(gaussians: Gaussians, view: View) -> float:
     return -10 * float(np.log10(np.mean((_image(gaussians, view) - view.load_image()) ** 2)))
 
 
-def _views_of_seams(capture: Capture, points: InitialPoints, count: int, views: int = 4) -> list[View]:
-    """The held-out views in which the points of two cells are most nearly equal in number."""
+def _write_pictures(
+    gaussians: Gaussians, capture: Capture, points: InitialPoints, count: int, folder: Path
+) -> None:
+    """Write the four held-out views in which the points of two cells are most nearly equal in number."""
+    folder.mkdir(parents=True, exist_ok=True)
     axes = ground_axes(World.of_cameras(view.camera for view in capture.train_views).up)
     cut = cut_blocks(capture, points.points, axes, count)
+    colors = np.random.default_rng(0).permuted(np.linspace(0.1, 0.9, 3 * count).reshape(count, 3), axis=0)
+    of_cells = torch.from_numpy(colors[cut.cells_of(gaussians.means.numpy())]).float()[:, None]
+    painted = replace(gaussians, sh0=(of_cells - 0.5) / SH_C0, shN=torch.zeros_like(gaussians.shN))
 
     def second(view: View) -> float:
         return float(np.sort(cut.shares(view, points.points))[-2])
 
-    return sorted(capture.test_views, key=second)[-views:]
+    for view in sorted(capture.test_views, key=second)[-4:]:
+        images = [view.load_image(), _image(gaussians, view), _image(painted, view)]
+        picture = np.round(255 * np.concatenate(images, 1)).astype(np.uint8)
+        Image.fromarray(picture).save(folder / f"{view.stem}.png")
 
 
 if __name__ == "__main__":
