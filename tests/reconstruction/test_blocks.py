@@ -27,7 +27,7 @@ from lexsplat.reconstruction.blocks import (
     side_by_side,
 )
 from lexsplat.reconstruction.settings import ReconstructionConfig
-from lexsplat.reconstruction.surroundings import Surroundings, shares_in_image, sizes_in_view
+from lexsplat.reconstruction.surroundings import Surroundings, shares_in_images, sizes_in_images
 from lexsplat.runtime.errors import CaptureError, MemoryBudgetError, WorkersError
 from lexsplat.runtime.workers import open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -194,7 +194,7 @@ def test_gaussians_that_reach_into_an_image_have_a_size_in_it(capture):
     surface = np.random.default_rng(1).normal(size=(2000, 3))
     surface /= np.linalg.norm(surface, axis=1, keepdims=True)
     radius = 0.7
-    found = sizes_in_view(camera, places, np.full(500, radius / 3, np.float32)) > 0
+    found = sizes_in_images([camera], places, np.full(500, radius / 3, np.float32))[0] > 0
     assert 0 < found.sum() < 400
     for center in local[~found]:
         x, y, z = (center + radius * surface).T
@@ -282,7 +282,7 @@ def test_gaussians_are_thinned_by_the_image_and_not_by_the_nearest_view_of_the_v
     # The same by hand: the share of a Gaussian is its area over that of one of SMALL pixels.
     expected = (50 * 0.1 / (places[:, 1] + 40.0) / surroundings.SMALL) ** 2
     extents = np.column_stack([places, np.full((4000, 2), 0.1)]).astype(np.float32)
-    np.testing.assert_allclose(shares_in_image(far, extents), expected, rtol=1e-3)
+    np.testing.assert_allclose(shares_in_images([near, far], extents)[1], expected, rtol=1e-3)
 
 
 def test_blocks_that_no_view_sees_are_refused(capture):

@@ -25,6 +25,7 @@ class TwoNodes:
         from ray.cluster_utils import Cluster
 
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+        os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 - workers would wait for all else on this machine
         paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))  # workers read the tasks of this file
         head = {"num_cpus": 0, "object_store_memory": STORE_BYTES, "include_dashboard": False}

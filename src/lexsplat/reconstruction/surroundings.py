@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 SMALL = 2.0
 """Geometric mean of the two largest standard deviations in pixels below which a Gaussian takes part by chance."""
 
+_AT_ONCE = 1 << 16
+"""Pairs of a Gaussian and an image that are looked at together, which bounds the memory."""
+
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -47,7 +50,10 @@ class Surroundings:
         for cell in cells:
             own = extents_of(cell)
             drawn = rng.random(len(cell), np.float32)
-            taking = np.any([drawn < shares_in_image(camera, own) for camera in cameras], axis=0)
+            rows = max(1, _AT_ONCE // len(cameras))
+            starts = range(0, len(cell), rows)
+            largest = [shares_in_images(cameras, own[start : start + rows]).max(0) for start in starts]
+            taking = drawn < np.concatenate([np.zeros(0, np.float32), *largest])
             parts.append(cell.select(torch.from_numpy(np.flatnonzero(taking))))
             extents.append(own[taking])
             draws.append(drawn[taking])
@@ -62,7 +68,7 @@ class Surroundings:
 
     def in_image(self, camera: Camera) -> Gaussians:
         """Those that take part in an image, each enlarged to the area of all that it stands for."""
-        shares = shares_in_image(camera, self.extents)
+        shares = shares_in_images([camera], self.extents)[0]
         taking = np.flatnonzero(self.draws < shares)
         part = self.gaussians.select(torch.from_numpy(taking).to(self.gaussians.device))
         kept = torch.from_numpy(shares[taking]).to(part.device)
@@ -75,27 +81,31 @@ def extents_of(gaussians: Gaussians) -> NDArray[np.float32]:
     return torch.cat([gaussians.means, sizes], 1).numpy()
 
 
-def shares_in_image(camera: Camera, extents: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Chance ``[N]`` of Gaussians to take part in an image: their area over that of `SMALL`, at most 1; 0 outside."""
+def shares_in_images(cameras: Sequence[Camera], extents: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Chance ``[C, N]`` of Gaussians to take part in images: their area over that of `SMALL`, at most 1."""
     longest, middle = extents[:, 3], extents[:, 4]
-    sizes = sizes_in_view(camera, extents[:, :3], longest)
-    return np.minimum(1.0, sizes**2 * (middle / longest) / SMALL**2, dtype=np.float32)
+    sizes = sizes_in_images(cameras, extents[:, :3], longest)
+    return np.minimum(1.0, sizes**2 * (middle / longest / SMALL**2), dtype=np.float32)
 
 
-def sizes_in_view(
-    camera: Camera, centers: NDArray[np.floating], deviations: NDArray[np.floating]
-) -> NDArray[np.floating]:
-    """Standard deviations ``[N]`` in pixels of Gaussians in the image of a camera; 0 outside of it.
+def sizes_in_images(
+    cameras: Sequence[Camera], centers: NDArray[np.float32], deviations: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Standard deviations ``[C, N]`` in pixels of Gaussians in the images of cameras; 0 outside of them.
 
     They reach three deviations far. Some that are just outside are counted too.
     """
-    local = centers @ camera.viewmat[:3, :3].T.astype(np.float32) + camera.viewmat[:3, 3].astype(np.float32)
-    depth, radii = np.maximum(local[:, 2], 1e-3), 3 * deviations
-    found = local[:, 2] > -radii
-    for axis, size in enumerate((camera.width, camera.height)):
-        focal, middle = camera.K[axis, axis], camera.K[axis, 2]
-        place = focal * local[:, axis] / depth + middle
+    viewmats = np.array([camera.viewmat for camera in cameras], np.float32)
+    intrinsics = np.array([camera.K for camera in cameras], np.float32)
+    local = centers @ viewmats[:, :3, :3].transpose(0, 2, 1) + viewmats[:, None, :3, 3]
+    depth, radii = np.maximum(local[..., 2], 1e-3), 3 * deviations
+    found = local[..., 2] > -radii
+    for axis in range(2):
+        focal, middle = intrinsics[:, axis, axis, None], intrinsics[:, axis, 2, None]
+        ends = np.array([(camera.width, camera.height)[axis] for camera in cameras], np.float32)[:, None]
+        place = focal * local[..., axis] / depth + middle
         reach = 1.5 * focal * radii / depth + 2
-        found &= (place > -reach) & (place < size + reach)
-    found |= np.linalg.norm(local, axis=1) < radii
-    return np.where(found, max(camera.K[0, 0], camera.K[1, 1]) * deviations / depth, 0.0)
+        found &= (place > -reach) & (place < ends + reach)
+    found |= np.square(local).sum(-1) < radii**2
+    focal = intrinsics[:, (0, 1), (0, 1)].max(1)[:, None]
+    return np.where(found, focal * deviations / depth, np.float32(0))
