@@ -102,6 +102,12 @@ def test_another_version_of_ray_is_told_with_the_remedy():
     )
 
 
+def test_a_cluster_that_answers_and_lets_nobody_in_may_want_a_token():
+    found = RuntimeError("Failed to connect to Ray cluster at head:6379")
+    assert "RAY_AUTH_MODE=token" in str(ray_workers._unreachable("head:6379", found, answers=True))
+    assert "RAY_AUTH_MODE" not in str(ray_workers._unreachable("head:6379", found))
+
+
 @pytest.mark.slow
 def test_two_nodes_give_the_bits_of_this_process_in_order(on_ray):
     np.testing.assert_array_equal(total(on_ray), total(IN_PROCESS))

@@ -24,6 +24,7 @@ RETRIES = 20
 """Times that a task is done again after its worker or node was lost."""
 
 _PROBE_SECONDS = 120.0
+_TOKEN = "; if the cluster was started with a token, set RAY_AUTH_MODE=token and copy ~/.ray/auth_token from its head"
 _WAIT_SECONDS = 5.0
 _HEAD_TRIES = 4
 _CORES_SECONDS = 30.0
@@ -55,17 +56,19 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
         ) from error
     place = address or os.environ.get("RAY_ADDRESS") or "local"
     host, _, port = place.removeprefix("ray://").rpartition(":")
+    answers = False
     if host and port.isdigit():  # Ray tries for a minute where nothing listens
         try:
             socket.create_connection((host, int(port)), timeout=_WAIT_SECONDS).close()
         except OSError as error:
             raise _unreachable(place, error) from error
+        answers = True
     try:
         quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
         own: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
         ray.init(address=place, **quiet, **own)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
-        raise _unreachable(place, error) from error
+        raise _unreachable(place, error, answers=answers) from error
     lost = False
     try:
         _check_nodes(paths)
@@ -288,7 +291,8 @@ def _check_probe(node: str, found: str, code: str, missing: list[str]) -> None:
         )
 
 
-def _unreachable(place: str, error: Exception) -> WorkersError:
+def _unreachable(place: str, error: Exception, *, answers: bool = False) -> WorkersError:
+    """The error to tell; ``answers`` if something listens at the address, so that a token may be missing."""
     reason = " ".join(str(error).split())[:200]
     if "ersion mismatch" in reason:
         remedy = "use the same versions of Ray and Python on every machine"
@@ -300,7 +304,7 @@ def _unreachable(place: str, error: Exception) -> WorkersError:
         f"Ray at {place}",
         expected="a running cluster",
         found=reason or type(error).__name__,
-        remedy="check the address and: ray status",
+        remedy="check the address and: ray status" + (_TOKEN if answers else ""),
     )
 
 
