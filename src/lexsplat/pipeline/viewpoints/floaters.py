@@ -167,7 +167,7 @@ def _spread(gaussians: Gaussians) -> NDArray[np.float64]:
 def _gaps(
     gaussians: Gaussians, camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How far the surface of a view lies behind points ``[..., 3]``, relative to their depths, and the latter ``[...]``.
+    """How far the surface of a view lies behind points ``[..., 3]``, in parts of their depths, and these ``[...]``.
 
     NaN stands for points outside of the view and for pixels that are not opaque.
     """
