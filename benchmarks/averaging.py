@@ -6,9 +6,9 @@
 
 The stage is all of method "averaged": averaging, codebook and segments. The room has no mip filter, like splats of
 other programs: its views are rendered at full size. Its features are random; the time of averaging does not depend
-on their values. `sparse` is the program, `dense` the same with `DenseCellWeights`, the path of CUDA, and torch on all threads,
-as before the sparse path. Sparse runs
-first; `peak` is the peak memory of the process after its first run. "CPU s" is processor time of all threads.
+on their values. `sparse` is the program, `dense` the same with `DenseCellWeights`, the path of CUDA, with torch on
+all threads, as it was before the sparse path. Sparse runs first; `peak` is the peak memory of the process after its
+first run. "CPU s" is processor time of all threads.
 """
 
 from __future__ import annotations
