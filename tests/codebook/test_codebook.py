@@ -25,6 +25,7 @@ from lexsplat.codebook import (
     similarity,
     spherical_kmeans,
 )
+from lexsplat.codebook.fitting import _kmeans_seeds
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -226,6 +227,22 @@ def test_kmeans_never_raises_the_cosine_loss() -> None:
         losses.append(1.5 - float(book.similarity(clip, dino).max(-1).values.mean()))  # Eq. 5
     assert losses[0] > losses[-1]
     assert all(later <= earlier + 1e-6 for earlier, later in itertools.pairwise(losses))
+
+
+@pytest.mark.parametrize("noise", [1.0, 0.1])
+def test_kmeans_seeds_are_those_of_a_comparison_with_every_feature(noise):
+    """The same draws with squared distances in float64; clustered features are compared with few seeds."""
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(40, 16))[rng.integers(0, 40, 3000)] + noise * rng.normal(size=(3000, 16))
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    found = _kmeans_seeds(torch.from_numpy(features).float(), 64, torch.Generator().manual_seed(5)).tolist()
+    generator = torch.Generator().manual_seed(5)
+    expected, nearest = [int(torch.randint(3000, (1,), generator=generator))], np.inf
+    while len(expected) < 64:
+        nearest = np.minimum(nearest, ((features - features[expected[-1]]) ** 2).sum(1))
+        draw = float(torch.rand(1, generator=generator, dtype=torch.float64)) * nearest.sum()
+        expected.append(int(np.searchsorted(np.cumsum(nearest), draw, side="right")))
+    assert found == expected
 
 
 def test_kmeans_survives_fewer_features_than_codes() -> None:

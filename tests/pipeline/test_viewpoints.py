@@ -204,10 +204,10 @@ def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the
     """Both are within four of their radii from their neighbors, so distances alone do not tell them apart."""
     clean, dust = dusty()
     rng = np.random.default_rng(5)
-    above = solid(rng.uniform([-1, -1, 0.9], [1, 1, 1.2], (12, 3)))
+    above = solid(rng.uniform([-1, -1, 1.0], [1, 1, 1.4], (12, 3)))
     around = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     wall = solid(np.stack([9 * np.cos(around), 9 * np.sin(around), np.full(30, 0.5)], 1))
-    above.log_scales[:], wall.log_scales[:] = np.log(0.35), np.log(1.5)
+    above.log_scales[:], wall.log_scales[:] = np.log(0.25), np.log(1.5)
     scene = joined(clean, dust, above, wall)
     first = len(clean) + len(dust)
     own = isolation(scene)[1]
@@ -216,6 +216,23 @@ def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the
     assert np.isin(np.arange(first, first + 12), floating).mean() > 0.8
     assert not np.isin(np.arange(first + 12, len(scene)), floating).any()
     assert (floating >= len(clean)).all()
+
+
+def test_floaters_larger_than_the_things_they_engulf_are_found():
+    """Surfaces lie before, on and behind them. Plates under a fine pattern have near neighbors, too, and stay."""
+    clean, dust = dusty()
+    giants = solid(np.array([[-0.6, -0.6, 1.3], [0.5, -1.0, 0.9], [1.2, -0.5, 0.8], [-0.2, 1.2, 1.1]]))
+    giants.log_scales[:] = torch.log(torch.tensor([[1.2], [0.6], [0.4], [0.9]]))
+    plates = solid(np.array([[-0.8, -0.8, 0.0], [0.9, -0.9, 0.0]]))
+    plates.log_scales[:] = torch.log(torch.tensor([0.4, 0.4, 0.002]))
+    plates.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    scene = joined(clean, plates, dust, giants)
+    own = isolation(scene)[1]
+    assert (own[len(clean) : len(clean) + 2] < 0.8).all()
+    assert (own[-4:] < 2).all()
+    floating = find_floaters(scene, Path("dusty.ply"))
+    assert np.isin(np.arange(len(scene) - 4, len(scene)), floating).all()
+    assert (floating >= len(clean) + 2).all()
 
 
 @pytest.mark.slow

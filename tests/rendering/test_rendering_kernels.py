@@ -21,6 +21,7 @@ from lexsplat.geometry.cameras import look_at
 from lexsplat.rendering import Projection, cpu_backend, pairs, render
 from lexsplat.rendering.kernels import binning, blending, gradients, lanes
 from lexsplat.rendering.kernels.jit import parallel
+from lexsplat.runtime.device import kernel_threads, threads_for_kernels
 
 pytestmark = pytest.mark.slow
 
@@ -296,6 +297,15 @@ def test_a_tile_is_finished_when_its_last_pixel_is():
 
 
 # ----------------------------------------------------------------------------------------------- threads and cache
+
+
+def test_kernels_keep_their_threads_where_torch_has_one():
+    before = torch.get_num_threads()
+    with threads_for_kernels():
+        assert (torch.get_num_threads(), kernel_threads()) == (1, before)
+        with threads_for_kernels():
+            assert kernel_threads() == before
+    assert torch.get_num_threads() == kernel_threads() == before
 
 
 def test_parallel_processes_every_item_once_and_propagates_errors():

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 _SMALL_BLOCK = 1024
 """Features handled at a time if several copies of them are held."""
+_SLACK, _ROUNDING = 1 - 1e-5, 1e-5
+"""Of squared distances that are compared: single precision."""
 
 
 @one_thread()
@@ -231,20 +233,36 @@ def _uniform_codes(features: Tensor, num_codes: int, generator: torch.Generator)
 
 
 def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
-    """k-means++ seeds: each is drawn in proportion to the squared distance to the nearest earlier seed."""
+    """k-means++ seeds: each is drawn in proportion to the squared distance to the nearest earlier seed.
+
+    Only those features are compared with a new seed that it may be nearer to than their own seed: by the triangle
+    inequality, those more than half as far from their seed as that is from the new one.
+    """
     count = len(joint)
     seeds = [int(torch.randint(count, (1,), generator=generator))]
     blocks = (joint[i : i + _SMALL_BLOCK] for i in range(0, count, _SMALL_BLOCK))
     norms = torch.cat([block.square().sum(-1) for block in blocks])
     nearest = torch.full((count,), torch.inf, device=joint.device)
-    for _ in range(1, num_codes):
-        seed = joint[seeds[-1]]
-        squared = (norms + seed.square().sum() - 2 * (joint @ seed)).clamp_min(0)
-        nearest = torch.minimum(nearest, squared)
-        cumulative = nearest.double().cumsum(0)
+    owners = torch.zeros(count, dtype=torch.long, device=joint.device)
+    for number in range(num_codes - 1):
+        latest = seeds[-1]
+        apart = _squared_distances(joint, norms, torch.tensor(seeds, device=joint.device), latest)
+        near = (apart[owners] * _SLACK <= 4 * nearest + _ROUNDING).nonzero()[:, 0]
+        squared = _squared_distances(joint, norms, near, latest)
+        nearer = squared < nearest[near]
+        near = near[nearer]
+        nearest[near], owners[near] = squared[nearer], number
+        cumulative = nearest.cumsum(0, dtype=torch.float64)
         draw = torch.rand(1, generator=generator, dtype=torch.float64).to(joint.device) * cumulative[-1]
         seeds.append(min(int(torch.searchsorted(cumulative, draw, right=True)), count - 1))
     return torch.tensor(seeds, device=joint.device)
+
+
+def _squared_distances(joint: Tensor, norms: Tensor, rows: Tensor, other: int) -> Tensor:
+    """Squared distances of some features to one of them, from the squared lengths of all."""
+    many = len(rows) > len(joint) // 2  # then copies take longer than products
+    products = (joint @ joint[other])[rows] if many else joint[rows] @ joint[other]
+    return (norms[rows] + norms[other] - 2 * products).clamp_min_(0)
 
 
 def _nearest(joint: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:

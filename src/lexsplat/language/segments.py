@@ -144,9 +144,9 @@ def _links(means: FloatArray, neighbors: int) -> tuple[IntArray, IntArray]:
 
     count = len(means)
     _, found = cKDTree(means).query(means, k=neighbors + 1)
-    pairs = np.stack([np.repeat(np.arange(count), neighbors + 1), found.ravel().astype(np.int64)])
-    pairs = np.sort(pairs[:, pairs[0] != pairs[1]], axis=0)
-    keys = np.unique(pairs[0] * count + pairs[1])
+    own = np.arange(count)[:, None]
+    keys = np.sort((np.minimum(own, found) * count + np.maximum(own, found))[own != found])
+    keys = keys[np.diff(keys, prepend=-1) > 0]
     return keys // count, keys % count
 
 

@@ -51,13 +51,13 @@ class SparseCellWeights:
         """
         block = cell_weights.CHANNEL_BLOCK
         channels = values.shape[1]
-        padded = np.zeros((len(values), -(-channels // block) * block), np.float32)
-        padded[:, :channels] = values.numpy()
+        padded = torch.zeros(len(values), -(-channels // block) * block)
+        padded[:, :channels] = values
         t = self.tiles
         parallel(
             cell_weights.add_cells, t.tiles, TILE_GRAIN,
             t.order, t.tile_offsets, t.members, t.pairs, t.pair_offsets,
-            self.first_entries, self.entry_counts, self.cells, self.weights, padded, sums.numpy(),
+            self.first_entries, self.entry_counts, self.cells, self.weights, padded.numpy(), sums.numpy(),
         )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from contextvars import ContextVar
 
 import torch
 
@@ -23,6 +24,29 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+_kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=None)
+
+
+@contextlib.contextmanager
+def threads_for_kernels() -> Iterator[None]:
+    """Run torch on one thread inside the block, and compiled kernels on as many as torch used before.
+
+    The threads of torch wait by spinning. Where its operations take less than a millisecond, as those between the
+    kernels of a view do, that costs more processor time than they.
+    """
+    token = _kernel_threads.set(kernel_threads())
+    try:
+        with one_thread():
+            yield
+    finally:
+        _kernel_threads.reset(token)
+
+
+def kernel_threads() -> int:
+    """Number of threads on which a compiled kernel runs."""
+    return _kernel_threads.get() or torch.get_num_threads()
 
 
 def choose_device(wanted: str) -> str:

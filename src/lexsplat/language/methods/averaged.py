@@ -39,7 +39,7 @@ from lexsplat.language.segments import make_segments
 from lexsplat.rendering import BACK_PROJECTED_CHANNELS, prepare, weigh_cells
 from lexsplat.rendering.back_projection import CellWeights, cell_of
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.device import one_thread
+from lexsplat.runtime.device import one_thread, threads_for_kernels
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Needs, Workers, results
 
@@ -168,7 +168,8 @@ class Averaged:
         if config.averaged.segments:
             run.listener(Event("segments", 0, 1))
             shown = found.totals * found.visible(config.averaged)  # selections leave out what has no mass
-            field.segments = make_segments(gaussians, found.rows, shown)
+            with one_thread():
+                field.segments = make_segments(gaussians, found.rows, shown)
             run.listener(Event("segments", 1, 1))
         return field
 
@@ -255,6 +256,7 @@ def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
     return [tuple(names[start : start + size]) for start in range(0, len(names), size)]
 
 
+@threads_for_kernels()
 def _shard_sums(shared: _Averaging, item: tuple[tuple[str, ...], range, int]) -> tuple[Tensor, Tensor, int]:
     """The sums of some views over a range of dimensions ``[N, len(columns)]``, of weights ``[N]``, and the views."""
     names, columns, dimensions = item
@@ -401,12 +403,17 @@ def _cell_weights(
     share = cells[0] * cells[1] / (camera.height * camera.width)
     rows = cell_of(np.arange(camera.height), camera.height, cells[0])
     columns = cell_of(np.arange(camera.width), camera.width, cells[1])
-    # NumPy, because torch would start its threads for a millisecond's work.
-    known: NDArray[np.bool_] = np.any(features.numpy(), axis=-1, keepdims=True)[..., 0]
+    known = _any_nonzero(features.numpy())
     counts = known[rows[:, None], columns].astype(np.float32) * np.float32(share)
     if counting is not None:
         counts *= counting
     return weigh_cells(gaussians, camera, cells, torch.from_numpy(counts), prepare(gaussians, camera))
+
+
+def _any_nonzero(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which rows ``[..., C]`` have a number but 0, by their bits without the sign: NumPy is slow at halves."""
+    bits = values.view(f"u{values.itemsize}")
+    return np.asarray(np.bitwise_or.reduce(bits, axis=-1) << 1 != 0)
 
 
 def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragedConfig) -> Camera:

@@ -1,7 +1,9 @@
 """Gaussians that float free of all surfaces: where they are many, a scene without a capture leaves them out.
 
 Small floaters are far from everything. Large ones are as near to others as the large Gaussians of walls are. What
-tells them apart is that surfaces are seen behind floaters, and nothing is seen behind walls.
+tells them apart is that surfaces are seen behind floaters, and nothing is seen behind walls. The largest engulf parts
+of the scene, so surfaces lie before, on and behind them; what belongs to the scene and has details within its own
+radius, such as a table top with a pattern, lies on surfaces everywhere.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.pipeline.viewpoints.candidates import around
 from lexsplat.pipeline.viewpoints.looking import SMALL, draw_depth, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import find_surroundings
@@ -33,12 +36,22 @@ _CERTAIN = 6.0
 """The same for floaters that are counted to decide whether there are many."""
 _MANY = 0.04
 """Share of certain floaters above which they are left out: captures of things have 0.01 to 0.02."""
-_VIEWS = 300
-"""Number of views, at most, in which large floaters are looked for."""
-_IN_FRONT = 0.8
-"""A large floater is in front of surfaces in this share of the views that show it in front of or on one."""
-_SAME_DEPTH = 0.05
-"""Difference of depth, relative to depth, within which a Gaussian lies on a surface, if it is smaller than that."""
+_ENGULFING = 0.8
+"""Gaussians are looked at, too, if neighbors are nearer than this many of their middle radii: 1 % of a scene."""
+_VIEWS = 100
+"""Number of views, at most, in which large floaters are looked for,"""
+_ROUNDS = 3
+"""again and again without those that were found, which hid others, at most this many times."""
+_PARTS = 4
+"""Suspects are looked for in as many parts, each before the other ones: a wall is made of suspects."""
+_IN_FRONT = 0.5
+"""A large floater is in front of surfaces in this share of what shows it in front of or on one,"""
+_PIERCED = 0.2
+"""and one that engulfs others, in this share: surfaces pierce it."""
+_LEAST = 2
+"""Least number of points, over all views, at which a floater is in front of a surface."""
+_SAME_DEPTH = (0.05, 0.2)
+"""A point lies on a surface within its Gaussian's middle radius, at least and at most these parts of its depth."""
 
 
 @torch.no_grad()
@@ -61,10 +74,13 @@ def find_floaters(
     if float((alone > _CERTAIN).mean()) < _MANY:
         return np.zeros(0, np.int64)
     floating = alone > _ISOLATED
-    suspects = np.flatnonzero((relative > _ISOLATED) & ~floating)
-    solid = np.flatnonzero(relative <= _ISOLATED)
     with contextlib.suppress(CaptureError):  # no surfaces: the choice of views refuses such splats
-        floating[suspects] = _before_surfaces(gaussians, suspects, solid, up, seed)
+        for _ in range(_ROUNDS):
+            kept = np.flatnonzero(~floating)
+            found = _before_surfaces(_select(gaussians, kept), up, seed)
+            floating[kept[found]] = True
+            if not len(found):
+                break
     log.warning(
         "%s: %d of %d Gaussians float free of all surfaces and are left out; --keep-floaters keeps them",
         subject,
@@ -96,51 +112,72 @@ def _middle_radii(gaussians: Gaussians) -> NDArray[np.float64]:
     return np.asarray(np.sort(gaussians.scales.detach().cpu().double().numpy(), axis=1)[:, 1])
 
 
-def _before_surfaces(
-    gaussians: Gaussians,
-    suspects: NDArray[np.int64],
-    solid: NDArray[np.int64],
-    up: NDArray[np.float64] | None,
-    seed: int,
-) -> NDArray[np.bool_]:
-    """Whether each suspect hangs in front of what the solid Gaussians show, in most views that tell.
+def _before_surfaces(gaussians: Gaussians, up: NDArray[np.float64] | None, seed: int) -> NDArray[np.int64]:
+    """Indices of the large Gaussians that hang in front of surfaces, or engulf them.
 
     Raises:
-        CaptureError: If the solid Gaussians form no surfaces.
+        CaptureError: If the other Gaussians form no surfaces.
     """
-    rest = gaussians.select(torch.from_numpy(solid).to(gaussians.device))
-    found = find_surroundings(rest, up, look_from_above(rest), Path(), seed, warn=False)
+    relative, own = isolation(gaussians)
+    suspected = (relative > _ISOLATED) | (own < _ENGULFING)
+    suspects, solid = np.flatnonzero(suspected), np.flatnonzero(~suspected)
+    generator = np.random.default_rng(seed)
+    parts = generator.integers(0, _PARTS, len(suspects))
+    rest = [_select(gaussians, np.r_[solid, suspects[parts != part]]) for part in range(_PARTS)]
+    points, radii = _spread(_select(gaussians, suspects)), _middle_radii(gaussians)[suspects]
+    engulfing = own[suspects] < _ENGULFING
+    before, on = (np.zeros(len(suspects), np.int64) for _ in range(2))
+    for camera in _cameras(_select(gaussians, solid), up, seed, generator):
+        for part in range(_PARTS):
+            members = np.flatnonzero(parts == part)
+            gaps, depths = _gaps(rest[part], camera, points[members])
+            margins = np.clip(np.where(engulfing, 0, radii)[members, None] / depths, *_SAME_DEPTH)
+            before[members] += (gaps > margins).sum(1)
+            on[members] += (np.abs(gaps) <= margins).sum(1)
+    least = np.where(engulfing, _PIERCED, _IN_FRONT)
+    return suspects[(before >= _LEAST) & (before >= least * (before + on))]
+
+
+def _select(gaussians: Gaussians, indices: NDArray[np.int64]) -> Gaussians:
+    return gaussians.select(torch.from_numpy(indices).to(gaussians.device))
+
+
+def _cameras(
+    solid: Gaussians, up: NDArray[np.float64] | None, seed: int, generator: np.random.Generator
+) -> list[Camera]:
+    """Views around the scene that the solid Gaussians form."""
+    found = find_surroundings(solid, up, look_from_above(solid), Path(), seed, warn=False)
     cameras = [camera for camera, _ in around(found, SMALL)]
     if len(cameras) > _VIEWS:
-        chosen = np.random.default_rng(seed).choice(len(cameras), _VIEWS, replace=False)
+        chosen = generator.choice(len(cameras), _VIEWS, replace=False)
         cameras = [cameras[index] for index in np.sort(chosen)]
-    points = gaussians.means.detach().cpu().double().numpy()[suspects]
-    radii = _middle_radii(gaussians)[suspects]
-    before, on = (np.zeros(len(suspects), np.int64) for _ in range(2))
-    for camera in cameras:
-        gaps, depths = _gaps(rest, camera, points)
-        margin = np.maximum(radii, _SAME_DEPTH * depths)
-        before += gaps > margin
-        on += np.abs(gaps) <= margin
-    return np.asarray((before > 0) & (before >= _IN_FRONT * (before + on)))
+    return cameras
+
+
+def _spread(gaussians: Gaussians) -> NDArray[np.float64]:
+    """The center of each Gaussian, and the ends of its two longest axes ``[N, 5, 3]``."""
+    scales = gaussians.scales.detach().cpu().double()
+    axes = matrices_from_quaternions(gaussians.quats.detach().cpu().double()).mT * scales[..., None]
+    longest = scales.topk(2, dim=1).indices
+    arms = axes.gather(1, longest[..., None].expand(-1, -1, 3))
+    center = gaussians.means.detach().cpu().double()[:, None]
+    return np.asarray(torch.cat([center, center + arms, center - arms], 1).numpy())
 
 
 def _gaps(
     gaussians: Gaussians, camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How far the surface of a view lies behind each point ``[M]``, and the depths of the points ``[M]``.
+    """How far the surface of a view lies behind points ``[..., 3]``, in parts of their depths, and these ``[...]``.
 
     NaN stands for points outside of the view and for pixels that are not opaque.
     """
     surface, _, alpha = draw_depth(gaussians, camera)
     rotated = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depths = rotated[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = rotated @ camera.K.T / depths[:, None]
-    within = (
-        (depths > 0) & (pixels[:, :2] >= 0).all(1) & (pixels[:, :2] < (camera.width, camera.height)).all(1)
-    )
-    columns, rows = pixels[within, :2].astype(int).T
-    gaps = np.full(len(points), np.nan)
-    gaps[within] = np.where(alpha[rows, columns] > 0.8, surface[rows, columns], np.nan) - depths[within]
+    depths = rotated[..., 2]
+    depths = np.where(depths > 0, depths, np.nan)
+    pixels = (rotated @ camera.K.T)[..., :2] / depths[..., None]
+    within = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+    columns, rows = pixels[within].astype(int).T
+    gaps = np.full(depths.shape, np.nan)
+    gaps[within] = np.where(alpha[rows, columns] > 0.8, surface[rows, columns] / depths[within] - 1, np.nan)
     return gaps, depths

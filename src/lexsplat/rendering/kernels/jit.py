@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import torch
 from numba.core import event
 
+from lexsplat.runtime.device import kernel_threads
 from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import NOTE
@@ -108,7 +108,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def parallel(function: Callable[..., Any], count: int, grain: int, *arguments: Any) -> None:
-    """Run ``function(start, stop, *arguments)`` over ``range(count)`` on the number of threads that torch uses.
+    """Run ``function(start, stop, *arguments)`` over ``range(count)`` on the number of threads for kernels.
 
     Args:
         function: A kernel.
@@ -120,7 +120,7 @@ def parallel(function: Callable[..., Any], count: int, grain: int, *arguments: A
     if count <= 0:
         return
     pieces = -(-count // grain)
-    threads = min(torch.get_num_threads(), pieces)
+    threads = min(kernel_threads(), pieces)
     if threads <= 1:
         function(0, count, *arguments)
         return
