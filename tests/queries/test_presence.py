@@ -219,3 +219,44 @@ def test_a_part_is_named_behind_its_thing(phrase, part):
 )  # fmt: skip
 def test_the_thing_of_a_part_is_what_stands_before_it(phrase, thing):
     assert thing_of_part(phrase) == thing
+
+
+@pytest.fixture
+def mug_and_handle():
+    """Codes of the body of a mug, of its handle and of much else; and the embeddings of "mug" and "mug handle"."""
+    axes = torch.eye(12)
+    texts = {"mug": axes[0], "mug handle": unit(axes[0] + 0.8 * axes[1], dim=0)}
+    codewords = torch.stack([axes[0], unit(axes[0] + axes[1], dim=0), *axes[4:12].repeat(4, 1)])
+    words = torch.stack([texts["mug"], *axes[8:12]])
+    made = make_scene(per_ball=100)
+    codes = (torch.arange(500) % len(codewords)).to(torch.uint8)[:, None]
+    field = CodeField(Codebook(codewords, codewords), codes, torch.ones(500, 1), torch.zeros(500))
+
+    def embed(phrases):
+        return torch.stack([texts[phrase] for phrase in phrases])
+
+    scale = EverydayScale.of(codewords, words)
+    return scale, codewords, PresenceClassifier(made.gaussians, field, scale, embed), embed
+
+
+def test_the_body_of_a_mug_is_no_mug_handle(mug_and_handle):
+    scale, codewords, judge, embed = mug_and_handle
+    asked = ["mug handle", "mug"]
+    body, handle = scale.relevancy(codewords, embed(asked), judge.best_heights(asked))[:2]
+    assert body[0] < 0.5 < handle[0]
+    assert handle[1] > 0.5, "the handle belongs to the mug"
+    alone = scale.relevancy(codewords, embed(asked))
+    assert alone[0, 0] > 0.5, "everyday words alone do not tell them apart"
+    assert torch.equal(alone[:, 1], scale.relevancy(codewords, embed(asked), judge.best_heights(asked))[:, 1])
+
+
+def test_a_part_is_compared_with_its_thing_by_shares_of_their_best_heights(mug_and_handle):
+    scale, codewords, judge, embed = mug_and_handle
+    heights = scale.heights(codewords, embed(["mug handle", "mug"])).double()
+    top = heights.topk(1, dim=0).values[0]  # 4 % of 34 codes is one
+    over_thing = (heights[:, 0] / top[0]) / (heights[:, 1].clamp_min(1e-6) / top[1]) / 1.05
+    over_words = heights[:, 0] / scale.best / 0.72
+    own = heights[:, 0] / top[0] / 0.68
+    expected = torch.sigmoid(12 * 0.68 * (torch.stack([over_thing, over_words, own]).amin(0) - 1))
+    found = scale.relevancy(codewords, embed(["mug handle"]), judge.best_heights(["mug handle"]))[:, 0]
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)

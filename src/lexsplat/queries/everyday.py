@@ -15,8 +15,8 @@ text, because most codes do not show it. Two ratios of heights have no unit and 
 
 A code shows what a text names if both ratios exceed `BORDER`. The relevancy is a logistic function of the lesser one,
 0.5 at the border. Everyday words name no color: "green apple" may exceed them all at a green bowl, where "green bowl"
-describes more. So a thing with a color is also compared with the scene's objects in any color. Presence
-(`lexsplat.queries.presence`) reads the same heights.
+describes more. So a thing with a color is also compared with the scene's objects in any color, and a part with its
+thing. Presence (`lexsplat.queries.presence`) reads the same heights.
 
 The constants were chosen on the second bundled scene with the bundled encoder and three encoders of
 ``benchmarks/web_like.py`` together (docs/selection.md). None depends on the encoder.
@@ -75,10 +75,10 @@ class EverydayScale:
         words = torch.nn.functional.normalize(words.to(codewords.device, torch.float32), dim=-1)
         mean = words.mean(0)
         heights = _heights(codewords, words, mean)
-        peaks = _peaks(heights)
-        count = min(_BEST_WORDS, len(peaks))
+        reached = peaks(heights)
+        count = min(_BEST_WORDS, len(reached))
         return cls(
-            mean, heights.amax(1).clamp_min(_LEAST), max(float(peaks.topk(count).values.mean()), _LEAST)
+            mean, heights.amax(1).clamp_min(_LEAST), max(float(reached.topk(count).values.mean()), _LEAST)
         )
 
     def heights(self, codewords: Tensor, texts: Tensor) -> Tensor:
@@ -95,7 +95,7 @@ class EverydayScale:
                 of everyday words (`lexsplat.queries.presence.PresenceClassifier.best_heights` has others).
         """
         heights = self.heights(codewords, texts)
-        own = heights / _peaks(heights).clamp_min(_LEAST)
+        own = heights / peaks(heights).clamp_min(_LEAST)
         ratio = torch.minimum(own, heights / (self.best[:, None] if best is None else best))
         return torch.sigmoid(STEEPNESS * (ratio - BORDER))
 
@@ -106,6 +106,7 @@ def _heights(codewords: Tensor, texts: Tensor, mean: Tensor) -> Tensor:
     return shared - shared.quantile(OFFSET, dim=0)
 
 
-def _peaks(heights: Tensor) -> Tensor:
+def peaks(heights: Tensor) -> Tensor:
+    """The best height ``[P]`` of texts, from their heights at the codes ``[K, P]``."""
     count = max(1, round(PEAK_SHARE * len(heights)))
     return heights.topk(count, dim=0).values.mean(0)

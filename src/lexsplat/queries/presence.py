@@ -31,7 +31,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segment_codes import SegmentCodes, codes_of_field
-from lexsplat.queries.everyday import EverydayScale, everyday_words
+from lexsplat.queries.everyday import BORDER, EverydayScale, everyday_words, peaks
 from lexsplat.queries.objects import FITS, whole_segments
 from lexsplat.queries.selection import Presence
 from lexsplat.queries.vocabulary import COLORS, has_color, is_part, thing_of_part
@@ -44,6 +44,11 @@ name with most of what they are confused with; and for parts where their thing i
 scene, with the bundled encoder and three of ``benchmarks/web_like.py``."""
 AT_THING = 0.3
 """Strength of its thing at a place that may be a part of it."""
+
+BORDER_PART, OVER_THING = 0.72, 1.05
+"""Ratios of heights at which the relevancy of a part is 0.5, instead of `BORDER`: over everyday words, and over its
+thing. Chosen on the second scene with the bundled encoder, two ways to crop and three codebooks, and checked with six
+encoders of ``benchmarks/web_like.py``."""
 
 PEAK_SHARE = 5e-4
 PEAK_COUNT = 20
@@ -126,9 +131,15 @@ class PresenceClassifier:
     def best_heights(self, phrases: Sequence[str]) -> Tensor:
         """Heights that phrases are compared with at each code ``[K, P]``.
 
-        They are those of everyday words and, for things with a color, of the scene's objects in any color.
+        They are those of everyday words and, for things with a color, of the scene's objects in any color. Parts are
+        also compared with their thing, or a mug would be as good a "mug handle" as its handle.
         """
-        return torch.stack([self._best(phrase) for phrase in phrases], dim=1)
+        found = [(self._best(phrase), thing_of_part(phrase)) for phrase in phrases]
+        best = [
+            self._beside(thing, phrase, best) if thing else best
+            for phrase, (best, thing) in zip(phrases, found)
+        ]
+        return torch.stack(best, dim=1)
 
     @torch.no_grad()
     def evidence(self, phrases: Sequence[str], texts: Tensor, scores: Tensor) -> list[Evidence]:
@@ -209,6 +220,16 @@ class PresenceClassifier:
     def _best(self, phrase: str) -> Tensor:
         """The heights ``[K]`` that a phrase is compared with."""
         return self._best_colored if has_color(phrase) and not is_part(phrase) else self.scale.best
+
+    def _beside(self, thing: str, part: str, best: Tensor) -> Tensor:
+        """The heights ``[K]`` that a part is compared with, from those of everyday words.
+
+        A code shows the part where it reaches a larger share of its best height than its thing does there.
+        """
+        heights = self.scale.heights(self.language.codebook.clip, self._embed([part, thing]))
+        reached = peaks(heights).clamp_min(_LEAST)
+        thing_at_best = heights[:, 1].clamp_min(_LEAST) * reached[0] / reached[1]
+        return torch.maximum(BORDER_PART * best, OVER_THING * thing_at_best) / BORDER
 
     def _compared(self, heights: Tensor, places: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
         """Ratios and heights of phrases at places ``[V, P]`` each, from their heights at the codes ``[K, P]``."""
