@@ -32,6 +32,9 @@ export interface EverydayRule {
   /** "Yes" for a part where its thing is described, and from which strength it is. */
   yes_part: number;
   at_thing: number;
+  /** Ratios at which the relevancy of a part is 0.5: over everyday words, and over its thing. */
+  border_part: number;
+  over_thing: number;
   names: string[];
   qualities: string[];
   colors: string[];

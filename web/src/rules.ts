@@ -33,12 +33,26 @@ export function heightsOf(codewords: Float32Array, text: Float32Array, mean: Flo
 
 /** Relevancy of each code for a phrase with these heights; `best` has the heights that it is compared with there. */
 export function relevancyOf(heights: Heights, best: Float32Array, rule: EverydayRule): Table {
-  const count = Math.max(1, Math.round(rule.peak_share * heights.length));
-  const highest = heights.slice().sort().subarray(-count);
-  const peak = Math.max(LEAST, highest.reduce((sum, value) => sum + value, 0) / count);
+  const peak = highest(heights, rule);
   return heights.map((height, k) => {
     const ratio = Math.min(height / peak, height / best[k]);
     return 1 / (1 + Math.exp(-rule.steepness * (ratio - rule.border)));
+  });
+}
+
+/** The best height of a phrase: the mean of the largest. */
+function highest(heights: Heights, rule: EverydayRule): number {
+  const count = Math.max(1, Math.round(rule.peak_share * heights.length));
+  const largest = heights.slice().sort().subarray(-count);
+  return Math.max(LEAST, largest.reduce((sum, value) => sum + value, 0) / count);
+}
+
+/** What a part is compared with at each code: everyday words, and its thing by shares of their best heights. */
+export function besideThing(part: Heights, thing: Heights, best: Float32Array, rule: EverydayRule): Float32Array {
+  const share = highest(part, rule) / highest(thing, rule);
+  return best.map((height, k) => {
+    const ofThing = Math.max(LEAST, thing[k]) * share;
+    return Math.max(rule.border_part * height, rule.over_thing * ofThing) / rule.border;
   });
 }
 

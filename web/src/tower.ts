@@ -2,7 +2,7 @@
 
 import type { Table } from "./language";
 import type { EverydayRule, Manifest } from "./manifest";
-import { type Heights, hasColor, heightsOf, isPart, relevancyOf } from "./rules";
+import { type Heights, besideThing, hasColor, heightsOf, isPart, relevancyOf, thingOfPart } from "./rules";
 import { PhraseTokenizer } from "./tokenizer";
 
 /** What a phrase means to the codes of the scene. */
@@ -10,7 +10,7 @@ export interface Description {
   table: Table;
   heights: Heights;
   best: Float32Array;
-  /** The heights that the phrase is compared with: `best`, or `colored` for a phrase with a color. */
+  /** The heights that presence compares the phrase with: `best`, or `colored` for a phrase with a color. */
   compared: Float32Array;
   rule: EverydayRule;
   /** Distributions of the scene's objects, and the best heights for phrases with a color; null without segments. */
@@ -90,13 +90,21 @@ export class TextTower {
 
   /** Heights and relevancy of a phrase for every code. */
   describe(phrase: string): Description {
-    const { templates, everyday } = this.#text;
-    const embedding = unit(templates.map((template) => this.embed(template.replace("{}", phrase))));
-    const [codewords, mean, best] = ["codewords", "mean", "best"].map((name) => this.#get(name).data as Float32Array);
-    const heights = heightsOf(codewords, embedding, mean, everyday);
+    const { everyday } = this.#text;
+    const heights = this.#heights(phrase);
+    const best = this.#get("best").data as Float32Array;
     const [places, colored] = ["places", "best_colored"].map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
     const compared = colored && hasColor(phrase, everyday) && !isPart(phrase, everyday) ? colored : best;
-    return { table: relevancyOf(heights, compared, everyday), heights, best, compared, rule: everyday, places, colored };
+    const thing = thingOfPart(phrase, everyday);
+    const rivals = thing ? besideThing(heights, this.#heights(thing), compared, everyday) : compared;
+    return { table: relevancyOf(heights, rivals, everyday), heights, best, compared, rule: everyday, places, colored };
+  }
+
+  #heights(phrase: string): Heights {
+    const { templates, everyday } = this.#text;
+    const embedding = unit(templates.map((template) => this.embed(template.replace("{}", phrase))));
+    const [codewords, mean] = ["codewords", "mean"].map((name) => this.#get(name).data as Float32Array);
+    return heightsOf(codewords, embedding, mean, everyday);
   }
 
   /** The embedding of a phrase, of unit length. */
