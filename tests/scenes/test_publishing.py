@@ -157,6 +157,19 @@ def test_what_was_asked_in_the_viewer_comes_first_as_plain_text(balls, tmp_path)
     assert len(lines) == len(phrases)
 
 
+def test_only_things_that_were_asked_for_are_in_the_dictionary_as_a_table_answers_no_relations():
+    asked = [
+        "mug left of the duck",
+        "red mug",
+        "the biggest toy",
+        "why is the mug so red",
+        'mug "',
+        "where is the lamp?",
+    ]
+    of_scene = [phrase for phrase, kind in vocabulary.page_phrases(asked).items() if kind == vocabulary.ASKED]
+    assert of_scene == ["red mug", "where is the lamp?"]
+
+
 @pytest.mark.parametrize(
     ("make", "found"),
     [

@@ -44,10 +44,14 @@ def chromium() -> Iterator:
         browser.close()
 
 
-def open_page(browser, address: str, width: int = 480, height: int = 360, script: str = ""):
+def open_page(
+    browser, address: str, width: int = 480, height: int = 360, script: str = "", phone: bool = False
+):
     """A page that has started or failed; ``page.requested`` and ``page.complaints`` are filled."""
     size = {"width": width, "height": height}
-    page = browser.new_page(viewport=size, reduced_motion="reduce", color_scheme="dark")
+    page = browser.new_page(
+        viewport=size, reduced_motion="reduce", color_scheme="dark", has_touch=phone, is_mobile=phone
+    )
     page.set_default_timeout(60_000)
     page.requested, page.complaints = [], []
     page.on("request", lambda request: page.requested.append(request.url))
@@ -76,3 +80,14 @@ def ask(page, text: str) -> None:
     page.fill(".search input", text)
     page.keyboard.press("Enter")
     until(page, "Boolean(document.querySelector('.card'))")
+
+
+def covered_tools(page) -> list[str]:
+    """Names of the tools whose middle, or one of whose corners, is not theirs at that point of the page."""
+    return page.evaluate(
+        """() => [...document.querySelectorAll(".tools > button")].filter((tool) => {
+            const { left, right, top, bottom } = tool.getBoundingClientRect();
+            const points = [[(left + right) / 2, (top + bottom) / 2], [left + 3, top + 3], [right - 3, bottom - 3]];
+            return !points.every(([x, y]) => tool.contains(document.elementFromPoint(x, y)));
+        }).map((tool) => tool.ariaLabel)"""
+    )

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from support.page_browser import CHROMIUM, ask, chromium, open_page, until
+from support.page_browser import CHROMIUM, ask, chromium, covered_tools, open_page, until
 from support.viewer_scene import WORDS, ball_scene
 
-from lexsplat.viewer.history import History
+from lexsplat.viewer.history import MAX_LENGTH, History
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -231,3 +231,60 @@ def test_a_video_has_many_pictures_also_where_they_take_long(page):
         }"""
     )
     assert drawn >= 5
+
+
+def test_what_the_server_did_not_understand_is_not_denied_and_long_texts_stay_in_the_box(page):
+    ask(page, "why is qwer so round")
+    assert page.locator(".card .state").inner_text() != "not in this scene"
+    assert page.evaluate("lexsplat.app.answers[0].unknown")
+    page.keyboard.press("Escape")
+    page.fill(".search input", 'ball "1')
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.status')?.textContent.includes('quotation marks in pairs')")
+    assert page.locator(".search input").input_value() == 'ball "1'
+    page.evaluate("lexsplat.app.clear()")
+    page.locator(".search input").fill("")
+    page.locator(".search input").press_sequentially("ball " * 30)
+    page.keyboard.press("Enter")
+    until(page, "Boolean(document.querySelector('.card'))")
+    assert len(page.evaluate("lexsplat.app.answers[0].prompt")) <= MAX_LENGTH
+
+
+def test_a_hidden_answer_leaves_no_preview_in_the_picture_and_after_an_edit_the_keyboard_goes_on(
+    page, viewer
+):
+    ask(page, "ball 2")
+
+    def shown() -> np.ndarray:
+        page.evaluate("lexsplat.app.stage.settled()")
+        page.evaluate("document.querySelectorAll('.bar').forEach((e) => { e.style.opacity = '0'; })")
+        taken = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(float)
+        page.evaluate("document.querySelectorAll('.bar').forEach((e) => { e.style.opacity = ''; })")
+        return taken
+
+    page.get_by_label("Hide ball 2").click()
+    plain = shown()
+    page.get_by_label("Show ball 2").click()
+    page.locator(".bench summary").click()
+    page.get_by_label("Edit ball 2").select_option("delete")
+    until(page, "document.querySelector('.taken').textContent.includes('300 Gaussians')")
+    assert np.abs(shown() - plain).max() > 40
+    page.get_by_label("Hide ball 2").click()
+    assert np.abs(shown() - plain).max() < 12
+    page.get_by_label("Show ball 2").click()
+    page.locator(".bench summary").click()
+    page.get_by_label("Edit ball 2").select_option("delete")
+    page.get_by_role("button", name="Apply").click()
+    until(page, "lexsplat.app.server.entry.version === 2")
+    until(page, "document.activeElement.tagName === 'CANVAS'", 10)
+    page.keyboard.press("z")
+    until(page, "lexsplat.app.server.entry.version === 3")
+
+
+def test_every_tool_can_be_pressed_on_small_windows(page):
+    ask(page, "ball 1, ball 2, ball 3")
+    until(page, "document.querySelectorAll('.card').length === 3")
+    for width, height in ((667, 375), (740, 360), (800, 360), (390, 667), (360, 640), (390, 844), (720, 480)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(100)
+        assert covered_tools(page) == [], (width, height)

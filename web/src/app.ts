@@ -2,8 +2,9 @@
 
 import * as THREE from "three";
 import { Budget } from "./budget";
-import { type Answer, type Clicked, type Source, answered, card, freeColor, painted, spoken } from "./answers";
-import { h, save } from "./dom";
+import { type Answer, type Clicked, type Source, answered, freeColor, painted, spoken } from "./answers";
+import { type CardHost, Cards } from "./card";
+import { h, isTouched } from "./dom";
 import { Edits } from "./edits";
 import type { Geometry, Place } from "./geometry";
 import { type Manifest, type ObjectEntry, PageError, type ViewEntry } from "./manifest";
@@ -11,6 +12,7 @@ import { Measure } from "./measure";
 import { Overlay } from "./overlay";
 import { Notes } from "./notes";
 import { objectsPanel, titleOf, viewsPanel } from "./panels";
+import { prompts } from "./questions";
 import { type Change, MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
 import { Server } from "./server";
@@ -21,6 +23,7 @@ import { toolbar } from "./tools";
 import { vantage } from "./vantage";
 import { workbench } from "./workbench";
 
+const FARTHEST = 50; // of a camera in a link from the middle of the scene, in radii of the scene
 const MOST_AT_ONCE = 200_000; // splats; in larger scenes, colors come before places
 
 export class App {
@@ -36,7 +39,7 @@ export class App {
   readonly edits: Edits | null;
   readonly #painter: Painter;
   readonly #overlay: Overlay;
-  readonly #list = h("ul", { class: "answers", "aria-label": "Answers" });
+  readonly #cards: Cards;
   readonly #sheet: HTMLElement;
   readonly #tries = h("p", { class: "examples" });
   readonly #notes: Notes;
@@ -46,6 +49,8 @@ export class App {
   #preview: Preview | null = null;
   #previewed = false;
   #colors = 0;
+  /** Counts the questions that replace what was asked before. */
+  #turn = 0;
   #view = "";
   #written = "";
 
@@ -63,7 +68,7 @@ export class App {
     this.#bounds = geometry.bounds();
     this.search = new SearchBar({
       complete: (text) => this.source?.complete(text) ?? [],
-      ask: (text, add) => this.run(() => this.ask(text, add)),
+      ask: (text, add) => this.run(() => this.#typed(text, add)),
     });
     this.answering = source.then((found) => this.#begin(found));
     this.views = viewsPanel(manifest.views, (view) => this.jump(view), this.server !== null);
@@ -71,11 +76,12 @@ export class App {
     this.measure = new Measure(stage, geometry, this.#overlay, manifest);
     const list = async (): Promise<ObjectEntry[]> => (this.server ? this.server.objects() : (manifest.objects ?? []));
     this.objects = objectsPanel(list, this.measure.sizes(), (object) => this.#goTo(object));
-    this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#list);
+    this.#cards = new Cards(this.#host);
+    this.#sheet = h("section", { class: "sheet", "aria-label": "What was found" }, this.#tries, this.#cards.element);
     this.#notes = new Notes(this.#sheet, (phrase, add) => this.run(() => this.ask(phrase, add)));
     this.#sheet.append(this.#notes.element);
     const tools = toolbar(this, this.#life.signal);
-    const waiting = [this.search.element, this.#list, this.#tries, tools, this.objects.element];
+    const waiting = [this.search.element, this.#cards.element, this.#tries, tools, this.objects.element];
     this.edits = server && new Edits(server, waiting, (text) => this.note(text), (work) => this.run(work));
     root.append(
       h("div", { class: "bar" }, this.search.element, this.#sheet),
@@ -90,6 +96,7 @@ export class App {
     stage.onDraw = () => this.#overlay.update();
     this.#listen();
     new ResizeObserver(() => this.#cover()).observe(this.#sheet);
+    new ResizeObserver(() => root.style.setProperty("--tools", `${tools.offsetWidth}px`)).observe(tools);
   }
 
   /** From now on questions are answered. */
@@ -123,48 +130,72 @@ export class App {
     const view = this.manifest.views.find(({ name }) => name === state.view) ?? null;
     if (state.camera) {
       const [x, y, z, a, b, c, fov] = state.camera;
-      const placed = new THREE.Vector3(x, y, z);
-      await this.stage.fly(placed, new THREE.Vector3(a, b, c), false, THREE.MathUtils.clamp(fov, 5, 120));
+      const { center, radius } = this.#bounds;
+      const near = (point: THREE.Vector3): THREE.Vector3 => point.sub(center).clampLength(0, FARTHEST * radius).add(center);
+      const [placed, target] = [near(new THREE.Vector3(x, y, z)), near(new THREE.Vector3(a, b, c))];
+      if (placed.distanceTo(target) < 1e-6 * radius) target.copy(center);
+      await this.stage.fly(placed, target, false, THREE.MathUtils.clamp(fov, 5, 120));
     } else this.start(view);
     this.#mode = state.mode;
+    this.onMode(state.mode === "heat");
     const joined = (prompts: string[]): string => prompts.join("\n").toLowerCase();
     if (joined(state.prompts) === joined(this.answers.map((answer) => answer.prompt))) return;
     this.clear();
-    for (const prompt of state.prompts) await this.ask(prompt, true, !view && !state.camera);
+    const turn = this.#turn;
+    for (const prompt of state.prompts) if (turn === this.#turn) await this.ask(prompt, true, !view && !state.camera);
   }
 
-  /** Ask for something; several prompts are separated by commas. */
+  /** Ask for something; several prompts are separated by commas. Answers to what was asked before a new question are dropped. */
   async ask(text: string, add = false, fly = true): Promise<void> {
-    const prompts = text.split(",").map((part) => part.trim()).filter(Boolean);
-    if (!add) this.answers.length = 0;
+    if (!add) this.#turn++;
+    const turn = this.#turn;
     this.#preview = null;
     if (!this.source) this.note("One moment: the words are loading.");
     const source = await this.answering;
-    this.note("");
-    for (const prompt of prompts) {
-      const answer = await source.answer(prompt, freeColor(this.answers));
-      if (answer) this.#add(answer);
-      else this.#unknown(prompt);
+    const fresh: Answer[] = [];
+    const unknown: string[] = [];
+    for (const prompt of prompts(text, source.dictionary.grammar)) {
+      const answer = await source.answer(prompt, freeColor([]));
+      if (answer) fresh.push(answer);
+      else unknown.push(prompt);
     }
+    if (turn !== this.#turn) return;
+    this.note("");
+    if (!add) this.answers.length = 0;
+    for (const answer of fresh) this.#add(answer);
+    unknown.forEach((prompt) => this.#unknown(prompt));
     if (this.geometry.count > MOST_AT_ONCE && !this.stage.software) {
       this.#paint(); // colors first, then places
       await new Promise((resolve) => setTimeout(resolve));
     }
-    for (const answer of this.answers) await source.refine(answer);
+    for (const answer of [...this.answers]) await source.refine(answer);
+    if (turn !== this.#turn) return;
     this.#paint();
     this.#refresh();
-    const fresh = this.answers.slice(-prompts.length);
     if (fresh.length) this.#notes.say(fresh.map((answer) => `${answer.prompt}: ${spoken(answer)}`).join(". "));
     const first = fresh.find((answer) => painted(answer) && answer.places?.length);
     if (fly && first) this.#flyTo(first);
   }
 
+  /** Ask what was typed; what fails is typed again. */
+  async #typed(text: string, add: boolean): Promise<void> {
+    try {
+      await this.ask(text, add);
+    } catch (error) {
+      const { input } = (window.lexsplat.app ?? this).search;
+      input.value ||= text;
+      throw error;
+    }
+  }
+
   #add(answer: Answer): void {
     if (this.answers.length === MOST_PROMPTS) this.answers.shift();
+    answer.color = freeColor(this.answers);
     this.answers.push(answer);
   }
 
   clear(): void {
+    this.#turn++;
     this.answers.length = 0;
     this.#preview = null;
     this.note("");
@@ -213,51 +244,50 @@ export class App {
   }
 
   #refresh(): void {
-    this.#list.replaceChildren(
-      ...this.answers.map((answer) =>
-        card(answer, {
-          show: (one, step) => {
-            const count = one.places?.length ?? 0;
-            one.place = count ? (one.place + step) % count : 0;
-            this.#refresh();
-            this.#flyTo(one);
-          },
-          remove: (one) => {
-            this.answers.splice(this.answers.indexOf(one), 1);
-            this.#preview = null;
-            this.#paint();
-            this.#refresh();
-            this.search.input.focus();
-          },
-          changed: (one) => {
-            one.place = 0;
-            one.places = null;
-            this.#paint();
-            clearTimeout(this.#later);
-            this.#later = setTimeout(() => this.run(() => this.#refine(one)), 250);
-          },
-          repaint: () => {
-            this.#paint();
-            this.#refreshKeepingFocus();
-          },
-          further: (one) => this.server && workbench(one, this.server, this.geometry, this.stage.camera.up, this.#bench()),
-        }),
-      ),
-    );
+    this.#cards.update(this.answers);
     this.#sheet.classList.toggle("asked", this.answers.length > 0);
   }
 
+  readonly #host: CardHost = {
+    ask: (phrase) => this.run(() => this.ask(phrase, true)),
+    show: (one, step) => {
+      const count = one.places?.length ?? 0;
+      one.place = count ? (one.place + step) % count : 0;
+      this.#refresh();
+      this.#flyTo(one);
+    },
+    remove: (one) => {
+      this.answers.splice(this.answers.indexOf(one), 1);
+      this.#preview = null;
+      this.#paint();
+      this.#refresh();
+      if (isTouched()) this.stage.canvas.focus();
+      else this.search.input.focus();
+    },
+    changed: (one) => {
+      one.place = 0;
+      one.places = null;
+      this.#paint();
+      clearTimeout(this.#later);
+      this.#later = setTimeout(() => this.run(() => this.#refine(one)), 250);
+    },
+    repaint: () => {
+      this.#paint();
+      this.#refresh();
+    },
+    further: (one) => this.server && workbench(one, this.server, this.geometry, this.stage.camera.up, this.#bench()),
+    closed: () => {
+      this.#preview = null;
+      this.#paint();
+    },
+  };
+
   async #refine(answer: Answer): Promise<void> {
     await (await this.answering).refine(answer);
+    if (!this.answers.includes(answer)) return;
     if (answer.presence === "no" && answer.anyway && !answer.places?.length) answer.places = this.geometry.best(answer.scores);
     this.#paint();
-    this.#refreshKeepingFocus();
-  }
-
-  #refreshKeepingFocus(): void {
-    const focused = document.activeElement?.getAttribute("aria-label");
     this.#refresh();
-    if (focused) this.#list.querySelector<HTMLElement>(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   }
 
   #bench() {
@@ -276,23 +306,12 @@ export class App {
   }
   #later: ReturnType<typeof setTimeout> | undefined;
 
-  /** Nothing in the page can tell what a prompt means: offer the nearest phrases. */
+  /** Nothing in the page can tell what a prompt means: offer the nearest phrases, and the text model if there is one. */
   #unknown(prompt: string): void {
     if (!(this.source instanceof Tables)) return;
     const { dictionary, loader } = this.source;
-    const count = dictionary.phrases.length.toLocaleString("en");
-    this.note(`“${prompt}” is not among the ${count} phrases of this page.`);
-    this.#notes.offer(dictionary.similar(prompt).map((phrase) => ({ phrase })), true, "Nearest: ");
-    if (loader?.waiting) {
-      const size = (loader.bytes / 1e6).toFixed(0);
-      this.#notes.append(
-        h("button", {
-          type: "button",
-          text: `Load the text model (${size} MB) to ask anything`,
-          onclick: () => this.run(() => loader.agree().then(() => this.ask(prompt, true))),
-        }),
-      );
-    }
+    const load = loader?.waiting ? { bytes: loader.bytes, agreed: () => this.run(() => loader.agree().then(() => this.ask(prompt, true))) } : null;
+    this.#notes.unknown(prompt, dictionary, load);
   }
 
   note(text: string): void {
@@ -313,7 +332,7 @@ export class App {
       const before = this.answers.findIndex((answer) => answer.from === "click");
       if (before >= 0) this.answers.splice(before, 1);
       const name = sure.length ? `clicked: ${shown[0].phrase}` : "what was clicked";
-      this.#add(answered(name, freeColor(this.answers), { ...found, phrase: name }));
+      this.#add(answered(name, "", { ...found, phrase: name }));
       this.#preview = null;
       this.#paint();
       this.#refresh();
@@ -334,6 +353,9 @@ export class App {
     this.note(`${name}: ${this.measure.sides(size)}`);
     this.stage.flyTo(place, vantage(place, this.manifest.views, this.stage.camera.position, this.geometry));
   }
+
+  /** Told whether heat is shown. */
+  onMode: (heat: boolean) => void = () => undefined;
 
   toggleHeat(): boolean {
     this.#mode = this.#mode === "heat" ? "marks" : "heat";
@@ -373,18 +395,6 @@ export class App {
   pick(x: number, y: number): void {
     if (this.measure.active) this.note(this.measure.click(x, y));
     else this.run(async () => void (await this.whatIs(x, y)));
-  }
-
-  async savePicture(): Promise<void> {
-    save(await this.stage.picture(), "picture.png");
-  }
-
-  async saveVideo(): Promise<void> {
-    this.note("Recording for six seconds …");
-    const made = await this.stage.record();
-    if (!made) throw new PageError("This browser records no videos.");
-    save(made.video, `video${made.suffix}`);
-    this.note("");
   }
 
   async copyLink(): Promise<void> {

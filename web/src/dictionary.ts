@@ -1,17 +1,12 @@
 // Phrases with their tables of relevancies, found by spelling: exact, by prefix, and with typing errors.
 
+import type { Grammar } from "./grammar";
 import { type Language, type Table, dot } from "./language";
 import type { Presence } from "./rules";
 
-const QUESTION =
-  /^(?:please |can you )?(?:where (?:is|are)|where can i find|show(?: me)?|find(?: me)?|is there|are there|how many|what is)\s+/;
-const ARTICLE = /^(?:the|a|an|some|any|my|your)\s+/;
-
-/** Lower case, single spaces, no question around the phrase. */
-export function normalize(text: string): string {
-  const plain = text.normalize("NFC").toLowerCase().replace(/\s+/g, " ").replace(/[?!.]+\s*$/, "").trim();
-  const phrase = plain.replace(QUESTION, "").replace(/ (?:are|is) there$/, "").replace(ARTICLE, "");
-  return phrase.trim() || plain;
+/** Lower case, single spaces, no mark at the end. */
+export function plainly(text: string): string {
+  return text.normalize("NFC").toLowerCase().replace(/\s+/g, " ").replace(/[?!.]+\s*$/, "").trim();
 }
 
 /** A phrase as it is, and what it may be in the singular. */
@@ -36,7 +31,7 @@ export class Dictionary {
    * `list` has a phrase a line, its kind and presence in front; `tables` a relevancy for each phrase and code in
    * 255ths, empty where a server answers.
    */
-  constructor(list: string, tables: Uint8Array, numCodes: number) {
+  constructor(list: string, tables: Uint8Array, numCodes: number, readonly grammar: Grammar) {
     const lines = list.split("\n").filter(Boolean);
     this.#kinds = lines.map((line) => line[0]).join("");
     this.#presences = lines.map((line) => line[1]).join("");
@@ -73,11 +68,14 @@ export class Dictionary {
     return this.#tables.subarray(place * this.#numCodes, (place + 1) * this.#numCodes);
   }
 
-  /** The place of a phrase as typed, without its question, or in the singular; -1 if it is unknown. */
+  /** Whether a phrase is here as it is typed. */
+  has(text: string): boolean {
+    return this.#places.has(text.trim().toLowerCase());
+  }
+
+  /** The place of a phrase as it is, or in the singular; -1 if it is unknown. */
   find(text: string): number {
-    const plain = text.trim().toLowerCase();
-    const phrase = normalize(text);
-    for (const form of [plain, ...singulars(phrase)]) {
+    for (const form of [text.trim().toLowerCase(), ...singulars(plainly(text))]) {
       const place = this.#places.get(form);
       if (place !== undefined) return place;
     }
@@ -96,7 +94,7 @@ export class Dictionary {
 
   /** Phrases that begin with what was typed, or have a word that does; then with typing errors. */
   complete(text: string, count = 8): string[] {
-    const typed = normalize(text);
+    const typed = this.#phrase(text);
     if (!typed) return this.examples(count);
     const scored: [number, number][] = [];
     this.phrases.forEach((phrase, place) => {
@@ -130,9 +128,16 @@ export class Dictionary {
     return chosen;
   }
 
+  /** What is typed, without a question around it. */
+  #phrase(text: string): string {
+    const plain = plainly(text);
+    return plain && this.grammar.undetermined(this.grammar.phrase(this.grammar.inFull(plain)));
+  }
+
   /** The phrases with the most similar spelling, the nearest first. */
   similar(text: string, count = 3): string[] {
-    const typed = normalize(text).split(" ").filter((word) => word.length > 2 || this.#words.has(word));
+    const names = (word: string): boolean => !this.grammar.has("closed", word) && !["the", "of", "a", "an"].includes(word);
+    const typed = this.#phrase(text).split(" ").filter((word) => names(word) && (word.length > 2 || this.#words.has(word)));
     const corrected = typed.map((word) => (this.#words.has(word) ? word : this.#nearestWord(word)));
     if (!corrected.some(Boolean)) return [];
     const scored: [number, number][] = [];

@@ -58,6 +58,18 @@ export function iconButton(name: Icon, label: string, onclick: () => void, key =
   return h("button", { type: "button", class: "icon", "aria-label": label, title, onclick }, icon(name));
 }
 
+/** Whether fingers point: a focused text box brings up a keyboard that covers half of the page. */
+export function isTouched(): boolean {
+  return matchMedia("(pointer: coarse)").matches;
+}
+
+/** Close a panel after a choice where it covers what was chosen. */
+export function closeOnPhone(panel: HTMLElement): void {
+  if (!isTouched() && !matchMedia("(max-width: 640px), (max-height: 460px)").matches) return;
+  panel.hidden = true;
+  panel.dispatchEvent(new Event("close"));
+}
+
 /** Save a file from the page. */
 export function save(blob: Blob, name: string): void {
   const url = URL.createObjectURL(blob);

@@ -1,39 +1,50 @@
-// Kinds of things, such as "toy": answered by the objects of the scene that are of the kind (lexsplat.queries.kinds).
+// Kinds of things, such as "toy", and things in a color: answered by the objects of the scene (lexsplat.queries.kinds).
 
-import type { Answer } from "./answers";
+import type { Found } from "./answers";
 import type { Geometry, Place } from "./geometry";
 import { type ObjectEntry, PageError } from "./manifest";
 
 export class Kinds {
   readonly #members: ReadonlyMap<string, number[]>;
-  readonly #names: string[];
-  readonly #places: Place[];
+  readonly #objects: ObjectEntry[];
+  #places: Place[] | null = null;
 
   /** `content` is the place of each splat in the list of objects, [N] uint8, 255 for none. */
-  constructor(content: Uint8Array, geometry: Geometry, objects: ObjectEntry[], members: Record<string, number[]>) {
+  constructor(
+    readonly content: Uint8Array, readonly geometry: Geometry, objects: ObjectEntry[], members: Record<string, number[]>,
+  ) {
     if (content.length !== geometry.count) {
       throw new PageError("objects.bin: its length does not fit the scene; publish the scene again.");
     }
     this.#members = new Map(Object.entries(members));
-    this.#names = objects.map(({ name }) => name);
-    const used = new Set(Object.values(members).flat());
-    const splats: number[][] = objects.map(() => []);
-    content.forEach((place, i) => used.has(place) && splats[place]?.push(i));
-    this.#places = splats.map((own) => geometry.place(own));
+    this.#objects = objects;
   }
 
-  has(phrase: string): boolean {
-    return this.#members.has(phrase);
+  has(kind: string): boolean {
+    return this.#members.has(kind);
   }
 
-  /** The objects of a kind; `plain` is the answer to its name as a phrase. */
-  answer(kind: string, plain: Answer): Answer {
-    const members = this.#members.get(kind)!.filter((place) => this.#places[place]?.splats.length);
-    if (members.length === 0) return plain;
-    const scores = plain.scores.slice();
-    const places = members.map((place) => this.#places[place]);
+  /**
+   * The objects of a kind, "" for any; with `color`, those of this main color, or else those that have it as well.
+   * Null if there are none. `plain` are the scores of the other splats.
+   */
+  find(kind: string, color: string, plain: Float32Array | null): Pick<Found, "scores" | "presence" | "places" | "members" | "note"> | null {
+    this.#places ??= this.#found();
+    const all = (this.#members.get(kind) ?? []).filter((place) => this.#places![place]?.splats.length);
+    const inColor = (most: number): number[] => all.filter((place) => this.#objects[place].colors?.slice(0, most).includes(color));
+    const main = color ? inColor(1) : all;
+    const members = main.length ? main : inColor(Infinity);
+    if (members.length === 0) return null;
+    const scores = plain?.slice() ?? new Float32Array(this.geometry.count);
+    const places = members.map((place) => this.#places![place]);
     for (const { splats } of places) for (const splat of splats) scores[splat] = 1;
-    const names = [...new Set(members.map((place) => this.#names[place]))];
-    return { ...plain, phrase: kind, scores, presence: "yes", members: places, places, note: names.join(", ") };
+    const names = [...new Set(members.map((place) => this.#objects[place].name))];
+    return { scores, presence: "yes", members: places, places, note: names.join(", ") };
+  }
+
+  #found(): Place[] {
+    const splats: number[][] = this.#objects.map(() => []);
+    this.content.forEach((place, i) => splats[place]?.push(i));
+    return splats.map((own) => this.geometry.place(own));
   }
 }

@@ -4,6 +4,7 @@ import { App } from "./app";
 import { Dictionary } from "./dictionary";
 import { h } from "./dom";
 import { Geometry } from "./geometry";
+import { Grammar } from "./grammar";
 import { Kinds } from "./kinds";
 import { Language } from "./language";
 import { Files, type Manifest, PageError } from "./manifest";
@@ -23,6 +24,8 @@ declare global {
     lexsplat: { ready: Promise<App>; app: App | null };
   }
 }
+
+const LONGEST_WAIT = 5_000; // milliseconds
 
 async function start(root: HTMLElement): Promise<App> {
   firstTheme();
@@ -55,17 +58,23 @@ async function show(files: Files, manifest: Manifest, stage: Stage, root: HTMLEl
   const geometry = new Geometry(stage.mesh, scene.gaussians, manifest.selection_rule);
   if (manifest.server) {
     const phrases = new TextDecoder().decode(await files.read(manifest.words.phrases));
-    const server = new Server(stage, geometry, new Dictionary(phrases, new Uint8Array(0), 0), manifest, async (next) => {
+    const server = new Server(stage, geometry, new Dictionary(phrases, new Uint8Array(0), 0, new Grammar(manifest.grammar)), manifest, async (next) => {
       app.dispose();
       const shown = next ? files.take(next) : await files.manifest();
       root.replaceChildren(stage.canvas);
       window.lexsplat.app = await show(files, shown, stage, root);
       await window.lexsplat.app.restore();
+      if (document.activeElement === document.body) stage.canvas.focus({ preventScroll: true }); // what had the focus is gone
     });
     const app = new App(stage, geometry, manifest, Promise.resolve(server), server, root);
     return app;
   }
-  return new App(stage, geometry, manifest, stage.shown.then(() => tables(files, manifest, stage, geometry)), null, root);
+  return new App(stage, geometry, manifest, firstPicture(stage).then(() => tables(files, manifest, stage, geometry)), null, root);
+}
+
+/** The first picture with splats; where none is in view, the words wait a moment only. */
+function firstPicture(stage: Stage): Promise<void> {
+  return Promise.race([stage.shown, new Promise<void>((resolve) => setTimeout(resolve, LONGEST_WAIT))]);
 }
 
 /** Everything that answers without a server. */
@@ -85,7 +94,7 @@ async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: 
   const loader = manifest.text ? new TowerLoader(files, manifest) : null;
   const whole = segments && new Segments(segments, scene.gaussians, language.segment_rule!);
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
-  const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes);
+  const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes, new Grammar(manifest.grammar));
   const spelling = english && letters ? new Spelling(letters, english.things) : null;
   return new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds, spelling, english?.only ?? false);
 }

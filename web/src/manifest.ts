@@ -91,10 +91,20 @@ export interface ServerEntry {
   modes: string[];
 }
 
+/** Patterns of Python as sources of regular expressions that ignore case, and words (lexsplat.scenes.publishing.grammar). */
+export interface GrammarEntry {
+  patterns: Record<string, string>;
+  replaced: Record<"contractions" | "reworded" | "frames", [string, string][]>;
+  words: Record<string, string[]>;
+  materials: Record<string, string>;
+}
+
 export interface ObjectEntry {
   name: string;
   center: [number, number, number];
   size: [number, number, number];
+  /** Color words, the most frequent first; only in pages without a server. */
+  colors?: string[];
 }
 
 export interface Manifest {
@@ -137,8 +147,9 @@ export interface Manifest {
     english?: { file: string; things: string[]; only: boolean } | null;
   };
   objects: ObjectEntry[] | null;
-  /** Places in the list of objects for each kind of things ("toy") that the scene holds. */
+  /** Places in the list of objects for each kind of things ("toy") that the scene holds; "" is any thing. */
   kinds: Record<string, number[]> | null;
+  grammar: GrammarEntry;
   text: {
     weights: string;
     tokenizer: string;
@@ -183,6 +194,11 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
   ["words.phrases", "a text", isText],
   ["words.count", "a number", Number.isFinite],
   ["text", "an object or null", orNull(isRecord)],
+  ["grammar", "an object", isRecord],
+  ["grammar.patterns", "an object", isRecord],
+  ["grammar.replaced", "an object", isRecord],
+  ["grammar.words", "an object", isRecord],
+  ["grammar.materials", "an object", isRecord],
   ["files", "an object", isRecord],
   ["licenses", "an object", isRecord],
   ["views", "a list of cameras", areViews],

@@ -1,5 +1,6 @@
 // What the page says under the answers: one line, and phrases to ask instead.
 
+import type { Dictionary } from "./dictionary";
 import { h, icon } from "./dom";
 
 export class Notes {
@@ -31,6 +32,15 @@ export class Notes {
     if (phrases.length === 0) return;
     const buttons = phrases.map(({ phrase, title }) => h("button", { type: "button", text: phrase, title, onclick: () => this.#ask(phrase, add) }));
     this.element.append(h("p", { class: "examples" }, before, ...buttons));
+  }
+
+  /** A prompt that is no phrase of a dictionary; `model` is a text model that is not loaded yet. */
+  unknown(prompt: string, dictionary: Dictionary, model: { bytes: number; agreed: () => void } | null): void {
+    this.tell(`“${prompt}” is not among the ${dictionary.phrases.length.toLocaleString("en")} phrases of this page.`);
+    this.offer(dictionary.similar(prompt).map((phrase) => ({ phrase })), true, "Nearest: ");
+    if (!model) return;
+    const size = (model.bytes / 1e6).toFixed(0);
+    this.append(h("button", { type: "button", text: `Load the text model (${size} MB) to ask anything`, onclick: model.agreed }));
   }
 
   append(element: HTMLElement): void {

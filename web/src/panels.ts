@@ -1,7 +1,7 @@
 // Panels that open: the original views, and help.
 
 import { leftOut } from "./budget";
-import { h, iconButton } from "./dom";
+import { closeOnPhone, h, iconButton } from "./dom";
 import type { Manifest, ObjectEntry, ViewEntry } from "./manifest";
 import type { Server } from "./server";
 
@@ -20,7 +20,11 @@ export function viewsPanel(views: ViewEntry[], jump: (view: ViewEntry) => void, 
     image.src = `photo/${current}`;
   };
   const beside = photos ? h("input", { type: "checkbox", onchange: () => look() }) : null;
-  const buttons = views.map((view, n) => h("button", { type: "button", text: view.name, onclick: () => go(n) }));
+  const choose = (n: number): void => {
+    go(n);
+    closeOnPhone(element);
+  };
+  const buttons = views.map((view, n) => h("button", { type: "button", text: view.name, onclick: () => choose(n) }));
   const list = h("ul", {}, ...buttons.map((button) => h("li", {}, button)));
   const go = (n: number): void => {
     if (views.length === 0) return;
@@ -67,13 +71,17 @@ export function objectsPanel(
   const kind = h("span", { class: "fine", text: `sizes in ${unit}` });
   const element = h("aside", { class: "views objects", "aria-label": "Objects in this scene", hidden: true }, h("div", { class: "row" }, head, kind), list);
   let found: Promise<void> | null = null;
+  const choose = (object: ObjectEntry): void => {
+    go(object);
+    closeOnPhone(element);
+  };
   const fill = async (): Promise<void> => {
     head.textContent = "Looking for objects …";
     const objects = await find();
     head.textContent = objects.length === 1 ? "One object" : `${objects.length} objects`;
     list.replaceChildren(
       ...objects.map((object) =>
-        h("li", {}, h("button", { type: "button", onclick: () => go(object) }, h("span", { text: object.name }), h("span", { class: "fine", text: sides(object.size) }))),
+        h("li", {}, h("button", { type: "button", onclick: () => choose(object) }, h("span", { text: object.name }), h("span", { class: "fine", text: sides(object.size) }))),
       ),
     );
   };

@@ -1,6 +1,7 @@
 // The search bar: a text box with completions, as the ARIA pattern of a combobox has it.
 
-import { h, icon, iconButton } from "./dom";
+import { h, icon, iconButton, isTouched } from "./dom";
+import { MOST_LETTERS } from "./state";
 
 export interface SearchHost {
   complete(text: string): string[];
@@ -17,7 +18,7 @@ export class SearchBar {
 
   constructor(host: SearchHost) {
     this.#host = host;
-    this.#list = h("ul", { id: "completions", role: "listbox", "aria-label": "Completions", hidden: true });
+    this.#list = h("ul", { id: "completions", role: "listbox", "aria-label": "Completions", tabindex: -1, hidden: true });
     this.input = h("input", {
       type: "text",
       name: "q",
@@ -31,7 +32,7 @@ export class SearchBar {
       autocapitalize: "none",
       spellcheck: "false",
       enterkeyhint: "search",
-      maxlength: 200,
+      maxlength: MOST_LETTERS,
       oninput: () => this.#open(),
       onfocus: () => this.#open(),
       onblur: () => setTimeout(() => this.close(), 150),
@@ -73,6 +74,7 @@ export class SearchBar {
     this.close();
     if (!text.trim()) return this.input.focus();
     this.input.value = ""; // the answers show what was asked
+    if (isTouched()) this.input.blur(); // with it goes the keyboard, which covers the answer
     this.#host.ask(text, add);
   }
 

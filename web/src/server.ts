@@ -13,6 +13,8 @@ interface Header {
   instances: { center: number[]; size: number[] }[];
   understood?: string;
   note?: string;
+  /** Whether it has words that nothing here knows. */
+  unknown?: boolean;
   names?: { phrase: string; score: number }[];
   point?: [number, number, number];
 }
@@ -50,7 +52,9 @@ export class Server implements Source {
     const asked = { prompt, camera: this.stage.lens() };
     const { header, found } = await this.#found("ask", asked);
     this.dictionary.remember(prompt);
-    return answered(prompt, color, { ...found, phrase: header.understood || prompt, note: header.note ?? "" });
+    const note = header.note ?? "";
+    const unknown = header.unknown ?? /not understood|knows English words alone|which photos may not tell/.test(note);
+    return answered(prompt, color, { ...found, phrase: header.understood || prompt, note, unknown });
   }
 
   async refine(answer: Answer): Promise<void> {

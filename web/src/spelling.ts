@@ -2,6 +2,7 @@
 
 import { singulars } from "./dictionary";
 
+const SAME_FORM = new Set(["stairs", "scissors", "trousers", "clothes", "pants"]);
 const HASHES = 5;
 /** What a phrase with several typing errors may mean, at most. */
 const MOST = 4;
@@ -37,6 +38,18 @@ export class Spelling {
       phrase: words.join(" "),
       note: words.flatMap((word, n) => (word === typed[n] ? [] : [`“${typed[n]}” may be a typing error: asked for “${word}”`])).join("; "),
     })).filter(({ note }) => note !== "");
+  }
+
+  /** A phrase with its last word in the singular, if that is a word, as lexsplat.queries.spelling has it. */
+  singular(phrase: string): string {
+    const [head, ...rest] = phrase.split(" of ");
+    const last = /[a-z]{3,}$/.exec(head)?.[0] ?? "";
+    if (!last.endsWith("s") || /(?:ss|us|is)$/.test(last) || SAME_FORM.has(last) || phrase.includes(" to ")) return phrase;
+    const [one, two] = [last.slice(0, -1), last.slice(0, -2)];
+    const [f, fe] = [last.replace(/ves$/, "f"), last.replace(/ves$/, "fe")];
+    const forms = /(?:ss|x|ch|sh)es$/.test(last) ? [two, one] : [f, fe, one, last.replace(/ies$/, "y"), two];
+    const found = forms.find((form) => form !== last && this.isWord(form));
+    return found ? [head.slice(0, -last.length) + found, ...rest].join(" of ") : phrase;
   }
 
   /** The words of a phrase that are neither English nor words of things. */

@@ -2,6 +2,9 @@
 
 import type { Mode } from "./painter";
 
+/** Letters of what is asked, at most: lexsplat.viewer.history.MAX_LENGTH. */
+export const MOST_LETTERS = 120;
+
 export interface State {
   prompts: string[];
   view: string;
@@ -15,7 +18,7 @@ export function readState(hash: string): State {
   const parameters = new URLSearchParams(hash.replace(/^#/, ""));
   const camera = (parameters.get("camera") ?? "").split(",").map(Number);
   return {
-    prompts: parameters.getAll("q").map((prompt) => prompt.slice(0, 200)).filter((prompt) => prompt.trim()).slice(0, 6),
+    prompts: parameters.getAll("q").map((prompt) => prompt.slice(0, MOST_LETTERS)).filter((prompt) => prompt.trim()).slice(0, 6),
     view: parameters.get("view") ?? "",
     camera: camera.length === 7 && camera.every(Number.isFinite) ? camera : null,
     mode: parameters.get("show") === "heat" ? "heat" : "marks",

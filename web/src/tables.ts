@@ -1,9 +1,10 @@
 // Answers without a server: the dictionary, then the text tower, then whole segments.
 
 import { type Answer, type Clicked, type Source, answered, painted } from "./answers";
-import { Dictionary, normalize, singulars } from "./dictionary";
+import { type Dictionary, plainly, singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
 import { type Language, shownSplats } from "./language";
+import { type Question, type Thing, understood } from "./questions";
 import { type Presence, hasColor, isPart, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
@@ -39,25 +40,81 @@ export class Tables implements Source {
   }
 
   async answer(prompt: string, color: string): Promise<Answer | null> {
-    if (!this.spelling || this.dictionary.find(prompt) >= 0) return this.#asked(prompt, prompt, color);
-    const phrase = normalize(prompt);
+    if (this.dictionary.has(prompt)) return this.#mended(prompt, prompt, color);
+    const question = understood(prompt, this.dictionary.grammar);
+    const { things, beyond, left, state } = question;
+    if (beyond) return this.#beyond(question, prompt, color);
+    if (left || things.length === 0) {
+      const quoted = ` (“${left || prompt.trim()}”)`;
+      return doubtful(await this.#plain(plainly(prompt) || prompt.trim(), prompt, color), `not understood${quoted}: asked for as one thing, in these words`);
+    }
+    const answers: Answer[] = [];
+    for (const thing of things) {
+      const answer = await this.#thing(thing, prompt, color);
+      if (!answer) return null;
+      answers.push(answer);
+    }
+    const answer = answers.length === 1 ? answers[0] : this.#united(answers, question, prompt, color);
+    return state ? doubtful(answer, `“${state}” is asked as a word of the thing, which photos may not tell`) : answer;
+  }
+
+  /** What asks for more than things is not answered; its things are offered. */
+  #beyond({ things, beyond }: Question, prompt: string, color: string): Answer {
+    const named = things.map(({ text, color: own }) => [own, text || (own && "things")].filter(Boolean).join(" "));
+    const offers = [...new Set(named.filter(Boolean).map((name) => this.spelling?.singular(name) ?? name))];
+    const note = `This page finds single things. “${beyond}” needs lexsplat view.`;
+    const found = { phrase: prompt, from: "page", scores: new Float32Array(this.geometry.count), places: [], presence: "unsure" as const };
+    return answered(prompt, color, { ...found, threshold: this.geometry.rule.threshold, note, unknown: true, beyond, offers });
+  }
+
+  async #thing({ text, color: own, exact }: Thing, prompt: string, color: string): Promise<Answer | null> {
+    if (exact) return this.#plain(text.toLowerCase(), prompt, color);
+    if (text && !own) return this.#mended(text.toLowerCase(), prompt, color);
+    const { threshold } = this.geometry.rule;
+    const phrase = [own, text || (own ? "things" : "any object")].filter(Boolean).join(" ");
+    const none = { scores: new Float32Array(this.geometry.count), presence: "no" as const, places: [] };
+    const kind = text ? singulars(text).find((form) => this.kinds.has(form)) : "";
+    const found = kind === undefined ? null : this.kinds.find(kind, own, null);
+    return answered(prompt, color, { phrase, from: "objects", threshold, ...(found ?? none) });
+  }
+
+  /** Several answers as one. */
+  #united(parts: Answer[], { together }: Question, prompt: string, color: string): Answer {
+    const order: Presence[] = ["no", "unsure", "yes"];
+    const places = parts.map(({ presence }) => order.indexOf(presence));
+    const presence = order[together ? Math.min(...places) : Math.max(...places)];
+    const shown = presence === "no" ? parts : parts.filter((part) => part.presence !== "no");
+    const scores = shown[0].scores.slice();
+    for (const part of shown.slice(1)) part.scores.forEach((score, i) => (scores[i] = Math.max(scores[i], score)));
+    const lacking = parts.filter((part) => part.presence === "no").map((part) => `${part.unknown ? "not found" : "not in this scene"}: “${part.phrase}”`);
+    const note = [...parts.map((part) => part.note), ...lacking].filter(Boolean).join("; ");
+    const phrase = parts.map((part) => part.phrase).join(together ? " and " : " or ");
+    const unknown = parts.some((part) => part.unknown);
+    return answered(prompt, color, { phrase, from: parts[0].from, scores, presence, threshold: parts[0].threshold, note, unknown, parts: shown });
+  }
+
+  /** The answer to a thing, its typing errors mended. */
+  async #mended(text: string, prompt: string, color: string): Promise<Answer | null> {
+    if (!this.spelling || this.dictionary.find(text) >= 0) return this.#asked(text, prompt, color);
+    const phrase = plainly(text);
     for (const { phrase: meant, note } of this.spelling.meant(phrase)) {
       const answer = await this.#asked(meant, prompt, color);
       if (answer && answer.presence !== "no") return { ...answer, note };
     }
-    const answer = await this.#asked(prompt, prompt, color);
+    const answer = await this.#asked(text, prompt, color);
     const strange = this.englishOnly ? this.spelling.strange(phrase) : [];
-    if (!answer || strange.length === 0) return answer;
+    if (strange.length === 0) return answer;
     const listed = strange.slice(0, 3).map((word) => `“${word.slice(0, 40)}”`).join(", ");
-    const note = `the bundled encoder knows English words alone, not ${listed}`;
-    return { ...answer, note, unknown: true, presence: answer.presence === "yes" ? "unsure" : answer.presence };
+    return doubtful(answer, `the bundled encoder knows English words alone, not ${listed}`);
   }
 
   /** The answer to a text, for what was typed. */
   async #asked(text: string, prompt: string, color: string): Promise<Answer | null> {
-    const plain = await this.#plain(text, prompt, color);
-    const kind = singulars(normalize(text)).find((form) => this.kinds.has(form));
-    return kind && plain ? this.kinds.answer(kind, plain) : plain;
+    const thing = this.dictionary.find(text) >= 0 ? text : (this.spelling?.singular(plainly(text)) ?? text);
+    const plain = await this.#plain(thing, prompt, color);
+    const kind = plain && singulars(plainly(text)).find((form) => this.kinds.has(form));
+    const members = kind ? this.kinds.find(kind, "", plain.scores) : null;
+    return members ? { ...plain!, phrase: kind!, ...members } : plain;
   }
 
   /** The answer to a phrase by its own relevancy. */
@@ -69,7 +126,7 @@ export class Tables implements Source {
       const phrase = this.dictionary.phrases[known];
       return answered(prompt, color, { phrase, from: "dictionary", ...this.#whole(own, presence) });
     }
-    const phrase = normalize(text);
+    const phrase = plainly(text) || text;
     const tower = await this.loader?.load();
     if (!tower) return null;
     const described = tower.describe(phrase);
@@ -110,6 +167,11 @@ export class Tables implements Source {
   async refine(answer: Answer): Promise<void> {
     answer.places ??= answer.members;
     if (answer.places) return;
+    if (answer.parts && answer.threshold === answer.automatic) {
+      for (const part of answer.parts) await this.refine(part);
+      answer.places = painted(answer) ? apart(answer.parts.flatMap((part) => part.places ?? [])) : [];
+      return;
+    }
     const hidden = this.segments?.hidden;
     const seen = (place: Place): Place => (hidden ? { ...place, splats: place.splats.filter((i) => !hidden[i]) } : place);
     const found = painted(answer) ? this.geometry.places(answer.scores, answer.threshold) : [];
@@ -122,4 +184,21 @@ export class Tables implements Source {
     const names = this.dictionary.name(this.language.distribution(hit.splats, hit.shares), 4);
     return { names, point: hit.point.toArray(), found: null };
   }
+}
+
+/** An answer to words that were not understood, or not known: nothing about it is certain. */
+function doubtful<T extends Answer | null>(answer: T, note: string): T {
+  if (!answer) return answer;
+  const presence = answer.presence === "yes" ? "unsure" : answer.presence;
+  return { ...answer, note: [answer.note, note].filter(Boolean).join("; "), unknown: true, presence };
+}
+
+/** Places without those that are mostly in an earlier one. */
+function apart(places: Place[]): Place[] {
+  const taken = new Set<number>();
+  return places.filter(({ splats }) => {
+    const shared = splats.filter((splat) => taken.has(splat)).length;
+    for (const splat of splats) taken.add(splat);
+    return shared <= splats.length / 2;
+  });
 }

@@ -1,7 +1,8 @@
 // The tools at the side, and the keys that press them.
 
 import type { App } from "./app";
-import { h, iconButton } from "./dom";
+import { h, iconButton, save } from "./dom";
+import { PageError } from "./manifest";
 import { helpDialog } from "./panels";
 import { changeTheme } from "./theme";
 
@@ -16,6 +17,10 @@ export function toolbar(app: App, signal: AbortSignal): HTMLElement {
     app.note(app.measure.active ? "Click on two points." : "");
   }, "m");
   const heat = iconButton("heat", "Show heat instead of marks", () => press(heat, app.toggleHeat()), "h");
+  app.onMode = (on) => press(heat, on);
+  for (const [panel, button] of [[app.views, views], [app.objects, objects]] as const) {
+    panel.element.addEventListener("close", () => press(button, false));
+  }
   const dialog = helpDialog(manifest, server);
   const buttons: Record<string, HTMLButtonElement> = { v: views, o: objects, m: measure, h: heat };
   if (server) {
@@ -30,8 +35,8 @@ export function toolbar(app: App, signal: AbortSignal): HTMLElement {
   }
   Object.assign(buttons, {
     0: iconButton("whole", "Back to the start", () => app.start(null), "0"),
-    p: iconButton("picture", "Save the picture", () => app.run(() => app.savePicture()), "p"),
-    r: iconButton("video", "Record a video", () => app.run(() => app.saveVideo()), "r"),
+    p: iconButton("picture", "Save the picture", () => app.run(async () => save(await app.stage.picture(), "picture.png")), "p"),
+    r: iconButton("video", "Record a video", () => app.run(() => saveVideo(app)), "r"),
     l: iconButton("link", "Copy the link", () => app.run(() => app.copyLink()), "l"),
     t: iconButton("theme", "Light or dark", () => (app.stage.background = changeTheme()), "t"),
     "?": iconButton("help", "Help and about", () => dialog.showModal(), "?"),
@@ -39,6 +44,14 @@ export function toolbar(app: App, signal: AbortSignal): HTMLElement {
   for (const button of [views, objects, measure, heat]) press(button, false);
   addEventListener("keydown", (event) => key(event, app, buttons), { signal });
   return h("nav", { class: "tools", "aria-label": "Tools" }, ...Object.values(buttons), dialog);
+}
+
+async function saveVideo(app: App): Promise<void> {
+  app.note("Recording for six seconds …");
+  const made = await app.stage.record();
+  if (!made) throw new PageError("This browser records no videos.");
+  save(made.video, `video${made.suffix}`);
+  app.note("");
 }
 
 function key(event: KeyboardEvent, app: App, buttons: Record<string, HTMLButtonElement>): void {

@@ -127,3 +127,15 @@ def _size(text: str) -> str:
     words = text.lower().split()
     sizes = _SIZES if len(words) > 1 and (words[0] == "something" or is_kind(words[-1])) else _RELATIVE
     return next((word for word in words[: len(words) - 1] if word in sizes.split()), "")
+
+
+FOR_PAGES = {
+    "part_of": _PART, "unit": _UNIT, "numeral": _NUMBER, "fixed": _FIXED, "describes": _DESCRIBES,
+    "article": _ARTICLE, "starts": _STARTS, "later": _LATER,
+}  # fmt: skip
+"""Patterns by which published pages find what names no thing (`lexsplat.scenes.publishing.grammar`)."""
+WORDS_FOR_PAGES = {
+    "closed": sorted(_CLOSED), "verb_phrase": sorted(_VERB_PHRASE), "sizes": _SIZES.split(),
+    "relative": _RELATIVE.split(),
+}  # fmt: skip
+"""Closed classes of words."""

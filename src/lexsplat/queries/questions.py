@@ -359,3 +359,17 @@ def _with_quality_first(words: str) -> str:
     if found and re.search(r"\b(?:and|or)\b", found[1]):
         return ""
     return f"{found[2]} {_ARTICLES.sub('', found[1])}" if found else words
+
+
+FOR_PAGES = {
+    "tail": _TAIL, "tag": _TAG, "where_is_it": _WHERE_IS_IT, "is": _IS, "counted_tail": _COUNTED_TAIL,
+    "purpose": _PURPOSE, "last_qualities": _LAST_QUALITIES, "articles": _ARTICLES, "left_over": _LEFT_OVER,
+    "yes_or_no": _YES_OR_NO, "stated": _STATED, "only": _ONLY, "all_of": _ALL_OF, "state": _STATE, "moment": _MOMENT,
+}  # fmt: skip
+"""Patterns by which published pages read questions (`lexsplat.scenes.publishing.grammar`)."""
+REPLACED = {
+    "contractions": [(re.compile(pattern, re.IGNORECASE), instead) for pattern, instead in _CONTRACTIONS],
+    "reworded": list(_REWORDED),
+    "frames": list(_COMPILED),
+}
+"""Patterns and what pages put in their place, in this order."""

@@ -13,6 +13,9 @@ from lexsplat import __version__
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.kinds import KIND_PHRASES, is_of_kind
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.vocabulary import SURFACES
+from lexsplat.scenes.objects import object_colors
+from lexsplat.scenes.publishing.grammar import page_grammar
 from lexsplat.scenes.publishing.sidecar import selection_rule
 from lexsplat.scenes.scene import Scene
 
@@ -67,6 +70,7 @@ def scene_manifest(
         "text": None,
         "objects": None,
         "kinds": None,
+        "grammar": page_grammar(),
         "views": view_entries(scene),
         "licenses": {"page.js": "Apache-2.0 and those of LICENSES.txt"},
         "provenance": {**scene.encoder_identity(), "built_with": built_with},
@@ -101,12 +105,19 @@ def object_entries(objects: Sequence[Selection]) -> list[dict[str, Any]]:
     return entries
 
 
+def colored_entries(scene: Scene, objects: Sequence[Selection]) -> list[dict[str, Any]]:
+    """`object_entries` with "colors": the color words of each object, the most frequent first."""
+    entries = zip(object_entries(objects), objects)
+    return [{**entry, "colors": object_colors(scene, each)} for entry, each in entries]
+
+
 def kind_entries(objects: Sequence[Selection]) -> dict[str, list[int]]:
-    """The places of a scene's objects that each kind holds, by every text that names the kind."""
+    """The places of a scene's objects that each kind holds, by every text that names the kind; "" is any thing."""
     found = {
         text: [place for place, each in enumerate(objects) if is_of_kind(each.phrase, text)]
         for text in KIND_PHRASES
     }
+    found[""] = [place for place, each in enumerate(objects) if each.phrase not in SURFACES]
     return {text: places for text, places in found.items() if places}
 
 

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.grammar import understand
+from lexsplat.queries.phrases import Thing
 from lexsplat.queries.relevancy import embed_prompts
-from lexsplat.runtime.errors import LexsplatError
+from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.runtime.files import read_json
 from lexsplat.scenes.scene import Scene
 
@@ -54,15 +56,26 @@ def everyday_phrases(bundled: bool = False) -> dict[str, str]:
 
 
 def page_phrases(asked: Iterable[str] = (), bundled: bool = False) -> dict[str, str]:
-    """The kind of each phrase of a page: those asked of the scene, then everyday ones."""
+    """The kind of each phrase of a page: the things asked of the scene, then everyday phrases.
+
+    What else was asked ("mug left of the duck") has no place in a table: its relevancy is not its answer.
+    """
     phrases: dict[str, str] = {}
     for phrase in asked:
         plain = " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", phrase).split())[:_LONGEST].lower()
-        if plain and len(phrases) < _MOST_ASKED:
+        if plain and len(phrases) < _MOST_ASKED and _is_thing(plain):
             phrases[plain] = ASKED
     for phrase, kind in everyday_phrases(bundled).items():
         phrases.setdefault(phrase, kind)
     return phrases
+
+
+def _is_thing(phrase: str) -> bool:
+    try:
+        understood = understand(phrase)
+    except QueryError:
+        return False
+    return isinstance(understood.phrase, Thing) and not understood.unknown
 
 
 def asked_phrases(scene: Scene) -> list[str]:

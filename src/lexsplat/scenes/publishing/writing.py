@@ -22,9 +22,9 @@ from lexsplat.scenes.publishing.manifest import (
     DRAWN_SPLATS,
     FORMAT,
     checksums,
+    colored_entries,
     kind_entries,
     listed_objects,
-    object_entries,
     one_line,
     scene_manifest,
 )
@@ -237,7 +237,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
             },
         },
         "text": text,
-        "objects": object_entries(objects),
+        "objects": colored_entries(scene, objects),
         "kinds": kind_entries(objects),
         "licenses": {
             "page.js": "Apache-2.0 and those of LICENSES.txt",
