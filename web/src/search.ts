@@ -35,7 +35,7 @@ export class SearchBar {
       maxlength: MOST_LETTERS,
       oninput: () => this.#open(),
       onfocus: () => this.#open(),
-      onblur: () => setTimeout(() => this.close(), 150),
+      onblur: () => setTimeout(() => document.activeElement !== this.input && this.close(), 150), // it may be back by then
       onkeydown: (event: KeyboardEvent) => this.#key(event),
     });
     this.element = h(
