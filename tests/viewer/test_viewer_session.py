@@ -68,6 +68,12 @@ def test_phrases_with_relations_are_answered_by_find_and_say_how_they_were_under
     assert header["understood"] == str(scene.understand("ball 4 and ball 0").phrase)
 
 
+@pytest.mark.parametrize(("prompt", "unknown"), [("ball 2", False), ("ball 2 beyond seldom of", True)])
+def test_the_page_learns_whether_a_prompt_was_understood(session, prompt, unknown):
+    (length,) = struct.unpack_from("<I", reply := session.ask(Asked(prompt)))
+    assert json.loads(reply[4 : 4 + length])["unknown"] is unknown
+
+
 def test_left_and_right_are_those_of_the_page_that_asks(session, scene_and_balls, monkeypatch):
     scene, ground_truth = scene_and_balls
     seen = []

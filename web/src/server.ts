@@ -13,7 +13,7 @@ interface Header {
   instances: { center: number[]; size: number[] }[];
   understood?: string;
   note?: string;
-  /** Whether it has words that nothing here knows. */
+  /** Whether nothing is certain: it holds words that the encoder does not know, or has no grammar. */
   unknown?: boolean;
   names?: { phrase: string; score: number }[];
   point?: [number, number, number];
@@ -52,8 +52,7 @@ export class Server implements Source {
     const asked = { prompt, camera: this.stage.lens() };
     const { header, found } = await this.#found("ask", asked);
     this.dictionary.remember(prompt);
-    const note = header.note ?? "";
-    const unknown = header.unknown ?? /not understood|knows English words alone|which photos may not tell/.test(note);
+    const { note = "", unknown = false } = header;
     return answered(prompt, color, { ...found, phrase: header.understood || prompt, note, unknown });
   }
 

@@ -117,7 +117,11 @@ class Session:
         if asked.threshold is None:
             self.history.add(asked.prompt)
         note = "; ".join(filter(None, (understood.note, selection.note)))
-        notes = {"understood": "" if plain else str(understood.phrase), "note": note}
+        notes = {
+            "understood": "" if plain else str(understood.phrase),
+            "note": note,
+            "unknown": understood.unknown,
+        }
         return self._reply(selection, notes)
 
     def what_is(self, asked: Asked) -> bytes:
