@@ -19,6 +19,7 @@ SINGLE = (
     "objects", "a place to sit", "cone you see at road works", "is the mug red?", "hey robot, where is the duck?",
     "show me the mug, please", "mug, duck and banana", "the handle of that blue mug", '"red apple"', "vase, white",
     'the "red apple" and the duck', "is there a zebra or a duck?", "is there a zebra and a duck?", "pink things",
+    "red toy", "orange fruit", "yellow fruit", "blue toy", "something with leaves", "things with leaves",
     "can you see the mug?", "How many books?", "zebra", "red apple",
 )  # fmt: skip
 FURTHER = (
@@ -28,6 +29,7 @@ FURTHER = (
     "closest to the lamp", "how many things are on the table?", "which is bigger, the mug or the duck?", "small mug",
     "not the mug", "second toy from the left", "mug between the duck and the apple", "all fruit except the banana",
     "the toy in the back left corner", "is the mug on the table?", "are all toys red?", "the thing closest to me",
+    "small table", "large lamp", "all except the books", "all but the apple",
     "mug that is not blue", "book that is larger than the mug",
 )  # fmt: skip
 """What needs relations, an order, a comparison, a number or an exception."""

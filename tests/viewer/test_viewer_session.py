@@ -194,6 +194,13 @@ def test_steps_are_called_by_the_words_of_the_visitor(session):
     ]
 
 
+def test_a_step_for_one_of_several_places_says_so(session):
+    one = session.edit("recolor", Asked("ball 4 and ball 0", instance=1), {"color": [1, 0, 0]})
+    assert one["server"]["steps"][0].startswith("recolor 2 of 2 of ball 4 and ball 0 (")
+    both = session.edit("recolor", Asked("ball 4 and ball 0"), {"color": [1, 0, 0]})
+    assert both["server"]["steps"][1].startswith("recolor ball 4 and ball 0 (")
+
+
 @pytest.mark.parametrize(
     ("action", "values"),
     [("recolor", {"color": [2, 0, 0]}), ("move", {"scale": -1}), ("move", {"by": [float("nan"), 0, 0]}),

@@ -246,6 +246,7 @@ class Parser {
       if (grammar.match("thing_word", noun)) return [thing(`something made of ${material}`)];
       return this.#thing(`${grammar.entry.materials[material] ?? material} ${noun}`);
     }
+    if (words.toLowerCase() === "all") return [thing("")]; // all but the apple
     const word = grammar.match("thing_word", words);
     if (word) return word[1] ? this.#colored(`something ${word[1]}`) : [thing("")];
     const something = grammar.match("something", words);

@@ -40,9 +40,10 @@ export class Tables implements Source {
   }
 
   async answer(prompt: string, color: string): Promise<Answer | null> {
-    if (this.dictionary.has(prompt)) return this.#mended(prompt, prompt, color);
     const question = understood(prompt, this.dictionary.grammar);
     const { things, beyond, left, state } = question;
+    const plain = things.length === 1 && !things[0].color && !beyond && !left && !state;
+    if (plain && this.dictionary.has(prompt)) return this.#mended(prompt, prompt, color);
     if (beyond) return this.#beyond(question, prompt, color);
     if (left || things.length === 0) {
       const quoted = ` (“${left || prompt.trim()}”)`;
@@ -110,7 +111,9 @@ export class Tables implements Source {
 
   /** The answer to a text, for what was typed. */
   async #asked(text: string, prompt: string, color: string): Promise<Answer | null> {
-    const thing = this.dictionary.find(text) >= 0 ? text : (this.spelling?.singular(plainly(text)) ?? text);
+    // As in Python, words behind "something" stay as they are: something with leaves.
+    const kept = this.dictionary.find(text) >= 0 || text.startsWith("something ");
+    const thing = kept ? text : (this.spelling?.singular(plainly(text)) ?? text);
     const plain = await this.#plain(thing, prompt, color);
     const kind = plain && singulars(plainly(text)).find((form) => this.kinds.has(form));
     const members = kind ? this.kinds.find(kind, "", plain.scores) : null;

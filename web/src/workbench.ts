@@ -24,7 +24,9 @@ export function workbench(answer: Answer, server: Server, geometry: Geometry, up
   const facts = h("p", { class: "fine" });
   const middle = answer.places?.[answer.place]?.center.clone() ?? new THREE.Vector3();
   const photos = h("p", { class: "examples" });
-  const instance = (): number | null => (answer.places && answer.places.length > 1 ? answer.place : null);
+  const several = answer.places && answer.places.length > 1 ? answer.places.length : 0;
+  const all = h("input", { type: "checkbox", onchange: () => element.dispatchEvent(new Event("toggle")) });
+  const instance = (): number | null => (several && !all.checked ? answer.place : null);
   const formats = h("select", { "aria-label": "File format" }, ...server.entry.formats.map((name) => h("option", { value: name, text: name })));
   const download = h("button", {
     type: "button",
@@ -55,22 +57,24 @@ export function workbench(answer: Answer, server: Server, geometry: Geometry, up
     h("summary", { text: "Size, file, edit" }),
     facts,
     photos,
+    h("label", { class: "fine", hidden: !several }, all, ` All ${several} places, not only this one`),
     h("div", { class: "row" }, formats, download),
-    editor(answer, server, geometry, { up, middle }, host, instance),
+    editor(answer, server, geometry, { up, middle }, host, { instance, all }),
   );
   return element;
 }
 
 function editor(
   answer: Answer, server: Server, geometry: Geometry, axes: { up: THREE.Vector3; middle: THREE.Vector3 }, host: BenchHost,
-  instance: () => number | null,
+  { instance, all }: { instance: () => number | null; all: HTMLInputElement },
 ): HTMLElement {
   const input = (label: string, value: string, step = "any"): HTMLInputElement =>
     h("input", { type: "number", value, step, "aria-label": label, title: label, oninput: () => show() });
   const color = h("input", { type: "color", value: "#2f6fdf", "aria-label": "New color", oninput: () => show() });
   const by = ["x", "y", "z"].map((axis) => input(`Shift along ${axis}, units of the scene`, "0", "0.05"));
   const turn = input("Turn, degrees", "0", "5");
-  const scale = input("Size, factor", "1", "0.1");
+  const scale = input("Size, factor", "1");
+  scale.min = "0.001";
   const moving = h("div", { class: "row numbers", hidden: true }, "by", ...by, "turn", turn, "×", scale);
   const change = h(
     "select",
@@ -78,10 +82,10 @@ function editor(
     h("option", { value: "", text: "Edit …" }),
     ...CHANGES.map((name) => h("option", { value: name, text: LABELS[name] })),
   );
-  const apply = h("button", { type: "button", text: "Apply", onclick: () => host.edit(change.value as Change, values()) });
+  const apply = h("button", { type: "button", text: "Apply", onclick: () => (scale.checkValidity() ? host.edit(change.value as Change, values()) : scale.reportValidity()) });
   const taken = h("p", { class: "fine taken", "aria-live": "polite" });
   /** What the last change that was chosen would apply to. */
-  let planned: { kind: Change; splats: number[]; light: number } | null = null;
+  let planned: { kind: Change; of: number | null; splats: number[]; light: number } | null = null;
   const amount = (field: HTMLInputElement, least = -Infinity): number => {
     const value = Number(field.value);
     return Number.isFinite(value) && value > least ? value : Number(field.defaultValue);
@@ -101,13 +105,14 @@ function editor(
     apply.hidden = kind === "";
     taken.hidden = kind === "";
     if (kind === "") return host.preview(null);
-    if (planned?.kind !== kind) {
+    if (planned?.kind !== kind || planned.of !== instance()) {
       taken.textContent = "Looking for what it takes along …";
       return host.run(async () => {
-        const { splats, count } = await server.preview(kind, { ...answer.asked, instance: instance() });
-        planned = { kind, splats, light: geometry.light(splats) };
+        const of = instance();
+        const { splats, count } = await server.preview(kind, { ...answer.asked, instance: of });
+        planned = { kind, of, splats, light: geometry.light(splats) };
         taken.textContent = told(kind, count);
-        if (change.value === kind) show();
+        if (change.value === kind && instance() === of) show();
       });
     }
     host.preview({
@@ -122,6 +127,7 @@ function editor(
     });
   };
   color.hidden = apply.hidden = true;
+  all.addEventListener("change", show);
   return h("div", {}, h("div", { class: "row" }, change, color, apply), moving, taken);
 }
 

@@ -192,6 +192,12 @@ class Session:
             raise QueryError("instance", expected=f"one of {selection.count}", found=str(asked.instance))
         return selection.instances[asked.instance]
 
+    def _name(self, asked: Asked) -> str:
+        """What a step is about: "all fruits", or "1 of 2 of all fruits"."""
+        count = self._select(asked).count if asked.instance is not None else 0
+        one = f"{(asked.instance or 0) + 1} of {count} of " if count > 1 else ""
+        return one + asked.prompt
+
     def _hit(self, asked: Asked) -> Hit:
         if asked.click is None or asked.camera is None:
             raise QueryError("click", expected="a pixel and a camera", found="none")
@@ -242,7 +248,7 @@ class Session:
                 getattr(self.editor, action)()
             else:
                 chosen = self._chosen(asked)
-                named = chosen.described(phrase=asked.prompt) if asked.prompt else chosen
+                named = chosen.described(phrase=self._name(asked)) if asked.prompt else chosen
                 self._change(action, named, values)
         except ValueError as error:  # numbers that have no meaning for these Gaussians
             raise QueryError(

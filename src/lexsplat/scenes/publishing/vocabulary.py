@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import lru_cache
 from importlib.resources import files
 
 import torch
@@ -58,16 +59,22 @@ def everyday_phrases(bundled: bool = False) -> dict[str, str]:
 def page_phrases(asked: Iterable[str] = (), bundled: bool = False) -> dict[str, str]:
     """The kind of each phrase of a page: the things asked of the scene, then everyday phrases.
 
-    What else was asked ("mug left of the duck") has no place in a table: its relevancy is not its answer.
+    What is no plain thing ("mug left of the duck", "red toy", "small table") is left out: its relevancy is not its
+    answer.
     """
     phrases: dict[str, str] = {}
     for phrase in asked:
         plain = " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", phrase).split())[:_LONGEST].lower()
         if plain and len(phrases) < _MOST_ASKED and _is_thing(plain):
             phrases[plain] = ASKED
-    for phrase, kind in everyday_phrases(bundled).items():
+    for phrase, kind in _everyday_things(bundled).items():
         phrases.setdefault(phrase, kind)
     return phrases
+
+
+@lru_cache
+def _everyday_things(bundled: bool) -> dict[str, str]:
+    return {phrase: kind for phrase, kind in everyday_phrases(bundled).items() if _is_thing(phrase)}
 
 
 def _is_thing(phrase: str) -> bool:
