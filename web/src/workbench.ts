@@ -57,7 +57,7 @@ export function workbench(answer: Answer, server: Server, geometry: Geometry, up
     h("summary", { text: "Size, file, edit" }),
     facts,
     photos,
-    h("label", { class: "fine", hidden: !several }, all, ` All ${several} places, not only this one`),
+    several > 0 && h("label", { class: "scope" }, all, ` All ${several} places, not only this one`),
     h("div", { class: "row" }, formats, download),
     editor(answer, server, geometry, { up, middle }, host, { instance, all }),
   );

@@ -67,16 +67,13 @@ def page_phrases(asked: Iterable[str] = (), bundled: bool = False) -> dict[str, 
         plain = " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", phrase).split())[:_LONGEST].lower()
         if plain and len(phrases) < _MOST_ASKED and _is_thing(plain):
             phrases[plain] = ASKED
-    for phrase, kind in _everyday_things(bundled).items():
-        phrases.setdefault(phrase, kind)
+    for phrase, kind in everyday_phrases(bundled).items():
+        if phrase not in phrases and _is_thing(phrase):
+            phrases[phrase] = kind
     return phrases
 
 
-@lru_cache
-def _everyday_things(bundled: bool) -> dict[str, str]:
-    return {phrase: kind for phrase, kind in everyday_phrases(bundled).items() if _is_thing(phrase)}
-
-
+@lru_cache(maxsize=10_000)  # the viewer asks for the same phrases after each edit
 def _is_thing(phrase: str) -> bool:
     try:
         understood = understand(phrase)
