@@ -85,9 +85,7 @@ def _circle_positions(target: Target, reach: float, surroundings: Surroundings) 
 
 def inside(surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
     """Cameras at eye height on a grid of free places within the scene that look all around, `TURNS` at each."""
-    return [
-        camera for place in free_places(surroundings) for camera in all_around(place, surroundings, size)
-    ]
+    return [camera for place in free_places(surroundings) for camera in all_around(place, surroundings, size)]
 
 
 def free_places(surroundings: Surroundings, level: float = _EYE) -> list[Points]:

@@ -120,7 +120,9 @@ def choose_views(
         log.warning(
             "%s: taken as %s, which is uncertain; see the contact sheet",
             subject,
-            "a room and looked at from inside" if tried.interior.is_room else "an object and looked at from around",
+            "a room and looked at from inside"
+            if tried.interior.is_room
+            else "an object and looked at from around",
         )
     chosen, visible, unseen = _cover(tried)
     cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
@@ -174,11 +176,7 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
         listener(Event("views", done, len(candidates)))
     interior = examine(gaussians, found, inner, depths, qualities[len(outer) :])
     cameras = [camera for camera, _ in candidates]
-    if interior.is_room:  # from outside, walls show their backs
-        allowed = found.box.contains(np.stack([camera.position for camera in cameras]))
-        allowed[len(outer) :] = True
-    else:  # what is inside is between things, beside them, or within a hollow one
-        allowed = np.arange(len(candidates)) < len(outer)
+    allowed = _on_its_side(interior, found, cameras, len(outer))
     good = np.zeros(len(candidates), bool)
     for part in _LENIENT:
         if good[allowed].mean() < (_ENOUGH_INSIDE if interior.is_room else _ENOUGH):
@@ -206,6 +204,19 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
         (weigh(others) > _SEEN).any(0),
         interior,
     )
+
+
+def _on_its_side(
+    interior: Interior, found: Surroundings, cameras: list[Camera], outer: int
+) -> NDArray[np.bool_]:
+    """Which cameras are within a room, or around an object; ``outer`` is the number of those that look at targets."""
+    within = found.box.contains(np.stack([camera.position for camera in cameras]))
+    looking_around = np.arange(len(cameras)) >= outer
+    if interior.is_room:  # from outside, walls show their backs
+        return np.asarray(within | looking_around)
+    if interior.is_shell:
+        return np.asarray(~(within | looking_around))
+    return ~looking_around  # what looks around is between things, or beside them
 
 
 def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> bool:
