@@ -14,7 +14,7 @@ from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
-from lexsplat.pipeline.viewpoints.interior import Interior, examine
+from lexsplat.pipeline.viewpoints.interior import Interior, examine, without_lonely_points
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
@@ -165,7 +165,7 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
     if len(outer) > _MOST_CANDIDATES:
         kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
         outer = [outer[index] for index in kept]
-    inner = inside(found, SMALL)
+    inner = inside(without_lonely_points(found), SMALL)
     candidates = [*outer, *((camera, None) for camera in inner)]
     qualities, depths = np.zeros(len(candidates), np.float32), []
     for done, (camera, target) in enumerate(candidates, start=1):
@@ -180,7 +180,8 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
     good = np.zeros(len(candidates), bool)
     for part in _LENIENT:
         if good[allowed].mean() < (_ENOUGH_INSIDE if interior.is_room else _ENOUGH):
-            good[allowed] = _clear_enough(qualities[allowed], part)
+            least = 0.0 if interior.is_room else _LEAST_CLEAR
+            good[allowed] = _clear_enough(qualities[allowed], part, least)
             if not (interior.is_room or interior.is_shell):
                 good = _before_walls(gaussians, cameras, good, found)
     looked_at = np.arange(len(gaussians))
@@ -201,7 +202,7 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
         [cameras[index] for index in chosen_from],
         qualities[good],
         weigh(chosen_from),
-        (weigh(others) > _SEEN).any(0),
+        np.asarray((weigh(others) > _SEEN).any(axis=0)),
         interior,
     )
 
@@ -233,9 +234,11 @@ def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> boo
     return before or float((depth < 0.3 * distance).mean()) > 0.05
 
 
-def _clear_enough(qualities: NDArray[np.float32], part: float) -> NDArray[np.bool_]:
+def _clear_enough(
+    qualities: NDArray[np.float32], part: float, least: float = _LEAST_CLEAR
+) -> NDArray[np.bool_]:
     """Which views show enough surfaces, with both least shares reduced to a part of them."""
-    enough = qualities >= part * _LEAST_CLEAR
+    enough = qualities >= part * least
     best = float(np.quantile(qualities[enough], 0.9)) if enough.any() else 0.0
     return np.asarray(enough & (qualities > part * _LEAST_OF_BEST * best))
 

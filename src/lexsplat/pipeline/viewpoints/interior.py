@@ -6,16 +6,17 @@ closed, too, but empty: from any place inside, all that is seen is the convex sh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import TURNS, all_around, free_places
+from lexsplat.pipeline.viewpoints.floaters import isolation
 from lexsplat.pipeline.viewpoints.looking import SMALL, Image, look
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings
 
@@ -38,6 +39,9 @@ _THINGS = 0.015
 """Least share of things in what is seen from the places of a room: 0.02 for a ball of a fifth of its height,"""
 _HARDLY = 0.005
 """and share above which it may be a room; an empty shell has 0."""
+_LONELY = 3.0
+"""Lonely Gaussians are this many times farther from their neighbors than usual, whatever their size."""
+_NEIGHBORS = 12
 _POINTS = 3000
 """Points of what a place shows, at most."""
 
@@ -82,7 +86,9 @@ def examine(
     depths: list[Image],
     qualities: NDArray[np.float32],
 ) -> Interior:
-    """Examine the inside of a scene.
+    """Examine the inside of a scene, and again without lonely Gaussians if it is neither a room nor empty.
+
+    Floaters fill a room like haze; the space above a table has walls of haze only.
 
     Args:
         gaussians: The scene.
@@ -91,13 +97,42 @@ def examine(
         depths: What they show, ``[H, W]`` each, infinite where nothing is drawn.
         qualities: Share of surfaces in each.
     """
+    result = _examined(gaussians, found, cameras, depths, qualities)
+    empty = result.enclosed >= _ENCLOSED and result.things < _HARDLY
+    if result.is_room or empty or not cameras:
+        return result
+    sociable = isolation(gaussians)[0] < _LONELY
+    rest = gaussians.select(torch.from_numpy(np.flatnonzero(sociable)).to(gaussians.device))
+    looks = [look(rest, camera) for camera in cameras]
+    shares = np.array([clear for _, clear in looks], np.float32)
+    without = _examined(rest, found, cameras, [depth for depth, _ in looks], shares)
+    return without if without.is_room else result
+
+
+def without_lonely_points(found: Surroundings) -> Surroundings:
+    """The same surroundings, whose places are free even if a floater is near."""
+    points = found.tree.data
+    apart = found.tree.query(points, k=min(_NEIGHBORS + 1, len(points)))[0][:, 1:].mean(1)
+    return replace(found, tree=cKDTree(points[apart < _LONELY * np.median(apart)]))
+
+
+def _examined(
+    gaussians: Gaussians,
+    found: Surroundings,
+    cameras: list[Camera],
+    depths: list[Image],
+    qualities: NDArray[np.float32],
+) -> Interior:
+    found = without_lonely_points(found)
     closed, things = [], []
     for first in range(0, len(cameras), TURNS):
         views = slice(first, first + TURNS)
         closed.append(_is_closed(depths[views]) and float(qualities[views].mean()) >= _CLEAR)
         if closed[-1]:
             things.append(_share_of_things(cameras[views], depths[views], found))
-    result = Interior(len(closed), float(np.mean(closed or [0])), float(np.median(things or [0])))
+    result = Interior(
+        len(closed), float(np.mean(closed)) if closed else 0.0, float(np.median(things)) if things else 0.0
+    )
     if not result.is_room:
         return result
     for level in _LEVELS:
