@@ -333,7 +333,7 @@ def test_rooms_that_no_chosen_view_shows_count_as_unseen(monkeypatch):
 
 def test_an_interior_is_a_room_an_object_or_uncertain():
     """An empty shell, hardly anything in a shell, a ball in a room, a half open stage, things on a table."""
-    cases = [(1, 0), (1, 0.01), (1, 0.025), (0.5, 0.2), (0.1, 0.9)]
+    cases = [(1, 0), (1, 0.005), (1, 0.014), (0.5, 0.2), (0.1, 0.9)]
     found = [Interior(9, enclosed, things) for enclosed, things in cases]
     assert [one.is_room for one in found] == [False, False, True, False, False]
     assert [one.is_shell for one in found] == [True, True, False, False, False]

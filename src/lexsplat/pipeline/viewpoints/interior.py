@@ -35,9 +35,9 @@ _DEEP = 0.1
 """Things are this far within the hull of what a place shows, relative to the height of the scene."""
 _NEAR = 0.05
 """Things are this close to solid points, relative to the height of the scene; floaters are not."""
-_THINGS = 0.015
-"""Least share of things in what is seen from the places of a room: 0.02 for a ball of a fifth of its height,"""
-_HARDLY = 0.005
+_THINGS = 0.008
+"""Least share of things in what is seen from the places of a room: it is 0.014 for two balls on the floor,"""
+_HARDLY = 0.003
 """and share above which it may be a room; an empty shell has 0."""
 _LONELY = 3.0
 """Lonely Gaussians are this many times farther from their neighbors than usual, whatever their size."""
