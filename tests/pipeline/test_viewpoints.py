@@ -20,6 +20,7 @@ from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.pipeline.viewpoints import choosing, stage
 from lexsplat.pipeline.viewpoints.choosing import choose_views
 from lexsplat.pipeline.viewpoints.floaters import find_floaters, isolation
+from lexsplat.pipeline.viewpoints.interior import Interior
 from lexsplat.pipeline.viewpoints.looking import look, surface_share
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.errors import CaptureError
@@ -233,6 +234,110 @@ def test_floaters_larger_than_the_things_they_engulf_are_found():
     floating = find_floaters(scene, Path("dusty.ply"))
     assert np.isin(np.arange(len(scene) - 4, len(scene)), floating).all()
     assert (floating >= len(clean) + 2).all()
+
+
+def with_floaters(clean: Gaussians, low, high, count: int) -> Gaussians:
+    """Half-opaque Gaussians of 2 to 15 cm in a box of meters."""
+    generator = np.random.default_rng(1)
+    points = generator.uniform(low, high, (count, 3))
+    floaters = gaussians_from_points(points, generator.random((count, 3)), sh_degree=0, opacity=0.5)
+    sizes = np.exp(generator.uniform(np.log(0.02), np.log(0.15), (count, 1)))
+    floaters.log_scales[:] = torch.from_numpy(np.log(sizes)).float()
+    return joined(clean, floaters)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.01, 0.03, 0.05])
+def test_a_furnished_room_with_floaters_is_looked_at_from_inside(share):
+    room = solid(furnished())
+    scene = with_floaters(room, [0, 0, 0], [5, 4, 2.5], round(share * len(room)))
+    floating = find_floaters(scene, Path("room.ply"))
+    chosen = choose_views(scene.select(torch.from_numpy(np.delete(np.arange(len(scene)), floating))), up=UP)
+    positions = np.stack([camera.position for camera in chosen.cameras])
+    assert chosen.room
+    assert "as of a room, from inside" in chosen.note
+    assert ((positions > 0) & (positions < [5, 4, 2.5])).all()
+    if share < 0.02:  # more floaters hide the room from most of its places, and the count says so
+        assert chosen.unseen < 0.1 * chosen.visible
+
+
+def outside_balls(balls, points: np.ndarray) -> np.ndarray:
+    """Which points are in none of some balls."""
+    centers, radii = np.array([center for center, _ in balls]), np.array([radius for _, radius in balls])
+    return (np.linalg.norm(points[:, None] - centers, axis=2) > radii - 1e-6).all(1)
+
+
+def ball():
+    """Points on a hollow thing, and which positions are outside of it."""
+    whole = [((0, 0, 0), 1.0)]
+    return on_sphere(*whole[0], 6000, 0), lambda positions: outside_balls(whole, positions)
+
+
+def crate():
+    low, high = np.array([-1, -0.6, 0]), np.array([1, 0.6, 1.2])
+    return box(low, high, 9000, 0), lambda positions: ((positions < low) | (positions > high)).any(1)
+
+
+def person():
+    """The skin of a person of balls in rows, all one hollow: a trunk, a head, two arms and two legs."""
+    balls = [((0, 0, z), 0.25) for z in np.arange(0.9, 1.5, 0.06)] + [((0, 0, 1.8), 0.2)]
+    balls += [((x, 0, z), 0.12) for x in (-0.16, 0.16) for z in np.arange(0.12, 0.9, 0.05)]
+    balls += [((side * x, 0, 1.45), 0.1) for side in (-1, 1) for x in np.arange(0.25, 0.8, 0.05)]
+    skins = [on_sphere(*one, round(25_000 * one[1] ** 2), n) for n, one in enumerate(balls)]
+    points = np.concatenate(skins)
+    return points[outside_balls(balls, points)], lambda positions: outside_balls(balls, positions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shell", [ball, person, crate])
+def test_a_hollow_object_alone_is_looked_at_from_all_around(shell):
+    points, are_outside = shell()
+    chosen = choose_views(solid(points), up=UP)
+    assert not chosen.room
+    assert "as of an object, from around" in chosen.note
+    positions = np.stack([camera.position for camera in chosen.cameras])
+    low, high = points.min(0), points.max(0)
+    assert are_outside(positions).all()
+    azimuths = np.sort(np.arctan2(*(positions - (low + high) / 2).T[:2]))
+    assert np.diff(azimuths, append=azimuths[0] + 2 * np.pi).max() < np.pi / 2
+    assert chosen.visible > 0.8 * len(points)
+    assert chosen.unseen < 0.05 * chosen.visible
+
+
+def row_of_rooms(count: int) -> np.ndarray:
+    """Closed rooms of 4.8 x 4 x 2.5 in a row, each with a ball on the floor."""
+    parts = []
+    for k in range(count):
+        parts.append(box((5 * k, 0, 0), (5 * k + 4.8, 4, 2.5), 5000, k))
+        parts.append(on_sphere((5 * k + 2.4, 2, 0.5), 0.5, 600, k))
+    return np.concatenate(parts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 6])
+def test_every_closed_room_of_a_row_has_views(count):
+    chosen = choose_views(solid(row_of_rooms(count)), up=UP)
+    positions = np.stack([camera.position for camera in chosen.cameras])
+    assert np.unique(positions[:, 0] // 5).tolist() == list(range(count))
+    assert chosen.visible > 0.6 * len(row_of_rooms(count))  # ceilings are above all views
+    assert chosen.unseen < 0.05 * chosen.visible
+
+
+@pytest.mark.slow
+def test_rooms_that_no_chosen_view_shows_count_as_unseen(monkeypatch):
+    """Eight views do for two rooms of six."""
+    monkeypatch.setattr(choosing, "_MOST_VIEWS", 8)
+    chosen = choose_views(solid(row_of_rooms(6)), up=UP)
+    assert chosen.unseen > 0.3 * chosen.visible > 0.15 * len(row_of_rooms(6))
+
+
+def test_an_interior_is_a_room_an_object_or_uncertain():
+    """An empty shell, hardly anything in a shell, a ball in a room, a half open stage, things on a table."""
+    cases = [(1, 0), (1, 0.005), (1, 0.014), (0.5, 0.2), (0.1, 0.9)]
+    found = [Interior(9, enclosed, things) for enclosed, things in cases]
+    assert [one.is_room for one in found] == [False, False, True, False, False]
+    assert [one.is_shell for one in found] == [True, True, False, False, False]
+    assert [one.is_certain for one in found] == [True, False, True, False, True]
 
 
 @pytest.mark.slow

@@ -20,11 +20,20 @@ _DISTANCES = (0.75, 1.1)
 """In distances from which the target fills the height of the image."""
 _CLEARANCE = 0.15
 """Free radius around a camera, relative to its distance from the target."""
+_CLEARANCE_INSIDE = 0.2
+"""The same within a room, relative to its height."""
 _CLOSEST = 0.5
 """Least distance, relative to that from which the whole scene fills the image."""
 _EYE = 0.6
 """Eye height in a room, relative to its height: 1.5 m of 2.5 m."""
+_CELL = 1.0
+"""Distance of places within the scene, relative to its height: every room gets some,"""
 _GRID = 4
+"""and at least as many along either side,"""
+_MOST_PLACES = 48
+"""but not more in all: they are looked around from, which takes time."""
+TURNS = 8
+"""Cameras at each place within the scene."""
 
 Points = NDArray[np.float64]
 
@@ -75,19 +84,36 @@ def _circle_positions(target: Target, reach: float, surroundings: Surroundings) 
 
 
 def inside(surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
-    """Cameras at eye height on a grid of free places within the scene that look all around, slightly down."""
+    """Cameras at eye height on a grid of free places within the scene that look all around, `TURNS` at each."""
+    return [camera for place in free_places(surroundings) for camera in all_around(place, surroundings, size)]
+
+
+def free_places(surroundings: Surroundings, level: float = _EYE) -> list[Points]:
+    """Places within the scene that are not close to anything, on a grid along the sides of its box.
+
+    Args:
+        surroundings: The scene.
+        level: Height of the places, relative to that of the scene.
+    """
+    box, up, height = surroundings.box, surroundings.up.direction, surroundings.height
+    cells = np.maximum(np.ceil(2 * box.half_sizes[:2] / max(_CELL * height, 1e-12)), _GRID)
+    cells = np.minimum(cells, _MOST_PLACES).astype(int)
+    while cells.prod() > _MOST_PLACES:
+        cells = np.maximum(cells * 9 // 10, _GRID)
+    first, second = (
+        np.outer((2 * np.arange(count) + 1) / count - 1, half * axis)
+        for count, half, axis in zip(cells, box.half_sizes, box.axes)
+    )
+    places = (box.center + first[:, None] + second[None]).reshape(-1, 3)
+    places += np.outer(surroundings.ground + level * height - places @ up, up)
+    return list(places[surroundings.tree.query(places)[0] >= _CLEARANCE_INSIDE * height])
+
+
+def all_around(place: Points, surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
+    """`TURNS` cameras at a place that look all around, slightly down."""
     first, second, up = upright_frame(surroundings.up.direction)
-    points = surroundings.tree.data
-    sides = [np.quantile(points @ axis, [0.1, 0.9]) for axis in (first, second)]
-    eye = surroundings.ground + _EYE * surroundings.height
-    clearance = 0.2 * surroundings.height
-    found = []
-    for a in np.linspace(sides[0][0], sides[0][1], _GRID):
-        for b in np.linspace(sides[1][0], sides[1][1], _GRID):
-            position = a * first + b * second + eye * up
-            if surroundings.tree.query(position)[0] < clearance:
-                continue
-            for angle in np.arange(8) * (math.pi / 4):
-                ahead = math.cos(angle) * first + math.sin(angle) * second - 0.2 * up
-                found.append(look_at(position, position + ahead, up, *size, FOV_Y))
-    return found
+    cameras = []
+    for angle in np.arange(TURNS) * (2 * math.pi / TURNS):
+        ahead = math.cos(angle) * first + math.sin(angle) * second - 0.2 * up
+        cameras.append(look_at(place, place + ahead, up, *size, FOV_Y))
+    return cameras

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +14,14 @@ from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
+from lexsplat.pipeline.viewpoints.interior import Interior, examine, without_lonely_points
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.progress import Event, Listener, silent
+
+log = logging.getLogger("lexsplat")
 
 SIZE = (960, 720)
 """Width and height of the chosen views in pixels."""
@@ -38,10 +42,14 @@ _LEAST_OF_BEST = 0.65
 """and least share relative to good views: where a splat is sharp, a view of fog is no use."""
 _ENOUGH = 0.05
 """Least share of good views among the candidates: a splat that is hazy everywhere is measured by itself,"""
+_ENOUGH_INSIDE = 0.5
+"""and in a room, which looks the same from everywhere but for the floaters in front,"""
 _LENIENT = (1.0, 0.5, 0.25)
 """by these parts of both least shares, one after the other."""
-_ENCLOSED = 0.7
-"""Share of good views all around from inside that makes a scene a room."""
+_SOME = 1 / 3
+"""Where fewer of the clear views see into the scene, it has no inside: a solid thing hides its own middle."""
+_MOST_OTHERS = 128
+"""Views that are not good enough to be chosen, at most, that tell which Gaussians can be seen at all."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +61,9 @@ class ChosenViews:
         up: The up direction.
         candidates: Number of cameras that were tried.
         left_out: Number of those that showed floaters, holes, or something in front of their target.
-        visible: Number of Gaussians that any good candidate shows.
+        visible: Number of Gaussians that can be seen from around an object, or from free places within a room.
         unseen: Number of those that no chosen view shows.
+        room: Whether the scene was taken as a room.
     """
 
     cameras: tuple[Camera, ...]
@@ -63,12 +72,15 @@ class ChosenViews:
     left_out: int
     visible: int
     unseen: int
+    room: bool = False
 
     @property
     def note(self) -> str:
         """One line for the user."""
+        kind = "a room, from inside" if self.room else "an object, from around"
         return (
-            f"{len(self.cameras)} views chosen of {self.candidates} ({self.left_out} showed no surfaces); "
+            f"{len(self.cameras)} views chosen of {self.candidates} ({self.left_out} showed no surfaces), "
+            f"as of {kind}; "
             f"{self.unseen:,} of {self.visible:,} visible Gaussians are in none of them"
         )
 
@@ -104,6 +116,14 @@ def choose_views(
             found=f"none of {tried.count} tried (fog, holes, or no free space)",
             remedy="give the capture it was made from, or the up direction with --up x,y,z",
         )
+    if not tried.interior.is_certain:
+        log.warning(
+            "%s: taken as %s, which is uncertain; see the contact sheet",
+            subject,
+            "a room and looked at from inside"
+            if tried.interior.is_room
+            else "an object and looked at from around",
+        )
     chosen, visible, unseen = _cover(tried)
     cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
     share = len(gaussians) / max(tried.weights.shape[1], 1)
@@ -114,6 +134,7 @@ def choose_views(
         tried.count - len(tried.cameras),
         round(visible * share),
         round(unseen * share),
+        tried.interior.is_room,
     )
 
 
@@ -126,12 +147,16 @@ class _Tried:
         cameras: The good ones, small.
         qualities: Share of their pixels that show a surface ``[C]``.
         weights: Weight of a sample of the Gaussians in each ``[C, n]``, pixels.
+        elsewhere: Whether other candidates show them ``[n]``.
+        interior: Whether the scene is a room.
     """
 
     count: int
     cameras: list[Camera]
     qualities: NDArray[np.float32]
     weights: NDArray[np.float32]
+    elsewhere: NDArray[np.bool_]
+    interior: Interior
 
 
 def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, listener: Listener) -> _Tried:
@@ -140,33 +165,59 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
     if len(outer) > _MOST_CANDIDATES:
         kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
         outer = [outer[index] for index in kept]
-    inner = inside(found, SMALL)
+    inner = inside(without_lonely_points(found), SMALL)
     candidates = [*outer, *((camera, None) for camera in inner)]
-    qualities = np.zeros(len(candidates), np.float32)
+    qualities, depths = np.zeros(len(candidates), np.float32), []
     for done, (camera, target) in enumerate(candidates, start=1):
         depth, clear = look(gaussians, camera)
+        if target is None:
+            depths.append(depth)
         qualities[done - 1] = 0 if target is not None and is_hidden(depth, camera, target) else clear
         listener(Event("views", done, len(candidates)))
+    interior = examine(gaussians, found, inner, depths, qualities[len(outer) :])
+    cameras = [camera for camera, _ in candidates]
+    allowed = _on_its_side(interior, found, cameras, len(outer))
     good = np.zeros(len(candidates), bool)
     for part in _LENIENT:
-        if good.mean() < _ENOUGH:
-            good = _clear_enough(qualities, part)
-            for index in np.flatnonzero(good):
-                good[index] = not _is_behind_a_wall(gaussians, candidates[index][0], found)
-            if (
-                inner and good[len(outer) :].mean() >= _ENCLOSED
-            ):  # a room: from outside, walls show their backs
-                good &= found.box.contains(np.stack([camera.position for camera, _ in candidates]))
-            else:  # no room: what is inside is between things, or beside them
-                good[len(outer) :] = False
+        if good[allowed].mean() < (_ENOUGH_INSIDE if interior.is_room else _ENOUGH):
+            least = 0.0 if interior.is_room else _LEAST_CLEAR
+            good[allowed] = _clear_enough(qualities[allowed], part, least)
+            if not (interior.is_room or interior.is_shell):
+                good = _before_walls(gaussians, cameras, good, found)
     looked_at = np.arange(len(gaussians))
     if len(looked_at) > _SAMPLE:
         looked_at = np.sort(generator.choice(looked_at, _SAMPLE, replace=False))
-    cameras = [candidates[index][0] for index in np.flatnonzero(good)]
-    weights = np.zeros((len(cameras), len(looked_at)), np.float32)
-    for row, camera in enumerate(cameras):
-        weights[row] = accumulate_weights(gaussians, camera).cpu().numpy()[looked_at]
-    return _Tried(len(candidates), cameras, qualities[good], weights)
+    others = np.flatnonzero(allowed & ~good)
+    others = others[:: -(-len(others) // _MOST_OTHERS) or 1]
+    chosen_from = np.flatnonzero(good)
+
+    def weigh(indices: NDArray[np.int64]) -> NDArray[np.float32]:
+        weights = np.zeros((len(indices), len(looked_at)), np.float32)
+        for row, index in enumerate(indices):
+            weights[row] = accumulate_weights(gaussians, cameras[index]).cpu().numpy()[looked_at]
+        return weights
+
+    return _Tried(
+        len(candidates),
+        [cameras[index] for index in chosen_from],
+        qualities[good],
+        weigh(chosen_from),
+        np.asarray((weigh(others) > _SEEN).any(axis=0)),
+        interior,
+    )
+
+
+def _on_its_side(
+    interior: Interior, found: Surroundings, cameras: list[Camera], outer: int
+) -> NDArray[np.bool_]:
+    """Which cameras are within a room, or around an object; ``outer`` is the number of those that look at targets."""
+    within = found.box.contains(np.stack([camera.position for camera in cameras]))
+    looking_around = np.arange(len(cameras)) >= outer
+    if interior.is_room:  # from outside, walls show their backs
+        return np.asarray(within | looking_around)
+    if interior.is_shell:
+        return np.asarray(~(within | looking_around))
+    return ~looking_around  # what looks around is between things, or beside them
 
 
 def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> bool:
@@ -183,11 +234,23 @@ def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> boo
     return before or float((depth < 0.3 * distance).mean()) > 0.05
 
 
-def _clear_enough(qualities: NDArray[np.float32], part: float) -> NDArray[np.bool_]:
+def _clear_enough(
+    qualities: NDArray[np.float32], part: float, least: float = _LEAST_CLEAR
+) -> NDArray[np.bool_]:
     """Which views show enough surfaces, with both least shares reduced to a part of them."""
-    enough = qualities >= part * _LEAST_CLEAR
+    enough = qualities >= part * least
     best = float(np.quantile(qualities[enough], 0.9)) if enough.any() else 0.0
     return np.asarray(enough & (qualities > part * _LEAST_OF_BEST * best))
+
+
+def _before_walls(
+    gaussians: Gaussians, cameras: list[Camera], good: NDArray[np.bool_], found: Surroundings
+) -> NDArray[np.bool_]:
+    """Which of the good cameras are not behind a wall; all of them if nearly all seem to be."""
+    before = good.copy()
+    for index in np.flatnonzero(good):
+        before[index] = not _is_behind_a_wall(gaussians, cameras[index], found)
+    return before if before.sum() >= _SOME * good.sum() else good
 
 
 def _is_behind_a_wall(gaussians: Gaussians, camera: Camera, found: Surroundings) -> bool:
@@ -208,7 +271,8 @@ def _cover(tried: _Tried) -> tuple[list[int], int, int]:
     """Greedy choice: the view that adds most coverage, again and again.
 
     Returns:
-        Indices of the chosen candidates; how many Gaussians of the sample any candidate shows; how many of these no
+        Indices of the chosen candidates; how many Gaussians of the sample any candidate of
+        the kind that is taken shows; how many of these no
         chosen one shows.
     """
     shown = np.minimum(tried.weights / _SEEN, 1)
@@ -227,5 +291,5 @@ def _cover(tried: _Tried) -> tuple[list[int], int, int]:
         chosen.append(indices[best])
         left.remove(indices[best])
         covered = np.minimum(covered + shown[indices[best]], _TIMES)
-    visible = possible > 0.5
+    visible = (possible > 0.5) | tried.elsewhere
     return chosen, int(visible.sum()), int((visible & (covered < 0.5)).sum())
