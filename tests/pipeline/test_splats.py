@@ -7,9 +7,16 @@ from lexsplat.pipeline.splats import existing_splats, splats_hash
 from lexsplat.runtime.errors import FileFormatError
 
 
-@pytest.mark.parametrize("name", [None, "absent.ply", "."])
-def test_only_an_existing_file_is_taken(tmp_path, name):
-    with pytest.raises(FileFormatError, match="no such file"):
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        (None, "no such file"),
+        ("absent.ply", "no such file"),
+        (".", "a folder without meta.json and lod-meta.json"),
+    ],
+)
+def test_only_an_existing_file_is_taken(tmp_path, name, found):
+    with pytest.raises(FileFormatError, match=f"found {found}"):
         existing_splats(None if name is None else tmp_path / name)
     (tmp_path / "there.ply").write_bytes(b"")
     assert existing_splats(tmp_path / "there.ply") == tmp_path / "there.ply"

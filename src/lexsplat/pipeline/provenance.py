@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 from lexsplat.captures import Capture
 from lexsplat.features.hub import content_hash, model_folder
 from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.world import parse_vector, stored_world, world_of
+from lexsplat.geometry.world import World, parse_vector, stored_world, world_of
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.environment import versions
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.files import to_json
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import keep_previous
 
@@ -53,11 +55,18 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
 
 
 def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
-    """Store the up direction, of the user or of the cameras. A scale stored for other cameras is dropped."""
+    """Store the up direction, of the user, the cameras, or the splats from which views were chosen.
+
+    Chosen views are level with the up direction of the splats: what is estimated from them looks certain even where
+    that is a guess. A scale stored for other cameras is dropped.
+    """
     record = folder.record
     world = world_of(record, cameras)
     if up is not None:
         world = world.with_up(parse_vector(up))
+    elif world.source != "user" and is_of_chosen_views(record):
+        chosen = World.from_json({"up": record["stages"]["views"]["up"], "meters_per_unit": None})
+        world = replace(world, up=chosen.up, source=chosen.source)
     before = record.get("world")
     if isinstance(before, dict) and before.get("meters_per_unit") and world.meters_per_unit is None:
         log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")
