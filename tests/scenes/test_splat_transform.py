@@ -1,7 +1,7 @@
 """Round trips with splat-transform (`@playcanvas/splat-transform` on npm), both ways, in every format that it knows.
 
-Skipped unless ``splat-transform`` 3 is on the path; `.ci/run` installs it, and node 20 suffices. The references are the
-Gaussians themselves and the PLY that splat-transform writes, read by plyfile.
+Skipped unless ``splat-transform`` 3 is on the path; `.ci/run` installs it, and node 20 suffices. The references are
+the Gaussians themselves and the PLY that splat-transform writes, read by plyfile.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ from lexsplat.cli.settings import Settings
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
 
-
 _OF_SPLATS = "lexsplat language --splats FILE --output SCENE"
 
 

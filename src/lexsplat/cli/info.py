@@ -32,8 +32,9 @@ class Info:
         chosen = facts.pop("chosen_views")
         if chosen is not None:
             facts["capture"] = (
-                f"none: {chosen['views']} views chosen from {chosen['splats']}; {chosen['unseen']:,} of "
-                f"{chosen['visible']:,} visible Gaussians are in none of them, {chosen['floaters']:,} floaters left out"
+                f"none: {chosen['views']} views chosen from {chosen['splats']}; "
+                f"{chosen['unseen']:,} of {chosen['visible']:,} visible Gaussians are in none of them, "
+                f"{chosen['floaters']:,} floaters left out"
             )
         width = max(len(name) for name in facts)
         for name, value in facts.items():

@@ -1,8 +1,8 @@
 """The up direction and the scale of a scene.
 
-Photos alone determine neither. Up is estimated from the camera poses, of splats without photos from the Gaussians, and
-can be given; the scale is known once a
-distance in the scene has been given (``lexsplat scale``). Both are stored in ``scene.json`` as ``world``::
+Photos alone determine neither. Up is estimated from the camera poses, or from splats without photos, and can be
+given; the scale is known once a distance in the scene has been given (``lexsplat scale``). Both are stored in
+``scene.json`` as ``world``::
 
     {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "splats" | "user"},
      "meters_per_unit": 0.41 | null, "poses": "..."}

@@ -68,7 +68,7 @@ def capture_of_splats(
     folder.record["images"] = "poses/images"
     folder.record["capture"] = None
     capture = load_capture(poses, test_every=0)
-    warnings = folder.record["stages"]["views"]["warnings"]
+    warnings = folder.record["stages"]["views"].get("warnings", [])
     return replace(capture, warnings=(*capture.warnings, *warnings))
 
 
@@ -105,7 +105,7 @@ def _kept_warnings() -> Iterator[list[str]]:
     """The warnings of lexsplat in this block, which are shown as well."""
     found: list[str] = []
     handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda entry: found.append(entry.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
     log.addHandler(handler)
     try:
         yield found

@@ -61,7 +61,7 @@ def splat_file(path: Path) -> Path:
 
 
 def _is_gzip(path: Path) -> bool:
-    """Whether a file is packed as a whole. SPZ is gzip itself; ``.splat`` and ``.ksplat`` may begin with any bytes."""
+    """Whether a file is packed as a whole. SPZ is gzip itself; ``.splat``, ``.ksplat`` may begin with any bytes."""
     if path.name.lower().endswith((".spz", "splat")):
         return False
     try:
