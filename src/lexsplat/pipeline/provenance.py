@@ -7,10 +7,13 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 from lexsplat.captures import Capture
 from lexsplat.features.hub import content_hash, model_folder
+from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.world import World, parse_vector, stored_world, world_of
+from lexsplat.geometry.world import parse_vector, stored_world, world_of
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.environment import versions
 from lexsplat.runtime.errors import ModelError
@@ -48,7 +51,8 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
         "seed": config.seed,
         "sources": sources,
     }
-    folder.record["warnings"] = list(capture.warnings)
+    chosen = folder.record["stages"]["views"]["warnings"] if is_of_chosen_views(folder.record) else []
+    folder.record["warnings"] = [*capture.warnings, *chosen]
     folder.save()
     cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
     return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
@@ -65,8 +69,8 @@ def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]
     if up is not None:
         world = world.with_up(parse_vector(up))
     elif world.source != "user" and is_of_chosen_views(record):
-        chosen = World.from_json({"up": record["stages"]["views"]["up"], "meters_per_unit": None})
-        world = replace(world, up=chosen.up, source=chosen.source)
+        found = record["stages"]["views"]["up"]
+        world = replace(world, up=Up(np.array(found["direction"]), found["reliable"]), source="splats")
     before = record.get("world")
     if isinstance(before, dict) and before.get("meters_per_unit") and world.meters_per_unit is None:
         log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")

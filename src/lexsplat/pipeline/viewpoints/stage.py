@@ -6,7 +6,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from lexsplat.captures import Capture, load_capture
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.geometry.world import World, parse_vector
+from lexsplat.geometry.world import parse_vector
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints.choosing import choose_views
@@ -67,9 +66,7 @@ def capture_of_splats(
         folder.finish("views", key, time.perf_counter() - start, **facts, warnings=warnings)
     folder.record["images"] = "poses/images"
     folder.record["capture"] = None
-    capture = load_capture(poses, test_every=0)
-    warnings = folder.record["stages"]["views"].get("warnings", [])
-    return replace(capture, warnings=(*capture.warnings, *warnings))
+    return load_capture(poses, test_every=0)
 
 
 def _choose(
@@ -90,7 +87,7 @@ def _choose(
     log.log(NOTE if few else logging.WARNING, "%s: %s", splats, chosen.note)
     return {
         "splats": str(splats.resolve()),
-        "up": World(chosen.up, "splats" if up is None else "user").to_json()["up"],
+        "up": chosen.up,
         "views": len(chosen.cameras),
         "candidates": chosen.candidates,
         "showed_no_surfaces": chosen.left_out,
