@@ -68,6 +68,30 @@ def test_wrong_usage_has_status_2_and_no_traceback(arguments, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("build", ["--splats", "g.ply"]),
+        ("build", ["g.ply"]),
+        ("reconstruct", ["g.ply"]),
+        ("language", ["g.ply"]),
+    ],
+    ids=str,
+)
+def test_splats_in_place_of_a_capture_are_sent_to_language(command, arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("g.ply").write_bytes(b"ply")
+    with pytest.raises(SystemExit) as caught:
+        cli.main([command, *arguments, "--output", "scene"])
+    assert caught.value.code == 2
+    assert "lexsplat language --splats FILE --output SCENE" in capsys.readouterr().err
+
+
+def test_the_help_page_of_language_has_the_options_that_its_warnings_name(capsys):
+    options = options_of(help_page(capsys, "language", "--help"))
+    assert {"--up", "--keep-floaters"} <= options
+
+
 STOPPED = "stopped; run the same command again to go on\n"
 
 

@@ -1,15 +1,28 @@
 """Gaussians of another program: the file is checked before any work (agreement: test_early_checks)."""
 
+import gzip
+import logging
+
 import pytest
 from support.sog_files import write_streamed
+from support.splats import tame
 
 from lexsplat.pipeline.splats import existing_splats, splats_hash
 from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.ply import write_ply
+from lexsplat.scenes.formats.reading import read_splats
 
 
-@pytest.mark.parametrize("name", [None, "absent.ply", "."])
-def test_only_an_existing_file_is_taken(tmp_path, name):
-    with pytest.raises(FileFormatError, match="no such file"):
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        (None, "no such file"),
+        ("absent.ply", "no such file"),
+        (".", "a folder without meta.json and lod-meta.json"),
+    ],
+)
+def test_only_an_existing_file_is_taken(tmp_path, name, found):
+    with pytest.raises(FileFormatError, match=f"found {found}"):
         existing_splats(None if name is None else tmp_path / name)
     (tmp_path / "there.ply").write_bytes(b"")
     assert existing_splats(tmp_path / "there.ply") == tmp_path / "there.ply"
@@ -24,3 +37,24 @@ def test_the_hash_of_a_sog_in_a_folder_depends_on_each_of_its_parts(tmp_path):
         found.add(splats_hash(tmp_path))
     assert len(found) == 4
     assert splats_hash(tmp_path) == splats_hash(tmp_path / "lod-meta.json") in found
+
+
+def test_sizes_of_zero_are_a_warning_and_refused_where_most_gaussians_are_points_or_lines(tmp_path, caplog):
+    g = tame(40)
+    g.log_scales[:30, 0] = -200  # flat
+    g.log_scales[:20, 1] = -200  # lines
+    write_ply(g, tmp_path / "g.ply")
+    with caplog.at_level(logging.WARNING):
+        assert len(read_splats(tmp_path / "g.ply")) == 40
+    assert "g.ply: 30 of 40 Gaussians have a size of 0, read as 1e-12" in caplog.text
+    g.log_scales[20, 1] = -200
+    write_ply(g, tmp_path / "g.ply")
+    with pytest.raises(FileFormatError, match="found 21 of 40 Gaussians with two or three sizes of 0"):
+        read_splats(tmp_path / "g.ply")
+
+
+@pytest.mark.parametrize("name", ["g.ply", "g.ply.gz", "g.glb"])
+def test_a_packed_file_is_to_be_unpacked(tmp_path, name):
+    (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
+    with pytest.raises(FileFormatError, match="found gzip; unpack it first"):
+        read_splats(tmp_path / name)

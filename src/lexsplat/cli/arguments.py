@@ -5,7 +5,8 @@ A command class may have these attributes beside its fields:
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
 - ``defaults``: defaults of options that are None or empty, in words, beside the usual ones;
-- ``synonyms``: other spellings of options.
+- ``synonyms``: other spellings of options;
+- ``elsewhere``: options of another command, with the command that has them.
 
 Its method ``check``, if it has one, raises ValueError for options that are invalid together.
 """
@@ -67,6 +68,10 @@ def parse(command: type[CommandT], name: str, words: Sequence[str]) -> CommandT:
     """
     program = f"lexsplat {name}"
     words = [_in_our_spelling(word, getattr(command, "synonyms", {})) for word in words]
+    for option, other in getattr(command, "elsewhere", {}).items():
+        if any(word.partition("=")[0] == option for word in words):
+            print(f"error: {program} has no {option}; use: {other}", file=sys.stderr)
+            raise SystemExit(2)
     if HELP_ALL in words:
         _print_help(command, program, set(getattr(command, "unused", ())))
     if any(word in HELP for word in words):

@@ -14,6 +14,17 @@ from lexsplat.cli.settings import Settings
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
 
+_OF_SPLATS = "lexsplat language --splats FILE --output SCENE"
+
+
+def _is_splats(capture: str) -> bool:
+    """Whether a capture is a file with the name of splats."""
+    if not Path(capture).is_file():
+        return False
+    from lexsplat.scenes.formats.reading import READERS
+
+    return Path(capture).name.lower().endswith(tuple(READERS))
+
 
 @dataclasses.dataclass
 class Build:
@@ -44,9 +55,13 @@ class Build:
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
     unused: ClassVar[tuple[str, ...]] = ("keep_floaters",)
     until: ClassVar[Literal["reconstruct", "language"]] = "language"
+    elsewhere: ClassVar[dict[str, str]] = {"--splats": _OF_SPLATS}
 
     def check(self) -> None:
         """Refuse invalid options."""
+        for capture in (self.capture, *self.more):
+            if _is_splats(capture):
+                raise ValueError(f"{capture}: expected a capture, found splats; use: {_OF_SPLATS}")
         if self.more and (self.test_views or getattr(self, "splats", None) is not None):
             raise ValueError("--test-views and --splats belong to one CAPTURE: build the scenes one by one")
 
@@ -138,7 +153,9 @@ class Language(Build):
     capture: OptionalCaptureArgument = dataclasses.field(default="", kw_only=True)
     splats: Path | None = None
 
+    essential: ClassVar[tuple[str, ...]] = (*ESSENTIAL_SETTINGS, "up", "keep_floaters")
     unused: ClassVar[tuple[str, ...]] = ()
+    elsewhere: ClassVar[dict[str, str]] = {}
 
     def check(self) -> None:
         """Refuse invalid options."""

@@ -29,6 +29,13 @@ class Info:
             return
         if facts["method"] is not None and facts["segments"] is None:
             facts["segments"] = "none; the method averaged makes them, for answers by whole things"
+        chosen = facts.pop("chosen_views")
+        if chosen is not None:
+            facts["capture"] = (
+                f"none: {chosen['views']} views chosen from {chosen['splats']}; "
+                f"{chosen['unseen']:,} of {chosen['visible']:,} visible Gaussians are in none of them, "
+                f"{chosen['floaters']:,} floaters left out"
+            )
         width = max(len(name) for name in facts)
         for name, value in facts.items():
             value = "unknown" if value is None else value

@@ -1,9 +1,10 @@
 """The up direction and the scale of a scene.
 
-Photos alone determine neither. Up is estimated from the camera poses and can be given; the scale is known once a
-distance in the scene has been given (``lexsplat scale``). Both are stored in ``scene.json`` as ``world``::
+Photos alone determine neither. Up is estimated from the camera poses, or from splats without photos, and can be
+given; the scale is known once a distance in the scene has been given (``lexsplat scale``). Both are stored in
+``scene.json`` as ``world``::
 
-    {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "user"},
+    {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "splats" | "user"},
      "meters_per_unit": 0.41 | null, "poses": "..."}
 
 "poses" is a fingerprint of the camera poses; stored values are valid only for these poses.
@@ -23,7 +24,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.fingerprints import digest
 
-Source = Literal["cameras", "user"]
+Source = Literal["cameras", "splats", "user"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class World:
 
     Args:
         up: The direction away from the ground.
-        source: Origin of the up direction: the cameras, or the user.
+        source: Origin of the up direction: the cameras, the splats that came without cameras, or the user.
         meters_per_unit: Length of a world unit in meters; None if unknown.
 
     Raises:
@@ -87,7 +88,7 @@ class World:
         """
         try:
             up, scale = content["up"], content["meters_per_unit"]
-            source: Source = "user" if up["from"] == "user" else "cameras"
+            source: Source = up["from"] if up["from"] in ("splats", "user") else "cameras"
             world = cls(Up(np.array([0.0, 0.0, 1.0]), False)).with_up(float(v) for v in up["direction"])
             world = replace(world, up=replace(world.up, reliable=bool(up["reliable"])), source=source)
             return replace(world, meters_per_unit=None if scale is None else float(scale))

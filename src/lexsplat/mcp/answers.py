@@ -22,7 +22,11 @@ Count = Annotated[int, Field(ge=0)]
 
 Up = TypedDict(
     "Up",
-    {"direction": Vector, "reliable": bool, "from": Annotated[str, Field(description="cameras or user")]},
+    {
+        "direction": Vector,
+        "reliable": bool,
+        "from": Annotated[str, Field(description="cameras, splats or user")],
+    },
 )
 
 

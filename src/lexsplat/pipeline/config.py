@@ -61,7 +61,8 @@ class BuildConfig:
         iterations: Reconstruction steps; by default 30,000 on CUDA and 3,000 on a CPU.
         frames: Number of frames sampled from a video.
         test_every: Every n-th view is held out if the capture does not list held-out views; 0 holds out none.
-        up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras.
+        up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras, or
+            from splats without a capture.
         keep_floaters: Keep Gaussians that float free of all surfaces; splats without a capture lose them where there
             are many.
         method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 from lexsplat.captures import Capture
 from lexsplat.features.hub import content_hash, model_folder
+from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.world import parse_vector, stored_world, world_of
 from lexsplat.pipeline.config import BuildConfig
@@ -15,6 +19,7 @@ from lexsplat.runtime.environment import versions
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.files import to_json
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import keep_previous
 
@@ -46,18 +51,26 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
         "seed": config.seed,
         "sources": sources,
     }
-    folder.record["warnings"] = list(capture.warnings)
+    chosen = folder.record["stages"]["views"]["warnings"] if is_of_chosen_views(folder.record) else []
+    folder.record["warnings"] = [*capture.warnings, *chosen]
     folder.save()
     cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
     return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
 
 
 def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
-    """Store the up direction, of the user or of the cameras. A scale stored for other cameras is dropped."""
+    """Store the up direction, of the user, the cameras, or the splats from which views were chosen.
+
+    Chosen views are level with the up direction of the splats: what is estimated from them looks certain even where
+    that is a guess. A scale stored for other cameras is dropped.
+    """
     record = folder.record
     world = world_of(record, cameras)
     if up is not None:
         world = world.with_up(parse_vector(up))
+    elif world.source != "user" and is_of_chosen_views(record):
+        found = record["stages"]["views"]["up"]
+        world = replace(world, up=Up(np.array(found["direction"]), found["reliable"]), source="splats")
     before = record.get("world")
     if isinstance(before, dict) and before.get("meters_per_unit") and world.meters_per_unit is None:
         log.warning("the cameras have changed, so the scale no longer holds: run lexsplat scale again")

@@ -36,7 +36,9 @@ def existing_splats(path: Path | None) -> Path:
         FileFormatError: If there is no such file.
     """
     if path is None or not splat_file(path).is_file():
-        raise FileFormatError(path, expected="a file of Gaussians", found="no such file")
+        is_folder = path is not None and path.is_dir()
+        found = f"a folder without {META} and {LOD_META}" if is_folder else "no such file"
+        raise FileFormatError(path, expected="a file of Gaussians", found=found)
     return splat_file(path)
 
 

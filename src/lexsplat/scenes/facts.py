@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from lexsplat.geometry.world import world_of
 from lexsplat.scenes.folder import SceneFolder
+
+
+def is_of_chosen_views(record: Mapping[str, Any]) -> bool:
+    """Whether the views of a scene were chosen from splats that came without a capture."""
+    rendered = record.get("capture") is None and record.get("images") == "poses/images"
+    return rendered and "up" in record["stages"].get("views", {})
+
+
+def _chosen_views(record: Mapping[str, Any]) -> dict[str, Any] | None:
+    """From which splats the views of a scene were chosen, and how much they show; None for photos."""
+    if not is_of_chosen_views(record):
+        return None
+    names = ("splats", "views", "candidates", "visible", "unseen", "floaters")
+    return {name: record["stages"]["views"].get(name) for name in names}
 
 
 def scene_facts(folder: SceneFolder) -> dict[str, Any]:
@@ -21,6 +36,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "scene": str(folder.root),
         "capture": record.get("capture"),
+        "chosen_views": _chosen_views(record),
         "views": {"training": splits.count("train"), "held out": splits.count("test")},
         "size": ", ".join(sizes),
         **world_of(record, {name: view.camera for name, view in views.items()}).to_json(),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,30 +61,53 @@ def capture_of_splats(
     if not (complete and folder.is_finished("views", key)):
         start = time.perf_counter()
         folder.reopen("views")
-        gaussians = read_splats(splats).to(device)
-        up = None if config.up is None else np.array(parse_vector(config.up))
-        floaters = np.zeros(0, np.int64)
-        if not config.keep_floaters:
-            floaters = find_floaters(gaussians, splats, up=up, seed=config.seed)
-        gaussians = _without(gaussians, floaters)
-        chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
-        write_chosen_capture(gaussians, chosen, poses)
-        with atomic_path(poses / _FLOATERS) as path, open(path, "wb") as file:
-            np.save(file, floaters)
-        few = chosen.unseen <= _MANY_UNSEEN * chosen.visible
-        log.log(NOTE if few else logging.WARNING, "%s: %s", splats, chosen.note)
-        facts = {
-            "views": len(chosen.cameras),
-            "candidates": chosen.candidates,
-            "showed_no_surfaces": chosen.left_out,
-            "visible": chosen.visible,
-            "unseen": chosen.unseen,
-            "floaters": len(floaters),
-        }
-        folder.finish("views", key, time.perf_counter() - start, **facts)
+        with _kept_warnings() as warnings:
+            facts = _choose(splats, poses, config, device, listener)
+        folder.finish("views", key, time.perf_counter() - start, **facts, warnings=warnings)
     folder.record["images"] = "poses/images"
     folder.record["capture"] = None
     return load_capture(poses, test_every=0)
+
+
+def _choose(
+    splats: Path, poses: Path, config: BuildConfig, device: str, listener: Listener
+) -> dict[str, Any]:
+    """Choose views and write their capture; returns facts for the record of the stage."""
+    gaussians = read_splats(splats).to(device)
+    up = None if config.up is None else np.array(parse_vector(config.up))
+    floaters = np.zeros(0, np.int64)
+    if not config.keep_floaters:
+        floaters = find_floaters(gaussians, splats, up=up, seed=config.seed)
+    gaussians = _without(gaussians, floaters)
+    chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
+    write_chosen_capture(gaussians, chosen, poses)
+    with atomic_path(poses / _FLOATERS) as path, open(path, "wb") as file:
+        np.save(file, floaters)
+    few = chosen.unseen <= _MANY_UNSEEN * chosen.visible
+    log.log(NOTE if few else logging.WARNING, "%s: %s", splats, chosen.note)
+    return {
+        "splats": str(splats.resolve()),
+        "up": chosen.up,
+        "views": len(chosen.cameras),
+        "candidates": chosen.candidates,
+        "showed_no_surfaces": chosen.left_out,
+        "visible": chosen.visible,
+        "unseen": chosen.unseen,
+        "floaters": len(floaters),
+    }
+
+
+@contextlib.contextmanager
+def _kept_warnings() -> Iterator[list[str]]:
+    """The warnings of lexsplat in this block, which are shown as well."""
+    found: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    log.addHandler(handler)
+    try:
+        yield found
+    finally:
+        log.removeHandler(handler)
 
 
 def splats_of_capture(splats: Path, capture: Capture, folder: SceneFolder) -> Gaussians:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
-from lexsplat.geometry.boxes import Box, Up, fit_box
+from lexsplat.geometry.boxes import Box, Up, fit_box, upright_frame
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering.compositing import NEAR
 from lexsplat.runtime.errors import CaptureError
 
 log = logging.getLogger("lexsplat")
@@ -31,13 +32,25 @@ _FLAT = 0.02
 """Variance across a flat piece, relative to its second largest."""
 _CONVENTIONS = ((0, 0, 1), (0, 1, 0), (0, -1, 0))
 """Up directions of files that follow a convention: z up, y up (glTF), y down (COLMAP)."""
+
+_TILTED = math.cos(math.radians(15))
 _ALIGNED, _OTHER = math.cos(math.radians(10)), math.cos(math.radians(20))
 _CORE = 2.5
 """The middle of the scene reaches this many radii; beyond it is background."""
 _LOW = 0.05
 """Share of the points below the ground, where nobody has looked and nothing is as it seems."""
 _LEAD = 0.15
-"""Difference of the scores of two up directions by which one is certain."""
+"""Difference of the scores of two up directions by which one is certain,"""
+_GROUND = 0.25
+"""if a ground lies under this share of the scene as seen from above: under a thing alone there is none."""
+_GROUND_HEIGHT = 0.08
+"""Half the height of the slab in which a ground lies, relative to the height of the scene."""
+_GROUND_CELLS = 24
+"""Cells along the longer side of the scene in which the ground is counted."""
+_LEAST_RADIUS = 1.5 * NEAR
+"""Radius of the smallest scene: cameras come about as near to things, and nothing nearer than `NEAR` is drawn."""
+_SOLID = 0.3
+"""Opacity of solid Gaussians."""
 
 Points = NDArray[np.float64]
 
@@ -100,21 +113,23 @@ def find_surroundings(
         warn: Warn of an up direction that is a guess or seems wrong, and of a flat scene.
 
     Raises:
-        CaptureError: If fewer than `FEWEST` Gaussians are solid, or all are at one point.
+        CaptureError: If fewer than `FEWEST` Gaussians are solid, all are at one point, or the scene is too small to
+            be rendered.
     """
     points = _solid_points(gaussians, seed)
-    spread = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if len(points) < FEWEST or spread <= 0:
-        raise CaptureError(
-            subject,
-            expected=f"at least {FEWEST} Gaussians that form surfaces",
-            found=f"{len(points)} of {len(gaussians)}" if spread > 0 else f"{len(gaussians)} at one point",
-            remedy="check the file, or give the capture it was made from",
-        )
+    _check_points(points, gaussians, subject)
     tree = cKDTree(points)
     center = np.median(points, axis=0)
     away = np.linalg.norm(points - center, axis=1)
     whole = Target(center, float(np.quantile(away, 0.6)))
+    if whole.radius < _LEAST_RADIUS:
+        factor = 10.0 ** math.ceil(-math.log10(max(whole.radius, 1e-12)))
+        raise CaptureError(
+            subject,
+            expected=f"a scene with a radius of at least {_LEAST_RADIUS:g} units",
+            found=f"{whole.radius:.2g}, and nothing nearer to a camera than {NEAR:g} is drawn",
+            remedy=f"scale the splats up, as does: splat-transform {subject.name} --scale {factor:.0f} scaled.ply",
+        )
     core = points[away < _CORE * whole.radius]
     targets = tuple(_targets(core, center, seed))
 
@@ -127,10 +142,30 @@ def find_surroundings(
     scores = np.array([score + look(facing(Up(direction, True))) for direction, score in candidates])
     best = candidates[int(scores.argmax())][0]
     others = [s for s, (direction, _) in zip(scores, candidates) if direction @ best < _OTHER]
-    estimated = Up(best, bool(scores.max() - max(others) > _LEAD))
+    certain = scores.max() - max(others) > _LEAD and ground_share(core, best) > _GROUND
+    estimated = Up(best, bool(certain))
     if warn:
         _warn(estimated, up, points, subject)
     return facing(estimated if up is None else Up(up / np.linalg.norm(up), True))
+
+
+def _check_points(points: Points, gaussians: Gaussians, subject: Path) -> None:
+    """Refuse Gaussians that form no surfaces; the error is that of `find_surroundings`."""
+    opaque = int((gaussians.opacities > _SOLID).sum())
+    if opaque < FEWEST:
+        found = f"{opaque:,} of {len(gaussians):,} opaque"
+    elif len(points) < FEWEST:
+        found = f"{len(points):,} of {len(gaussians):,}"
+    elif np.ptp(points, axis=0).max() <= 0:
+        found = f"{len(gaussians):,} at one point"
+    else:
+        return
+    raise CaptureError(
+        subject,
+        expected=f"at least {FEWEST} Gaussians that form surfaces",
+        found=found,
+        remedy="check the file, or give the capture it was made from",
+    )
 
 
 def _warn(estimated: Up, given: Points | None, points: Points, subject: Path) -> None:
@@ -152,7 +187,7 @@ def _warn(estimated: Up, given: Points | None, points: Points, subject: Path) ->
 
 def _solid_points(gaussians: Gaussians, seed: int) -> Points:
     """Centers of a sample of the Gaussians, without transparent ones and floaters ``[M, 3]``."""
-    solid = np.flatnonzero((gaussians.opacities > 0.3).cpu().numpy())
+    solid = np.flatnonzero((gaussians.opacities > _SOLID).cpu().numpy())
     if len(solid) > SAMPLE:
         solid = np.sort(np.random.default_rng(seed).choice(solid, SAMPLE, replace=False))
     points = gaussians.means.detach().cpu().double().numpy()[solid]
@@ -205,12 +240,37 @@ def _up_score(points: Points, normals: Points, shares: Points, up: Points) -> fl
     heights = points @ up
     low, high = np.quantile(heights, [_LOW, 1 - _LOW])
     level = (heights - low) / max(high - low, 1e-12)
-    across = np.where(np.abs(normals @ up) > math.cos(math.radians(15)), shares, 0)
+    across = np.where(np.abs(normals @ up) > _TILTED, shares, 0)
     floor = float(across[level < 0.33].sum() - across[level > 0.67].sum())
     standing = float(((level > 0.33) & (level < 0.67)).mean() - (level > 0.67).mean())
     lying = 0.5 - float(np.median(level))
     usual = max(float(up @ np.array(axis)) for axis in _CONVENTIONS)
     return floor + 0.5 * standing + lying + (0.2 if usual > math.cos(math.radians(20)) else 0.0)
+
+
+def ground_share(points: Points, up: Points) -> float:
+    """Share of a scene, as seen from above, under which a level ground lies, in 0..1.
+
+    The ground is the slab in the lower third that holds most pieces of surface across the up direction.
+
+    Args:
+        points: Solid points ``[M, 3]`` of the middle of the scene.
+        up: The up direction ``[3]``, of unit length.
+    """
+    normals, flatness = _normals(points[cKDTree(points).query(points, k=_NEIGHBORS)[1]])
+    heights = points @ up
+    low, high = np.quantile(heights, [_LOW, 1 - _LOW])
+    level = (np.abs(normals @ up) > _TILTED) & (flatness > 0.5) & (heights < low + (high - low) / 3)
+    half = _GROUND_HEIGHT * (high - low)
+    if not level.any() or half <= 0:
+        return 0.0
+    counts, edges = np.histogram(heights[level], max(1, math.ceil(float(np.ptp(heights[level])) / half)))
+    middle = edges[counts.argmax()] + half / 2
+    footprint = points @ np.stack(upright_frame(up)[:2]).T
+    first, last = np.quantile(footprint, [0.02, 0.98], axis=0)
+    cells = np.floor((footprint - first) / max(float((last - first).max()) / _GROUND_CELLS, 1e-300))
+    ground = level & (np.abs(heights - middle) < half)
+    return len(np.unique(cells[ground], axis=0)) / len(np.unique(cells, axis=0))
 
 
 def _targets(points: Points, middle: Points, seed: int) -> list[Target]:

@@ -1,7 +1,8 @@
 """Values of other programs' files: bounds on counts, bytes as opacities, and numbers that cannot be rendered.
 
 Formats allow more than rendering does: opacities of 0 and 1 have infinite logits, sizes of 0 infinite logarithms.
-Those are moved to the nearest number that renders alike. Gaussians with NaN are dropped, with a warning.
+Those are moved to the nearest number that renders alike, sizes with a warning. Gaussians with NaN are dropped, with a
+warning.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
     """The Gaussians with infinite logits and logarithms made finite, and without those that cannot be rendered.
 
     Raises:
-        FileFormatError: If there are none, or more than `MOST_DROPPED` of them cannot be rendered.
+        FileFormatError: If there are none, more than `MOST_DROPPED` of them cannot be rendered, or more than half are
+            points or lines of size 0.
     """
+    _check_sizes(gaussians, path)
     quats = gaussians.quats.clone()
     quats[(quats == 0).all(1)] = quats.new_tensor([1.0, 0, 0, 0])
     gaussians = replace(
@@ -56,6 +59,25 @@ def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
         raise FileFormatError(path, expected="finite numbers", found=found, remedy="regenerate the file")
     logger.warning("%s: %d of %d Gaussians dropped: %s", path, count, len(gaussians), damage)
     return gaussians.select(valid)
+
+
+def _check_sizes(gaussians: Gaussians, path: Path) -> None:
+    """Warn of sizes of 0: a flat Gaussian has one, a line two, a point three.
+
+    Raises:
+        FileFormatError: If more than half of the Gaussians are points or lines, which show nothing.
+    """
+    zeros = (gaussians.log_scales < _SMALLEST_LOG_SCALE - 0.01).sum(1)  # 1e-12 itself may be rounded
+    count, thin = int((zeros > 0).sum()), int((zeros > 1).sum())
+    if thin > len(gaussians) / 2:
+        raise FileFormatError(
+            path,
+            expected="Gaussians with sizes",
+            found=f"{thin:,} of {len(gaussians):,} Gaussians with two or three sizes of 0",
+            remedy="regenerate the file",
+        )
+    if count:
+        logger.warning("%s: %d of %d Gaussians have a size of 0, read as 1e-12", path, count, len(gaussians))
 
 
 def _valid(gaussians: Gaussians) -> Tensor:

@@ -47,6 +47,8 @@ def read_splats(path: Path) -> Gaussians:
     """
     refuse_pickle(path)
     path = splat_file(path)
+    if _is_gzip(path):
+        raise FileFormatError(path, expected="splats", found="gzip", remedy="unpack it first: gunzip FILE.gz")
     for ending, read in READERS.items():
         if path.name.lower().endswith(ending):
             return renderable(read(path), path)
@@ -56,6 +58,17 @@ def read_splats(path: Path) -> Gaussians:
 def splat_file(path: Path) -> Path:
     """The path, or of a folder with a SOG the file that names its parts."""
     return next((path / name for name in (LOD_META, META) if (path / name).is_file()), path)
+
+
+def _is_gzip(path: Path) -> bool:
+    """Whether a file is packed as a whole. SPZ is gzip itself; ``.splat``, ``.ksplat`` may begin with any bytes."""
+    if path.name.lower().endswith((".spz", "splat")):
+        return False
+    try:
+        with open(path, "rb") as file:
+            return file.read(3) == b"\x1f\x8b\x08"
+    except OSError:
+        return False  # the reader reports the error
 
 
 def _is_compressed(path: Path) -> bool:
