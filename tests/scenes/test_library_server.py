@@ -56,7 +56,8 @@ def test_the_vectors_give_the_bounds_with_a_linear_offset():
     shares = torch.ones(9)
     shares[4] = 0
     shared, offset = (torch.from_numpy(rng.normal(size=size)).float() for size in (9, 7))
-    codes, text = Codes(units, shared, torch.rand(9) + 0.1, shares, offset), rng.normal(size=6)
+    limits = torch.from_numpy(rng.uniform(0.1, 1.1, 9)).float()
+    codes, text = Codes(units, shared, limits, shares, offset), rng.normal(size=6)
     numbers, vectors = served_by.code_vectors(codes)
     assert numbers.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
     cosines = units.double().numpy() @ text - shared.double().numpy()
