@@ -125,6 +125,16 @@ def clip_folder(tmp_path_factory) -> Path:
     return write_clip(tmp_path_factory.mktemp("clip"))
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium (`page_browser`)."""
+    pytest.importorskip("playwright.sync_api")
+    from support.page_browser import chromium
+
+    with chromium() as running:
+        yield running
+
+
 @pytest.fixture
 def pretended_gpu(monkeypatch):
     """A pretended GPU with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts synchronizations."""

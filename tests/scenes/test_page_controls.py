@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.page_browser import CHROMIUM, ask, chromium, covered_tools, open_page, serving, until
+from support.page_browser import CHROMIUM, ask, covered_tools, open_page, serving, until
 from support.viewer_scene import ball_scene
 
 from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
@@ -18,13 +18,6 @@ LIST = """() => {
     lexsplat.app.manifest.objects = [{ name: "ball 0", center: center.toArray(), size: [0.3, 0.3, 0.3] }];
 }"""
 """The list of objects gets one, which this scene without everyday things lacks."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    pytest.importorskip("playwright.sync_api")
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

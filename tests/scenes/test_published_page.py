@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from support.encoder_folders import write_clip
 from support.language_scene import CENTERS
-from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
+from support.page_browser import CHROMIUM, ask, open_page, serving, until
 from support.siglip_folder import siglip_folder
 from support.viewer_scene import ball_scene
 
@@ -43,13 +43,6 @@ PROMPTS = (
 SIZE = (664, 498)
 """Of a window in which nothing covers the picture's bottom, with the sides of the demo's photos."""
 HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</script>\"'{{TITLE}}"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    pytest.importorskip("playwright.sync_api")
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

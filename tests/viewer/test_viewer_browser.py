@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from support.page_browser import CHROMIUM, ask, chromium, covered_tools, open_page, until
+from support.page_browser import CHROMIUM, ask, covered_tools, open_page, until
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.viewer.history import MAX_LENGTH, History
@@ -20,13 +20,6 @@ PIXELS = """(points) => points.map((point) => {
     const hit = lexsplat.app.stage.pixel(lexsplat.app.stage.camera.position.clone().fromArray(point));
     return [hit.x, hit.y];
 })"""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    pytest.importorskip("playwright.sync_api")
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture
