@@ -126,7 +126,7 @@ class SceneTask:
 
 @dataclass(frozen=True)
 class _Scenes:
-    """What all scenes share: their folder, and who is told of their stages."""
+    """What all scenes share: the output folder and the listener of progress events."""
 
     folder: SharedFolder
     listener: Listener
