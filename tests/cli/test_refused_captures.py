@@ -13,6 +13,7 @@ from support.tiny_capture import write_capture
 from lexsplat import cli
 
 
+@pytest.mark.slow
 def test_an_unknown_encoder_is_refused_with_three_remedies(tiny_capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     output = tmp_path / "out"

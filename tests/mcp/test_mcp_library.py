@@ -16,6 +16,8 @@ from lexsplat.runtime.files import read_json
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import open_scenes
 
+pytestmark = pytest.mark.slow
+
 SCHEMA = Path(__file__).parents[2] / "docs" / "schemas" / "library.json"
 
 

@@ -240,6 +240,7 @@ def test_resources_and_prompts_are_offered(server):
     assert "my ring" in prompt.messages[0].content.text
 
 
+@pytest.mark.slow
 def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folder_alone(scenes, tmp_path):
     server = make_server(scenes, tmp_path / "output")
     reply, _ = ask(server, "export", phrase="rubber duck", file="duck.ply")

@@ -183,6 +183,7 @@ def dusty() -> tuple[Gaussians, Gaussians]:
     return clean, dust
 
 
+@pytest.mark.slow
 def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay(caplog):
     clean, dust = dusty()
     distances = np.linalg.norm(dust.means.numpy()[:, None] - on_table()[None, ::10], axis=2).min(1)
@@ -201,6 +202,7 @@ def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay
     assert not caplog.text
 
 
+@pytest.mark.slow
 def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the_scene_stay():
     """Both are within four of their radii from their neighbors, so distances alone do not tell them apart."""
     clean, dust = dusty()
@@ -219,6 +221,7 @@ def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the
     assert (floating >= len(clean)).all()
 
 
+@pytest.mark.slow
 def test_floaters_larger_than_the_things_they_engulf_are_found():
     """Surfaces lie before, on and behind them. Plates under a fine pattern have near neighbors, too, and stay."""
     clean, dust = dusty()

@@ -26,6 +26,7 @@ def points(capture):
     return initial_points(capture)
 
 
+@pytest.mark.slow
 def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_and_the_color_of_its_pixel(
     capture, points, monkeypatch
 ):

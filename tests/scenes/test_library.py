@@ -30,6 +30,8 @@ from lexsplat.scenes.library.entries import Codes, map_codes
 from lexsplat.scenes.library.records import read_record, write_record
 from lexsplat.scenes.library.searching import spellings_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def _encoders(monkeypatch):

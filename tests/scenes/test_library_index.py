@@ -22,6 +22,8 @@ from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.contents import Contents
 from lexsplat.scenes.library.indexed import decidable
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def _encoders(monkeypatch):

@@ -13,6 +13,8 @@ from lexsplat.runtime.errors import LibraryError
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.library import Library
 
+pytestmark = pytest.mark.slow
+
 QUESTIONS = ("🍎🦆", "где утка", "why is the sky blue", "bananna", "mug or dog", "unicorn", "red apple")
 
 
