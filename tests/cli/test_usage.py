@@ -89,7 +89,7 @@ def test_splats_in_place_of_a_capture_are_sent_to_language(command, arguments, t
 
 def test_the_help_page_of_language_has_the_options_that_its_warnings_name(capsys):
     options = options_of(help_page(capsys, "language", "--help"))
-    assert {"--up", "--keep-floaters"} <= options
+    assert {"--up", "--keep-floaters", "--views-from"} <= options
 
 
 STOPPED = "stopped; run the same command again to go on\n"

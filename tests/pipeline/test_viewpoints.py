@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -341,6 +342,27 @@ def test_an_interior_is_a_room_an_object_or_uncertain():
     assert [one.is_room for one in found] == [False, False, True, False, False]
     assert [one.is_shell for one in found] == [True, True, False, False, False]
     assert [one.is_certain for one in found] == [True, False, True, False, True]
+
+
+def test_what_a_user_says_a_scene_is_is_certain():
+    found = [Interior(9, enclosed, things) for enclosed, things in ((1.0, 0.0), (0.45, 0.05), (1.0, 0.05))]
+    inside, around = ([replace(one, side=side) for one in found] for side in ("inside", "around"))
+    assert all(one.is_room and one.is_certain and not one.is_shell for one in inside)
+    assert all(one.is_certain and not one.is_room for one in around)
+    assert [one.is_shell for one in around] == [True, False, False]
+
+
+@pytest.mark.slow
+def test_a_room_is_looked_at_from_around_and_a_table_from_the_places_on_it_if_a_user_says_so():
+    around = choose_views(solid(furnished()), up=UP, side="around")
+    positions = np.stack([camera.position for camera in around.cameras])
+    assert ((positions > 0) & (positions < [5, 4, 2.5])).all(1).mean() < 0.1
+    assert "an object" in around.note
+    table = on_table()
+    inside = choose_views(solid(table), up=UP, side="inside")
+    positions = np.stack([camera.position for camera in inside.cameras])
+    assert ((positions > table.min(0)) & (positions < table.max(0))).all()
+    assert "a room" in inside.note
 
 
 @pytest.mark.slow

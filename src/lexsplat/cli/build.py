@@ -53,7 +53,7 @@ class Build:
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
-    unused: ClassVar[tuple[str, ...]] = ("keep_floaters",)
+    unused: ClassVar[tuple[str, ...]] = ("keep_floaters", "views_from")
     until: ClassVar[Literal["reconstruct", "language"]] = "language"
     elsewhere: ClassVar[dict[str, str]] = {"--splats": _OF_SPLATS}
 
@@ -132,7 +132,7 @@ class Reconstruct(Build):
     )
     unused: ClassVar[tuple[str, ...]] = (
         "clip", "dino", "features_from", "method", "joint", "features", "codebook", "averaged", "trained",
-        "keep_floaters",
+        "keep_floaters", "views_from",
     )  # fmt: skip
     until: ClassVar[Literal["reconstruct", "language"]] = "reconstruct"
 
@@ -153,7 +153,7 @@ class Language(Build):
     capture: OptionalCaptureArgument = dataclasses.field(default="", kw_only=True)
     splats: Path | None = None
 
-    essential: ClassVar[tuple[str, ...]] = (*ESSENTIAL_SETTINGS, "up", "keep_floaters")
+    essential: ClassVar[tuple[str, ...]] = (*ESSENTIAL_SETTINGS, "up", "keep_floaters", "views_from")
     unused: ClassVar[tuple[str, ...]] = ()
     elsewhere: ClassVar[dict[str, str]] = {}
 

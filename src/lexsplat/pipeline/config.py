@@ -65,6 +65,8 @@ class BuildConfig:
             from splats without a capture.
         keep_floaters: Keep Gaussians that float free of all surfaces; splats without a capture lose them where there
             are many.
+        views_from: From where splats without a capture are looked at: from "inside" a room, or from "around" an
+            object; by default what they seem to be.
         method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in
             docs/results.md); "trained" is the optimization of the paper.
         joint: Train language together with geometry, as the authors' code does; needs method "trained".
@@ -99,6 +101,7 @@ class BuildConfig:
     test_every: int = 8
     up: str | None = None
     keep_floaters: bool = False
+    views_from: Literal["auto", "inside", "around"] = "auto"
     method: MethodName = "averaged"
     joint: bool = False
     as_in_paper: bool = False
@@ -115,6 +118,8 @@ class BuildConfig:
                 object.__setattr__(self, encoder, "bundled")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device must be auto, cpu or cuda, got {self.device!r}")
+        if self.views_from not in ("auto", "inside", "around"):
+            raise ValueError(f"views_from must be auto, inside or around, got {self.views_from!r}")
         if self.encoder_device not in ("auto", "cpu", "cuda", "mps"):
             raise ValueError(f"encoder_device must be auto, cpu, cuda or mps, got {self.encoder_device!r}")
         parse_bytes(self.memory)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
-from lexsplat.pipeline.viewpoints.interior import Interior, examine, without_lonely_points
+from lexsplat.pipeline.viewpoints.interior import Interior, Side, examine, without_lonely_points
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
@@ -90,6 +90,7 @@ def choose_views(
     gaussians: Gaussians,
     *,
     up: NDArray[np.float64] | None = None,
+    side: Side = "auto",
     subject: Path = Path("splats"),
     seed: int = 0,
     listener: Listener = silent,
@@ -99,6 +100,7 @@ def choose_views(
     Args:
         gaussians: The scene.
         up: The up direction; None estimates it.
+        side: From where they look: "inside" a room, "around" an object; "auto" finds out.
         subject: The file, for errors and warnings.
         seed: Seed of samples.
         listener: Receives events of stage "views".
@@ -108,21 +110,23 @@ def choose_views(
     """
 
     found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
-    tried = _good_candidates(gaussians, found, seed, listener)
+    tried = _good_candidates(gaussians, found, side, seed, listener)
     if not tried.cameras:
         raise CaptureError(
             subject,
             expected="a place from which the Gaussians look like surfaces",
             found=f"none of {tried.count} tried (fog, holes, or no free space)",
-            remedy="give the capture it was made from, or the up direction with --up x,y,z",
+            remedy="give the capture it was made from, the up direction with --up x,y,z, or --views-from",
         )
     if not tried.interior.is_certain:
         log.warning(
-            "%s: taken as %s, which is uncertain; see the contact sheet",
+            "%s: taken as %s, which is uncertain; see the contact sheet, and give --views-from %s if it is wrong",
             subject,
-            "a room and looked at from inside"
-            if tried.interior.is_room
-            else "an object and looked at from around",
+            *(
+                ("a room and looked at from inside", "around")
+                if tried.interior.is_room
+                else ("an object and looked at from around", "inside")
+            ),
         )
     chosen, visible, unseen = _cover(tried)
     cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
@@ -159,7 +163,9 @@ class _Tried:
     interior: Interior
 
 
-def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, listener: Listener) -> _Tried:
+def _good_candidates(
+    gaussians: Gaussians, found: Surroundings, side: Side, seed: int, listener: Listener
+) -> _Tried:
     generator = np.random.default_rng(seed)
     outer: list[tuple[Camera, Target | None]] = list(around(found, SMALL))
     if len(outer) > _MOST_CANDIDATES:
@@ -174,7 +180,7 @@ def _good_candidates(gaussians: Gaussians, found: Surroundings, seed: int, liste
             depths.append(depth)
         qualities[done - 1] = 0 if target is not None and is_hidden(depth, camera, target) else clear
         listener(Event("views", done, len(candidates)))
-    interior = examine(gaussians, found, inner, depths, qualities[len(outer) :])
+    interior = replace(examine(gaussians, found, inner, depths, qualities[len(outer) :]), side=side)
     cameras = [camera for camera, _ in candidates]
     allowed = _on_its_side(interior, found, cameras, len(outer))
     good = np.zeros(len(candidates), bool)

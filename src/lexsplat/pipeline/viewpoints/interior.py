@@ -7,6 +7,7 @@ closed, too, but empty: from any place inside, all that is seen is the convex sh
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +20,9 @@ from lexsplat.pipeline.viewpoints.candidates import TURNS, all_around, free_plac
 from lexsplat.pipeline.viewpoints.floaters import isolation
 from lexsplat.pipeline.viewpoints.looking import SMALL, Image, look
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings
+
+Side = Literal["auto", "inside", "around"]
+"""From where splats are looked at: as a room, as an object, or as `examine` finds."""
 
 _DRAWN = 0.9
 """Least share of the pixels all around a closed place that are drawn: doors and windows are holes."""
@@ -55,25 +59,31 @@ class Interior:
         places: Number of free places.
         enclosed: Share of those that are closed all around, in 0..1.
         things: Share of what closed places show that stands free of the shell around them, in 0..1.
+        side: What the user says; "auto" leaves it to the shares.
     """
 
     places: int
     enclosed: float
     things: float
+    side: Side = "auto"
 
     @property
     def is_room(self) -> bool:
         """Whether the scene is a room; else it is an object, or things on a table."""
+        if self.side != "auto":
+            return self.side == "inside"
         return self.enclosed >= _ENCLOSED and self.things >= _THINGS
 
     @property
     def is_shell(self) -> bool:
         """Whether the scene is closed and empty: its outer side is all there is to see."""
-        return self.enclosed > 0 and self.things < _THINGS
+        return not self.is_room and self.enclosed > 0 and self.things < _THINGS
 
     @property
     def is_certain(self) -> bool:
-        """Whether both shares are far from where the answer changes."""
+        """Whether the user says it, or both shares are far from where the answer changes."""
+        if self.side != "auto":
+            return True
         if self.is_room:
             return self.things >= 1.2 * _THINGS
         return self.enclosed < _PARTLY or self.things < _HARDLY

@@ -47,7 +47,7 @@ def capture_of_splats(
     Args:
         splats: File of Gaussians.
         folder: The scene folder.
-        config: Settings of the build, of which the up direction and the seed are read.
+        config: Settings of the build, of which the up direction, the seed, and those of the views are read.
         device: Device to render on.
         listener: Receives events of stage "views".
 
@@ -56,7 +56,8 @@ def capture_of_splats(
         CaptureError: If no views can be chosen.
     """
     splats, poses = existing_splats(splats), folder.root / "poses"
-    key = fingerprint(_RULES, splats_hash(splats), config.up, config.seed, config.keep_floaters)
+    settings = (config.up, config.seed, config.keep_floaters, config.views_from)
+    key = fingerprint(_RULES, splats_hash(splats), *settings)
     complete = (poses / "transforms.json").is_file() and (poses / _FLOATERS).is_file()
     if not (complete and folder.is_finished("views", key)):
         start = time.perf_counter()
@@ -79,7 +80,9 @@ def _choose(
     if not config.keep_floaters:
         floaters = find_floaters(gaussians, splats, up=up, seed=config.seed)
     gaussians = _without(gaussians, floaters)
-    chosen = choose_views(gaussians, up=up, subject=splats, seed=config.seed, listener=listener)
+    chosen = choose_views(
+        gaussians, up=up, side=config.views_from, subject=splats, seed=config.seed, listener=listener
+    )
     write_chosen_capture(gaussians, chosen, poses)
     with atomic_path(poses / _FLOATERS) as path, open(path, "wb") as file:
         np.save(file, floaters)
