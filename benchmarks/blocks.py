@@ -94,7 +94,7 @@ def _write_pictures(
     """Write the four held-out views in which the points of two cells are most nearly equal in number."""
     folder.mkdir(parents=True, exist_ok=True)
     axes = ground_axes(World.of_cameras(view.camera for view in capture.train_views).up)
-    cut = cut_blocks(capture, points.points, axes, count)
+    cut = cut_blocks(capture, points.points, axes, count, deal=True)
     colors = np.random.default_rng(0).permuted(np.linspace(0.1, 0.9, 3 * count).reshape(count, 3), axis=0)
     of_cells = torch.from_numpy(colors[cut.cells_of(gaussians.means.numpy())]).float()[:, None]
     painted = replace(gaussians, sh0=(of_cells - 0.5) / SH_C0, shN=torch.zeros_like(gaussians.shN))

@@ -14,7 +14,7 @@ from lexsplat import cli
 from lexsplat.captures import load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.boxes import Up
-from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction import Reconstructor, block_training, surroundings
 from lexsplat.reconstruction.block_files import BETAS, CellState, idle, plan
@@ -69,7 +69,7 @@ def street(capture, length: float = 40.0):
 def test_cells_cover_the_plane_once_with_equal_numbers_of_points(count, capture):
     made, places = street(capture)
     axes = ground_axes(UP)
-    cells = cut_blocks(made, places, axes, count).cells
+    cells = cut_blocks(made, places, axes, count, deal=False).cells
     anywhere = np.random.default_rng(1).normal(0, 100, (500, 2))
     assert (sum(cell.holds(anywhere).astype(int) for cell in cells) == 1).all(), "also far away"
     numbers = [cell.holds(places @ axes.T).sum() for cell in cells]
@@ -80,7 +80,7 @@ def test_cells_cover_the_plane_once_with_equal_numbers_of_points(count, capture)
 @pytest.mark.parametrize("count", [2, 3, 6])
 def test_each_view_belongs_to_one_block_and_each_cell_is_owned_by_one_that_trains_it(count, capture):
     made, places = street(capture)
-    cut = cut_blocks(made, places, ground_axes(UP), count)
+    cut = cut_blocks(made, places, ground_axes(UP), count, deal=False)
     assert sorted(name for block in cut.blocks for name in block.views) == sorted(made.views)
     assert max(len(b.views) for b in cut.blocks) - min(len(b.views) for b in cut.blocks) <= 1
     assert sorted(cell for block in cut.blocks for cell in block.owned) == list(range(count))
@@ -90,7 +90,7 @@ def test_each_view_belongs_to_one_block_and_each_cell_is_owned_by_one_that_train
 def test_a_block_of_a_street_trains_the_cells_in_front_of_its_views(capture):
     made, places = street(capture)
     axes = ground_axes(UP)
-    cut = cut_blocks(made, places, axes, 6)
+    cut = cut_blocks(made, places, axes, 6, deal=False)
     for block in cut.blocks:
         stands = np.array([float(name) for name in block.views])
         for cell in block.trained:
@@ -103,9 +103,47 @@ def test_a_block_of_a_street_trains_the_cells_in_front_of_its_views(capture):
         assert len(block.trained) + len(block.shown) < 6, "cells that no view shows take no part"
 
 
+def around(capture):
+    """Views on a circle that look at a table in its middle, and points on the table."""
+    some, views = next(iter(capture.views.values())), {}
+    for number, angle in enumerate(np.linspace(0, 2 * np.pi, 40, endpoint=False)):
+        place = np.array([6 * np.cos(angle), 6 * np.sin(angle), 4.0])
+        name = f"{number:02}"
+        camera = look_at(place, np.zeros(3), UP.direction, 96, 72, 1.0)
+        views[name] = dataclasses.replace(some, name=name, camera=camera)
+    places = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 0.3], (3000, 3)).astype(np.float32)
+    return dataclasses.replace(capture, views=views, train_names=tuple(views), test_names=()), places
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_blocks_around_a_table_have_views_from_all_sides_and_train_all_cells(count, capture):
+    made, places = around(capture)
+    cut = cut_blocks(made, places, ground_axes(UP), count, deal=True)
+    assert sorted(name for block in cut.blocks for name in block.views) == sorted(made.views)
+    assert max(len(b.views) for b in cut.blocks) - min(len(b.views) for b in cut.blocks) <= 1
+    assert sorted(cell for block in cut.blocks for cell in block.owned) == list(range(count))
+    for block in cut.blocks:
+        assert block.dealt
+        assert block.trained == tuple(range(count))
+        stands = np.array([made.views[name].camera.position[:2] for name in block.views])
+        assert np.linalg.norm(stands.mean(0)) < 3.5, "those of one side have a mean about 5.7 from the middle"
+    assert cut.pairs(0) == [(number,) for number in range(count)]
+    apart = cut_blocks(made, places, ground_axes(UP), count, deal=False)
+    assert not any(block.dealt for block in apart.blocks), "the memory does not hold all Gaussians"
+
+
+def test_blocks_of_a_street_are_the_same_whether_views_may_be_dealt_or_not(capture):
+    made, places = street(capture)
+    for count in (2, 3, 6):
+        either = [
+            cut_blocks(made, places, ground_axes(UP), count, deal=deal).blocks for deal in (False, True)
+        ]
+        assert either[0] == either[1]
+
+
 def test_blocks_that_are_trained_side_by_side_have_no_cell_in_common(capture):
     made, places = street(capture)
-    cut = cut_blocks(made, places, ground_axes(UP), 6)
+    cut = cut_blocks(made, places, ground_axes(UP), 6, deal=False)
     groups = side_by_side(cut.blocks)
     assert len(groups) < 6
     assert sorted(index for group in groups for index in group) == list(range(6))
@@ -116,7 +154,7 @@ def test_blocks_that_are_trained_side_by_side_have_no_cell_in_common(capture):
 
 def test_blocks_are_paired_with_each_neighbor_in_turn(capture):
     made, places = street(capture)
-    cut = cut_blocks(made, places, ground_axes(UP), 6)
+    cut = cut_blocks(made, places, ground_axes(UP), 6, deal=False)
     partners: dict[int, set[int]] = {number: set() for number in range(6)}
     for turn in range(20):
         pairs = cut.pairs(turn)
@@ -139,7 +177,7 @@ def test_visits_have_all_steps_of_the_training_once_and_each_block_its_share(
     iterations, rounds, pairs, capture
 ):
     made, places = street(capture)
-    cut = cut_blocks(made, places, ground_axes(UP), 3)
+    cut = cut_blocks(made, places, ground_axes(UP), 3, deal=False)
     visits = [visit for group in plan(cut, iterations, rounds, pairs=pairs) for visit in group]
     assert [visit.start for visit in visits] == [0, *(visit.end for visit in visits[:-1])]
     assert visits[-1].end == iterations
@@ -155,7 +193,7 @@ def test_visits_have_all_steps_of_the_training_once_and_each_block_its_share(
 
 def test_every_view_is_used_equally_often(capture):
     made, places = street(capture)
-    cut = cut_blocks(made, places, ground_axes(UP), 3)
+    cut = cut_blocks(made, places, ground_axes(UP), 3, deal=False)
     visits = [visit for group in plan(cut, 5 * len(made.views), 4) for visit in group]
     names = [name for visit in visits for name in visit.views(0)]
     assert sorted(names) == sorted(5 * list(made.views))
@@ -205,7 +243,7 @@ def test_gaussians_that_reach_into_an_image_have_a_size_in_it(capture):
 def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, monkeypatch):
     monkeypatch.setattr(block_training, "BETAS", (0.9, 0.999))  # those of one piece
     whole = Reconstructor(capture, dataclasses.replace(CONFIG, warm_up=0.0), points)
-    cut = cut_blocks(capture, points.points, ground_axes(UP), 1)
+    cut = cut_blocks(capture, points.points, ground_axes(UP), 1, deal=False)
     (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)
     config, start = whole.config, CellState.untrained(whole.gaussians().map(torch.clone))
     trainer = VisitReconstructor(capture, config, visit, start, None, 0)
@@ -220,7 +258,7 @@ def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, mo
 
 def test_gaussians_of_other_cells_are_drawn_and_stay_as_they_are(capture, points, monkeypatch):
     monkeypatch.setattr(surroundings, "SMALL", 1e-3)  # none is thinned
-    cut = cut_blocks(capture, points.points, ground_axes(UP), 1)
+    cut = cut_blocks(capture, points.points, ground_axes(UP), 1, deal=False)
     (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)
     gaussians = Reconstructor(capture, CONFIG, points).gaussians().map(torch.clone)
     half = len(gaussians) // 2
@@ -292,7 +330,7 @@ def test_blocks_that_no_view_sees_are_refused(capture):
     with pytest.raises(
         CaptureError, match=r"block \d of 4: expected points, and at least 3 views .*smaller --blocks"
     ):
-        cut_blocks(made, behind, ground_axes(UP), 4)
+        cut_blocks(made, behind, ground_axes(UP), 4, deal=False)
 
 
 def test_captures_without_a_ground_plane_are_refused():
@@ -424,7 +462,8 @@ def test_stray_points_far_away_do_not_change_what_a_block_trains(capture):
     axes = ground_axes(UP)
     strays = np.array([[900.0, 3.0, 1.0], [-700.0, 3.0, 1.0]], np.float32)
     before, after = (
-        cut_blocks(made, each, axes, 4).blocks for each in (places, np.concatenate([places, strays]))
+        cut_blocks(made, each, axes, 4, deal=False).blocks
+        for each in (places, np.concatenate([places, strays]))
     )
     assert [(block.trained, block.owned) for block in before] == [(b.trained, b.owned) for b in after]
 

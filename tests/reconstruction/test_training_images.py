@@ -54,3 +54,39 @@ def test_downscaled_images_and_cameras_agree(views):
 
 def test_views_without_a_mask_use_all_pixels(views):
     assert TrainingImages(views, memory=0).valid(views[0].name) is None
+
+
+def test_reduced_photos_are_kept_in_a_folder_with_the_same_bits(views, tmp_path, monkeypatch):
+    name = views[0].name
+    expected = TrainingImages(views, memory=0, shrink=2.0).target(name).image
+    for _ in range(2):  # written, then read
+        assert torch.equal(
+            TrainingImages(views, memory=0, shrink=2.0, folder=tmp_path).target(name).image, expected
+        )
+    (kept,) = tmp_path.iterdir()
+    assert kept.stat().st_size < PHOTO_BYTES / 4 + 200
+    monkeypatch.setattr(type(views[0]), "load_image", None)
+    assert torch.equal(
+        TrainingImages(views, memory=0, shrink=2.0, folder=tmp_path).target(name).image, expected
+    )
+
+
+@pytest.mark.parametrize("damage", [b"", b"no array", "short", "other size"])
+def test_a_damaged_kept_photo_is_made_again(damage, views, tmp_path):
+    name = views[0].name
+    expected = TrainingImages(views, memory=0, shrink=2.0, folder=tmp_path).target(name).image
+    (kept,) = tmp_path.iterdir()
+    whole = kept.read_bytes()
+    if damage == "other size":
+        np.save(kept, np.zeros((3, 3, 3), np.uint8))
+    else:
+        kept.write_bytes(whole[:-9] if damage == "short" else damage)
+    assert torch.equal(
+        TrainingImages(views, memory=0, shrink=2.0, folder=tmp_path).target(name).image, expected
+    )
+    assert kept.read_bytes() == whole
+
+
+def test_photos_of_full_size_are_not_kept(views, tmp_path):
+    TrainingImages(views, memory=0, folder=tmp_path).target(views[0].name)
+    assert not list(tmp_path.iterdir())

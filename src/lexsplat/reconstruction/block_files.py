@@ -166,6 +166,11 @@ class CellFiles:
         """File of a visit; -1 is the state before the first."""
         return self._folder / f"{self._key}-{visit + 1:05}.safetensors"
 
+    @property
+    def photos(self) -> Path:
+        """Folder of the reduced photos."""
+        return self._folder / f"{self._key}-photos"
+
     def latest(self, groups: int) -> dict[str, tuple[int, int]]:
         """Visit that wrote the present state of each cell and of the exposures of each block, and its last step.
 

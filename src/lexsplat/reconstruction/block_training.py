@@ -40,6 +40,7 @@ from lexsplat.reconstruction.surroundings import Surroundings
 from lexsplat.reconstruction.trainer import Reconstructor, initial_gaussians
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import WorkersError
+from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, results
 
@@ -234,10 +235,11 @@ def reconstruct_blocks(
         TrainingError: If a block diverges; finished visits are kept.
         WorkersError: If a worker does not see ``run.folder``.
     """
-    blocks = cut_blocks(capture, points.points, ground_axes(up), count)
+    cap = config.cap(torch.device(run.device))
+    deal = run.device != "cpu" or 2 * cap * budget.GAUSSIAN_BYTES <= run.memory
+    blocks = cut_blocks(capture, points.points, ground_axes(up), count, deal=deal)
     none = capture.points[:0]  # workers get the capture with every group of visits, and need its views only
     capture = replace(capture, points=none, point_colors=capture.point_colors[:0])
-    cap = config.cap(torch.device(run.device))
     rounds = max(ROUNDS, math.ceil(config.iterations / ROUND_STEPS))
     rounds = max(1, min(rounds, config.iterations // (FEWEST_STEPS * count)))
     # The exposures of a block are kept with its visits, so that it is visited alone.
@@ -252,7 +254,8 @@ def reconstruct_blocks(
     needs = Needs(memory=run.memory, gpu=run.device == "cuda")
     own = replace(run, workers=IN_PROCESS, listener=silent)
     with SharedFolder.offered(run.folder) as folder:
-        files = CellFiles(folder.path, run.key, blocks, groups)
+        key = fingerprint(run.key, [(block.views, block.trained) for block in blocks.blocks])
+        files = CellFiles(folder.path, key, blocks, groups)
         finished, extent = files.finished(), capture.extent
         room: tuple[int, ...] = ()
         if finished < 0:
@@ -340,6 +343,7 @@ def _visit(shared: _Shared, visit: Visit) -> int:
     part = replace(shared.capture, views=own, train_names=block.views, test_names=())
     options = {"device": run.device, "memory": run.memory, "extent": shared.extent}
     trainer = VisitReconstructor(part, shared.config, visit, state, around, run.seed, **options)
+    trainer.photo_folder = files.photos
     before = latest.get(f"{EXPOSURES}{block.number}")
     if before is not None:
         trainer.load_exposures(files.read(before[0], EXPOSURES))

@@ -4,6 +4,9 @@ The ground plane is cut into cells with equal numbers of points, and the views, 
 groups of equal size. A block is a group of views and the few cells that fill most of their pixels. The Gaussians of
 these cells are trained with the views; those of other cells that the views show take part with fixed values. Each
 view belongs to one block and is used as a whole, so that all blocks together draw the pixels of one piece.
+
+Around a table every group shows the same cells, and what differs is the side that it shows. The views of such groups
+are dealt to their blocks at random, and each trains all cells, where the memory allows it.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import pdist
 
 from lexsplat.geometry.boxes import Up
 from lexsplat.reconstruction.settings import ReconstructionConfig
@@ -35,6 +40,13 @@ CELLS_OF_PAIR = 6
 
 _COVERED = 0.95
 """Share of the pixels of a block's views that the cells which it trains show, as far as `CELLS_TRAINED` allows."""
+_ALIKE = 0.7
+"""Least overlap of the shares of the cells in the pixels of two groups of views that show the same: of nine groups on
+a street it is at most 0.85 between neighbors and 0.65 between the next but one, around a table at least 0.86."""
+_FEWEST_ALIKE = 3
+"""Groups that show the same, at least: two are visited together as they are;"""
+_SHARE_ALIKE = 1 / 3
+"""and their least share of all groups: thin blocks of a street show the same as their neighbors, but not all."""
 _FEWEST_VIEWS = 3
 _MOST_BLOCKS = 1024
 
@@ -66,6 +78,7 @@ class Block:
         trained: Indices of the cells that it trains, in ascending order.
         owned: Those of them in which it adds and removes Gaussians; each cell is owned by one block.
         shown: Cells that it does not train and that its views show.
+        dealt: Whether its views are a random choice of those of all blocks that show the same.
     """
 
     number: int
@@ -73,6 +86,7 @@ class Block:
     trained: tuple[int, ...]
     owned: tuple[int, ...]
     shown: tuple[int, ...]
+    dealt: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,12 +105,11 @@ class Blocks:
 
     def cells_of(self, means: NDArray[np.floating]) -> NDArray[np.int64]:
         """The cell ``[N]`` of each center ``[N, 3]``."""
-        ground = means.astype(np.float64) @ self.axes.T
-        return np.argmax([cell.holds(ground) for cell in self.cells], axis=0)
+        return _cells_of(means, self.cells, self.axes)
 
     def shares(self, view: View, points: NDArray[np.float32]) -> NDArray[np.float64]:
         """Share of each cell ``[B]`` in a view: of the points that it shows, each by its area in the image."""
-        return _shares(view, points, self.cells, self.axes)
+        return _shares(view, points, self.cells_of(points), len(self.cells))
 
     def joined(self, numbers: Sequence[int]) -> Block:
         """Blocks as one, under the number of the first."""
@@ -104,13 +117,20 @@ class Blocks:
         trained = {cell for block in chosen for cell in block.trained}
         owned = {cell for block in chosen for cell in block.owned}
         shown = {cell for block in chosen for cell in block.shown} - trained
-        views = tuple(name for block in chosen for name in block.views)
-        return Block(numbers[0], views, *(tuple(sorted(cells)) for cells in (trained, owned, shown)))
+        return Block(
+            numbers[0],
+            tuple(name for block in chosen for name in block.views),
+            tuple(sorted(trained)),
+            tuple(sorted(owned)),
+            tuple(sorted(shown)),
+            all(block.dealt for block in chosen),
+        )
 
     def pairs(self, turn: int) -> list[tuple[int, ...]]:
         """The blocks in pairs that together train at most `CELLS_OF_PAIR` cells, and others alone.
 
         Which ones are paired is drawn anew with each ``turn``, so that views are mixed with those of all neighbors.
+        Blocks with dealt views have mixed ones already.
         """
         left = set(range(len(self.blocks)))
         found: list[tuple[int, ...]] = []
@@ -129,7 +149,9 @@ class Blocks:
             (first, second)
             for second in range(len(cells))
             for first in range(second)
-            if cells[first] & cells[second] and len(cells[first] | cells[second]) <= CELLS_OF_PAIR
+            if cells[first] & cells[second]
+            and len(cells[first] | cells[second]) <= CELLS_OF_PAIR
+            and not (self.blocks[first].dealt or self.blocks[second].dealt)
         ]
 
 
@@ -188,7 +210,7 @@ def ground_axes(up: Up) -> NDArray[np.float64]:
 
 
 def cut_blocks(
-    capture: Capture, points: NDArray[np.float32], axes: NDArray[np.float64], count: int
+    capture: Capture, points: NDArray[np.float32], axes: NDArray[np.float64], count: int, *, deal: bool
 ) -> Blocks:
     """Cut a capture into blocks.
 
@@ -197,15 +219,17 @@ def cut_blocks(
         points: Initial points ``[P, 3]``.
         axes: From `ground_axes`.
         count: Number of blocks.
+        deal: Whether all Gaussians fit into the memory, so that blocks that show the same may train all cells.
 
     Raises:
         CaptureError: If a cell has no points, if too few views show it, or if there are too few views.
     """
     views = capture.train_views
     cells = tuple(Cell(*ends) for ends in _cut(points @ axes.T, count))
-    shares = np.array([_shares(view, points, cells, axes) for view in views]).reshape(len(views), count)
-    for number, cell in enumerate(cells):
-        own, shown = int(cell.holds(points @ axes.T).sum()), int((shares[:, number] > 0).sum())
+    homes = _cells_of(points, cells, axes)
+    shares = np.array([_shares(view, points, homes, count) for view in views]).reshape(len(views), count)
+    for number in range(count):
+        own, shown = int((homes == number).sum()), int((shares[:, number] > 0).sum())
         if shown < _FEWEST_VIEWS or not own or len(views) < 2 * count:
             raise CaptureError(
                 f"block {number + 1} of {count}",
@@ -214,8 +238,11 @@ def cut_blocks(
                 remedy="give a smaller --blocks",
             )
     groups = _groups(np.array([view.camera.position @ axes.T for view in views]), count)
+    dealt = np.zeros(count, bool)
+    if deal:
+        groups, dealt = _dealt(groups, shares)
     weights = np.array([shares[group].sum(0) for group in groups])
-    trained = [_cells_seen_most(row) for row in weights]
+    trained = [_cells_seen(row) if all_ else _cells_seen_most(row) for row, all_ in zip(weights, dealt)]
     for index in range(count):
         if not any(index in of_block for of_block in trained):
             trained[int(weights[:, index].argmax())].add(index)
@@ -228,10 +255,40 @@ def cut_blocks(
             tuple(sorted(trained[number])),
             tuple(np.flatnonzero(owner == number).tolist()),
             tuple(np.flatnonzero((weights[number] > 0) & ~trains[number]).tolist()),
+            bool(dealt[number]),
         )
         for number, group in enumerate(groups)
     )
     return Blocks(cells, blocks, axes)
+
+
+def _dealt(
+    groups: list[NDArray[np.int64]], shares: NDArray[np.float64]
+) -> tuple[list[NDArray[np.int64]], NDArray[np.bool_]]:
+    """Deal the views of groups that show the same cells among them, at random; which groups these are ``[B]``."""
+    found, dealt = list(groups), np.zeros(len(groups), bool)
+    weights = np.array([shares[group].sum(0) for group in groups])
+    seeing = np.flatnonzero(weights.sum(1) > 0)
+    fewest = max(_FEWEST_ALIKE, _SHARE_ALIKE * len(groups))
+    if len(seeing) < fewest:
+        return found, dealt
+    weights = weights[seeing] / weights[seeing].sum(1, keepdims=True)
+    apart = pdist(weights, "cityblock") / 2  # one minus the overlap
+    labels = fcluster(linkage(apart, "complete"), 1 - _ALIKE, "distance")  # no two of a set overlap less
+    for label in np.unique(labels):
+        members = seeing[labels == label]
+        if len(members) < fewest:
+            continue
+        dealt[members] = True
+        views = np.random.default_rng(0).permutation(np.concatenate([groups[number] for number in members]))
+        ends = np.cumsum([len(groups[number]) for number in members])
+        for number, part in zip(members, np.split(views, ends[:-1])):
+            found[number] = np.sort(part)
+    return found, dealt
+
+
+def _cells_seen(weights: NDArray[np.float64]) -> set[int]:
+    return set(np.flatnonzero(weights > 0).tolist())
 
 
 def _cells_seen_most(weights: NDArray[np.float64]) -> set[int]:
@@ -241,16 +298,22 @@ def _cells_seen_most(weights: NDArray[np.float64]) -> set[int]:
 
 
 def _shares(
-    view: View, points: NDArray[np.float32], cells: tuple[Cell, ...], axes: NDArray[np.float64]
+    view: View, points: NDArray[np.float32], homes: NDArray[np.int64], count: int
 ) -> NDArray[np.float64]:
     """Share of each cell ``[B]`` in a view: of the points that it shows, each by its area in the image."""
     shown, depth = _shown(view.camera, points)
     if not len(shown):
-        return np.zeros(len(cells))
+        return np.zeros(count)
     area = np.maximum(depth, np.quantile(depth, 0.1)) ** -2
-    ground = points[shown] @ axes.T
-    found = np.array([area[cell.holds(ground)].sum() for cell in cells])
-    return found / area.sum()
+    return np.bincount(homes[shown], area, count) / area.sum()
+
+
+def _cells_of(
+    means: NDArray[np.floating], cells: tuple[Cell, ...], axes: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """The cell ``[N]`` of each center ``[N, 3]``."""
+    ground = means.astype(np.float64) @ axes.T
+    return np.argmax([cell.holds(ground) for cell in cells], axis=0)
 
 
 def _shown(camera: Camera, points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

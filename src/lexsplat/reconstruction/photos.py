@@ -1,20 +1,26 @@
 """The training photos, loaded on first use and cached as bytes within a memory budget.
 
 The cache never evicts: views are visited in random order, in which a least-recently-used cache would almost always
-miss. A photo has the same values (8 bits per channel) whether it comes from the cache or from its file.
+miss. A photo has the same values (8 bits per channel) whether it comes from the cache or from its file. Blocks load
+their photos anew in each visit; reduced photos are small and slow to make, so that they are kept on disk as well.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.reconstruction.image_losses import SSIMTarget, ssim_target
+from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.fingerprints import fingerprint
 
 if TYPE_CHECKING:
     from lexsplat.captures import View
@@ -29,11 +35,19 @@ class TrainingImages:
             moments, which are eight times as large and quick to recompute, take the rest.
         shrink: Factor by which images are smaller than the views' cameras.
         device: Device of the targets.
+        folder: Folder that keeps photos of at most a quarter of the pixels of their files; None keeps none.
     """
 
     def __init__(
-        self, views: Iterable[View], *, memory: int, shrink: float = 1.0, device: torch.device | str = "cpu"
+        self,
+        views: Iterable[View],
+        *,
+        memory: int,
+        shrink: float = 1.0,
+        device: torch.device | str = "cpu",
+        folder: Path | None = None,
     ) -> None:
+        self._folder = folder
         self._views = {view.name: view for view in views}
         self._device = torch.device(device)
         self._cameras = {
@@ -92,9 +106,24 @@ class TrainingImages:
         if name in self._photos:
             return self._photos[name]
         view, camera = self._views[name], self._cameras[name]
-        image = view.load_image((camera.width, camera.height))
-        photo = torch.from_numpy(np.round(image * 255.0).astype(np.uint8)).to(self._device)
+        photo = torch.from_numpy(self._pixels(view, (camera.width, camera.height))).to(self._device)
         if photo.nbytes <= self._photo_room:
             self._photo_room -= photo.nbytes
             self._photos[name] = photo
         return photo
+
+    def _pixels(self, view: View, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """A photo ``[H, W, 3]`` in 8 bits, from the folder if it is there."""
+        kept = None
+        if self._folder is not None and 4 * size[0] * size[1] <= view.capture_size[0] * view.capture_size[1]:
+            kept = self._folder / f"{fingerprint(view.name, size)}.npy"
+            with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or damaged
+                pixels = np.load(kept, allow_pickle=False)
+                if pixels.shape == (size[1], size[0], 3) and pixels.dtype == np.uint8:
+                    return pixels
+        pixels = np.round(view.load_image(size) * 255.0).astype(np.uint8)
+        if kept is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(kept) as path, open(path, "wb") as file:
+                np.save(file, pixels)
+        return pixels

@@ -25,6 +25,8 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.training import run_training
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.geometry.cameras import Camera
@@ -58,6 +60,8 @@ class Reconstructor:
     """
 
     parameter_prefixes: tuple[str, ...] = ("parameters/", "exposures/")
+    photo_folder: Path | None = None
+    """Folder that keeps reduced photos for the next training of the same capture (`TrainingImages`)."""
 
     def __init__(
         self,
@@ -312,6 +316,7 @@ class Reconstructor:
                 memory=self._photo_bytes,
                 shrink=shrink,
                 device=self.device,
+                folder=self.photo_folder,
             )
             self._images_shrink = shrink
         return self._images
