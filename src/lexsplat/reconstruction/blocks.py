@@ -6,7 +6,7 @@ these cells are trained with the views; those of other cells that the views show
 view belongs to one block and is used as a whole, so that all blocks together draw the pixels of one piece.
 
 Around a table every group shows the same cells, and what differs is the side that it shows. The views of such groups
-are dealt to their blocks at random, and each trains all cells, where the memory allows it.
+are dealt to their blocks in turn, and each trains all cells, where the memory allows it.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Block:
         trained: Indices of the cells that it trains, in ascending order.
         owned: Those of them in which it adds and removes Gaussians; each cell is owned by one block.
         shown: Cells that it does not train and that its views show.
-        dealt: Whether its views are a random choice of those of all blocks that show the same.
+        dealt: Whether its views are every n-th of those of n blocks that show the same.
     """
 
     number: int
@@ -265,7 +265,7 @@ def cut_blocks(
 def _dealt(
     groups: list[NDArray[np.int64]], shares: NDArray[np.float64]
 ) -> tuple[list[NDArray[np.int64]], NDArray[np.bool_]]:
-    """Deal the views of groups that show the same cells among them, at random; which groups these are ``[B]``."""
+    """Deal the views of groups that show the same cells among them, in turn; which groups these are ``[B]``."""
     found, dealt = list(groups), np.zeros(len(groups), bool)
     weights = np.array([shares[group].sum(0) for group in groups])
     seeing = np.flatnonzero(weights.sum(1) > 0)
@@ -280,10 +280,9 @@ def _dealt(
         if len(members) < fewest:
             continue
         dealt[members] = True
-        views = np.random.default_rng(0).permutation(np.concatenate([groups[number] for number in members]))
-        ends = np.cumsum([len(groups[number]) for number in members])
-        for number, part in zip(members, np.split(views, ends[:-1])):
-            found[number] = np.sort(part)
+        views = np.concatenate([groups[number] for number in members])
+        for place, number in enumerate(members):
+            found[number] = np.sort(views[place :: len(members)])
     return found, dealt
 
 
