@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from lexsplat.features import extract_features
 from lexsplat.features.extraction import missing_views
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders
-from lexsplat.runtime.errors import CaptureError, WorkersError
+from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -87,12 +86,10 @@ def _extract_view(shared: _Extraction, view: View) -> dict[str, bytes]:
             capture, encoders.clip, encoders.dino, config.features, cache_dir=folder, memory=memory
         )
 
-    if shared.cache.is_visible:
-        extract(shared.cache.path)
-        return {}
-    with tempfile.TemporaryDirectory() as folder:
-        extract(Path(folder))
-        return {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}
+    visible = shared.cache.is_visible
+    with shared.cache.opened(None if visible else {}) as folder:
+        extract(folder)
+        return {} if visible else {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
 
 
 @functools.lru_cache(maxsize=1)
@@ -183,12 +180,6 @@ def _build_scene(shared: _Scenes, task: SceneTask) -> list[str]:
     """Build a scene; returns the names of its stages."""
     from lexsplat.pipeline.build import build
 
-    if not shared.folder.is_visible:
-        raise WorkersError(
-            shared.folder.path,
-            expected="a folder that every worker sees",
-            found="no such folder on one of them",
-            remedy="give an --output on a file system that every node mounts at the same path",
-        )
-    built = build(task.source, task.output, task.config, until=task.until, listener=shared.listener)
+    with shared.folder.opened(None):
+        built = build(task.source, task.output, task.config, until=task.until, listener=shared.listener)
     return list(built.record["stages"])

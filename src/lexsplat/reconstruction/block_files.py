@@ -8,7 +8,7 @@ planned before the first, so a run that was killed knows from the files alone wh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from lexsplat.geometry.gaussians import TENSORS, Gaussians
 from lexsplat.reconstruction.blocks import Block, Blocks, side_by_side
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_json, write_json, write_tensors
+from lexsplat.runtime.workers import SharedFolder
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 STATISTICS = ("grad2d", "count")
@@ -160,11 +161,27 @@ class CellFiles:
 
     def __init__(self, folder: Path, key: str, blocks: Blocks, groups: list[list[Visit]]) -> None:
         self._folder, self._key, self._count = folder, key, len(blocks.cells)
-        self._groups = groups
+        self._blocks, self._groups = blocks, groups
 
     def path(self, visit: int) -> Path:
         """File of a visit; -1 is the state before the first."""
         return self._folder / f"{self._key}-{visit + 1:05}.safetensors"
+
+    def at(self, folder: Path) -> CellFiles:
+        """The same files in another folder."""
+        return CellFiles(folder, self._key, self._blocks, self._groups)
+
+    def needed(self, visit: Visit, groups: int) -> set[str]:
+        """Names of the files that a visit reads.
+
+        Args:
+            visit: The visit.
+            groups: Number of finished groups of visits.
+        """
+        latest, block = self.latest(groups), visit.block
+        read = [str(cell) for cell in (*block.trained, *block.shown)]
+        read += [name for name in [f"{EXPOSURES}{block.number}"] if name in latest]
+        return {self.path(latest[name][0]).name for name in read}
 
     @property
     def photos(self) -> Path:
@@ -250,6 +267,35 @@ class CellFiles:
     def gaussians(self, visit: int, cell: int, antialiased: bool) -> Gaussians:
         """The Gaussians of a cell after a visit."""
         return Gaussians(**self.read(visit, f"{cell}/parameters/"), antialiased=antialiased)
+
+
+@dataclass(frozen=True)
+class VisitsOfGroup(Mapping[str, tuple[Visit, Mapping[str, bytes] | None]]):
+    """The visits of a group, each with the files that it reads, loaded when it begins.
+
+    Args:
+        visits: The visits by name.
+        files: The files.
+        groups: Number of groups of visits before this one.
+        folder: The folder, if workers do not see it; None sends no files.
+    """
+
+    visits: Mapping[str, Visit]
+    files: CellFiles
+    groups: int
+    folder: SharedFolder | None
+
+    def __getitem__(self, name: str) -> tuple[Visit, Mapping[str, bytes] | None]:
+        visit = self.visits[name]
+        if self.folder is None:
+            return visit, None
+        return visit, self.folder.read(self.files.needed(visit, self.groups))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.visits)
+
+    def __len__(self) -> int:
+        return len(self.visits)
 
 
 def merged(parts: list[Gaussians]) -> Gaussians:

@@ -28,6 +28,7 @@ from lexsplat.reconstruction.block_files import (
     CellFiles,
     CellState,
     Visit,
+    VisitsOfGroup,
     idle,
     merged,
     plan,
@@ -39,7 +40,7 @@ from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, Reconstructio
 from lexsplat.reconstruction.surroundings import Surroundings
 from lexsplat.reconstruction.trainer import Reconstructor, initial_gaussians
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.errors import WorkersError
+from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, results
@@ -233,7 +234,7 @@ def reconstruct_blocks(
         CaptureError: If there is no ground plane, or a block has no views.
         MemoryBudgetError: If a block does not fit into ``run.memory``.
         TrainingError: If a block diverges; finished visits are kept.
-        WorkersError: If a worker does not see ``run.folder``.
+        WorkersError: If a worker comes later that does not see ``run.folder``, as the others do.
     """
     cap = config.cap(torch.device(run.device))
     deal = run.device != "cpu" or 2 * cap * budget.GAUSSIAN_BYTES <= run.memory
@@ -258,6 +259,7 @@ def reconstruct_blocks(
         files = CellFiles(folder.path, key, blocks, groups)
         finished, extent = files.finished(), capture.extent
         room: tuple[int, ...] = ()
+        seen = workers.see(folder)
         if finished < 0:
             finished = 0
             _write_start(files, blocks, config, points, run)
@@ -265,13 +267,13 @@ def reconstruct_blocks(
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
                 room = _room(files, group[0].round, index, config, cap)
             shared = _Shared(capture, config, blocks, folder, files, own, extent, index, room)
-            items = {
-                f"block {visit.block.number + 1} of {count}, round {visit.round + 1}": visit
-                for visit in group
-            }
-            for done, size in enumerate(
-                results(workers.map(_visit, shared, items, needs)), group[0].number + 1
-            ):
+            names = {f"block {v.block.number + 1} of {count}, round {v.round + 1}": v for v in group}
+            items = VisitsOfGroup(names, files, index, None if seen else folder)
+            found = results(workers.map(_visit, shared, items, needs))
+            for done, (number, size, content) in enumerate(found, group[0].number + 1):
+                if content:
+                    with atomic_path(files.path(number)) as path:
+                        path.write_bytes(content)
                 listener(Event("blocks", done, total, {"gaussians": float(size), **workers.metrics}))
             files.remove_old(index + 1)
         latest = files.latest(len(groups))
@@ -316,16 +318,26 @@ def _room(
     return room
 
 
-def _visit(shared: _Shared, visit: Visit) -> int:
-    """Train a block for the steps of a visit and write its cells; returns the number of its Gaussians."""
+def _visit(shared: _Shared, item: tuple[Visit, Mapping[str, bytes] | None]) -> tuple[int, int, bytes]:
+    """Train a block for the steps of a visit and write its cells.
+
+    Args:
+        shared: What all visits read.
+        item: The visit, and the files that it reads if the workers do not see the folder.
+
+    Returns:
+        The number of the visit and of its Gaussians, and its file if the workers do not see the folder.
+    """
+    visit, carried = item
+    with shared.folder.opened(carried) as folder:
+        files = shared.files.at(folder)
+        count = _trained(replace(shared, files=files), visit)
+        content = b"" if carried is None else files.path(visit.number).read_bytes()
+        return visit.number, count, content
+
+
+def _trained(shared: _Shared, visit: Visit) -> int:
     run, files, blocks = shared.run, shared.files, shared.blocks
-    if not shared.folder.is_visible:
-        raise WorkersError(
-            shared.folder.path,
-            expected="a folder that every worker sees",
-            found="no such folder on one of them",
-            remedy="give an --output on a file system that every node mounts at the same path",
-        )
     latest, block = files.latest(shared.groups), visit.block
     if files.path(visit.number).exists():  # by a run that was killed before the others of its group had ended
         return sum(len(files.gaussians(visit.number, cell, False)) for cell in block.trained)

@@ -16,7 +16,7 @@ from lexsplat.runtime.environment import code_identity, version_of_lexsplat
 from lexsplat.runtime.errors import LexsplatError, WorkersError
 from lexsplat.runtime.memory import size_text
 from lexsplat.runtime.progress import NOTE
-from lexsplat.runtime.workers import ANY_MACHINE, Needs, Outcome, R, S, T, Workers
+from lexsplat.runtime.workers import ANY_MACHINE, Needs, Outcome, R, S, SharedFolder, T, Workers
 
 log = logging.getLogger("lexsplat")
 
@@ -98,6 +98,16 @@ class RayWorkers:
         """See `Workers.metrics`."""
         return {"workers": float(self._running)}
 
+    def see(self, folder: SharedFolder) -> bool:
+        """See `Workers.see`."""
+        import ray
+
+        try:
+            answers = _on_every_node(ray.remote(_sees), folder)
+            return all(ray.get(list(answers.values()), timeout=_PROBE_SECONDS))
+        except (ConnectionError, ray.exceptions.RayError) as error:
+            raise _gone(error) from error
+
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
     ) -> Iterator[Outcome]:
@@ -112,14 +122,14 @@ class RayWorkers:
             options = _options(needs, len(items))
             task = ray.remote(_run).options(**options)
             everyone = ray.put(shared)
-            todo, running = deque(items.items()), deque[tuple[str, Any]]()
+            todo, running = deque(items), deque[tuple[str, Any]]()
             cores, asked = _cores(), time.monotonic()
             while todo or running:
                 if time.monotonic() - asked > _CORES_SECONDS and _head_answers():  # nodes may have come
                     cores, asked = _cores(), time.monotonic()
                 while todo and len(running) < 2 * cores:
-                    name, item = todo.popleft()
-                    running.append((name, task.remote(work, everyone, item)))
+                    name = todo.popleft()
+                    running.append((name, task.remote(work, everyone, items[name])))
                 self._running = min(cores, len(running))
                 name, reference = running.popleft()
                 yield _outcome(name, reference)
@@ -127,6 +137,11 @@ class RayWorkers:
             raise _gone(error) from error
         except (ray.exceptions.ObjectStoreFullError, ray.exceptions.OutOfDiskError) as error:
             raise _store_full(needs.result) from error
+
+
+def _sees(folder: SharedFolder) -> bool:
+    """Whether a node sees a folder. A worker calls it."""
+    return folder.is_visible
 
 
 def _cores() -> int:
@@ -236,7 +251,6 @@ def _check_nodes(paths: tuple[Path, ...]) -> None:
         WorkersError: If a node cannot do the work.
     """
     import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as OnNode
 
     def probe(files: list[str]) -> tuple[str, str, list[str]]:
         # Nested, so that it is sent by value: a node without lexsplat can run it too.
@@ -248,18 +262,11 @@ def _check_nodes(paths: tuple[Path, ...]) -> None:
             return "", "", []
         return version_of_lexsplat(), code_identity(), [file for file in files if not Path(file).exists()]
 
-    task, files = ray.remote(probe), [str(path.resolve()) for path in paths]
-    nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
-    if not nodes:
+    answers = _on_every_node(ray.remote(probe), [str(path.resolve()) for path in paths])
+    if not answers:
         raise WorkersError(
             "--workers", expected="nodes with CPUs", found="none", remedy="add nodes to the cluster"
         )
-    answers = {
-        node["NodeManagerHostname"] + "/" + node["NodeID"][:6]: task.options(
-            num_cpus=0, scheduling_strategy=OnNode(node["NodeID"], soft=True)
-        ).remote(files)
-        for node in nodes
-    }
     for name, reference in answers.items():
         try:
             found, code, missing = ray.get(reference, timeout=_PROBE_SECONDS)
@@ -269,7 +276,21 @@ def _check_nodes(paths: tuple[Path, ...]) -> None:
                 f"node {name}", expected="an answer", found=type(error).__name__, remedy=remedy
             ) from error
         _check_probe(name, found, code, missing)
-    log.log(NOTE, "workers: %s nodes, %s cores", len(nodes), int(ray.cluster_resources().get("CPU", 0)))
+    log.log(NOTE, "workers: %s nodes, %s cores", len(answers), int(ray.cluster_resources().get("CPU", 0)))
+
+
+def _on_every_node(task: Any, argument: Any) -> dict[str, Any]:
+    """References to the answers of all nodes that can compute, by the name of the node."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as OnNode
+
+    return {
+        node["NodeManagerHostname"] + "/" + node["NodeID"][:6]: task.options(
+            num_cpus=0, scheduling_strategy=OnNode(node["NodeID"], soft=True)
+        ).remote(argument)
+        for node in ray.nodes()
+        if node["Alive"] and node["Resources"].get("CPU")
+    }
 
 
 def _check_probe(node: str, found: str, code: str, missing: list[str]) -> None:

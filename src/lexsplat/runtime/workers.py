@@ -6,14 +6,15 @@ added in one order, and any number of workers gives the same bits.
 
 from __future__ import annotations
 
+import tempfile
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from lexsplat.runtime.errors import LexsplatError
+from lexsplat.runtime.errors import LexsplatError, WorkersError
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -64,6 +65,9 @@ class Workers(Protocol):
     def metrics(self) -> dict[str, float]:
         """What progress tells of them: the number of tasks that run at a time, as "workers"."""
 
+    def see(self, folder: SharedFolder) -> bool:
+        """Whether every worker sees a folder of this process."""
+
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
     ) -> Iterator[Outcome]:
@@ -72,7 +76,8 @@ class Workers(Protocol):
         Args:
             work: A function of a module. It may run more than once for an item, so it writes files atomically.
             shared: What all tasks read, sent to each worker once.
-            items: What tells the tasks apart, by name.
+            items: What tells the tasks apart, by name. An item is looked up when its task begins, so that a mapping
+                may load large ones then.
             needs: What one task needs.
 
         Yields:
@@ -89,6 +94,10 @@ class InProcess:
     def metrics(self) -> dict[str, float]:
         """See `Workers.metrics`."""
         return {}
+
+    def see(self, folder: SharedFolder) -> bool:
+        """See `Workers.see`."""
+        return True
 
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
@@ -171,7 +180,7 @@ def _in_process() -> Iterator[Workers]:
 
 @dataclass(frozen=True)
 class SharedFolder:
-    """A folder of results that workers write to where they see it.
+    """A folder of results that workers write to where they see it; where they do not, files travel with the tasks.
 
     Args:
         path: The folder, absolute.
@@ -200,6 +209,36 @@ class SharedFolder:
             return self._mark.read_text(encoding="ascii") == self.token
         except OSError:
             return False
+
+    def read(self, names: Iterable[str]) -> dict[str, bytes]:
+        """The content of files, to be sent to a worker that does not see them."""
+        return {name: (self.path / name).read_bytes() for name in names}
+
+    @contextmanager
+    def opened(self, files: Mapping[str, bytes] | None) -> Iterator[Path]:
+        """The folder, for a worker.
+
+        Args:
+            files: What `read` returned, for workers that do not see the folder: they get one of their own with these
+                files, for the time of the task. None means the folder itself.
+
+        Raises:
+            WorkersError: If this process does not see the folder and got no files.
+        """
+        if files is not None:
+            with tempfile.TemporaryDirectory() as own:
+                for name, content in files.items():
+                    (Path(own) / name).write_bytes(content)
+                yield Path(own)
+            return
+        if not self.is_visible:
+            raise WorkersError(
+                self.path,
+                expected="a folder that every worker sees",
+                found="no such folder on one of them",
+                remedy="give an --output on a file system that every node mounts at the same path",
+            )
+        yield self.path
 
     @property
     def _mark(self) -> Path:
