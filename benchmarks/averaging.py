@@ -32,8 +32,9 @@ from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
 from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
-from lexsplat.language.methods import averaged
-from lexsplat.language.methods.averaged import Averaged, AveragedConfig, average_features
+from lexsplat.language.methods import averaging
+from lexsplat.language.methods.averaged import Averaged, AveragedConfig
+from lexsplat.language.methods.averaging import average_features
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, feature_maps
@@ -81,9 +82,9 @@ def measured(run: Callable[[], Any], path: str) -> dict[str, Any]:
     start, cpu = time.perf_counter(), time.process_time()
     with ExitStack() as patches:
         if path == "dense":
-            patches.enter_context(patch.object(averaged, "weigh_cells", dense_cells))
-            unwrapped = averaged._shard_sums.__wrapped__  # type: ignore[attr-defined]
-            patches.enter_context(patch.object(averaged, "_shard_sums", unwrapped))
+            patches.enter_context(patch.object(averaging, "weigh_cells", dense_cells))
+            unwrapped = averaging._shard_sums.__wrapped__  # type: ignore[attr-defined]
+            patches.enter_context(patch.object(averaging, "_shard_sums", unwrapped))
         found = run()
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)

@@ -18,11 +18,10 @@ from lexsplat.language.fields import CodeField
 from lexsplat.language.methods import METHODS
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
-    MeanFeatures,
-    average_features,
     features_of_codes,
     field_from_means,
 )
+from lexsplat.language.methods.averaging import MeanFeatures, average_features
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.visibility import hidden_gaussians

@@ -28,10 +28,10 @@ from lexsplat.features.dino import DinoEncoder
 from lexsplat.language.fields import TrainedField, field_from_tensors
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
-    average_features,
     features_of_codes,
     field_from_means,
 )
+from lexsplat.language.methods.averaging import average_features
 from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.language.methods.trained import train_field
 from lexsplat.language.methods.trained_settings import TrainedConfig

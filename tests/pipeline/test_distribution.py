@@ -3,17 +3,22 @@
 import dataclasses
 import json
 import shutil
+from collections.abc import Mapping
 
+import numpy as np
 import pytest
 import torch
+from support.blind_workers import BlindWorkers
 from support.color_encoder import ColorClip, ColorDino
+from support.language_scene import make_scene
 from support.schemas import SCHEMAS
 from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
 from lexsplat.captures import load_capture
 from lexsplat.features import FeatureMap, FeatureMaps, extract_features
-from lexsplat.language.methods.averaged import MOST_SHARDS, SHARD_VIEWS, view_shards
+from lexsplat.language.methods.averaged import AveragedConfig
+from lexsplat.language.methods.averaging import MOST_SHARDS, SHARD_VIEWS, average_features, view_shards
 from lexsplat.pipeline import distribution
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers, scene_tasks
@@ -89,6 +94,44 @@ def test_feature_maps_travel_without_what_they_keep():
 
 def _one_map(name):
     return FeatureMap(torch.ones(2, 2, 3))
+
+
+class Stored(Mapping):
+    """Feature maps in the files of a folder."""
+
+    def __init__(self, folder, names):
+        self.folder, self.names = folder, names
+
+    def __getitem__(self, name):
+        return FeatureMap(torch.from_numpy(np.load(self.folder / f"{name}.npy")))
+
+    def __iter__(self):
+        return iter(self.names)
+
+    def __len__(self):
+        return len(self.names)
+
+
+def test_averages_of_workers_that_do_not_see_the_scene_folder_are_those_of_one_process(tmp_path):
+    made = make_scene()
+    eight = list(made.cameras.values())
+    cameras = {f"{number:02}": eight[number % 8] for number in range(40)}
+    maps = Stored(tmp_path / "scene", list(cameras))
+    maps.folder.mkdir()
+    rng = np.random.default_rng(0)
+    for name in cameras:
+        np.save(maps.folder / f"{name}.npy", rng.normal(size=(6, 8, 5)).astype(np.float16))
+    workers = BlindWorkers(maps.folder)
+    found = [
+        average_features(
+            made.gaussians, cameras, maps, AveragedConfig(), memory=memory, scratch=maps.folder, workers=each
+        )
+        for each, memory in ((IN_PROCESS, 1 << 30), (workers, 1 << 30), (workers, 1 << 16))
+    ]
+    assert workers.tasks > 4, "two shards, and several ranges of dimensions where memory is short"
+    for other in found[1:]:
+        assert np.array_equal(found[0].means, other.means)
+        assert torch.equal(found[0].totals, other.totals)
 
 
 def test_two_captures_of_one_name_are_refused(tmp_path):

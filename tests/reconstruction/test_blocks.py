@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from support.blind_workers import BlindWorkers
 from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
@@ -478,4 +479,17 @@ def test_blocks_on_ray_have_the_bits_of_one_process(capture, points, tmp_path, m
     with open_workers("ray", (capture.root,)) as workers:
         run = dataclasses.replace(run, folder=tmp_path / "ray", workers=workers)
         there = reconstruct_blocks(capture, config, points, UP, 2, run)
+    assert all(torch.equal(a, b) for a, b in zip(here.tensors().values(), there.tensors().values()))
+
+
+def test_blocks_of_workers_that_do_not_see_the_scene_folder_have_the_bits_of_one_process(
+    capture, points, tmp_path
+):
+    config = dataclasses.replace(CONFIG, iterations=36, densify_min_every=2, densify_every=2)
+    run = BlockRun("cpu", 0, 256 << 20, tmp_path / "here", "key")
+    here = reconstruct_blocks(capture, config, points, UP, 2, run)
+    workers = BlindWorkers(tmp_path / "unseen")
+    run = dataclasses.replace(run, folder=tmp_path / "unseen", workers=workers)
+    there = reconstruct_blocks(capture, config, points, UP, 2, run)
+    assert workers.tasks > 2
     assert all(torch.equal(a, b) for a, b in zip(here.tensors().values(), there.tensors().values()))

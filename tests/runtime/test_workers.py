@@ -124,6 +124,13 @@ def test_a_task_that_fails_on_a_node_is_told_with_its_name_and_the_rest_is_kept(
 
 
 @pytest.mark.slow
+def test_nodes_tell_whether_they_see_a_folder_itself(on_ray, tmp_path):
+    with SharedFolder.offered(tmp_path / "there") as folder:
+        assert on_ray.see(folder)
+        assert not on_ray.see(SharedFolder(folder.path, "that of another machine"))
+
+
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(on_ray, tmp_path):
     found = [o.result for o in on_ray.map(two_nodes.dies_once, tmp_path, {"a": 0, "b": 1})]
     assert found == [0, 1]

@@ -47,8 +47,6 @@ _FEWEST_ALIKE = 3
 """Groups that show the same, at least: two are visited together as they are;"""
 _SHARE_ALIKE = 1 / 3
 """and their least share of all groups: thin blocks of a street show the same as their neighbors, but not all."""
-_FAR = 0.02
-"""Share of the pixels of a block's views that the cells which it leaves out show, at most."""
 _FEWEST_VIEWS = 3
 _MOST_BLOCKS = 1024
 
@@ -256,23 +254,12 @@ def cut_blocks(
             tuple(views[index].name for index in group),
             tuple(sorted(trained[number])),
             tuple(np.flatnonzero(owner == number).tolist()),
-            _taking_part(weights[number], trains[number]),
+            tuple(np.flatnonzero((weights[number] > 0) & ~trains[number]).tolist()),
             bool(dealt[number]),
         )
         for number, group in enumerate(groups)
     )
     return Blocks(cells, blocks, axes)
-
-
-def _taking_part(weights: NDArray[np.float64], trained: NDArray[np.bool_]) -> tuple[int, ...]:
-    """Cells that are not trained and that views show, without those at the far end of a street."""
-    ascending = np.argsort(weights, kind="stable")
-    far = ascending[
-        np.cumsum(weights[ascending]) <= float(__import__("os").environ.get("FAR", _FAR)) * weights.sum()
-    ]
-    near = np.ones(len(weights), bool)
-    near[far] = False
-    return tuple(np.flatnonzero(near & (weights > 0) & ~trained).tolist())
 
 
 def _dealt(

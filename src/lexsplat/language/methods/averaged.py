@@ -15,10 +15,8 @@ which gives u_G: 0 for a mean of length 1, and 1 for a mean no longer than that 
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,30 +28,14 @@ from torch.nn import functional
 from lexsplat.codebook import Codebook, CodebookConfig
 from lexsplat.codebook.fitting import spherical_kmeans
 from lexsplat.features import FeatureMap, FeatureMaps
-from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.language.code_maps import check_views
 from lexsplat.language.fields import CodeField
+from lexsplat.language.methods.averaging import ROWS, MeanFeatures, average_features
 from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
 from lexsplat.language.segments import make_segments
-from lexsplat.rendering import BACK_PROJECTED_CHANNELS, prepare, weigh_cells
-from lexsplat.rendering.back_projection import CellWeights, cell_of
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.device import one_thread, threads_for_kernels
+from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.progress import Event, Listener, silent
-from lexsplat.runtime.workers import IN_PROCESS, Needs, Workers, results
-
-ROWS = 16_384
-"""Gaussians handled at a time outside rendering."""
-
-SHARD_VIEWS = 16
-"""Views whose sums are made apart, at least."""
-
-MOST_SHARDS = 64
-"""Shards of a capture at most: each sends as many bytes as the sums have."""
-
-MAX_STORE = 1 << 30
-"""Bytes that the sums may take at most, however much memory there is."""
 
 
 @dataclass(frozen=True)
@@ -87,45 +69,6 @@ class AveragedConfig:
             raise ValueError(f"temperature must be positive, got {self.temperature:g}")
         if self.min_visibility < 0 or self.prior_visibility < 0:
             raise ValueError("min_visibility and prior_visibility must not be negative")
-
-
-@dataclass(frozen=True)
-class MeanFeatures:
-    """The mean feature of each Gaussian over the training views.
-
-    Args:
-        means: ``[N, Dc + Dd]`` float16, each half of length at most 1; 0 for Gaussians that were not seen. In memory
-            or in a file.
-        totals: Sum of the weights of all pixels ``[N]``, in cells of the feature maps.
-        dino: Size Dd of the DINO half; 0 without.
-    """
-
-    means: NDArray[np.float16]
-    totals: Tensor
-    dino: int = 0
-
-    def rows(self, index: slice | Tensor) -> Tensor:
-        """CLIP means of some Gaussians ``[n, Dc]`` float32, on the device of `totals`."""
-        return self.halves(index)[0]
-
-    def halves(self, index: slice | Tensor) -> list[Tensor]:
-        """The same, followed by the DINO means ``[n, Dd]`` if there are any."""
-        chosen = index if isinstance(index, slice) else index.cpu().numpy()
-        rows = torch.from_numpy(np.asarray(self.means[chosen], np.float32)).to(self.totals.device)
-        clip = rows.shape[1] - self.dino
-        return [rows[:, :clip], rows[:, clip:]] if self.dino else [rows]
-
-    def visible(self, config: AveragedConfig) -> Tensor:
-        """Which Gaussians the training views show ``[N]`` bool."""
-        return (self.totals >= config.min_visibility) & (self.totals > 0)
-
-
-Valid = Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]
-"""Valid pixels ``[H, W]`` of a view by its name and (width, height); None if all are valid."""
-
-
-def all_valid(name: str, size: tuple[int, int]) -> None:
-    """The `Valid` of views without masks."""
 
 
 class Averaged:
@@ -172,111 +115,6 @@ class Averaged:
                 field.segments = make_segments(gaussians, found.rows, shown)
             run.listener(Event("segments", 1, 1))
         return field
-
-
-# Beside its inputs: masks, and three options of the run that tests leave out.
-def average_features(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    feature_maps: Mapping[str, FeatureMap],
-    config: AveragedConfig,
-    *,
-    valid: Valid = all_valid,
-    memory: int = budget.DEFAULT_MEMORY,
-    scratch: Path | None = None,
-    workers: Workers = IN_PROCESS,
-    listener: Listener = silent,
-) -> MeanFeatures:
-    """The mean feature of each Gaussian, weighted by its share of the pixels: of CLIP, and of DINO if asked for.
-
-    Args:
-        gaussians: The geometry.
-        cameras: Cameras of the training views by name.
-        feature_maps: Dense features by view name; cells whose CLIP feature is zero are ignored.
-        config: Settings.
-        valid: Valid pixels of a view.
-        memory: Host memory in bytes, a quarter of which the sums may take (at most `MAX_STORE`). If they need more,
-            the views are traversed several times, for a range of feature dimensions each, and the means are kept in
-            a file. The result does not depend on it.
-        scratch: Folder for that file; None takes the system's.
-        workers: Where the sums of each shard of views are made. The result does not depend on it.
-        listener: Receives events of stage "average".
-
-    Raises:
-        ValueError: If there is no view, a view has no features, or their dimensions differ.
-    """
-    names = sorted(cameras)
-    check_views(names, feature_maps)
-    gaussians, count = gaussians.detach(), len(gaussians)
-    dino = feature_maps[names[0]].dino if config.dino else None
-    with_dino = 0 if dino is None else dino.shape[-1]
-    dimensions = feature_maps[names[0]].clip.shape[-1] + with_dino
-    share = max(1, min(MAX_STORE, memory // 4))
-    ranges = list(_ranges(dimensions, count, share))
-    means = _store(count, dimensions, share, scratch)
-    shards = view_shards(names)
-    shared = _Averaging(gaussians, dict(cameras), feature_maps, config, valid, with_dino)
-    needs = Needs(gpu=gaussians.device.type == "cuda", result=4 * count * (len(ranges[0]) + 1))
-    totals = torch.zeros(count, device=gaussians.device)
-    done = 0
-    for columns in ranges:
-        sums = torch.zeros(count, len(columns), device=gaussians.device)
-        items = {shard[0]: (shard, columns, dimensions) for shard in shards}
-        for part, weights, views in results(workers.map(_shard_sums, shared, items, needs)):
-            sums += part.to(sums.device)
-            if columns.start == 0:
-                totals += weights.to(sums.device)
-            done += views
-            listener(Event("average", done, len(ranges) * len(names), workers.metrics))
-        for start in range(0, count, ROWS):
-            rows = slice(start, start + ROWS)
-            mean = sums[rows] / totals[rows, None].clamp_min(1e-12)
-            means[rows, columns.start : columns.stop] = mean.cpu().numpy().astype(np.float16)
-    return MeanFeatures(means, totals, with_dino)
-
-
-@dataclass(frozen=True)
-class _Averaging:
-    """What the sums of every shard are made from: arguments of `average_features`."""
-
-    gaussians: Gaussians
-    cameras: Mapping[str, Camera]
-    feature_maps: Mapping[str, FeatureMap]
-    config: AveragedConfig
-    valid: Valid
-    with_dino: int
-
-
-def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """The views in shards whose sums are made apart and then added in order.
-
-    The shards depend on the views alone, not on the workers, and so do the bits of the sums.
-    """
-    size = max(SHARD_VIEWS, -(-len(names) // MOST_SHARDS))
-    return [tuple(names[start : start + size]) for start in range(0, len(names), size)]
-
-
-@threads_for_kernels()
-def _shard_sums(shared: _Averaging, item: tuple[tuple[str, ...], range, int]) -> tuple[Tensor, Tensor, int]:
-    """The sums of some views over a range of dimensions ``[N, len(columns)]``, of weights ``[N]``, and the views."""
-    names, columns, dimensions = item
-    gaussians = shared.gaussians
-    sums = torch.zeros(len(gaussians), len(columns), device=gaussians.device)
-    totals = torch.zeros(len(gaussians), device=gaussians.device)
-    for name in names:
-        found = shared.feature_maps[name]
-        features = found.clip
-        if shared.with_dino and found.dino is not None:
-            features = torch.cat([features, found.dino], dim=-1)
-        if features.shape[-1] != dimensions:
-            raise ValueError(f"features of {name} have {features.shape[-1]} dimensions, others {dimensions}")
-        camera = _at_map_size(shared.cameras[name], features, gaussians.antialiased, shared.config)
-        counting = shared.valid(name, (camera.width, camera.height))
-        weights = _cell_weights(gaussians, camera, found.clip, counting)
-        weights.add_to(sums, features.flatten(0, 1)[:, columns.start : columns.stop])
-        if columns.start == 0:
-            totals += weights.totals()
-    return sums, totals, len(names)
 
 
 def features_of_codes(code_maps: Mapping[str, NDArray[np.integer]], codebook: Codebook) -> FeatureMaps:
@@ -392,56 +230,3 @@ def _own(halves: Sequence[Tensor], common: Sequence[Tensor]) -> list[Tensor]:
 def _joined(halves: Sequence[Tensor], lambda_dino: float) -> Tensor:
     """Both halves in a row, so that the product with a code is the similarity of Eq. 4."""
     return halves[0] if len(halves) == 1 else torch.cat([halves[0], lambda_dino * halves[1]], dim=-1)
-
-
-def _cell_weights(
-    gaussians: Gaussians, camera: Camera, features: Tensor, counting: NDArray[np.bool_] | None
-) -> CellWeights:
-    """Weights alpha T of the cells that have a feature, over the pixels that count."""
-    cells = (features.shape[0], features.shape[1])
-    # Cells a pixel covers, so that weights do not depend on the size at which views are rendered.
-    share = cells[0] * cells[1] / (camera.height * camera.width)
-    rows = cell_of(np.arange(camera.height), camera.height, cells[0])
-    columns = cell_of(np.arange(camera.width), camera.width, cells[1])
-    known = _any_nonzero(features.numpy())
-    counts = known[rows[:, None], columns].astype(np.float32) * np.float32(share)
-    if counting is not None:
-        counts *= counting
-    return weigh_cells(gaussians, camera, cells, torch.from_numpy(counts), prepare(gaussians, camera))
-
-
-def _any_nonzero(values: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which rows ``[..., C]`` have a number but 0, by their bits without the sign: NumPy is slow at halves."""
-    bits = values.view(f"u{values.itemsize}")
-    return np.asarray(np.bitwise_or.reduce(bits, axis=-1) << 1 != 0)
-
-
-def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragedConfig) -> Camera:
-    """The camera with about as many pixels as the map has cells; more pixels add no information.
-
-    Without the mip filter Gaussians look too large at low resolution, so such scenes are rendered at full size.
-    """
-    if not antialiased:
-        return camera
-    short = min(camera.width, camera.height)
-    return camera.downscaled(max(1.0, min(camera.width / features.shape[1], short / config.shortest_side)))
-
-
-def _ranges(dimensions: int, count: int, memory_bytes: int) -> Iterator[range]:
-    """Ranges of feature dimensions whose sums, and those of a shard, fit into the bound; whole blocks of channels."""
-    width = max(1, min(dimensions, memory_bytes // (8 * max(count, 1))))
-    if width < dimensions and width > BACK_PROJECTED_CHANNELS:
-        width -= width % BACK_PROJECTED_CHANNELS
-    for start in range(0, dimensions, width):
-        yield range(start, min(start + width, dimensions))
-
-
-def _store(count: int, dimensions: int, memory_bytes: int, scratch: Path | None) -> NDArray[np.float16]:
-    """Zeros for the means ``[count, dimensions]``: in memory, or in a file that is deleted with the array."""
-    if 2 * count * dimensions <= memory_bytes:
-        return np.zeros((count, dimensions), np.float16)
-    if scratch is not None:
-        scratch.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=scratch) as file:
-        file.truncate(2 * count * dimensions)
-        return np.memmap(file, np.float16, "r+", shape=(count, dimensions))

@@ -1,0 +1,276 @@
+"""The mean feature of each Gaussian over the training views, as sums over shards of views.
+
+The sums of each shard are made apart, on workers where there are any, and added in order: the workers change no bit.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.features import FeatureMap
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.code_maps import check_views
+from lexsplat.rendering import BACK_PROJECTED_CHANNELS, prepare, weigh_cells
+from lexsplat.rendering.back_projection import CellWeights, cell_of
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.device import threads_for_kernels
+from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, results
+
+if TYPE_CHECKING:
+    from lexsplat.language.methods.averaged import AveragedConfig
+
+ROWS = 16_384
+"""Gaussians handled at a time outside rendering."""
+
+SHARD_VIEWS = 16
+"""Views whose sums are made apart, at least."""
+
+MOST_SHARDS = 64
+"""Shards of a capture at most: each sends as many bytes as the sums have."""
+
+MAX_STORE = 1 << 30
+"""Bytes that the sums may take at most, however much memory there is."""
+
+
+@dataclass(frozen=True)
+class MeanFeatures:
+    """The mean feature of each Gaussian over the training views.
+
+    Args:
+        means: ``[N, Dc + Dd]`` float16, each half of length at most 1; 0 for Gaussians that were not seen. In memory
+            or in a file.
+        totals: Sum of the weights of all pixels ``[N]``, in cells of the feature maps.
+        dino: Size Dd of the DINO half; 0 without.
+    """
+
+    means: NDArray[np.float16]
+    totals: Tensor
+    dino: int = 0
+
+    def rows(self, index: slice | Tensor) -> Tensor:
+        """CLIP means of some Gaussians ``[n, Dc]`` float32, on the device of `totals`."""
+        return self.halves(index)[0]
+
+    def halves(self, index: slice | Tensor) -> list[Tensor]:
+        """The same, followed by the DINO means ``[n, Dd]`` if there are any."""
+        chosen = index if isinstance(index, slice) else index.cpu().numpy()
+        rows = torch.from_numpy(np.asarray(self.means[chosen], np.float32)).to(self.totals.device)
+        clip = rows.shape[1] - self.dino
+        return [rows[:, :clip], rows[:, clip:]] if self.dino else [rows]
+
+    def visible(self, config: AveragedConfig) -> Tensor:
+        """Which Gaussians the training views show ``[N]`` bool."""
+        return (self.totals >= config.min_visibility) & (self.totals > 0)
+
+
+Valid = Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]
+"""Valid pixels ``[H, W]`` of a view by its name and (width, height); None if all are valid."""
+
+
+def all_valid(name: str, size: tuple[int, int]) -> None:
+    """The `Valid` of views without masks."""
+
+
+# Beside its inputs: masks, and three options of the run that tests leave out.
+def average_features(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Camera],
+    feature_maps: Mapping[str, FeatureMap],
+    config: AveragedConfig,
+    *,
+    valid: Valid = all_valid,
+    memory: int = budget.DEFAULT_MEMORY,
+    scratch: Path | None = None,
+    workers: Workers = IN_PROCESS,
+    listener: Listener = silent,
+) -> MeanFeatures:
+    """The mean feature of each Gaussian, weighted by its share of the pixels: of CLIP, and of DINO if asked for.
+
+    Args:
+        gaussians: The geometry.
+        cameras: Cameras of the training views by name.
+        feature_maps: Dense features by view name; cells whose CLIP feature is zero are ignored.
+        config: Settings.
+        valid: Valid pixels of a view.
+        memory: Host memory in bytes, a quarter of which the sums may take (at most `MAX_STORE`). If they need more,
+            the views are traversed several times, for a range of feature dimensions each, and the means are kept in
+            a file. The result does not depend on it.
+        scratch: Folder for that file; None takes the system's.
+        workers: Where the sums of each shard of views are made. The result does not depend on it.
+        listener: Receives events of stage "average".
+
+    Raises:
+        ValueError: If there is no view, a view has no features, or their dimensions differ.
+    """
+    names = sorted(cameras)
+    check_views(names, feature_maps)
+    gaussians, count = gaussians.detach(), len(gaussians)
+    dino = feature_maps[names[0]].dino if config.dino else None
+    with_dino = 0 if dino is None else dino.shape[-1]
+    dimensions = feature_maps[names[0]].clip.shape[-1] + with_dino
+    share = max(1, min(MAX_STORE, memory // 4))
+    ranges = list(_ranges(dimensions, count, share))
+    means = _store(count, dimensions, share, scratch)
+    shards = view_shards(names)
+    seen = _is_seen(workers, scratch)
+    shared = _Averaging(gaussians, dict(cameras), feature_maps if seen else {}, config, valid, with_dino)
+    carried = 0 if seen else len(shards[0]) * feature_maps[names[0]].nbytes
+    needs = Needs(gpu=gaussians.device.type == "cuda", result=4 * count * (len(ranges[0]) + 1) + carried)
+    totals = torch.zeros(count, device=gaussians.device)
+    done = 0
+    for columns in ranges:
+        sums = torch.zeros(count, len(columns), device=gaussians.device)
+        items = _Shards(shards, columns, dimensions, None if seen else feature_maps)
+        for part, weights, views in results(workers.map(_shard_sums, shared, items, needs)):
+            sums += part.to(sums.device)
+            if columns.start == 0:
+                totals += weights.to(sums.device)
+            done += views
+            listener(Event("average", done, len(ranges) * len(names), workers.metrics))
+        for start in range(0, count, ROWS):
+            rows = slice(start, start + ROWS)
+            mean = sums[rows] / totals[rows, None].clamp_min(1e-12)
+            means[rows, columns.start : columns.stop] = mean.cpu().numpy().astype(np.float16)
+    return MeanFeatures(means, totals, with_dino)
+
+
+def _is_seen(workers: Workers, folder: Path | None) -> bool:
+    """Whether the workers see the folder of the scene, where the features are."""
+    if folder is None or not workers.distributed:
+        return True
+    with SharedFolder.offered(folder) as offered:
+        return workers.see(offered)
+
+
+_Shard = tuple[tuple[str, ...], range, int, Mapping[str, FeatureMap] | None]
+"""Views, the range of dimensions and their number, and the features if they travel with the task."""
+
+
+@dataclass(frozen=True)
+class _Shards(Mapping[str, _Shard]):
+    """The tasks of one range of dimensions, by the first view of each; features are loaded when a task begins."""
+
+    shards: Sequence[tuple[str, ...]]
+    columns: range
+    dimensions: int
+    carried: Mapping[str, FeatureMap] | None
+
+    def __getitem__(self, name: str) -> _Shard:
+        shard = next(shard for shard in self.shards if shard[0] == name)
+        maps = None if self.carried is None else {view: self.carried[view] for view in shard}
+        return shard, self.columns, self.dimensions, maps
+
+    def __iter__(self) -> Iterator[str]:
+        return (shard[0] for shard in self.shards)
+
+    def __len__(self) -> int:
+        return len(self.shards)
+
+
+@dataclass(frozen=True)
+class _Averaging:
+    """What the sums of every shard are made from: arguments of `average_features`."""
+
+    gaussians: Gaussians
+    cameras: Mapping[str, Camera]
+    feature_maps: Mapping[str, FeatureMap]
+    config: AveragedConfig
+    valid: Valid
+    with_dino: int
+
+
+def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """The views in shards whose sums are made apart and then added in order.
+
+    The shards depend on the views alone, not on the workers, and so do the bits of the sums.
+    """
+    size = max(SHARD_VIEWS, -(-len(names) // MOST_SHARDS))
+    return [tuple(names[start : start + size]) for start in range(0, len(names), size)]
+
+
+@threads_for_kernels()
+def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
+    """The sums of some views over a range of dimensions ``[N, len(columns)]``, of weights ``[N]``, and the views."""
+    names, columns, dimensions, carried = item
+    maps = shared.feature_maps if carried is None else carried
+    gaussians = shared.gaussians
+    sums = torch.zeros(len(gaussians), len(columns), device=gaussians.device)
+    totals = torch.zeros(len(gaussians), device=gaussians.device)
+    for name in names:
+        found = maps[name]
+        features = found.clip
+        if shared.with_dino and found.dino is not None:
+            features = torch.cat([features, found.dino], dim=-1)
+        if features.shape[-1] != dimensions:
+            raise ValueError(f"features of {name} have {features.shape[-1]} dimensions, others {dimensions}")
+        camera = _at_map_size(shared.cameras[name], features, gaussians.antialiased, shared.config)
+        counting = shared.valid(name, (camera.width, camera.height))
+        weights = _cell_weights(gaussians, camera, found.clip, counting)
+        weights.add_to(sums, features.flatten(0, 1)[:, columns.start : columns.stop])
+        if columns.start == 0:
+            totals += weights.totals()
+    return sums, totals, len(names)
+
+
+def _cell_weights(
+    gaussians: Gaussians, camera: Camera, features: Tensor, counting: NDArray[np.bool_] | None
+) -> CellWeights:
+    """Weights alpha T of the cells that have a feature, over the pixels that count."""
+    cells = (features.shape[0], features.shape[1])
+    # Cells a pixel covers, so that weights do not depend on the size at which views are rendered.
+    share = cells[0] * cells[1] / (camera.height * camera.width)
+    rows = cell_of(np.arange(camera.height), camera.height, cells[0])
+    columns = cell_of(np.arange(camera.width), camera.width, cells[1])
+    known = _any_nonzero(features.numpy())
+    counts = known[rows[:, None], columns].astype(np.float32) * np.float32(share)
+    if counting is not None:
+        counts *= counting
+    return weigh_cells(gaussians, camera, cells, torch.from_numpy(counts), prepare(gaussians, camera))
+
+
+def _any_nonzero(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which rows ``[..., C]`` have a number but 0, by their bits without the sign: NumPy is slow at halves."""
+    bits = values.view(f"u{values.itemsize}")
+    return np.asarray(np.bitwise_or.reduce(bits, axis=-1) << 1 != 0)
+
+
+def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragedConfig) -> Camera:
+    """The camera with about as many pixels as the map has cells; more pixels add no information.
+
+    Without the mip filter Gaussians look too large at low resolution, so such scenes are rendered at full size.
+    """
+    if not antialiased:
+        return camera
+    short = min(camera.width, camera.height)
+    return camera.downscaled(max(1.0, min(camera.width / features.shape[1], short / config.shortest_side)))
+
+
+def _ranges(dimensions: int, count: int, memory_bytes: int) -> Iterator[range]:
+    """Ranges of feature dimensions whose sums, and those of a shard, fit into the bound; whole blocks of channels."""
+    width = max(1, min(dimensions, memory_bytes // (8 * max(count, 1))))
+    if width < dimensions and width > BACK_PROJECTED_CHANNELS:
+        width -= width % BACK_PROJECTED_CHANNELS
+    for start in range(0, dimensions, width):
+        yield range(start, min(start + width, dimensions))
+
+
+def _store(count: int, dimensions: int, memory_bytes: int, scratch: Path | None) -> NDArray[np.float16]:
+    """Zeros for the means ``[count, dimensions]``: in memory, or in a file that is deleted with the array."""
+    if 2 * count * dimensions <= memory_bytes:
+        return np.zeros((count, dimensions), np.float16)
+    if scratch is not None:
+        scratch.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=scratch) as file:
+        file.truncate(2 * count * dimensions)
+        return np.memmap(file, np.float16, "r+", shape=(count, dimensions))
