@@ -53,7 +53,9 @@ if TYPE_CHECKING:
     from lexsplat.rendering import Rendering
 
 ROUNDS = 16
-"""Rounds in which all blocks are visited, at least."""
+"""Rounds in which all blocks are visited, at least;"""
+ROUNDS_DEALT = 10
+"""and if all views are dealt: their order does not matter then, and longer visits load less."""
 ROUND_STEPS = 500
 """Steps of a round at most; longer trainings have more rounds."""
 FEWEST_STEPS = 4
@@ -241,7 +243,8 @@ def reconstruct_blocks(
     blocks = cut_blocks(capture, points.points, ground_axes(up), count, deal=deal)
     none = capture.points[:0]  # workers get the capture with every group of visits, and need its views only
     capture = replace(capture, points=none, point_colors=capture.point_colors[:0])
-    rounds = max(ROUNDS, math.ceil(config.iterations / ROUND_STEPS))
+    rounds = ROUNDS_DEALT if all(block.dealt for block in blocks.blocks) else ROUNDS
+    rounds = max(rounds, math.ceil(config.iterations / ROUND_STEPS))
     rounds = max(1, min(rounds, config.iterations // (FEWEST_STEPS * count)))
     # The exposures of a block are kept with its visits, so that it is visited alone.
     groups = plan(blocks, config.iterations, rounds, pairs=not config.exposure)
