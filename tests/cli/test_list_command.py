@@ -48,6 +48,13 @@ def test_objects_share_no_gaussian(demo):
     assert int(shared.max()) == 1
 
 
+def test_a_thing_that_no_view_shows_is_not_listed_and_the_others_are(demo, monkeypatch):
+    unseen = next(thing for thing in demo.objects if thing.phrase == "rubber duck").mask | demo.hidden
+    monkeypatch.setattr(type(demo), "hidden", property(lambda _: unseen))
+    assert {thing.phrase for thing in objects_of(demo)} >= PLACES.keys() - {"rubber duck"}
+    assert "rubber duck" not in {thing.phrase for thing in objects_of(demo)}
+
+
 def test_a_vocabulary_names_the_things(demo, tmp_path, capsys):
     file = tmp_path / "names.txt"
     file.write_text("\ufeff# fruit\n\n apple \nbanana\nbanana\n", encoding="utf-8")

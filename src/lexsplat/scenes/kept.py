@@ -73,8 +73,8 @@ def keep(scene: Scene) -> None:
         scene.embed(judge.colored or ["object"])
         if scene.kept is None and scene.field.segments is not None:
             write_objects(scene, KeptObjects(scene.objects, judge.places), path.with_name(FILE))
-    except (OSError, LexsplatError) as error:  # the file is optional, and questions tell of a missing encoder
-        log.warning("%s: not kept (%s)", path, str(error)[:200])
+    except (OSError, LexsplatError) as error:  # nothing is lost: questions compute it, and tell of a missing encoder
+        log.debug("%s: not kept (%s)", path, str(error)[:200])
 
 
 def keep_for(folder: SceneFolder, device: str, listener: Listener) -> None:

@@ -114,7 +114,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         )
         for each in [both] if name in STUFF else both.instances:
             each = each.within(shown)
-            found.append(_named(each, words, judge.strengths(texts, _mean_codes(scene, each)[None])[0]))
+            if each:  # nothing is left of what no view shows
+                found.append(_named(each, words, judge.strengths(texts, _mean_codes(scene, each)[None])[0]))
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
