@@ -46,6 +46,7 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.formats.foreign import warnings_once
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
 
@@ -90,7 +91,7 @@ def build(
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
-    with folder.locked():
+    with folder.locked(), warnings_once():
         try:
             # Errors in ground truth and encoders are reported before structure from motion, not after it.
             photos: PhotoSurvey | None = PhotoSurvey(0, SIZE)

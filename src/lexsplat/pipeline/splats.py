@@ -38,7 +38,7 @@ def existing_splats(path: Path | None) -> Path:
     if path is None or not splat_file(path).is_file():
         is_folder = path is not None and path.is_dir()
         found = f"a folder without {META} and {LOD_META}" if is_folder else "no such file"
-        raise FileFormatError(path, expected="a file of Gaussians", found=found)
+        raise FileFormatError(path, expected="a file of Gaussians", found=found, remedy="check the path")
     return splat_file(path)
 
 

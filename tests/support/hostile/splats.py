@@ -69,6 +69,28 @@ def splat_ply() -> Reader:
     )  # fmt: skip
 
 
+def recounted_text(content: bytes, count: int) -> bytes:
+    """A binary PLY of float properties as text, with another count in its header."""
+    head, rows = content.split(b"end_header\n", 1)
+    width = head.count(b"property float")
+    numbers = np.frombuffer(rows, "<f4").reshape(-1, width)
+    lines = "".join(" ".join(f"{number:.6g}" for number in row) + "\n" for row in numbers.tolist())
+    head = head.replace(b"binary_little_endian", b"ascii")
+    head = head.replace(b"element vertex %d" % len(numbers), b"element vertex %d" % count)
+    return head + b"end_header\n" + lines.encode()
+
+
+def recounted_glb(content: bytes, count: Callable[[int], int]) -> bytes:
+    """A GLB in which accessors have other counts, by their index."""
+    (length,) = struct.unpack_from("<I", content, 12)
+    document, binary = json.loads(content[20 : 20 + length]), content[20 + length :]
+    for index, accessor in enumerate(document["accessors"]):
+        accessor["count"] = count(index)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON") + text + binary
+
+
 def point_cloud() -> bytes:
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz")

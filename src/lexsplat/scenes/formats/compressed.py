@@ -10,6 +10,9 @@ and takes all degrees of a ``.ksplat`` for one. splat-transform agrees with the 
 from __future__ import annotations
 
 import importlib.util
+import io
+import math
+import struct
 import subprocess
 import sys
 import tempfile
@@ -21,11 +24,22 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
-from lexsplat.scenes.formats.foreign import read_content
-from lexsplat.scenes.formats.ply import MIP, header_lines, is_antialiased, parse_ply, write_ply
+from lexsplat.scenes.formats.foreign import AGAIN, Damage, read_content, reason
+from lexsplat.scenes.formats.ply import MIP, is_antialiased, parse_ply, write_ply
+from lexsplat.scenes.formats.ply_elements import byte_order, data_left, header_lines, parse_elements
 
 COMPRESSED = {".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
 """GaussForge's name of each format, by file suffix."""
+
+_CHUNK = 256
+_BARE = str.maketrans("", "", "{}")
+_KSPLAT_HEADER, _KSPLAT_SECTION = 4096, 1024
+_KSPLAT = struct.Struct("<4xIIIIH")  # sections, those in use, and of Gaussians; number of Gaussians; compression level
+_KSPLAT_PART = struct.Struct("<IIIIfHxxIIIIH")
+"""Of a section: Gaussians, and how many there is space for; of buckets size, number, extent and bytes; range, bytes,
+full and partial buckets; degree of the harmonics."""
+_KSPLAT_BYTES = {0: (44, 4), 1: (24, 2), 2: (24, 1)}
+"""Bytes of a Gaussian, and of a coefficient, at each compression level."""
 
 _FORMAT_LINE = b"format binary_little_endian 1.0\n"
 _CONVERT = """
@@ -64,22 +78,82 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
         BackendError: If GaussForge is not installed.
         FileFormatError: If the file is damaged or has another format.
     """
-    read_content(path, kind)  # a missing file is a clearer error here
-    antialiased = False
+    content, antialiased = read_content(path, kind), False
+    _require_library(path)
     if kind == "compressed.ply":
-        with open(path, "rb") as file:
-            antialiased = is_antialiased(header_lines(file, path))
+        lines = header_lines(io.BytesIO(content), path)
+        antialiased, count = is_antialiased(lines), _chunked_count(lines, content, path)
+    else:
+        count = _sectioned_count(content, path)
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "plain.ply"
         _convert(path, kind, plain, "ply", subject=path)
         try:
             found = parse_ply(plain)
         except FileFormatError as error:  # its text concerns the temporary file, not the user's
-            raise FileFormatError(path, expected=f"a {kind} file", found="damaged content") from error
+            raise FileFormatError(
+                path, expected=f"a {kind} file", found="damaged content", remedy=AGAIN
+            ) from error
+    if len(found) != count:
+        raise FileFormatError(path, expected=f"{count:,} Gaussians", found=f"{len(found):,}", remedy=AGAIN)
     if kind == "ksplat":
         values = found.shN.transpose(1, 2).flatten(1)
         found = replace(found, shN=values[:, _places_in_ksplat(found.sh_degree)].reshape_as(found.shN))
     return replace(found, antialiased=antialiased)
+
+
+def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
+    """Number of Gaussians of a compressed PLY, which must be that of its chunks and of its data.
+
+    Raises:
+        FileFormatError: If it is another.
+    """
+    elements = parse_elements(lines, path)
+    counts = {element.name: element.count for element in elements}
+    count = counts.get("vertex", 0)
+    start = content.index(b"end_header") + len(b"end_header")
+    available = len(content) - content.index(b"\n", start) - 1
+    left = data_left(elements, byte_order(lines, path), available, lambda: content[-available:])
+    fits = counts.get("chunk") == math.ceil(count / _CHUNK) and counts.get("sh", count) == count
+    if left or not fits:
+        more = f"{left:,} bytes after them" if left > 0 else "fewer bytes" if left else f"elements {counts}"
+        raise FileFormatError(
+            path,
+            expected=f"{count:,} Gaussians in chunks of {_CHUNK}",
+            found=more.translate(_BARE),
+            remedy=AGAIN,
+        )
+    return count
+
+
+def _sectioned_count(content: bytes, path: Path) -> int:
+    """Number of Gaussians of a ``.ksplat``, which must be that of its sections and of its data.
+
+    Raises:
+        FileFormatError: If it is another.
+    """
+    try:
+        sections, _, _, count, level = _KSPLAT.unpack_from(content)
+        place, held = _KSPLAT_HEADER + _KSPLAT_SECTION * sections, 0
+        if level not in _KSPLAT_BYTES or place > len(content):
+            raise Damage(f"compression level {level} and {sections:,} sections")
+        for number in range(sections):
+            here, most, _, buckets, _, bucket, _, _, _, partial, degree = _KSPLAT_PART.unpack_from(
+                content, _KSPLAT_HEADER + _KSPLAT_SECTION * number
+            )
+            fixed, coefficient = _KSPLAT_BYTES[level]
+            size = fixed + coefficient * 3 * ((min(degree, 4) + 1) ** 2 - 1)
+            place += 4 * partial + bucket * buckets + size * most
+            held += here
+            if here != most:
+                raise Damage(f"a section of {here:,} Gaussians with data of {most:,}")
+        if held != count or not 0 <= len(content) - place < _KSPLAT_BYTES[level][0]:
+            raise Damage(f"{held:,} Gaussians in sections, and {len(content):,} bytes instead of {place:,}")
+    except (struct.error, Damage) as error:
+        raise FileFormatError(
+            path, expected="a ksplat file", found=reason(error), remedy=AGAIN
+        ) from error
+    return int(count)
 
 
 def _as_the_library_writes(shN: Tensor, kind: str) -> Tensor:
@@ -102,13 +176,8 @@ def _places_in_ksplat(degree: int) -> Tensor:
     return places.flatten()
 
 
-def _convert(source: Path, kind: str, target: Path, wanted: str, subject: Path) -> None:
-    """Convert a file with GaussForge in another process.
-
-    Raises:
-        BackendError: If GaussForge is not installed.
-        FileFormatError: If it refuses the file or ends by a signal.
-    """
+def _require_library(subject: Path) -> None:
+    """Refuse to go on without GaussForge; the error is that of `_convert`."""
     if importlib.util.find_spec("gaussforge") is None:
         raise BackendError(
             subject,
@@ -116,8 +185,23 @@ def _convert(source: Path, kind: str, target: Path, wanted: str, subject: Path) 
             found="not installed",
             remedy='pip install "lexsplat[formats]"',
         )
+
+
+def _convert(source: Path, kind: str, target: Path, wanted: str, subject: Path) -> None:
+    """Convert a file with GaussForge in another process.
+
+    Raises:
+        BackendError: If GaussForge is not installed.
+        FileFormatError: If it refuses the file or ends by a signal.
+    """
+    _require_library(subject)
     command = [sys.executable, "-c", _CONVERT, str(source), kind, str(target), wanted]
     run = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if run.returncode:
-        last = (run.stderr.strip().splitlines() or ["damaged content"])[-1][:200]
-        raise FileFormatError(subject, expected=f"a {kind if wanted == 'ply' else wanted} file", found=last)
+        last = (run.stderr.strip().splitlines() or [""])[-1][:200]
+        raise FileFormatError(
+            subject,
+            expected=f"a {kind if wanted == 'ply' else wanted} file",
+            found=last if "failed" in last else "damaged content",
+            remedy=AGAIN,
+        )

@@ -1,14 +1,18 @@
 """Values of other programs' files: bounds on counts, bytes as opacities, and numbers that cannot be rendered.
 
-Formats allow more than rendering does: opacities of 0 and 1 have infinite logits, sizes of 0 infinite logarithms.
-Those are moved to the nearest number that renders alike, sizes with a warning. Gaussians with NaN are dropped, with a
-warning.
+Formats allow more than rendering does: opacities of 0 and 1 have infinite logits, sizes of 0 infinite logarithms,
+rotations of 0 no direction. Those are moved to the nearest number that renders alike, sizes and rotations with a
+warning. Gaussians with NaN, and those too far or too large for cameras, are dropped, with a warning.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
 import math
+from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lexsplat.captures.readers.camera_files import MAX_COORDINATE
 from lexsplat.geometry.gaussians import LARGEST, TENSORS, Gaussians
 from lexsplat.runtime.errors import FileFormatError
 
@@ -25,10 +30,57 @@ logger = logging.getLogger(__name__)
 MOST_DROPPED = 0.1
 """Share of invalid Gaussians above which a file counts as damaged."""
 
+FARTHEST = MAX_COORDINATE / 5
+"""Largest coordinate and size of a Gaussian: cameras that look at a scene are outside it, at `MAX_COORDINATE` at most."""
+
+AGAIN = "copy the file again or export it again"
+"""The remedy for damage."""
+
+_told: ContextVar[set[str] | None] = ContextVar("told", default=None)
 _LARGEST_LOGIT = 20.0
 _SMALLEST_LOG_SCALE = math.log(1e-12)
+_SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
 _ALWAYS_ALLOWED = 10_000
 _MOST_PER_BYTE = 8
+
+
+class Damage(ValueError):
+    """What is wrong with the content of a file, in words for its user."""
+
+
+def reason(error: Exception) -> str:
+    """What a file's user is told of an error that its content caused: Python's own texts say nothing to them."""
+    text = ""
+    if isinstance(error, Damage):
+        text = str(error)
+    elif isinstance(error, json.JSONDecodeError):
+        text = "no valid JSON"
+    elif isinstance(error, FileNotFoundError) and error.filename:
+        text = f"no file {Path(error.filename).name}"
+    elif isinstance(error, OSError) and error.strerror:
+        text = error.strerror
+    elif isinstance(error, KeyError) and error.args:
+        text = f"no {error.args[0]!r:.80}"
+    return " ".join(f"damaged content{': ' if text else ''}{text}".split())[:240]
+
+
+@contextlib.contextmanager
+def warnings_once() -> Iterator[None]:
+    """What is read more than once in this block is warned of once."""
+    token = _told.set(set())
+    try:
+        yield
+    finally:
+        _told.reset(token)
+
+
+def warn(message: str, path: Path, *values: object) -> None:
+    """Log a warning of a file; see `warnings_once`."""
+    text, told = message % (path, *values), _told.get()
+    if told is None or text not in told:
+        logger.warning("%s", text)
+    if told is not None:
+        told.add(text)
 
 
 def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -38,17 +90,18 @@ def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
         FileFormatError: If there are none, more than `MOST_DROPPED` of them cannot be rendered, or more than half are
             points or lines of size 0.
     """
+    if len(gaussians) == 0:
+        raise FileFormatError(
+            path, expected="at least one Gaussian", found="none", remedy="export a scene that is not empty"
+        )
     _check_sizes(gaussians, path)
-    quats = gaussians.quats.clone()
-    quats[(quats == 0).all(1)] = quats.new_tensor([1.0, 0, 0, 0])
     gaussians = replace(
         gaussians,
-        quats=quats,
+        quats=_turned(gaussians.quats, path),
         log_scales=gaussians.log_scales.clamp_min(_SMALLEST_LOG_SCALE),  # NaN stays NaN
         opacity_logits=gaussians.opacity_logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT),
     )
-    if len(gaussians) == 0:
-        raise FileFormatError(path, expected="at least one Gaussian", found="none")
+    gaussians = _near(gaussians, path)
     damage = gaussians.find_invalid()
     if not damage:
         return gaussians
@@ -56,9 +109,42 @@ def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
     count = int((~valid).sum())
     if count > MOST_DROPPED * len(gaussians):
         found = f"{count:,} of {len(gaussians):,} Gaussians that cannot be rendered: {damage}"
-        raise FileFormatError(path, expected="finite numbers", found=found, remedy="regenerate the file")
-    logger.warning("%s: %d of %d Gaussians dropped: %s", path, count, len(gaussians), damage)
+        raise FileFormatError(path, expected="finite numbers", found=found, remedy="export the file again")
+    warn("%s: %d of %d Gaussians dropped: %s", path, count, len(gaussians), damage)
     return gaussians.select(valid)
+
+
+def _turned(quats: Tensor, path: Path) -> Tensor:
+    """Quaternions ``[N, 4]`` in which those of four zeros are no rotation, with a warning."""
+    empty = (quats.abs() < _SMALLEST_QUAT).all(1)
+    if count := int(empty.sum()):
+        warn("%s: %d of %d Gaussians have a rotation of four zeros, read as unturned", path, count, len(quats))
+    return torch.where(empty[:, None], quats.new_tensor([1.0, 0, 0, 0]), quats)
+
+
+def _near(gaussians: Gaussians, path: Path) -> Gaussians:
+    """The Gaussians without those of finite centers or sizes beyond `FARTHEST`, with a warning.
+
+    Raises:
+        FileFormatError: If they are more than `MOST_DROPPED` of them.
+    """
+    reach = torch.maximum(gaussians.means.abs().amax(1), gaussians.log_scales.double().exp().amax(1))
+    far = (reach > FARTHEST) & torch.isfinite(reach)
+    count = int(far.sum())
+    if not count:
+        return gaussians
+    limit = f"centers and sizes within {FARTHEST:,.0f} units"
+    if count > MOST_DROPPED * len(gaussians):
+        median = float(reach[far].median())
+        factor = np.format_float_positional(10.0 ** -math.floor(math.log10(median)))
+        raise FileFormatError(
+            path,
+            expected=limit,
+            found=f"{count:,} of {len(gaussians):,} Gaussians beyond, half of them at {median:.2g} or more",
+            remedy=f"scale or move the splats, as does: splat-transform {path.name} --scale {factor} scaled.ply",
+        )
+    warn("%s: %d of %d Gaussians dropped: they are not %s", path, count, len(gaussians), limit)
+    return gaussians.select(~far)
 
 
 def _check_sizes(gaussians: Gaussians, path: Path) -> None:
@@ -74,10 +160,10 @@ def _check_sizes(gaussians: Gaussians, path: Path) -> None:
             path,
             expected="Gaussians with sizes",
             found=f"{thin:,} of {len(gaussians):,} Gaussians with two or three sizes of 0",
-            remedy="regenerate the file",
+            remedy="export the file again",
         )
     if count:
-        logger.warning("%s: %d of %d Gaussians have a size of 0, read as 1e-12", path, count, len(gaussians))
+        warn("%s: %d of %d Gaussians have a size of 0, read as 1e-12", path, count, len(gaussians))
 
 
 def _valid(gaussians: Gaussians) -> Tensor:
@@ -99,7 +185,10 @@ def check_count(path: Path, count: int, size: int) -> None:
     """
     if count > max(_ALWAYS_ALLOWED, _MOST_PER_BYTE * size):
         raise FileFormatError(
-            path, expected=f"Gaussians that fit into {size:,} bytes", found=f"a count of {count:,}"
+            path,
+            expected=f"Gaussians that fit into {size:,} bytes",
+            found=f"a count of {count:,}",
+            remedy=AGAIN,
         )
 
 
@@ -126,7 +215,12 @@ def read_content(path: Path, kind: str) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise FileFormatError(path, expected=f"a readable {kind} file", found=str(error.strerror)) from error
+        raise FileFormatError(
+            path,
+            expected=f"a readable {kind} file",
+            found=str(error.strerror),
+            remedy="check the path and its permissions",
+        ) from error
 
 
 def joined(parts: list[Gaussians]) -> Gaussians:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-import logging
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,11 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, joined, read_content
+from lexsplat.scenes.formats.foreign import AGAIN, Damage, as_tensor, joined, read_content, reason, warn
 from lexsplat.scenes.formats.gltf import EXTENSION, GENERATOR
 from lexsplat.scenes.transforms import transformed
-
-logger = logging.getLogger(__name__)
 
 _UPRIGHT = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From the axes of glTF, y up and z toward the viewer's front, to those of a PLY."""
@@ -51,7 +48,7 @@ def read_gltf(path: Path) -> Gaussians:
     """
     try:
         document, binary = _parts(read_content(path, "glTF"))
-        file = _Document(document, binary, path.parent)
+        file = _Document(document, binary, path)
         unknown = set(document.get("extensionsRequired", [])) - _UNDERSTOOD
         if unknown:
             found = ", ".join(sorted(map(str, unknown)))
@@ -66,12 +63,16 @@ def read_gltf(path: Path) -> Gaussians:
     except FileFormatError:
         raise
     except _DAMAGE as error:
-        found = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileFormatError(
-            path, expected=f"glTF with {EXTENSION}", found=f"damaged content: {found}"
+            path, expected=f"glTF with {EXTENSION}", found=reason(error), remedy=AGAIN
         ) from error
     if not parts:
-        raise FileFormatError(path, expected=f"a primitive with {EXTENSION}", found="none")
+        raise FileFormatError(
+            path,
+            expected=f"a primitive with {EXTENSION}",
+            found="none",
+            remedy="export the splats with this extension; a mesh or a point cloud has no Gaussians",
+        )
     return joined(parts)
 
 
@@ -79,9 +80,13 @@ def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
     """The JSON document and the binary chunk, empty in a ``.gltf``."""
     if content[:4] != b"glTF":
         return _object(json.loads(content.decode("utf-8-sig"))), b""
+    if len(content) < 20:
+        raise Damage(f"{len(content)} bytes")
     _, version, total, length, kind = struct.unpack_from("<4sIII4s", content)
-    if version != 2 or kind != b"JSON" or total > len(content) or 20 + length > total:
-        raise ValueError(f"version {version}, {total} bytes of {len(content)}")
+    if version != 2 or kind != b"JSON" or 20 + length > total:
+        raise Damage(f"version {version} with {length:,} bytes of JSON in {total:,}")
+    if total != len(content):
+        raise Damage(f"{len(content):,} bytes, and a header that tells {total:,}")
     binary, start = b"", 20 + length
     if start + 8 <= total:
         size, kind = struct.unpack_from("<I4s", content, start)
@@ -92,22 +97,22 @@ def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
 
 def _object(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise TypeError("an object is missing")
+        raise Damage("a list or a value in place of a JSON object")
     return value
 
 
 def _index(value: Any) -> int:
     """An index of a list; negative ones would count from the end."""
     if type(value) is not int or value < 0:
-        raise ValueError(f"an index {str(value)[:40]!r}")
+        raise Damage(f"an index {str(value)[:40]!r}")
     return value
 
 
 class _Document:
     """A glTF document with its buffers."""
 
-    def __init__(self, document: dict[str, Any], binary: bytes, folder: Path) -> None:
-        self.document, self.folder = document, folder
+    def __init__(self, document: dict[str, Any], binary: bytes, path: Path) -> None:
+        self.document, self.path, self.folder = document, path, path.parent
         self.buffers: dict[int, bytes] = {0: binary} if binary else {}
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
@@ -126,7 +131,7 @@ class _Document:
         while waiting:
             index, parent = waiting.pop(0)
             if _index(index) in seen:
-                raise ValueError(f"node {index} has two parents")
+                raise Damage(f"node {index} has two parents")
             seen.add(index)
             node = self.item("nodes", index)
             world = parent @ _matrix(node)
@@ -141,51 +146,79 @@ class _Document:
         settings = _object(primitive["extensions"][EXTENSION])
         _refuse_compression(settings)
         if settings.get("kernel", "ellipse") != "ellipse":
-            raise ValueError(f"kernel {str(settings['kernel'])[:40]!r} instead of 'ellipse'")
+            raise Damage(f"kernel {str(settings['kernel'])[:40]!r} instead of 'ellipse'")
         if settings.get("colorSpace") == "lin_rec709_display":
-            logger.warning("colors are linear light in this glTF and are taken as sRGB: they look too dark")
+            warn("%s: colors are linear light and are taken as sRGB: they look too dark", self.path)
         attributes = _object(primitive["attributes"])
 
         def values(name: str, width: int, semantic: str = f"{EXTENSION}:") -> NDArray[np.float32]:
             if semantic + name not in attributes:
-                raise ValueError(f"no attribute {semantic}{name}")
-            return self.accessor(attributes[semantic + name], width)
+                raise Damage(f"no attribute {semantic}{name}")
+            used.append(attributes[semantic + name])
+            return self.accessor(used[-1], width)
 
+        used: list[Any] = []
         degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
         rest = [values(f"SH_DEGREE_{d}_COEF_{n}", 3) for d in range(1, degree + 1) for n in range(2 * d + 1)]
         means = values("POSITION", 3, "")
         opacities = values("OPACITY", 1)[:, 0]
         scales = values("SCALE", 3)
         if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():
-            raise ValueError("negative sizes, or opacities outside 0..1")
+            raise Damage("negative sizes, or opacities outside 0..1")
+        quats, sh0 = values("ROTATION", 4)[:, [3, 0, 1, 2]], values("SH_DEGREE_0_COEF_0", 3)
+        self.check_counts(used)
         own = primitive.get("extras", {}).get("lexsplat", {})
         return Gaussians(
             means=as_tensor(means),
-            quats=as_tensor(values("ROTATION", 4)[:, [3, 0, 1, 2]]),
+            quats=as_tensor(quats),
             log_scales=as_tensor(scales).log(),
             opacity_logits=as_tensor(opacities).logit(),
-            sh0=as_tensor(values("SH_DEGREE_0_COEF_0", 3))[:, None],
+            sh0=as_tensor(sh0)[:, None],
             shN=as_tensor(np.stack(rest, 1)) if rest else torch.zeros(len(means), 0, 3),
             antialiased=own.get("antialiased") is True,
         )
+
+    def check_counts(self, indices: list[Any]) -> None:
+        """Refuse attributes of different counts, and counts that leave out elements of all attributes.
+
+        Raises:
+            Damage: If they do.
+        """
+        counts = sorted({self.item("accessors", index)["count"] for index in indices})
+        if len(counts) > 1:
+            raise Damage(f"attributes of {counts[0]:,} and of {counts[-1]:,} Gaussians")
+        left = min(self._left(self.item("accessors", index)["bufferView"]) for index in indices)
+        if left:
+            raise Damage(f"a count of {counts[0]:,} Gaussians, and {left:,} more in the data")
+
+    def _left(self, number: int) -> int:
+        """Elements that a buffer view has after the last one of all accessors."""
+        view, end, step = self.item("bufferViews", number), 0, 1
+        for accessor in self.document["accessors"]:
+            if accessor.get("bufferView") == number:
+                size = np.dtype(_TYPES[accessor["componentType"]]).itemsize * _WIDTHS[accessor["type"]]
+                stride = view.get("byteStride", size)
+                last = accessor.get("byteOffset", 0) + (accessor["count"] - 1) * stride + size
+                end, step = max(end, last), max(step, stride)
+        return int((view["byteLength"] - end) // step)
 
     def accessor(self, index: Any, width: int) -> NDArray[np.float32]:
         """The numbers ``[count, width]`` of an accessor; normalized integers are fractions."""
         accessor = self.item("accessors", index)
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError("a sparse accessor")
+            raise Damage("a sparse accessor")
         view = self.item("bufferViews", accessor["bufferView"])
         _refuse_compression(view)
         kind = np.dtype(_TYPES[accessor["componentType"]])
         if _WIDTHS[accessor["type"]] != width:
-            raise ValueError(f"an accessor of {accessor['type']}")
+            raise Damage(f"an accessor of {accessor['type']}")
         count, step = _index(accessor["count"]), _index(view.get("byteStride", kind.itemsize * width))
         inside, length = _index(accessor.get("byteOffset", 0)), _index(view["byteLength"])
         start = _index(view.get("byteOffset", 0))
         data = self.buffer(_index(view["buffer"]))[start : start + length]
         last = inside + max(count - 1, 0) * step + kind.itemsize * width
         if len(data) < length or step < kind.itemsize * width or (count and last > length):
-            raise ValueError(f"an accessor of {count} elements beyond its {len(data)} bytes")
+            raise Damage(f"an accessor of {count} elements beyond its {len(data)} bytes")
         if count == 0:
             return np.zeros((0, width), np.float32)
         strides = (step, kind.itemsize)
@@ -202,11 +235,11 @@ class _Document:
                 try:
                     self.buffers[index] = base64.b64decode(uri.partition(",")[2], validate=True)
                 except binascii.Error as error:
-                    raise ValueError(f"a buffer: {error}") from error
+                    raise Damage(f"a buffer: {error}") from error
             else:
                 beside = (self.folder / unquote(uri)).resolve()
                 if "://" in uri or not beside.is_relative_to(self.folder.resolve()):
-                    raise ValueError(f"a buffer outside the folder: {uri[:80]!r}")
+                    raise Damage(f"a buffer outside the folder: {uri[:80]!r}")
                 self.buffers[index] = beside.read_bytes()
         return self.buffers[index]
 
@@ -214,7 +247,7 @@ class _Document:
 def _refuse_compression(part: dict[str, Any]) -> None:
     """Refuse data in another form, such as meshopt or SPZ; files need not say that they require it."""
     if part.get("extensions"):
-        raise ValueError(f"{', '.join(part['extensions'])} is not supported, export it uncompressed")
+        raise Damage(f"{', '.join(part['extensions'])} is not supported, export it uncompressed")
 
 
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
@@ -238,5 +271,5 @@ def _placed(gaussians: Gaussians, world: NDArray[np.float64]) -> Gaussians:
     if not scale > 0 or not np.allclose(
         world[:3, :3] @ world[:3, :3].T, scale**2 * np.eye(3), atol=1e-4 * scale**2
     ):
-        raise ValueError("a node that mirrors or deforms its splats")
+        raise Damage("a node that mirrors or deforms its splats")
     return transformed(gaussians, rotation=world[:3, :3] / scale, scale=scale, translation=world[:3, 3])

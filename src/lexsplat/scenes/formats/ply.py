@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,18 +17,16 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.foreign import warn
+from lexsplat.scenes.formats.ply_elements import (
+    SPLATS,
+    Element,
+    byte_order,
+    data_left,
+    header_lines,
+    parse_elements,
+)
 
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
-    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
-_ENCODINGS = {
-    "format ascii 1.0": "",
-    "format binary_little_endian 1.0": "<",
-    "format binary_big_endian 1.0": ">",
-}
-_MAX_HEADER_BYTES = 1 << 16
 MIP = "comment SplatRenderMode: mip"
 """The line of Gaussians trained with the mip filter, as Brush, SuperSplat and splat-transform write and read it."""
 _MODES = {MIP: True, "comment SplatRenderMode: default": False, "comment SplatRenderMode: 2dgs": False}
@@ -104,7 +101,7 @@ def read_ply(path: Path) -> Gaussians:
     gaussians = parse_ply(path)
     damage = gaussians.find_invalid()
     if damage:
-        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="regenerate the file")
+        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="export the file again")
     return gaussians
 
 
@@ -112,24 +109,47 @@ def parse_ply(path: Path) -> Gaussians:
     """Read a 3DGS PLY with whatever numbers it has, NaN and infinity included.
 
     Raises:
-        FileFormatError: If the file is not a PLY of 3D Gaussians or is truncated.
+        FileFormatError: If the file is not a PLY of 3D Gaussians, is truncated, or has more data than it declares.
     """
     try:
         with open(path, "rb") as file:
             lines = header_lines(file, path)
-            header = _parse_header(lines, path)
+            order, elements = byte_order(lines, path), parse_elements(lines, path)
+            vertices = _vertices(elements, path)
             available = os.path.getsize(path) - file.tell()
-            if available < header.least_bytes:
+            least = vertices.count * vertices.row_size(order) * (1 if order else 2)  # a digit and a space
+            if available < least:
                 raise FileFormatError(
                     path,
-                    expected=f"{header.count} Gaussians in {header.least_bytes} bytes",
+                    expected=f"{vertices.count} Gaussians in {least} bytes",
                     found=f"{available} bytes of data",
-                    remedy="the file is truncated: copy it again or regenerate it",
+                    remedy="the file is truncated: copy it again or export it again",
                 )
-            read = _binary_rows if header.order else _text_rows
-            return _gaussians_from_table(read(file, header, path), is_antialiased(lines), path)
+            table, left = (_binary_rows if order else _text_rows)(file, elements, order, path)
+            _check_left(left, vertices, order, path)
+            return _gaussians_from_table(table, is_antialiased(lines), path)
     except OSError as error:
-        raise FileFormatError(path, expected="a readable PLY file", found=str(error.strerror)) from error
+        raise FileFormatError(
+            path, expected="a readable PLY file", found=str(error.strerror), remedy="check the path and its permissions"
+        ) from error
+
+
+def _check_left(left: int, vertices: Element, order: str, path: Path) -> None:
+    """Refuse data that no element declares, or that an element lacks: counts and data disagree.
+
+    Less than a row cannot be a Gaussian, and is a warning.
+    """
+    if left < 0 or left >= vertices.row_size(order):
+        kind = "bytes" if order else "numbers"
+        more = f"{left:,} {kind} after the last one" if left > 0 else f"fewer {kind} in its other elements"
+        raise FileFormatError(
+            path,
+            expected=f"the {vertices.count:,} Gaussians that the header declares",
+            found=more,
+            remedy="the count or the data is wrong: export the file again",
+        )
+    if left:
+        warn("%s: %d %s after the last Gaussian are ignored", path, left, "bytes" if order else "numbers")
 
 
 def is_antialiased(lines: Sequence[str]) -> bool:
@@ -138,98 +158,60 @@ def is_antialiased(lines: Sequence[str]) -> bool:
     return bool(modes) and modes[-1]
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The vertices of a PLY: their number, columns, and byte order ("" for text)."""
-
-    count: int
-    columns: Sequence[tuple[str, str]]
-    order: str
-
-    @property
-    def dtype(self) -> np.dtype:
-        return np.dtype([(name, (self.order or "<") + kind) for name, kind in self.columns])
-
-    @property
-    def least_bytes(self) -> int:
-        return self.count * (self.dtype.itemsize if self.order else 2 * len(self.columns))
+def _binary_rows(
+    file: BinaryIO, elements: Sequence[Element], order: str, path: Path
+) -> tuple[np.ndarray, int]:
+    """The Gaussians, and how many bytes are left after all elements."""
+    vertices = elements[0]
+    dtype = np.dtype([(name, order + kind) for name, kind, _ in vertices.columns])
+    table = np.frombuffer(file.read(vertices.count * dtype.itemsize), dtype=dtype)
+    available = os.path.getsize(path) - file.tell()
+    return table, data_left(elements[1:], order, available, file.read)
 
 
-def _binary_rows(file: BinaryIO, header: _Header, path: Path) -> np.ndarray:
-    return np.frombuffer(file.read(header.count * header.dtype.itemsize), dtype=header.dtype)
-
-
-def _text_rows(file: BinaryIO, header: _Header, path: Path) -> np.ndarray:
-    wanted = header.count * len(header.columns)
+def _text_rows(
+    file: BinaryIO, elements: Sequence[Element], order: str, path: Path
+) -> tuple[np.ndarray, int]:
+    """The Gaussians, and how many numbers are left after all elements."""
+    vertices = elements[0]
+    wanted = vertices.count * len(vertices.columns)
     text = file.read()
-    with warnings.catch_warnings():  # numpy warns of text that is no number
-        warnings.simplefilter("ignore", DeprecationWarning)
+    with warnings.catch_warnings():  # numpy before 2.3 warns of text that is no number, and stops there
+        warnings.simplefilter("error", DeprecationWarning)
         try:
-            numbers = np.fromstring(text, np.float64, sep=" ")[:wanted]
-        except ValueError:
-            numbers = np.zeros(0)
+            numbers, found = np.fromstring(text, np.float64, sep=" "), ""
+        except (ValueError, DeprecationWarning):
+            numbers, found = np.zeros(0), "text that is no number"
     # A number that ends with the file may lack digits.
     if len(numbers) < wanted or (wanted and not text[-1:].isspace()):
         raise FileFormatError(
             path,
             expected=f"{wanted} numbers, each with a space or line break after it",
-            found=f"{len(numbers)} whole numbers",
-            remedy="the file is truncated or damaged: copy it again or regenerate it",
+            found=found or f"{len(numbers)} whole numbers",
+            remedy="the file is truncated or damaged: copy it again or export it again",
         )
     with np.errstate(over="ignore"):  # infinity is looked for later
-        rows = numbers.astype(np.float32).reshape(header.count, len(header.columns))
-    table = np.zeros(header.count, [(name, "<f4") for name, _ in header.columns])
-    for index, (name, _) in enumerate(header.columns):
+        rows = numbers[:wanted].astype(np.float32).reshape(vertices.count, len(vertices.columns))
+    table = np.zeros(vertices.count, [(name, "<f4") for name, _, _ in vertices.columns])
+    for index, (name, _, _) in enumerate(vertices.columns):
         table[name] = rows[:, index]
-    return table
+    rest = numbers[wanted:]
+    return table, data_left(elements[1:], order, len(rest), lambda: rest)
 
 
-def header_lines(file: BinaryIO, path: Path) -> list[str]:
-    """The lines of a PLY header up to ``end_header``, without line ends.
-
-    Raises:
-        FileFormatError: If the file does not begin with one.
-    """
-    lines: list[str] = []
-    consumed = 0
-    while not lines or lines[-1] != "end_header":
-        raw = file.readline(1024)
-        consumed += len(raw)
-        if not raw.endswith(b"\n") or consumed > _MAX_HEADER_BYTES or (not lines and raw.strip() != b"ply"):
-            raise FileFormatError(
-                path, expected="a PLY header", found=repr(raw[:20]), remedy="use a .ply of 3D Gaussians"
-            )
-        lines.append(raw.decode("ascii", "replace").strip())
-    return lines
-
-
-def _parse_header(lines: Sequence[str], path: Path) -> _Header:
-    order = next((_ENCODINGS[line] for line in lines if line in _ENCODINGS), None)
-    if order is None:
-        found = next((line for line in lines if line.startswith("format")), "no format line")
-        raise FileFormatError(path, expected=" or ".join(_ENCODINGS), found=found)
-    elements = [line.split() for line in lines if line.startswith("element ")]
-    if not elements or len(elements[0]) != 3 or elements[0][1] != "vertex" or not elements[0][2].isdecimal():
+def _vertices(elements: Sequence[Element], path: Path) -> Element:
+    """The Gaussians among the elements, which come first."""
+    if not elements or elements[0].name != "vertex" or elements[0].has_lists:
+        found = f"'element {elements[0].name}'"[:80] if elements else "none"
         raise FileFormatError(
-            path, expected="'element vertex COUNT' as the first element", found=str(elements)
+            path, expected="'element vertex COUNT' first, without lists", found=found, remedy=SPLATS
         )
-    start = next(i for i, line in enumerate(lines) if line.startswith("element "))
-    columns = []
-    for line in lines[start + 1 :]:
-        if line.startswith(("comment", "obj_info")):
-            continue
-        if not line.startswith("property "):
-            break
-        parts = line.split()
-        if len(parts) != 3 or parts[1] not in _TYPES:
-            raise FileFormatError(path, expected="scalar properties", found=repr(line))
-        columns.append((parts[2], _TYPES[parts[1]]))
-    names = [name for name, _ in columns]
+    names = [name for name, _, _ in elements[0].columns]
     missing = [name for name in (*_REQUIRED, "f_dc_0", "f_dc_1", "f_dc_2") if name not in names]
     if missing or len(set(names)) != len(names):
         found = f"no {', '.join(missing)}" if missing else "a duplicate property"
-        raise FileFormatError(path, expected="the properties of 3D Gaussians", found=found)
-    return _Header(int(elements[0][2]), columns, order)
+        raise FileFormatError(path, expected="the properties of 3D Gaussians", found=found, remedy=SPLATS)
+    return elements[0]
 
 
 def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> Gaussians:
@@ -243,7 +225,9 @@ def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> G
     complete = all(f"f_rest_{i}" in (table.dtype.names or ()) for i in range(num_rest))
     if num_rest not in (0, 9, 24, 45, 72) or not complete:
         found = str(num_rest) if complete else "gaps in their numbering"
-        raise FileFormatError(path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found)
+        raise FileFormatError(
+            path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found, remedy="export the file again"
+        )
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
     return Gaussians(
         means=columns("x", "y", "z"),

@@ -52,7 +52,12 @@ def read_splats(path: Path) -> Gaussians:
     for ending, read in READERS.items():
         if path.name.lower().endswith(ending):
             return renderable(read(path), path)
-    raise FileFormatError(path, expected="a name that ends in " + ", ".join(READERS), found=repr(path.suffix))
+    raise FileFormatError(
+        path,
+        expected="a name that ends in " + ", ".join(READERS),
+        found=repr(path.suffix),
+        remedy="export the splats in one of these formats",
+    )
 
 
 def splat_file(path: Path) -> Path:

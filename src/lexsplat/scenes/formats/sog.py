@@ -26,7 +26,15 @@ from PIL import Image
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, check_count, logits_of_bytes, read_content
+from lexsplat.scenes.formats.foreign import (
+    AGAIN,
+    Damage,
+    as_tensor,
+    check_count,
+    logits_of_bytes,
+    read_content,
+    reason,
+)
 
 META = "meta.json"
 """The part that names the others; alone in a folder with pictures, the name of the file."""
@@ -64,11 +72,12 @@ def read_sog(path: Path) -> Gaussians:
         with zipfile.ZipFile(io.BytesIO(read_content(path, ".sog"))) as archive:
             return _read(path, lambda name, limit: _in_archive(archive, name, limit), path.stat().st_size)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise FileFormatError(path, expected="a SOG archive", found=f"damaged content: {error}") from error
-    except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
-        found = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileFormatError(
-            path, expected="a SOG of version 1 or 2", found=f"damaged content: {found}"
+            path, expected="a SOG archive", found="no whole zip archive", remedy=AGAIN
+        ) from error
+    except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
+        raise FileFormatError(
+            path, expected="a SOG of version 1 or 2", found=reason(error), remedy=AGAIN
         ) from error
 
 
@@ -82,13 +91,15 @@ def _beside(path: Path, name: str, limit: int) -> bytes:
 
 
 def _in_archive(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    if name not in archive.namelist():
+        raise Damage(f"no {name} in the archive")
     with archive.open(name) as file:
         return _whole(file.read(limit + 1), name, limit)
 
 
 def _whole(content: bytes, name: str, limit: int) -> bytes:
     if len(content) > limit:
-        raise ValueError(f"{name} has more than {limit:,} bytes")
+        raise Damage(f"{name} has more than {limit:,} bytes")
     return content
 
 
@@ -96,21 +107,38 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
     meta = json.loads(load(META, _LARGEST_META))
     version = meta.get("version", 1)
     if version not in (1, 2):
-        raise FileFormatError(path, expected="SOG of version 1 or 2", found=f"version {version!r:.40}")
+        raise FileFormatError(
+            path,
+            expected="SOG of version 1 or 2",
+            found=f"version {version!r:.40}",
+            remedy="export it as SOG of version 2, or as .ply",
+        )
     count = meta["means"]["shape"][0] if version == 1 else meta["count"]
     if type(count) is not int or count < 0:
-        raise ValueError(f"a count of {count!r:.40}")
+        raise Damage(f"a count of {count!r:.40}")
     check_count(path, count, size)
 
-    def picture(part: str, index: int = 0) -> NDArray[np.uint8]:
-        return _pixels(load, meta[part]["files"][index], count).reshape(-1, 4)[:count]
+    def pixels(part: str, index: int = 0) -> NDArray[np.uint8]:
+        return _pixels(load, meta[part]["files"][index], count).reshape(-1, 4)
 
+    def picture(part: str, index: int = 0) -> NDArray[np.uint8]:
+        return pixels(part, index)[:count]
+
+    turns = pixels("quats")
+    held = _held(turns, count)
+    if held != count:
+        raise FileFormatError(
+            path,
+            expected=f"the {count:,} Gaussians of its count",
+            found=f"{held:,} in its pictures",
+            remedy="the count is wrong: export the file again",
+        )
     table = _table if version == 2 else _even_steps
     sh0, colors = picture("sh0"), table(meta["sh0"])
     logits = logits_of_bytes(sh0[:, 3]) if version == 2 else as_tensor(_looked_up(colors, sh0)[:, 3])
     return Gaussians(
         means=as_tensor(_positions(picture("means", 0), picture("means", 1), meta["means"])),
-        quats=as_tensor(_quats(picture("quats"))),
+        quats=as_tensor(_quats(turns[:count])),
         log_scales=as_tensor(_looked_up(table(meta["scales"]), picture("scales")[:, :3])),
         opacity_logits=logits,
         sh0=as_tensor(_looked_up(colors, sh0[:, :3]))[:, None],
@@ -124,15 +152,15 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
 def _pixels(load: _Load, name: str, count: int) -> NDArray[np.uint8]:
     """A picture ``[H, W, 4]`` of at least ``count`` pixels, and not of many more."""
     if not isinstance(name, str) or Path(name).name != name or "\\" in name:
-        raise ValueError(f"a part named {str(name)[:80]!r}")
+        raise Damage(f"a part named {str(name)[:80]!r}")
     content = load(name, _BYTES_A_PIXEL * count + _FURTHER_BYTES)
     try:
         picture = Image.open(io.BytesIO(content), formats=["WEBP"])
         if not count <= picture.width * picture.height <= 4 * count + _FURTHER_PIXELS:
-            raise ValueError(f"{name} of {picture.width} x {picture.height} pixels for {count:,}")
+            raise Damage(f"{name} of {picture.width} x {picture.height} pixels for {count:,}")
         return np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise Damage(f"{name} is no whole WebP picture") from error
 
 
 def _table(part: dict[str, Any]) -> NDArray[np.float32]:
@@ -141,7 +169,7 @@ def _table(part: dict[str, Any]) -> NDArray[np.float32]:
     if len(numbers) == 256 and numbers[0] is None:  # early versions of SuperSplat: the steps are nearly equal
         numbers[0] = numbers[1] + (numbers[1] - numbers[255]) / 255
     if not 0 < len(numbers) <= 256:
-        raise ValueError(f"a codebook of {len(numbers)} numbers")
+        raise Damage(f"a codebook of {len(numbers)} numbers")
     table = np.append(np.array(numbers, np.float64), np.full(256 - len(numbers), np.nan))
     return table.astype(np.float32)[:, None]
 
@@ -156,7 +184,7 @@ def _looked_up(table: NDArray[np.float32], pixels: NDArray[np.uint8]) -> NDArray
     """Numbers of the bytes of pixels ``[..., C]``, from a table ``[256, 1]`` or one for each channel."""
     channels = pixels.shape[-1]
     if table.shape[1] not in (1, channels, 4):
-        raise ValueError(f"bounds of {table.shape[1]} channels for {channels}")
+        raise Damage(f"bounds of {table.shape[1]} channels for {channels}")
     return table[pixels, np.arange(channels) if table.shape[1] > 1 else 0]
 
 
@@ -168,11 +196,22 @@ def _positions(low: NDArray[np.uint8], high: NDArray[np.uint8], part: dict[str, 
         return np.sign(values) * np.expm1(np.abs(values))
 
 
+def _held(pixels: NDArray[np.uint8], count: int) -> int:
+    """Number of Gaussians whose rotations are in a picture ``[P, 4]``: no rotation is four zeros.
+
+    What fills up the last rows is not among them: zeros, opaque black, and copies of the last Gaussian.
+    """
+    used = pixels.any(1)
+    rest = pixels[count:]
+    last = pixels[max(count - 1, 0)]
+    used[count:] = (rest[:, 3] >= FIRST_TAG) & rest[:, :3].any(1) & (rest != last).any(1)
+    return int(used.nonzero()[0][-1]) + 1 if used.any() else 0
+
+
 def _quats(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Quaternions wxyz; other tags than the four mean no rotation."""
+    """Quaternions wxyz, zero where the tag is none of the four."""
     small = (pixels[:, :3] / 255 * 2 - 1) / math.sqrt(2)
     quats = np.zeros((len(pixels), 4))
-    quats[:, 0] = 1
     for left_out, kept in enumerate(SMALL):
         rows = pixels[:, 3] == FIRST_TAG + left_out
         quats[np.ix_(rows, kept)] = small[rows]
@@ -188,11 +227,11 @@ def _harmonics(
     bands = part.get("bands", _BANDS.get(picture.shape[1]))  # version 1 has the width of the picture alone
     width, entries = COEFFICIENTS[bands] if bands in (1, 2, 3) else 0, part.get("count", 1 << 16)
     if not width or type(entries) is not int or not 0 < entries <= 1 << 16:
-        raise ValueError(f"a palette of {entries!r:.40} entries with {bands!r:.40} bands")
+        raise Damage(f"a palette of {entries!r:.40} entries with {bands!r:.40} bands")
     if picture.shape[1] != PALETTE_WIDTH * width:
-        raise ValueError(f"a palette {picture.shape[1]} pixels wide")
+        raise Damage(f"a palette {picture.shape[1]} pixels wide")
     palette = _looked_up(table, picture[..., :3]).reshape(-1, width, 3)
     index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
     if len(index) and index.max() >= len(palette):
-        raise ValueError(f"palette entry {index.max()} of {len(palette)}")
+        raise Damage(f"palette entry {index.max()} of {len(palette)}")
     return palette[index]

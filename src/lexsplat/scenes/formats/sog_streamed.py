@@ -14,7 +14,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import joined, read_content
+from lexsplat.scenes.formats.foreign import AGAIN, Damage, joined, read_content, reason, warn
 from lexsplat.scenes.formats.sog import read_sog
 
 LOD_META = "lod-meta.json"
@@ -34,10 +34,11 @@ def read_streamed_sog(path: Path) -> Gaussians:
     try:
         meta = json.loads(content)
         if meta.get("version", 1) != 1:
-            raise ValueError(f"version {meta['version']!r:.40}")
+            raise Damage(f"version {meta['version']!r:.40}")
         names = list(meta["filenames"])
-        ranges = sorted(set(_finest(meta["tree"])))
-        files = {file: _inside(path, names[file]) for file, _, _ in ranges}
+        levels = list(_ranges(meta["tree"]))
+        ranges = sorted({found for is_finest, found in levels if is_finest})
+        files = {file: _inside(path, _named(names, file)) for file, _, _ in ranges}
         environment = [_inside(path, meta["environment"])] if meta.get("environment") else []
     except (
         LookupError,
@@ -48,38 +49,49 @@ def read_streamed_sog(path: Path) -> Gaussians:
         OSError,
         RecursionError,
     ) as error:
-        found = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileFormatError(
-            path, expected="a streamed SOG of version 1", found=f"damaged content: {found}"
+            path, expected="a streamed SOG of version 1", found=reason(error), remedy=AGAIN
         ) from error
-    parts = [
-        part.select(_rows(path, part, ranges, file))
-        for file, part in ((f, read_sog(p)) for f, p in files.items())
-    ]
+    parts = []
+    for file, part_path in files.items():
+        part = read_sog(part_path)
+        named = _rows(path, part, [found for _, found in levels], file)
+        if len(named) < len(part):
+            left = len(part) - len(named)
+            warn("%s: %d of %d Gaussians of %s are in no region", path, left, len(part), names[file])
+        parts.append(part.select(_rows(path, part, ranges, file)))
     parts += [read_sog(part) for part in environment]
     if not parts:
-        raise FileFormatError(path, expected="at least one Gaussian", found="none")
+        raise FileFormatError(
+            path, expected="at least one Gaussian", found="none", remedy="export a scene that is not empty"
+        )
     return joined(parts)
 
 
-def _finest(node: Any) -> Iterator[_Range]:
-    """The ranges of the finest level of each region of the tree."""
+def _ranges(node: Any) -> Iterator[tuple[bool, _Range]]:
+    """The ranges of all levels of each region of the tree, and whether each is the finest of its region."""
     levels = node.get("lods") or {}
-    if levels:
-        lod = levels[min(levels, key=int)]
+    for level, lod in levels.items():
         found = lod["file"], lod.get("offset", 0), lod["count"]
         if any(type(number) is not int or number < 0 for number in found):
-            raise ValueError(f"a range {found!r:.80}")
-        yield found
+            raise Damage(f"a range {found!r:.80}")
+        yield level == min(levels, key=int), found
     for child in node.get("children") or []:
-        yield from _finest(child)
+        yield from _ranges(child)
+
+
+def _named(names: list[Any], file: int) -> Any:
+    """The name of a file by its number."""
+    if file >= len(names):
+        raise Damage(f"file {file} of {len(names)}")
+    return names[file]
 
 
 def _inside(path: Path, name: Any) -> Path:
     """A part, in the folder of the file or below."""
     part = (path.parent / name).resolve()
     if not part.is_relative_to(path.parent.resolve()) or not part.is_file():
-        raise ValueError(f"no part {str(name)[:80]!r} in the folder")
+        raise Damage(f"no part {str(name)[:80]!r} in the folder")
     return part
 
 
@@ -89,7 +101,10 @@ def _rows(path: Path, part: Gaussians, ranges: list[_Range], file: int) -> torch
     for _, start, count in (found for found in ranges if found[0] == file):
         if start + count > len(part):
             raise FileFormatError(
-                path, expected=f"{start + count:,} Gaussians in file {file}", found=f"{len(part):,}"
+                path,
+                expected=f"{start + count:,} Gaussians in file {file}",
+                found=f"{len(part):,}",
+                remedy=AGAIN,
             )
         chosen[start : start + count] = True
     return chosen.nonzero()[:, 0]

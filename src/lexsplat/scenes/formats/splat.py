@@ -14,7 +14,7 @@ import torch
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, logits_of_bytes, read_content
+from lexsplat.scenes.formats.foreign import AGAIN, as_tensor, logits_of_bytes, read_content
 
 _LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -46,11 +46,19 @@ def read_splat(path: Path) -> Gaussians:
     content = read_content(path, ".splat")
     if not content or len(content) % _LAYOUT.itemsize:
         raise FileFormatError(
-            path, expected=f"a multiple of {_LAYOUT.itemsize} bytes", found=f"{len(content)} bytes"
+            path,
+            expected=f"a multiple of {_LAYOUT.itemsize} bytes",
+            found=f"{len(content)} bytes",
+            remedy=AGAIN,
         )
     table = np.frombuffer(content, dtype=_LAYOUT)
     if (table["scale"] < 0).any():
-        raise FileFormatError(path, expected="sizes of 0 or more", found="negative ones: not a .splat file")
+        raise FileFormatError(
+            path,
+            expected="sizes of 0 or more",
+            found="negative ones: not a .splat file",
+            remedy="give the file the ending of its format",
+        )
     with np.errstate(divide="ignore"):  # the logarithm of 0 is minus infinity
         log_scales = np.log(table["scale"])
     rgba = as_tensor(table["rgba"][:, :3]) / 255

@@ -25,7 +25,16 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, check_count, logits_of_bytes, read_content
+from lexsplat.scenes.formats.foreign import (
+    AGAIN,
+    Damage,
+    as_tensor,
+    check_count,
+    logits_of_bytes,
+    read_content,
+    reason,
+    warn,
+)
 from lexsplat.scenes.transforms import transformed
 
 logger = logging.getLogger(__name__)
@@ -39,6 +48,7 @@ _MAGIC = b"NGSP"
 _ANTIALIASED, _EXTENSIONS = 1, 2
 _COLOR_SCALE = 0.15
 _MOST_FRACTIONAL_BITS = 30
+_MOST_EXTENSIONS = 1 << 20
 _FIXED_LIMIT = (1 << 23) - 1
 _COARSE = 0.25
 """Largest step of centers, as a share of the standard deviation of a Gaussian."""
@@ -61,19 +71,29 @@ def read_spz(path: Path) -> Gaussians:
     content = read_content(path, ".spz")
     try:
         head = zlib.decompressobj(31).decompress(content, 16) if content[:2] == b"\x1f\x8b" else content[:32]
+        if len(head) < _HEADER.size:
+            raise Damage(f"a header of {len(head)} bytes")
         magic, version, count, degree, bits, flags, _ = _HEADER.unpack_from(head)
         known = (2, 3) if content[:2] == b"\x1f\x8b" else (4,)
         if magic != _MAGIC or version not in known or degree > 4 or bits > _MOST_FRACTIONAL_BITS:
             found = f"version {version}" if magic == _MAGIC else "another file"
-            raise FileFormatError(path, expected="SPZ of version 2 or 3 in gzip, or 4", found=found)
+            raise FileFormatError(
+                path,
+                expected="SPZ of version 2 or 3 in gzip, or 4",
+                found=found,
+                remedy="export it as SPZ of one of these versions, or as .ply",
+            )
         check_count(path, count, len(content))
         layout = _layout(version, degree)
         sizes = {name: size * count for name, size in layout.items()}
-        streams = _inflated_4(content, sizes) if version == 4 else _inflated(content, sizes)
-    except (zlib.error, zstandard.ZstdError, struct.error, EOFError) as error:
-        raise FileFormatError(path, expected="an SPZ file", found=f"damaged content: {error}") from error
+        if version == 4:
+            streams = _inflated_4(content, sizes)
+        else:
+            streams = _inflated(content, sizes, bool(flags & _EXTENSIONS))
+    except (zlib.error, zstandard.ZstdError, struct.error, Damage) as error:
+        raise FileFormatError(path, expected="an SPZ file", found=reason(error), remedy=AGAIN) from error
     if flags & _EXTENSIONS:
-        logger.warning("%s: its extensions are ignored; they may name other axes", path)
+        warn("%s: its extensions are ignored; they may name other axes", path)
     arrays = {
         name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
     }
@@ -81,17 +101,22 @@ def read_spz(path: Path) -> Gaussians:
     return transformed(gaussians, rotation=HALF_TURN)
 
 
-def _inflated(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
-    """The streams of versions 2 and 3.
+def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> dict[str, bytes]:
+    """The streams of versions 2 and 3; only extensions, if the header has their flag, may follow them.
 
     Raises:
-        EOFError: If the file is cut.
+        Damage: If the file is cut, or has more data than its count allows: the streams would be read at wrong places.
     """
-    stream = zlib.decompressobj(31)
-    data = stream.decompress(content, _HEADER.size + sum(sizes.values()))
-    stream.decompress(stream.unconsumed_tail, 1 << 20)  # extensions and the checksum
-    if len(data) < _HEADER.size + sum(sizes.values()) or not stream.eof:
-        raise EOFError("the file is cut")
+    stream, size = zlib.decompressobj(31), _HEADER.size + sum(sizes.values())
+    data = stream.decompress(content, size)
+    rest = stream.decompress(stream.unconsumed_tail, _MOST_EXTENSIONS)
+    if len(data) < size or (not stream.eof and len(rest) < _MOST_EXTENSIONS):
+        raise Damage("the file is cut")
+    if not (stream.eof and _are_extensions(rest) if extended else not rest):
+        more = f"{len(rest):,}{'' if stream.eof else ' or more'}"
+        raise Damage(f"{more} bytes after the {sizes['alphas']:,} Gaussians of its count")
+    if stream.unused_data:
+        raise Damage(f"{len(stream.unused_data):,} bytes after its end")
     streams, start = {}, _HEADER.size
     for name, size in sizes.items():
         streams[name] = data[start : start + size]
@@ -99,26 +124,38 @@ def _inflated(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
     return streams
 
 
+def _are_extensions(data: bytes) -> bool:
+    """Whether data is a list of extensions: number, length and content of each."""
+    place = 0
+    while place + 8 <= len(data):
+        place += 8 + int.from_bytes(data[place + 4 : place + 8], "little")
+    return place == len(data)
+
+
 def _inflated_4(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
     """The streams of version 4.
 
     Raises:
-        EOFError: If the file is cut or sizes disagree.
+        Damage: If the file is cut, or sizes disagree with the count.
     """
     *_, number, contents = _HEADER_4.unpack_from(content)
-    start = contents + 16 * number
+    start, count = contents + 16 * number, sizes["alphas"]
     if number != len(sizes) or contents < _HEADER_4.size:
-        raise EOFError(f"{number} streams instead of {len(sizes)}")
+        raise Damage(f"{number} streams instead of {len(sizes)}")
     streams = {}
     for index, (name, size) in enumerate(sizes.items()):
         packed, unpacked = struct.unpack_from("<QQ", content, contents + 16 * index)
-        if unpacked != size or start + packed > len(content):
-            raise EOFError(f"a stream of {packed} and {unpacked} bytes")
+        if unpacked != size:
+            raise Damage(f"{unpacked:,} bytes of {name} instead of {size:,} for the {count:,} Gaussians of its count")
+        if start + packed > len(content):
+            raise Damage("the file is cut")
         with zstandard.ZstdDecompressor().stream_reader(content[start : start + packed]) as reader:
-            streams[name] = reader.read(size) if size else b""
+            streams[name] = reader.read(size + 1) if size else b""
         if len(streams[name]) != size:
-            raise EOFError("a stream is cut")
+            raise Damage(f"other {name} than those of {count:,} Gaussians")
         start += packed
+    if start != len(content):
+        raise Damage(f"{len(content) - start:,} bytes after its end")
     return streams
 
 
