@@ -1,7 +1,8 @@
 """Mutations of valid files: each is a pair of kind and bytes, and all are seeded. Independent of lexsplat.
 
-The kind "truncated" cuts the file after every byte, or at evenly chosen places of a longer file. The other kinds are
-random, or enumerate the structure of the format.
+The kind "truncated" cuts the file after every byte, or at evenly chosen places of a longer file. The kind "recounted"
+has counts that disagree with the data, or data after the end: the file fails or yields what it did before. The other
+kinds are random, or enumerate the structure of the format.
 """
 
 from __future__ import annotations

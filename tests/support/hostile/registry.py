@@ -23,6 +23,7 @@ class Reader:
         mutations: By file, relative to the folder: its mutations.
         exact: Files of which no part may be missing: if truncated, they fail or yield the same result.
         value_errors: Whether ValueError is documented for damaged content.
+        told: Whether each error has a remedy and no text of Python.
     """
 
     make: Callable[[Path], None]
@@ -31,6 +32,7 @@ class Reader:
     mutations: dict[str, Callable[[bytes, np.random.Generator], Iterator[Mutation]]]
     exact: tuple[str, ...] = ()
     value_errors: bool = False
+    told: bool = False
 
 
 READERS: dict[str, Callable[[], Reader]] = {}

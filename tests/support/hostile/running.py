@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import resource
 import shutil
 import signal
@@ -32,6 +33,13 @@ SECONDS = 5.0
 GIGABYTE = 1 << 30
 BASE_BYTES = 3 << 28
 """Memory of the process before any input: torch, Numba's kernels and other libraries."""
+
+
+PYTHON = re.compile(
+    r"requires a buffer|Expecting|object is not|has no attribute|index out of range|could not|codec|invalid literal|"
+    r"unsupported operand|not supported between|must be|too many values|not enough values|Errno|Traceback"
+)
+"""Parts of the texts of Python's own errors."""
 
 
 class Hang(BaseException):
@@ -74,7 +82,7 @@ def summary(result: Any) -> bytes:
 
 
 def attempt(target: Reader, folder: Path, report: Report, about: str, whole: bytes | None) -> None:
-    """Read once and check the result; ``whole`` is the summary that a truncated file must yield, if it is read."""
+    """Read once and check the result; ``whole`` is the summary that it must yield, if it is read."""
     from lexsplat.runtime.errors import LexsplatError
 
     allowed = (LexsplatError, ValueError) if target.value_errors else (LexsplatError,)
@@ -82,12 +90,14 @@ def attempt(target: Reader, folder: Path, report: Report, about: str, whole: byt
     try:
         result = target.read(folder)
         target.check(result)
-        assert whole is None or summary(result) == whole, "a truncated file was read as complete"
+        assert whole is None or summary(result) == whole, "a part of the file was read as the whole"
         report.right += 1
     except allowed as error:
         report.errors[type(error).__name__] += 1
         if "\n" in str(error) or not str(error):
             report.failures.append(f"{about}: not one line: {error!r}")
+        if target.told and (not getattr(error, "remedy", "") or PYTHON.search(str(error))):
+            report.failures.append(f"{about}: no remedy, or a text of Python: {error!r}")
     except Hang:
         report.failures.append(f"{about}: not finished after {SECONDS:g} s")
     except (Exception, MemoryError) as error:
@@ -122,9 +132,8 @@ def run_reader(name: str, work: Path, current: Path, *, every: int = 1) -> Repor
             path.write_bytes(changed)
             report.inputs += 1
             report.kinds[kind] += 1
-            attempt(
-                target, folder, report, about, whole if kind == "truncated" and file in target.exact else None
-            )
+            complete = kind == "recounted" or (kind == "truncated" and file in target.exact)
+            attempt(target, folder, report, about, whole if complete else None)
             if len(report.failures) >= 200:
                 break
         path.write_bytes(content)

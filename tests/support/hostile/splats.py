@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ import numpy as np
 from support.hostile import mutations as mutate
 from support.hostile.registry import READERS, Reader, finite, reader
 
+SplatReader = partial(Reader, told=True)
+FEWER = tuple(b"element vertex %d" % count for count in range(4))
 FILES = Path(__file__).parents[2] / "data" / "splats"
 
 
@@ -61,9 +65,11 @@ def splat_ply() -> Reader:
             yield kind, changed + content[end:]
         for count in (5, 10**6, 10**9, 2**63, 10**30):
             yield "counts", content.replace(b"element vertex 4", b"element vertex %d" % count)
+        yield from recounted(content, FEWER, b"element vertex 4")
+        yield from extended(content, b"\n\0\1")
         yield "foreign", point_cloud()
 
-    return Reader(
+    return SplatReader(
         lambda folder: write_ply(small_gaussians(), folder / "a.ply"), lambda folder: read_splats(folder / "a.ply"),
         check_gaussians, {"a.ply": headers}, exact=("a.ply",),
     )  # fmt: skip
@@ -91,6 +97,27 @@ def recounted_glb(content: bytes, count: Callable[[int], int]) -> bytes:
     return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON") + text + binary
 
 
+def recounted(content: bytes, counts: Iterable[bytes], old: bytes) -> Iterator[mutate.Mutation]:
+    """The file with other words in place of the one that has its count."""
+    assert content.count(old) == 1
+    for word in counts:
+        yield "recounted", content.replace(old, word)
+
+
+def extended(content: bytes, more: bytes) -> Iterator[mutate.Mutation]:
+    """The file with 1 to 100 further bytes."""
+    for length in range(1, 101):
+        yield "recounted", content + (more * length)[:length]
+
+
+def recounted_spz(content: bytes) -> Iterator[bytes]:
+    """An SPZ of 4 Gaussians, not compressed as a whole, with other counts or with more data."""
+    for count in (0, 1, 2, 3, 5, 8):
+        yield content[:8] + struct.pack("<I", count) + content[12:]
+    for length in range(1, 101):
+        yield content + bytes([length]) * length
+
+
 def point_cloud() -> bytes:
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz")
@@ -102,7 +129,7 @@ def splat() -> Reader:
     from lexsplat.scenes.formats.reading import read_splats
     from lexsplat.scenes.formats.splat import write_splat
 
-    return Reader(
+    return SplatReader(
         lambda folder: write_splat(small_gaussians(), folder / "a.splat"),
         lambda folder: read_splats(folder / "a.splat"), check_gaussians,
         {"a.splat": lambda content, rng: mutate.binary(content, rng, 200)},
@@ -116,18 +143,16 @@ def splat_text_ply() -> Reader:
 
     def make(folder: Path) -> None:
         write_ply(small_gaussians(), folder / "a.ply")
-        head, rows = (folder / "a.ply").read_bytes().split(b"end_header\n", 1)
-        numbers = np.frombuffer(rows, "<f4").reshape(4, -1).tolist()
-        lines = "".join(" ".join(f"{number:.6g}" for number in row) + "\n" for row in numbers)
-        head = head.replace(b"binary_little_endian", b"ascii")
-        (folder / "a.ply").write_bytes(head + b"end_header\n" + lines.encode())
+        (folder / "a.ply").write_bytes(recounted_text((folder / "a.ply").read_bytes(), 4))
 
     def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
         yield from mutate.text(content, rng, 600, 500)
         for count in (5, 10**6, 10**9, 2**63, 10**30):
             yield "counts", content.replace(b"element vertex 4", b"element vertex %d" % count)
+        yield from recounted(content, FEWER, b"element vertex 4")
+        yield from extended(content, b"1 ")
 
-    return Reader(make, lambda folder: read_splats(folder / "a.ply"), check_gaussians, {"a.ply": mutations})
+    return SplatReader(make, lambda folder: read_splats(folder / "a.ply"), check_gaussians, {"a.ply": mutations})
 
 
 def spz(version: int) -> Callable[[], Reader]:
@@ -145,12 +170,15 @@ def spz(version: int) -> Callable[[], Reader]:
 
         def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
             yield from mutate.binary(content, rng, 400, 500)
+            raw = gzip.decompress(content) if version < 4 else content
+            for changed in recounted_spz(raw):
+                yield "recounted", gzip.compress(changed, 1) if version < 4 else changed
             if version < 4:
                 for kind, changed in mutate.binary(gzip.decompress(content), rng, 400, 500):
                     # Cut before it is compressed, the file is complete and too short.
                     yield "moved" if kind == "truncated" else kind, gzip.compress(changed, 1)
 
-        return Reader(
+        return SplatReader(
             make, lambda folder: read_splats(folder / "a.spz"), check_gaussians, {"a.spz": mutations},
             exact=("a.spz",),
         )  # fmt: skip
@@ -168,10 +196,22 @@ def sog() -> Reader:
     from lexsplat.scenes.formats.reading import read_splats
     from lexsplat.scenes.formats.sog_writing import write_sog
 
-    return Reader(
+    def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+        yield from mutate.binary(content, rng, 500, 500)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            parts = {name: archive.read(name) for name in archive.namelist()}
+        document = json.loads(parts["meta.json"])
+        for count in (0, 1, 2, 3, 5, 6):
+            changed = io.BytesIO()
+            with zipfile.ZipFile(changed, "w") as archive:
+                for name, part in (parts | {"meta.json": json.dumps(document | {"count": count})}).items():
+                    archive.writestr(name, part)
+            yield "recounted", changed.getvalue()
+
+    return SplatReader(
         lambda folder: write_sog(small_gaussians(), folder / "a.sog"),
         lambda folder: read_splats(folder / "a.sog"), check_gaussians,
-        {"a.sog": lambda content, rng: mutate.binary(content, rng, 500, 500)},
+        {"a.sog": mutations},
     )  # fmt: skip
 
 
@@ -192,7 +232,7 @@ def sog_folder() -> Reader:
     names = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
     parts = {f"{name}.webp": picture for name in names}
     parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 150, 1200)
-    return Reader(make, read_splats, check_gaussians, parts)
+    return SplatReader(make, read_splats, check_gaussians, parts)
 
 
 @reader
@@ -204,8 +244,16 @@ def sog_version_1() -> Reader:
         f"{name}.webp": lambda content, rng: mutate.binary(content, rng, 40, 30)
         for name in ("means_u", "sh0", "shN_centroids", "shN_labels")
     }
-    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 150, 800)
-    return Reader(write_version_1, read_splats, check_gaussians, parts)
+
+    def counts(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+        yield from mutate.json_file(content, rng, 150, 800)
+        document = json.loads(content)
+        for count in (*range(10), 11, 12):
+            document["means"]["shape"] = [count, 3]
+            yield "recounted", json.dumps(document).encode()
+
+    parts["meta.json"] = counts
+    return SplatReader(write_version_1, read_splats, check_gaussians, parts)
 
 
 @reader
@@ -216,7 +264,7 @@ def sog_streamed() -> Reader:
 
     fine, coarse = ({"file": number, "offset": 0, "count": count} for number, count in enumerate((10, 5)))
     tree = {"children": [{"lods": {"0": fine, "1": coarse}}, {"lods": {"1": coarse}}]}
-    return Reader(
+    return SplatReader(
         lambda folder: write_streamed(folder, {"0_0": 10, "1_0": 5}, tree),
         read_splats, check_gaussians,
         {"lod-meta.json": lambda content, rng: mutate.json_file(content, rng, 150, 1200)},
@@ -237,8 +285,12 @@ def glb() -> Reader:
             text += b" " * (-len(text) % 4)
             head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON")
             yield kind, head + text + binary
+        for count in range(4):
+            yield "recounted", recounted_glb(content, lambda _, count=count: count)
+            for number in range(len(document["accessors"])):
+                yield "counts", recounted_glb(content, lambda i, n=number, c=count: c if i == n else 4)
 
-    return Reader(
+    return SplatReader(
         lambda folder: write_glb(small_gaussians(), folder / "a.glb"),
         lambda folder: read_splats(folder / "a.glb"), check_gaussians, {"a.glb": mutations},
         exact=("a.glb",),
@@ -266,7 +318,7 @@ def gltf() -> Reader:
         "a.gltf": lambda content, rng: mutate.json_file(content, rng, 100, 1000),
         "a.bin": lambda content, rng: mutate.binary(content, rng, 100, 100),
     }
-    return Reader(make, lambda folder: read_splats(folder / "a.gltf"), check_gaussians, parts)
+    return SplatReader(make, lambda folder: read_splats(folder / "a.gltf"), check_gaussians, parts)
 
 
 def compressed(ending: str, count: int) -> Callable[[], Reader]:
@@ -274,10 +326,22 @@ def compressed(ending: str, count: int) -> Callable[[], Reader]:
         from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
         from lexsplat.scenes.formats.reading import read_splats
 
-        return Reader(
+        def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
+            yield from mutate.binary(content, rng, count, 40)
+            if ending == ".ksplat":
+                for fewer in range(4):
+                    number = struct.pack("<I", fewer)
+                    header = content[:16] + number + content[20:]
+                    yield "recounted", header
+                    yield "recounted", header[:4096] + number * 2 + header[4104:]
+            else:
+                yield from recounted(content, FEWER, b"element vertex 4")
+            yield "recounted", content + bytes(50)
+
+        return SplatReader(
             lambda folder: write_compressed(small_gaussians(), folder / f"a{ending}", COMPRESSED[ending]),
             lambda folder: read_splats(folder / f"a{ending}"), check_gaussians,
-            {f"a{ending}": lambda content, rng: mutate.binary(content, rng, count, 40)},
+            {f"a{ending}": mutations},
         )  # fmt: skip
 
     return make

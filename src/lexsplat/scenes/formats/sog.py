@@ -15,7 +15,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,8 +124,8 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
     def picture(part: str, index: int = 0) -> NDArray[np.uint8]:
         return pixels(part, index)[:count]
 
-    turns = pixels("quats")
-    held = _held(turns, count)
+    turns, low, high = pixels("quats"), pixels("means", 0), pixels("means", 1)
+    held = _held(turns, (low, high), count)
     if held != count:
         raise FileFormatError(
             path,
@@ -137,7 +137,7 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
     sh0, colors = picture("sh0"), table(meta["sh0"])
     logits = logits_of_bytes(sh0[:, 3]) if version == 2 else as_tensor(_looked_up(colors, sh0)[:, 3])
     return Gaussians(
-        means=as_tensor(_positions(picture("means", 0), picture("means", 1), meta["means"])),
+        means=as_tensor(_positions(low[:count], high[:count], meta["means"])),
         quats=as_tensor(_quats(turns[:count])),
         log_scales=as_tensor(_looked_up(table(meta["scales"]), picture("scales")[:, :3])),
         opacity_logits=logits,
@@ -196,15 +196,19 @@ def _positions(low: NDArray[np.uint8], high: NDArray[np.uint8], part: dict[str, 
         return np.sign(values) * np.expm1(np.abs(values))
 
 
-def _held(pixels: NDArray[np.uint8], count: int) -> int:
+def _held(turns: NDArray[np.uint8], places: Sequence[NDArray[np.uint8]], count: int) -> int:
     """Number of Gaussians whose rotations are in a picture ``[P, 4]``: no rotation is four zeros.
 
-    What fills up the last rows is not among them: zeros, opaque black, and copies of the last Gaussian.
+    What fills up the last rows is not among them: zeros, opaque black, and copies of the last Gaussian, which are at
+    the same place in the pictures of positions.
     """
-    used = pixels.any(1)
-    rest = pixels[count:]
-    last = pixels[max(count - 1, 0)]
-    used[count:] = (rest[:, 3] >= FIRST_TAG) & rest[:, :3].any(1) & (rest != last).any(1)
+    used, last = turns.any(1), max(count - 1, 0)
+    copies = (turns[count:] == turns[last]).all(1)
+    for picture in places:
+        rest = np.zeros_like(turns[count:])
+        rest[: max(len(picture) - count, 0)] = picture[count : len(turns)]
+        copies &= (rest == picture[last]).all(1)
+    used[count:] = (turns[count:, 3] >= FIRST_TAG) & turns[count:, :3].any(1) & ~copies
     return int(used.nonzero()[0][-1]) + 1 if used.any() else 0
 
 
