@@ -3,11 +3,16 @@
 import gzip
 import logging
 
+import numpy as np
 import pytest
 from support.sog_files import write_streamed
 from support.splats import tame
 
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import existing_splats, splats_hash
+from lexsplat.pipeline.viewpoints import choosing
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.reading import read_splats
@@ -51,6 +56,27 @@ def test_sizes_of_zero_are_a_warning_and_refused_where_most_gaussians_are_points
     write_ply(g, tmp_path / "g.ply")
     with pytest.raises(FileFormatError, match="found 21 of 40 Gaussians with two or three sizes of 0"):
         read_splats(tmp_path / "g.ply")
+
+
+@pytest.mark.slow
+def test_a_build_warns_once_of_what_it_drops_and_keeps_the_warning(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (3000, 3)) * [1.5, 1.5, 0.002]
+    points[:800, 2] += 0.3 - 0.3 * (points[:800, :2] ** 2).sum(1)  # a hill on the ground
+    g = gaussians_from_points(points, rng.random((3000, 3)), sh_degree=0, opacity=0.98)
+    g.quats[:7], g.log_scales[7:12, 2], g.means[12, 0] = 0, -200, 1e9
+    write_ply(g, tmp_path / "g.ply")
+    config = BuildConfig(clip="bundled", dino="none", device="cpu", up="0,0,1")
+    folder = build(None, tmp_path / "scene", config, until="reconstruct", splats=tmp_path / "g.ply")
+    for words in (
+        "7 of 3000 Gaussians have a rotation",
+        "5 of 3000 Gaussians have a size",
+        "1 of 3000 Gaussians drop",
+    ):
+        assert caplog.text.count(words) == 1
+        assert sum(words in warning for warning in folder.record["stages"]["views"]["warnings"]) == 1
+    assert folder.record["stages"]["reconstruct"]["gaussians"] == 2999
 
 
 @pytest.mark.parametrize("name", ["g.ply", "g.ply.gz", "g.glb"])

@@ -411,7 +411,10 @@ def picture(width: int, height: int) -> bytes:
         ({"sh0__webp": b"\x89PNG\r\n\x1a\n"}, r"sh0\.webp"),
         ({"shN_labels__webp": None}, r"no shN_labels\.webp in the archive; copy"),
         ({"meta__json": b'{"version": 3}'}, "expected SOG of version 1 or 2, found version 3"),
-        ({"meta__json": b'{"means": {"shape": [3, 3]}}'}, "version 1 or 2, found damaged content: no 'quats'"),
+        (
+            {"meta__json": b'{"means": {"shape": [3, 3]}}'},
+            "version 1 or 2, found damaged content: no 'quats'",
+        ),
     ],
 )
 def test_zip_bombs_and_missing_parts_of_sog_are_refused(tmp_path, changed, words):

@@ -21,7 +21,7 @@ from support.splats import tame
 
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.compressed import write_compressed
-from lexsplat.scenes.formats.foreign import FARTHEST, warnings_once
+from lexsplat.scenes.formats.foreign import warnings_once
 from lexsplat.scenes.formats.gltf import write_glb
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.reading import READERS, read_splats
@@ -94,14 +94,18 @@ def ply(tmp_path, request) -> tuple[bytes, int, str]:
     """The content of a PLY of 20 Gaussians, the length of a row, and the unit of what is left."""
     write_ply(tame(20), tmp_path / "g.ply")
     content = (tmp_path / "g.ply").read_bytes()
-    return (content, 68, "bytes") if request.param == "binary" else (recounted_text(content, 20), 17, "numbers")
+    return (
+        (content, 68, "bytes") if request.param == "binary" else (recounted_text(content, 20), 17, "numbers")
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 10, 19])
 def test_ply_with_a_smaller_count_is_refused_with_both_numbers(tmp_path, ply, count):
     content, row, unit = ply
     changed = content.replace(b"element vertex 20", b"element vertex %d" % count)
-    refused(tmp_path / "g.ply", changed, f"the {count} Gaussians", f"{row * (20 - count):,} {unit} after the last")
+    refused(
+        tmp_path / "g.ply", changed, f"the {count} Gaussians", f"{row * (20 - count):,} {unit} after the last"
+    )
 
 
 def test_less_than_a_row_after_the_last_gaussian_is_a_warning_that_says_how_much(tmp_path, ply, caplog):
@@ -154,20 +158,29 @@ def sog(path: Path, count: int, **changed: bytes) -> bytes:
 
 @pytest.mark.parametrize("count", [0, 1, 10, 19, 21, 24])
 def test_sog_with_another_count_than_its_pictures_is_refused_with_both_numbers(tmp_path, count):
-    refused(tmp_path / "g.sog", sog(tmp_path / "g.sog", count), f"the {count} Gaussians", "found 20 in its pictures")
+    refused(
+        tmp_path / "g.sog",
+        sog(tmp_path / "g.sog", count),
+        f"the {count} Gaussians",
+        "found 20 in its pictures",
+    )
 
 
 @pytest.mark.parametrize("filled_with", ["zeros", "opaque black", "the last"])
 def test_what_fills_up_the_pictures_of_a_sog_are_no_gaussians(tmp_path, filled_with):
     write_sog(tame(20, 1), tmp_path / "g.sog")
+    pictures = {}
     with zipfile.ZipFile(tmp_path / "g.sog") as archive:
-        turns = np.asarray(Image.open(io.BytesIO(archive.read("quats.webp"))).convert("RGBA")).reshape(-1, 4)
-    pixels = np.zeros((64, 4), np.uint8)
-    pixels[:20] = turns[:20]
-    pixels[20:] = {"zeros": 0, "opaque black": (0, 0, 0, 255), "the last": turns[19]}[filled_with]
-    content = io.BytesIO()
-    Image.fromarray(pixels.reshape(8, 8, 4)).save(content, "WEBP", lossless=True, exact=True)
-    (tmp_path / "g.sog").write_bytes(sog(tmp_path / "g.sog", 20, quats=content.getvalue()))
+        for name in ("means_l", "means_u", "quats", "scales", "sh0", "shN_labels"):
+            picture = Image.open(io.BytesIO(archive.read(f"{name}.webp"))).convert("RGBA")
+            first = np.asarray(picture).reshape(-1, 4)[:20]
+            pixels = np.zeros((64, 4), np.uint8)
+            pixels[:20] = first
+            pixels[20:] = {"zeros": 0, "opaque black": (0, 0, 0, 255), "the last": first[19]}[filled_with]
+            content = io.BytesIO()
+            Image.fromarray(pixels.reshape(8, 8, 4)).save(content, "WEBP", lossless=True, exact=True)
+            pictures[name] = content.getvalue()
+    (tmp_path / "g.sog").write_bytes(sog(tmp_path / "g.sog", 20, **pictures))
     assert len(read_splats(tmp_path / "g.sog")) == 20
 
 
@@ -226,13 +239,27 @@ def test_glb_with_bytes_after_its_end_is_refused(tmp_path):
 # Numbers that cannot be worked with, remedies, and warnings
 
 
-@pytest.mark.parametrize(("size", "factor"), [(1e10, "0.0000000001"), (3e6, "0.000001"), (1e15, "0.000000000000001")])
+@pytest.mark.parametrize(
+    ("size", "factor"), [(1e10, "0.0000000001"), (3e6, "0.000001"), (1e15, "0.000000000000001")]
+)
 def test_splats_too_far_away_for_cameras_are_refused_with_a_factor_to_scale_by(tmp_path, size, factor):
     g = tame(40)
     g.means = torch.nn.functional.normalize(g.means.sign() + 0.1, dim=1) * size * 1.8
     write_ply(g, tmp_path / "g.ply")
-    words = (f"within {FARTHEST:,.0f} units", "40 of 40 Gaussians", f"splat-transform g.ply --scale {factor} ")
+    words = (
+        "within 10,000,000 units",
+        "of 40 Gaussians farther out",
+        f"splat-transform g.ply --scale {factor} ",
+    )
     refused(tmp_path / "g.ply", (tmp_path / "g.ply").read_bytes(), *words)
+
+
+def test_coordinates_of_a_map_are_read(tmp_path, caplog):
+    g = tame(40)
+    g.means += torch.tensor([4e5, 5.6e6, 300])
+    write_ply(g, tmp_path / "g.ply")
+    assert torch.equal(read_splats(tmp_path / "g.ply").means, g.means)
+    assert caplog.text == ""
 
 
 def test_a_few_gaussians_too_far_or_too_large_are_dropped_with_a_warning(tmp_path, caplog):
@@ -241,12 +268,16 @@ def test_a_few_gaussians_too_far_or_too_large_are_dropped_with_a_warning(tmp_pat
     write_ply(g, tmp_path / "g.ply")
     found = read_splats(tmp_path / "g.ply")
     assert torch.equal(found.means, g.means[[i for i in range(40) if i not in (3, 7)]])
-    assert "2 of 40 Gaussians dropped: they are not centers and sizes within 2,000,000 units" in caplog.text
+    assert (
+        "2 of 40 Gaussians dropped: expected centers and sizes that cameras within 10,000,000 units"
+        in caplog.text
+    )
 
 
 @pytest.mark.parametrize("ending", [ending for ending in READERS if ending != "lod-meta.json"])
 @pytest.mark.parametrize(
-    "content", [b"", b"ply\n", b"{}", b"[]", b"\x1f\x8b\x08", b"NGSP", b"NGSP" + bytes(50), b"glTF" + bytes(9)]
+    "content",
+    [b"", b"ply\n", b"{}", b"[]", b"\x1f\x8b\x08", b"NGSP", b"NGSP" + bytes(50), b"glTF" + bytes(9)],
 )
 def test_whatever_is_refused_has_a_remedy_and_no_text_of_python(tmp_path, ending, content):
     if ending == ".ksplat":
@@ -256,7 +287,15 @@ def test_whatever_is_refused_has_a_remedy_and_no_text_of_python(tmp_path, ending
     with pytest.raises(FileFormatError) as caught:
         read_splats(path)
     assert_tells(caught.value)
-    for text in ("requires a buffer", "Expecting value", "object is not", "object has", "index out of range", "b'", "Error"):
+    for text in (
+        "requires a buffer",
+        "Expecting value",
+        "object is not",
+        "object has",
+        "index out of range",
+        "b'",
+        "Error",
+    ):
         assert text not in str(caught.value)
 
 

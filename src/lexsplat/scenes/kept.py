@@ -73,7 +73,10 @@ def keep(scene: Scene) -> None:
         scene.embed(judge.colored or ["object"])
         if scene.kept is None and scene.field.segments is not None:
             write_objects(scene, KeptObjects(scene.objects, judge.places), path.with_name(FILE))
-    except (OSError, LexsplatError) as error:  # nothing is lost: questions compute it, and tell of a missing encoder
+    except (
+        OSError,
+        LexsplatError,
+    ) as error:  # nothing is lost: questions compute it, and tell of a missing encoder
         log.debug("%s: not kept (%s)", path, str(error)[:200])
 
 

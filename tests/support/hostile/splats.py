@@ -94,7 +94,9 @@ def recounted_glb(content: bytes, count: Callable[[int], int]) -> bytes:
         accessor["count"] = count(index)
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON") + text + binary
+    return (
+        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON") + text + binary
+    )
 
 
 def recounted(content: bytes, counts: Iterable[bytes], old: bytes) -> Iterator[mutate.Mutation]:
@@ -152,7 +154,9 @@ def splat_text_ply() -> Reader:
         yield from recounted(content, FEWER, b"element vertex 4")
         yield from extended(content, b"1 ")
 
-    return SplatReader(make, lambda folder: read_splats(folder / "a.ply"), check_gaussians, {"a.ply": mutations})
+    return SplatReader(
+        make, lambda folder: read_splats(folder / "a.ply"), check_gaussians, {"a.ply": mutations}
+    )
 
 
 def spz(version: int) -> Callable[[], Reader]:

@@ -34,7 +34,9 @@ COMPRESSED = {".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
 _CHUNK = 256
 _BARE = str.maketrans("", "", "{}")
 _KSPLAT_HEADER, _KSPLAT_SECTION = 4096, 1024
-_KSPLAT = struct.Struct("<4xIIIIH")  # sections, those in use, and of Gaussians; number of Gaussians; compression level
+_KSPLAT = struct.Struct(
+    "<4xIIIIH"
+)  # sections, those in use, and of Gaussians; number of Gaussians; compression level
 _KSPLAT_PART = struct.Struct("<IIIIfHxxIIIIH")
 """Of a section: Gaussians, and how many there is space for; of buckets size, number, extent and bytes; range, bytes,
 full and partial buckets; degree of the harmonics."""
@@ -150,9 +152,7 @@ def _sectioned_count(content: bytes, path: Path) -> int:
         if held != count or not 0 <= len(content) - place < _KSPLAT_BYTES[level][0]:
             raise Damage(f"{held:,} Gaussians in sections, and {len(content):,} bytes instead of {place:,}")
     except (struct.error, Damage) as error:
-        raise FileFormatError(
-            path, expected="a ksplat file", found=reason(error), remedy=AGAIN
-        ) from error
+        raise FileFormatError(path, expected="a ksplat file", found=reason(error), remedy=AGAIN) from error
     return int(count)
 
 

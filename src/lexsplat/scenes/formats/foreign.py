@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 MOST_DROPPED = 0.1
 """Share of invalid Gaussians above which a file counts as damaged."""
 
-FARTHEST = MAX_COORDINATE / 5
-"""Largest coordinate and size of a Gaussian: cameras that look at a scene are outside it, at `MAX_COORDINATE` at most."""
+AROUND = 5
+"""Cameras around a scene are at most this many times as far from its middle as the farthest Gaussian."""
 
 AGAIN = "copy the file again or export it again"
 """The remedy for damage."""
@@ -118,32 +118,38 @@ def _turned(quats: Tensor, path: Path) -> Tensor:
     """Quaternions ``[N, 4]`` in which those of four zeros are no rotation, with a warning."""
     empty = (quats.abs() < _SMALLEST_QUAT).all(1)
     if count := int(empty.sum()):
-        warn("%s: %d of %d Gaussians have a rotation of four zeros, read as unturned", path, count, len(quats))
+        warn(
+            "%s: %d of %d Gaussians have a rotation of four zeros, read as unturned", path, count, len(quats)
+        )
     return torch.where(empty[:, None], quats.new_tensor([1.0, 0, 0, 0]), quats)
 
 
 def _near(gaussians: Gaussians, path: Path) -> Gaussians:
-    """The Gaussians without those of finite centers or sizes beyond `FARTHEST`, with a warning.
+    """The Gaussians without those so far out or so large that cameras around them are beyond `MAX_COORDINATE`.
+
+    Coordinates of a map, which are millions of meters from their origin, stay.
 
     Raises:
         FileFormatError: If they are more than `MOST_DROPPED` of them.
     """
-    reach = torch.maximum(gaussians.means.abs().amax(1), gaussians.log_scales.double().exp().amax(1))
-    far = (reach > FARTHEST) & torch.isfinite(reach)
+    means, sizes = gaussians.means.double(), gaussians.log_scales.double().exp().amax(1)
+    middle = means.nanmedian(0).values
+    reach = middle.abs().max() + AROUND * torch.maximum((means - middle).abs().amax(1), sizes)
+    far = (reach > MAX_COORDINATE) & torch.isfinite(reach)
     count = int(far.sum())
     if not count:
         return gaussians
-    limit = f"centers and sizes within {FARTHEST:,.0f} units"
+    limit = f"centers and sizes that cameras within {MAX_COORDINATE:,.0f} units of the origin can look at"
     if count > MOST_DROPPED * len(gaussians):
-        median = float(reach[far].median())
+        median = float(torch.maximum(means.abs().amax(1), sizes)[far].median())
         factor = np.format_float_positional(10.0 ** -math.floor(math.log10(median)))
         raise FileFormatError(
             path,
             expected=limit,
-            found=f"{count:,} of {len(gaussians):,} Gaussians beyond, half of them at {median:.2g} or more",
+            found=f"{count:,} of {len(gaussians):,} Gaussians farther out, half of them {median:.2g} units or more",
             remedy=f"scale or move the splats, as does: splat-transform {path.name} --scale {factor} scaled.ply",
         )
-    warn("%s: %d of %d Gaussians dropped: they are not %s", path, count, len(gaussians), limit)
+    warn("%s: %d of %d Gaussians dropped: expected %s", path, count, len(gaussians), limit)
     return gaussians.select(~far)
 
 

@@ -130,7 +130,10 @@ def parse_ply(path: Path) -> Gaussians:
             return _gaussians_from_table(table, is_antialiased(lines), path)
     except OSError as error:
         raise FileFormatError(
-            path, expected="a readable PLY file", found=str(error.strerror), remedy="check the path and its permissions"
+            path,
+            expected="a readable PLY file",
+            found=str(error.strerror),
+            remedy="check the path and its permissions",
         ) from error
 
 
@@ -169,9 +172,7 @@ def _binary_rows(
     return table, data_left(elements[1:], order, available, file.read)
 
 
-def _text_rows(
-    file: BinaryIO, elements: Sequence[Element], order: str, path: Path
-) -> tuple[np.ndarray, int]:
+def _text_rows(file: BinaryIO, elements: Sequence[Element], order: str, path: Path) -> tuple[np.ndarray, int]:
     """The Gaussians, and how many numbers are left after all elements."""
     vertices = elements[0]
     wanted = vertices.count * len(vertices.columns)

@@ -101,14 +101,20 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
         if words[:1] == ["element"]:
             if len(words) != 3 or not words[2].isdecimal():
                 raise FileFormatError(
-                    path, expected="'element NAME COUNT'", found=repr(line[:80]), remedy="export the file again"
+                    path,
+                    expected="'element NAME COUNT'",
+                    found=repr(line[:80]),
+                    remedy="export the file again",
                 )
             elements.append(Element(words[1], int(words[2]), ()))
         elif words[:1] == ["property"]:
             column = _column(words)
             if column is None or not elements:
                 raise FileFormatError(
-                    path, expected="a property of an element", found=repr(line[:80]), remedy="export the file again"
+                    path,
+                    expected="a property of an element",
+                    found=repr(line[:80]),
+                    remedy="export the file again",
                 )
             last = elements[-1]
             elements[-1] = Element(last.name, last.count, (*last.columns, column))

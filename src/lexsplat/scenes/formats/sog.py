@@ -202,7 +202,7 @@ def _held(turns: NDArray[np.uint8], places: Sequence[NDArray[np.uint8]], count: 
     What fills up the last rows is not among them: zeros, opaque black, and copies of the last Gaussian, which are at
     the same place in the pictures of positions.
     """
-    used, last = turns.any(1), max(count - 1, 0)
+    used, last = np.asarray(turns.any(1)), max(count - 1, 0)
     copies = (turns[count:] == turns[last]).all(1)
     for picture in places:
         rest = np.zeros_like(turns[count:])

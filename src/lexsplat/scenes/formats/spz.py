@@ -146,7 +146,9 @@ def _inflated_4(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
     for index, (name, size) in enumerate(sizes.items()):
         packed, unpacked = struct.unpack_from("<QQ", content, contents + 16 * index)
         if unpacked != size:
-            raise Damage(f"{unpacked:,} bytes of {name} instead of {size:,} for the {count:,} Gaussians of its count")
+            raise Damage(
+                f"{unpacked:,} bytes of {name} instead of {size:,} for the {count:,} Gaussians of its count"
+            )
         if start + packed > len(content):
             raise Damage("the file is cut")
         with zstandard.ZstdDecompressor().stream_reader(content[start : start + packed]) as reader:
