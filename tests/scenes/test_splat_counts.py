@@ -196,7 +196,7 @@ def test_gaussians_of_a_streamed_sog_that_no_region_has_are_counted(tmp_path, ca
 
 @pytest.mark.parametrize(("ending", "kind"), [(".ksplat", "ksplat"), (".compressed.ply", "compressed.ply")])
 @pytest.mark.parametrize("count", [20, 299])
-def test_chunks_and_sections_with_a_smaller_count_are_refused(tmp_path, ending, kind, count):
+def test_chunks_and_sections_with_a_smaller_count_are_refused(tmp_path, caplog, ending, kind, count):
     pytest.importorskip("gaussforge")
     path = tmp_path / f"g{ending}"
     write_compressed(tame(300, 1), path, kind)
@@ -214,6 +214,10 @@ def test_chunks_and_sections_with_a_smaller_count_are_refused(tmp_path, ending, 
         refused(path, changed, f"expected {count} Gaussians", "bytes after them")
         refused(path, changed.replace(b"sh 300", b"sh %d" % count), f"expected {count} Gaussians")
     refused(path, content + bytes(100))
+    if kind == "ksplat":
+        path.write_bytes(content + b"\n")
+        assert len(read_splats(path)) == 300
+        assert "1 bytes after the last Gaussian are ignored" in caplog.text
 
 
 # glTF

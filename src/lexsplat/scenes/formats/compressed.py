@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
-from lexsplat.scenes.formats.foreign import AGAIN, Damage, read_content, reason
+from lexsplat.scenes.formats.foreign import AGAIN, Damage, read_content, reason, warn
 from lexsplat.scenes.formats.ply import MIP, is_antialiased, parse_ply, write_ply
 from lexsplat.scenes.formats.ply_elements import byte_order, data_left, header_lines, parse_elements
 
@@ -153,6 +153,8 @@ def _sectioned_count(content: bytes, path: Path) -> int:
             raise Damage(f"{held:,} Gaussians in sections, and {len(content):,} bytes instead of {place:,}")
     except (struct.error, Damage) as error:
         raise FileFormatError(path, expected="a ksplat file", found=reason(error), remedy=AGAIN) from error
+    if place < len(content):
+        warn("%s: %d bytes after the last Gaussian are ignored", path, len(content) - place)
     return int(count)
 
 
