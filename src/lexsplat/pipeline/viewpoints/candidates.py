@@ -20,19 +20,30 @@ _DISTANCES = (0.75, 1.1)
 """In distances from which the target fills the height of the image."""
 _CLEARANCE = 0.15
 """Free radius around a camera, relative to its distance from the target."""
-_CLEARANCE_INSIDE = 0.2
-"""The same within a room, relative to its height."""
+_CLEARANCE_INSIDE = (0.2, 0.1, 0.05)
+"""The same within a room, relative to the free height there: the largest at which there is a place."""
 _CLOSEST = 0.5
 """Least distance, relative to that from which the whole scene fills the image."""
 _EYE = 0.6
-"""Eye height in a room, relative to its height: 1.5 m of 2.5 m."""
-_CELL = 1.0
-"""Distance of places within the scene, relative to its height: every room gets some,"""
-_GRID = 4
-"""and at least as many along either side,"""
-_MOST_PLACES = 48
-"""but not more in all: they are looked around from, which takes time."""
-TURNS = 8
+"""Eye height in a room, relative to the free height: 1.5 m of 2.5 m."""
+_GRID = (8, 48)
+"""Columns along either side of the scene in which free places are looked for, at least and at most,"""
+_COLUMN = 0.2
+"""which are this wide, relative to the height of the scene,"""
+_STEPS = 24
+"""heights in each,"""
+_WALL = 0.05
+"""and distance from solid points within which nothing is free, relative to the height of the scene."""
+_STOREY = 0.3
+"""Least free height of a place, relative to that of the scene: none under a table, but
+in each of three storeys."""
+_APART = 0.4
+"""Least distance of places within the scene, relative to their free height: every room gets some."""
+_MOST_PLACES = 40
+"""They are looked around from, which takes time."""
+_TILTS = ((-0.2, 8), (-1.2, 4))
+"""Slopes of the cameras at each place within the scene, and how many of each: down is the floor."""
+TURNS = sum(count for _, count in _TILTS)
 """Cameras at each place within the scene."""
 
 Points = NDArray[np.float64]
@@ -84,36 +95,72 @@ def _circle_positions(target: Target, reach: float, surroundings: Surroundings) 
 
 
 def inside(surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
-    """Cameras at eye height on a grid of free places within the scene that look all around, `TURNS` at each."""
+    """Cameras at eye height at free places within the scene that look all around, `TURNS` at each."""
     return [camera for place in free_places(surroundings) for camera in all_around(place, surroundings, size)]
 
 
 def free_places(surroundings: Surroundings, level: float = _EYE) -> list[Points]:
-    """Places within the scene that are not close to anything, on a grid along the sides of its box.
+    """Places within the scene that are not close to anything, far from each other.
+
+    They are in columns that are free from a floor to a ceiling, or to the height of the scene: there may be several
+    above each other.
 
     Args:
         surroundings: The scene.
-        level: Height of the places, relative to that of the scene.
+        level: Height of the places, relative to the free height.
     """
+    height = surroundings.height
+    if height <= 0:
+        return []
+    places, rooms = _free_spans(surroundings, level)
+    distances = surroundings.tree.query(places)[0] if len(places) else np.zeros(0)
+    for clearance in _CLEARANCE_INSIDE:
+        free = np.flatnonzero(distances >= clearance * rooms)
+        if len(free):
+            return _spread(places[free], distances[free], rooms[free])
+    return []
+
+
+def _free_spans(surroundings: Surroundings, level: float) -> tuple[Points, Points]:
+    """Places at a level of every free span of the columns ``[M, 3]``, and the heights of these spans ``[M]``."""
     box, up, height = surroundings.box, surroundings.up.direction, surroundings.height
-    cells = np.maximum(np.ceil(2 * box.half_sizes[:2] / max(_CELL * height, 1e-12)), _GRID)
-    cells = np.minimum(cells, _MOST_PLACES).astype(int)
-    while cells.prod() > _MOST_PLACES:
-        cells = np.maximum(cells * 9 // 10, _GRID)
+    cells = np.clip(np.ceil(2 * box.half_sizes[:2] / (_COLUMN * height)), *_GRID).astype(int)
     first, second = (
         np.outer((2 * np.arange(count) + 1) / count - 1, half * axis)
         for count, half, axis in zip(cells, box.half_sizes, box.axes)
     )
-    places = (box.center + first[:, None] + second[None]).reshape(-1, 3)
-    places += np.outer(surroundings.ground + level * height - places @ up, up)
-    return list(places[surroundings.tree.query(places)[0] >= _CLEARANCE_INSIDE * height])
+    columns = (box.center + first[:, None] + second[None]).reshape(-1, 3)
+    columns += np.outer(surroundings.ground - columns @ up, up)
+    heights = (np.arange(_STEPS) + 0.5) / _STEPS * height
+    apart = surroundings.tree.query(columns[:, None] + heights[:, None] * up)[0]
+    free = np.pad(apart > _WALL * height, ((0, 0), (1, 1)))
+    starts, ends = (np.argwhere(free[:, 1:] & ~free[:, :-1]), np.argwhere(~free[:, 1:] & free[:, :-1]))
+    low, high = starts[:, 1] / _STEPS * height, ends[:, 1] / _STEPS * height
+    low, high = np.maximum(low - _WALL * height, 0), np.minimum(high + _WALL * height, height)
+    kept = high - low >= _STOREY * height
+    places = columns[starts[:, 0]] + np.outer(low + level * (high - low), up)
+    return places[kept], (high - low)[kept]
+
+
+def _spread(places: Points, distances: Points, rooms: Points) -> list[Points]:
+    """The freest place, and again and again the one that is farthest from those taken."""
+    chosen = [int(distances.argmax())]
+    nearest = np.full(len(places), np.inf)
+    while len(chosen) < _MOST_PLACES:
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
+        farthest = int((nearest / rooms).argmax())
+        if nearest[farthest] < _APART * rooms[farthest]:
+            break
+        chosen.append(farthest)
+    return list(places[chosen])
 
 
 def all_around(place: Points, surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
-    """`TURNS` cameras at a place that look all around, slightly down."""
+    """`TURNS` cameras at a place that look all around, slightly down and at the floor."""
     first, second, up = upright_frame(surroundings.up.direction)
     cameras = []
-    for angle in np.arange(TURNS) * (2 * math.pi / TURNS):
-        ahead = math.cos(angle) * first + math.sin(angle) * second - 0.2 * up
-        cameras.append(look_at(place, place + ahead, up, *size, FOV_Y))
+    for slope, count in _TILTS:
+        for angle in np.arange(count) * (2 * math.pi / count):
+            ahead = math.cos(angle) * first + math.sin(angle) * second + slope * up
+            cameras.append(look_at(place, place + ahead, up, *size, FOV_Y))
     return cameras

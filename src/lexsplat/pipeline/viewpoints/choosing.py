@@ -14,9 +14,15 @@ from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
-from lexsplat.pipeline.viewpoints.interior import Interior, Side, examine, without_lonely_points
+from lexsplat.pipeline.viewpoints.interior import (
+    Interior,
+    Side,
+    examine,
+    examine_inside,
+    without_lonely_points,
+)
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
-from lexsplat.pipeline.viewpoints.surroundings import Surroundings, Target, find_surroundings
+from lexsplat.pipeline.viewpoints.surroundings import SOLID, Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -48,6 +54,8 @@ _LENIENT = (1.0, 0.5, 0.25)
 """by these parts of both least shares, one after the other."""
 _SOME = 1 / 3
 """Where fewer of the clear views see into the scene, it has no inside: a solid thing hides its own middle."""
+_USUALLY_VISIBLE = 0.5
+"""Least share of the opaque Gaussians that some view should show: of captures it is .9, of made-up rooms .6."""
 _MOST_OTHERS = 128
 """Views that are not good enough to be chosen, at most, that tell which Gaussians can be seen at all."""
 
@@ -77,7 +85,7 @@ class ChosenViews:
     @property
     def note(self) -> str:
         """One line for the user."""
-        kind = "a room, from inside" if self.room else "an object, from around"
+        kind = "a room or another closed place, from inside" if self.room else "an object, from around"
         return (
             f"{len(self.cameras)} views chosen of {self.candidates} ({self.left_out} showed no surfaces), "
             f"as of {kind}; "
@@ -118,19 +126,18 @@ def choose_views(
             found=f"none of {tried.count} tried (fog, holes, or no free space)",
             remedy="give the capture it was made from, the up direction with --up x,y,z, or --views-from",
         )
-    if not tried.interior.is_certain:
-        log.warning(
-            "%s: taken as %s, which is uncertain; see the contact sheet, and give --views-from %s if it is wrong",
-            subject,
-            *(
-                ("a room and looked at from inside", "around")
-                if tried.interior.is_room
-                else ("an object and looked at from around", "inside")
-            ),
-        )
+    _warn(tried, found, gaussians, subject)
     chosen, visible, unseen = _cover(tried)
     cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
     share = len(gaussians) / max(tried.weights.shape[1], 1)
+    opaque = int((gaussians.opacities > SOLID).sum())
+    if visible * share < _USUALLY_VISIBLE * opaque:
+        log.warning(
+            "%s: only %s of %s opaque Gaussians can be seen from any place tried; floaters or walls hide the others",
+            subject,
+            f"{round(visible * share):,}",
+            f"{opaque:,}",
+        )
     return ChosenViews(
         cameras,
         found.up,
@@ -140,6 +147,30 @@ def choose_views(
         round(unseen * share),
         tried.interior.is_room,
     )
+
+
+def _warn(tried: _Tried, found: Surroundings, gaussians: Gaussians, subject: Path) -> None:
+    """Warn of a kind that is uncertain, or that depends on an up direction that is a guess."""
+    interior = tried.interior
+    taken = (
+        ("a room and looked at from inside", "around")
+        if interior.is_room
+        else ("an object and looked at from around", "inside")
+    )
+    for rival in found.rivals if interior.side == "auto" else ():
+        if examine_inside(gaussians, rival).is_room != interior.is_room:
+            log.warning(
+                "%s: taken as %s, which depends on the up direction, a guess: give --up x,y,z, or --views-from %s",
+                subject,
+                *taken,
+            )
+            return
+    if not interior.is_certain:
+        log.warning(
+            "%s: taken as %s, which is uncertain; see the contact sheet, and give --views-from %s if it is wrong",
+            subject,
+            *taken,
+        )
 
 
 @dataclass(frozen=True)

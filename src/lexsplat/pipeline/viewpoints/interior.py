@@ -27,26 +27,30 @@ Side = Literal["auto", "inside", "around"]
 _DRAWN = 0.9
 """Least share of the pixels all around a closed place that are drawn: doors and windows are holes."""
 _CLEAR = 0.2
-"""Least share of surfaces all around a closed place: between the things of a hazy capture it is .13 in the middle,
-and .20 at most."""
-_ENCLOSED = 0.6
-"""Least share of closed places among the free ones of a room,"""
-_PARTLY = 0.3
-"""and share above which it may be a room."""
+"""Least share of surfaces all around a closed place; others are hazy: between the things of a hazy capture it is .13
+in the middle, and .20 at most."""
+_ENCLOSED = 0.4
+"""Least share of closed places among the free ones of a room: the corners of its box may be outside,"""
+_MOSTLY = 0.6
+"""share above which that is certain,"""
+_PARTLY = 0.1
+"""and share of closed and hazy places above which what is no room might be one."""
 _LEVELS = (0.3, 0.85)
 """Heights, relative to that of the scene, that are looked at, too, where it is closed at eye height: what has legs
 and a neck is open there."""
 _DEEP = 0.1
-"""Things are this far within the hull of what a place shows, relative to the height of the scene."""
+"""Things are this far within the hull of what a place shows, relative to the smaller one of the height of the scene
+and the middle distance of what is seen."""
 _NEAR = 0.05
-"""Things are this close to solid points, relative to the height of the scene; floaters are not."""
-_THINGS = 0.008
-"""Least share of things in what is seen from the places of a room: it is 0.014 for two balls on the floor,"""
-_HARDLY = 0.003
-"""and share above which it may be a room; an empty shell has 0."""
+"""Things are this close to solid points, relative to the same; floaters are not."""
+_THINGS = 0.004
+"""Least share of things in what is seen from the places of a room; an empty shell has 0,"""
+_CERTAINLY = 0.012
+"""and share above which it is certain."""
 _LONELY = 3.0
 """Lonely Gaussians are this many times farther from their neighbors than usual, whatever their size."""
 _NEIGHBORS = 12
+_FEW_PLACES = 10
 _POINTS = 3000
 """Points of what a place shows, at most."""
 
@@ -59,12 +63,14 @@ class Interior:
         places: Number of free places.
         enclosed: Share of those that are closed all around, in 0..1.
         things: Share of what closed places show that stands free of the shell around them, in 0..1.
+        hazy: Share of the places around which something is drawn everywhere that is no clear surface.
         side: What the user says; "auto" leaves it to the shares.
     """
 
     places: int
     enclosed: float
     things: float
+    hazy: float = 0.0
     side: Side = "auto"
 
     @property
@@ -81,12 +87,30 @@ class Interior:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the user says it, or both shares are far from where the answer changes."""
+        """Whether the user says it, or the evidence is clear.
+
+        It is for a closed place with things in it, and for free places that are hardly ever closed. A closed shell
+        without things may be an empty room, and where there is no free place, nothing is known.
+        """
         if self.side != "auto":
             return True
         if self.is_room:
-            return self.things >= 1.2 * _THINGS
-        return self.enclosed < _PARTLY or self.things < _HARDLY
+            return self.enclosed >= _MOSTLY and self.things >= _CERTAINLY
+        return self.places > 0 and self.enclosed + self.hazy < _PARTLY
+
+
+@torch.no_grad()
+def examine_inside(gaussians: Gaussians, found: Surroundings) -> Interior:
+    """Examine the inside of a scene from a part of its free places."""
+    places = free_places(without_lonely_points(found))
+    cameras = [
+        camera
+        for place in places[:: -(-len(places) // _FEW_PLACES) or 1]
+        for camera in all_around(place, found, SMALL)
+    ]
+    looks = [look(gaussians, camera) for camera in cameras]
+    qualities = np.array([clear for _, clear in looks], np.float32)
+    return examine(gaussians, found, cameras, [depth for depth, _ in looks], qualities)
 
 
 @torch.no_grad()
@@ -97,9 +121,10 @@ def examine(
     depths: list[Image],
     qualities: NDArray[np.float32],
 ) -> Interior:
-    """Examine the inside of a scene, and again without lonely Gaussians if it is neither a room nor empty.
+    """Examine the inside of a scene, and again without floaters if it is hazy.
 
-    Floaters fill a room like haze; the space above a table has walls of haze only.
+    Floaters fill a room like haze; the space above a table has walls of haze only. Lonely Gaussians are left out, and
+    the others reach no farther than to their neighbors.
 
     Args:
         gaussians: The scene.
@@ -109,15 +134,23 @@ def examine(
         qualities: Share of surfaces in each.
     """
     result = _examined(gaussians, found, cameras, depths, qualities)
-    empty = result.enclosed >= _ENCLOSED and result.things < _HARDLY
-    if result.is_room or empty or not cameras:
+    if result.is_room or not result.hazy:
         return result
-    sociable = isolation(gaussians)[0] < _LONELY
-    rest = gaussians.select(torch.from_numpy(np.flatnonzero(sociable)).to(gaussians.device))
+    rest = _without_floaters(gaussians)
     looks = [look(rest, camera) for camera in cameras]
     shares = np.array([clear for _, clear in looks], np.float32)
     without = _examined(rest, found, cameras, [depth for depth, _ in looks], shares)
     return without if without.is_room else result
+
+
+def _without_floaters(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians that are not lonely, none larger than the distance of its neighbors."""
+    relative, own = isolation(gaussians)
+    radii = np.sort(gaussians.scales.detach().cpu().double().numpy(), axis=1)[:, 1]
+    sociable = torch.from_numpy(np.flatnonzero(relative < _LONELY)).to(gaussians.device)
+    rest = gaussians.select(sociable)
+    reach = torch.from_numpy(np.log(np.maximum(own * radii, 1e-12))).to(rest.log_scales)[sociable]
+    return replace(rest, log_scales=torch.minimum(rest.log_scales, reach[:, None]))
 
 
 def without_lonely_points(found: Surroundings) -> Surroundings:
@@ -135,14 +168,18 @@ def _examined(
     qualities: NDArray[np.float32],
 ) -> Interior:
     found = without_lonely_points(found)
-    closed, things = [], []
+    closed, hazy, things = [], [], []
     for first in range(0, len(cameras), TURNS):
         views = slice(first, first + TURNS)
-        closed.append(_is_closed(depths[views]) and float(qualities[views].mean()) >= _CLEAR)
+        drawn, clear = _is_closed(depths[views]), float(qualities[views].mean()) >= _CLEAR
+        closed.append(drawn and clear)
+        hazy.append(drawn and not clear)
         if closed[-1]:
             things.append(_share_of_things(cameras[views], depths[views], found))
+    if not closed:
+        return Interior(0, 0.0, 0.0)
     result = Interior(
-        len(closed), float(np.mean(closed)) if closed else 0.0, float(np.median(things)) if things else 0.0
+        len(closed), float(np.mean(closed)), float(np.median(things)) if things else 0.0, float(np.mean(hazy))
     )
     if not result.is_room:
         return result
@@ -150,7 +187,7 @@ def _examined(
         for place in free_places(found, level):
             around = all_around(place, found, SMALL)[::2]
             closed.append(_is_closed([look(gaussians, camera)[0] for camera in around]))
-    return Interior(result.places, float(np.mean(closed)), result.things)
+    return replace(result, enclosed=float(np.mean(closed)))
 
 
 def _is_closed(depths: list[Image]) -> bool:
@@ -161,13 +198,16 @@ def _share_of_things(cameras: list[Camera], depths: list[Image], found: Surround
     """Share of what is seen from a place that lies deep within the convex hull of all that is seen from it."""
     points = np.concatenate([_seen_points(camera, depth) for camera, depth in zip(cameras, depths)])
     points = points[:: max(1, len(points) // _POINTS)]
-    points = points[found.tree.query(points)[0] < _NEAR * found.height]
+    if not len(points):
+        return 0.0
+    size = min(found.height, float(np.median(np.linalg.norm(points - cameras[0].position, axis=1))))
+    points = points[found.tree.query(points)[0] < _NEAR * size]
     try:
         planes = ConvexHull(points).equations
     except (QhullError, ValueError):  # hardly a point, or all in one plane
         return 0.0
     depth = -(points @ planes[:, :3].T + planes[:, 3]).max(1)
-    return float((depth > _DEEP * found.height).mean())
+    return float((depth > _DEEP * size).mean())
 
 
 def _seen_points(camera: Camera, depth: Image) -> NDArray[np.float64]:

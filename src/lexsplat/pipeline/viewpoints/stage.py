@@ -33,7 +33,7 @@ _MANY_UNSEEN = 0.1
 """Share of the visible Gaussians above which those in no view are a warning."""
 _FLOATERS = "floaters.npy"
 """Indices of the Gaussians of the file that are left out, beside the chosen views."""
-_RULES = 4
+_RULES = 5
 """Changes where other views would be chosen, or other Gaussians left out, of the same file."""
 
 
@@ -65,6 +65,9 @@ def capture_of_splats(
         with _kept_warnings() as warnings:
             facts = _choose(splats, poses, config, device, listener)
         folder.finish("views", key, time.perf_counter() - start, **facts, warnings=warnings)
+    else:
+        for warning in folder.record["stages"]["views"].get("warnings", ()):
+            log.warning("%s", warning)
     folder.record["images"] = "poses/images"
     folder.record["capture"] = None
     return load_capture(poses, test_every=0)

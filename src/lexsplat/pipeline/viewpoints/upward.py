@@ -1,0 +1,211 @@
+"""Which way is up in a scene without cameras: a ground lies there, and things stand on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from lexsplat.geometry.boxes import upright_frame
+
+_NEIGHBORS = 12
+_CONVENTIONS = ((0, 0, 1), (0, 1, 0), (0, -1, 0))
+"""Up directions of files that follow a convention: z up, y up (glTF), y down (COLMAP)."""
+_TILTED = math.cos(math.radians(15))
+_ALIGNED = math.cos(math.radians(10))
+LOW = 0.05
+"""Share of the points below the ground, where nobody has looked and nothing is as it seems."""
+_GROUND_HEIGHT = 0.08
+"""Half the height of the slab in which a ground lies, relative to the height of the scene."""
+_GROUND_CELLS = 24
+"""Cells along the longer side of the scene in which the ground is counted."""
+_WITHIN = 0.04
+"""Things are this far within the convex hull of a scene, relative to its diagonal."""
+_LINK = 2.0
+"""Points of one thing are this near to each other, relative to the usual distance of twelve neighbors."""
+_FEWEST_OF_A_THING = 20
+_LEAD = 0.15
+"""Difference of the scores of two up directions by which one is certain,"""
+_GROUND = 0.25
+"""if a ground lies under this share of the scene as seen from above: under a thing alone there is none,"""
+_WALL = 0.5
+"""and if, where another side has this share and may be a wall or the ground,"""
+_STANDING = 0.5
+"""this share of the things stand on the ground,"""
+_RIVAL = 0.6
+"""and less than this part of it on the wall."""
+_SAME = math.cos(math.radians(20))
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class UpwardDirections:
+    """Directions that may be up ``[D, 3]``, the best one first, with scores ``[D]``.
+
+    Args:
+        directions: Unit vectors, more than 20 degrees apart.
+        scores: How likely each is up; only differences mean something.
+        grounds: Share of the scene under which a ground lies ``[D]``.
+        reliable: Whether the first one is up; else it is a guess.
+    """
+
+    directions: Points
+    scores: Points
+    grounds: Points
+    reliable: bool
+
+    def rivals(self) -> Points:
+        """The other directions that are nearly as likely, of which walls make some ``[d, 3]``."""
+        return self.directions[1:][self.scores[1:] > self.scores[0] - 2 * _LEAD]
+
+    def contradict(self, up: Points) -> bool:
+        """Whether the first one is far from a direction that is much less likely; if not reliable, a guess."""
+        if up @ self.directions[0] >= 0.7 * np.linalg.norm(up):
+            return False
+        near = self.directions @ up > _SAME * np.linalg.norm(up)
+        unlikely = not near.any() or self.scores[near].max() < self.scores[0] - 2 * _LEAD
+        return self.reliable or bool(unlikely and self.grounds[0] > _GROUND)
+
+
+def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirections:
+    """Find the directions that may be up.
+
+    Args:
+        points: Solid points ``[M, 3]`` of the middle of the scene.
+        look: How much the splat looks like surfaces from above, in 0..1, if a direction is up.
+    """
+    candidates = up_candidates(points)
+    directions = np.stack([direction for direction, _ in candidates])
+    grounds = np.array([ground_share(points, direction) for direction in directions])
+    standing = standing_shares(points, directions)
+    scores = np.array([score + look(direction) for direction, score in candidates])
+    scores += np.where(
+        grounds > _WALL, standing * grounds, 0
+    )  # elsewhere there are no walls to tell from a floor
+    kept: list[int] = []
+    for index in np.argsort(-scores, kind="stable"):
+        if not kept or (directions[kept] @ directions[index]).max() < _SAME:
+            kept.append(int(index))
+    best, others = kept[0], np.array(kept[1:])
+    walls = others[grounds[others] > _WALL]
+    reliable = scores[best] - scores[others].max() > _LEAD and grounds[best] > _GROUND
+    if len(walls):
+        rival = float(standing[walls].max())
+        reliable &= bool(standing[best] >= _STANDING and rival < _RIVAL * standing[best])
+    return UpwardDirections(directions[kept], scores[kept], grounds[kept], bool(reliable))
+
+
+def standing_shares(points: Points, directions: Points) -> Points:
+    """Share of the things of a scene that touch its lowest side, less that at its highest ``[D]``, in 0..1.
+
+    Things stand on the floor of a room, and few touch the ceiling. Only some touch a wall, or what is between two
+    walls touches both.
+
+    Args:
+        points: Solid points ``[M, 3]`` of the middle of the scene.
+        directions: Up directions ``[D, 3]``, of unit length.
+    """
+    link = _LINK * float(np.median(cKDTree(points).query(points, k=_NEIGHBORS)[0][:, -1]))
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    deep = max(_WITHIN * float(np.linalg.norm(high - low)), link / 2)
+    try:
+        hull = ConvexHull(points).equations
+    except (QhullError, ValueError):  # all in one plane
+        return np.zeros(len(directions))
+    inner = points[-(points @ hull[:, :3].T + hull[:, 3]).max(1) > deep]
+    if len(inner) < _FEWEST_OF_A_THING:
+        return np.zeros(len(directions))
+    pairs = cKDTree(inner).query_pairs(link, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(inner), len(inner)))
+    _, labels = connected_components(graph, directed=False)
+    sizes = np.bincount(labels)
+    things = np.flatnonzero(sizes >= _FEWEST_OF_A_THING)
+    shares = []
+    for direction in np.concatenate([directions, -directions]):
+        lowest = np.full(len(sizes), np.inf)
+        np.minimum.at(lowest, labels, inner @ direction)
+        standing = lowest[things] < np.quantile(points @ direction, 0.02) + deep + link
+        shares.append(float(sizes[things][standing].sum()) / max(int(sizes[things].sum()), 1))
+    touching = np.array(shares).reshape(2, -1)
+    return np.maximum(touching[0] - touching[1], 0)
+
+
+def _normals(neighborhoods: NDArray) -> tuple[Points, Points]:
+    """Unit normals ``[M, 3]`` of neighborhoods ``[M, k, 3]``, and how flat they are ``[M]`` in 0..1."""
+    offsets = neighborhoods - neighborhoods.mean(1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
+    return vectors[:, :, 0], 1 - np.clip(values[:, 0] / np.maximum(values[:, 1], 1e-12), 0, 1)
+
+
+def up_candidates(points: Points) -> list[tuple[Points, float]]:
+    """Directions that may be up, with scores.
+
+    They are the normals of the largest planes, either way, and the directions of the usual conventions. A direction
+    scores by the area of surfaces across it in the lower third of the scene, less that in the upper third; by what
+    stands above them; by how low the points lie; and a little by convention.
+
+    Args:
+        points: Solid points ``[M, 3]`` of the middle of the scene.
+    """
+    distances, neighbors = cKDTree(points).query(points, k=_NEIGHBORS)
+    normals, flatness = _normals(points[neighbors])
+    reach = distances[:, -1]
+    areas = np.minimum(reach, 3 * np.median(reach)) ** 2 * flatness
+    shares = areas / max(float(areas.sum()), 1e-300)
+    candidates = [np.array(axis, float) for axis in _CONVENTIONS]
+    left = shares.copy()
+    for _ in range(3):
+        tried = normals[np.argsort(-left, kind="stable")[:: max(1, len(left) // 200)]]
+        support = (np.abs(normals @ tried.T) > _ALIGNED).T @ left
+        first = tried[int(support.argmax())]
+        near = np.abs(normals @ first) > _ALIGNED
+        mean = (normals[near] * np.sign(normals[near] @ first)[:, None] * left[near, None]).sum(0)
+        if np.linalg.norm(mean) < 1e-12:
+            break
+        candidates += [mean / np.linalg.norm(mean), -mean / np.linalg.norm(mean)]
+        left = np.where(near, 0, left)
+    return [(candidate, _up_score(points, normals, shares, candidate)) for candidate in candidates]
+
+
+def _up_score(points: Points, normals: Points, shares: Points, up: Points) -> float:
+    heights = points @ up
+    low, high = np.quantile(heights, [LOW, 1 - LOW])
+    level = (heights - low) / max(high - low, 1e-12)
+    across = np.where(np.abs(normals @ up) > _TILTED, shares, 0)
+    floor = float(across[level < 0.33].sum() - across[level > 0.67].sum())
+    standing = float(((level > 0.33) & (level < 0.67)).mean() - (level > 0.67).mean())
+    lying = 0.5 - float(np.median(level))
+    usual = max(float(up @ np.array(axis)) for axis in _CONVENTIONS)
+    return floor + 0.5 * standing + lying + (0.2 if usual > math.cos(math.radians(20)) else 0.0)
+
+
+def ground_share(points: Points, up: Points) -> float:
+    """Share of a scene, as seen from above, under which a level ground lies, in 0..1.
+
+    The ground is the slab in the lower third that holds most pieces of surface across the up direction.
+
+    Args:
+        points: Solid points ``[M, 3]`` of the middle of the scene.
+        up: The up direction ``[3]``, of unit length.
+    """
+    normals, flatness = _normals(points[cKDTree(points).query(points, k=_NEIGHBORS)[1]])
+    heights = points @ up
+    low, high = np.quantile(heights, [LOW, 1 - LOW])
+    level = (np.abs(normals @ up) > _TILTED) & (flatness > 0.5) & (heights < low + (high - low) / 3)
+    half = _GROUND_HEIGHT * (high - low)
+    if not level.any() or half <= 0:
+        return 0.0
+    counts, edges = np.histogram(heights[level], max(1, math.ceil(float(np.ptp(heights[level])) / half)))
+    middle = edges[counts.argmax()] + half / 2
+    footprint = points @ np.stack(upright_frame(up)[:2]).T
+    first, last = np.quantile(footprint, [0.02, 0.98], axis=0)
+    cells = np.floor((footprint - first) / max(float((last - first).max()) / _GROUND_CELLS, 1e-300))
+    ground = level & (np.abs(heights - middle) < half)
+    return len(np.unique(cells[ground], axis=0)) / len(np.unique(cells, axis=0))
