@@ -16,7 +16,8 @@ from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.viewpoints import choosing
 from lexsplat.pipeline.viewpoints.looking import look_from_above
-from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings, ground_share
+from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
+from lexsplat.pipeline.viewpoints.upward import ground_share
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.ply import write_ply
@@ -104,11 +105,11 @@ def test_a_scene_as_small_as_the_near_plane_is_refused_with_a_remedy():
     table = on_table() - [0, 0, 0.1]
     with pytest.raises(CaptureError) as caught:
         surroundings(solid(table * 1e-3))
-    assert "expected a scene with a radius of at least 0.015 units, found 0.0011" in str(caught.value)
+    assert "expected a scene with a radius of at least 0.05 units, found 0.0011" in str(caught.value)
     assert "scale the splats up, as does: splat-transform thing.ply --scale 1000 scaled.ply" in str(
         caught.value
     )
-    assert surroundings(solid(table * 0.02)).whole.radius > 0.015
+    assert surroundings(solid(table * 0.1)).whole.radius > 0.05
 
 
 @pytest.mark.parametrize(

@@ -30,11 +30,13 @@ _CLEAR = 0.2
 """Least share of surfaces all around a closed place; others are hazy: between the things of a hazy capture it is .13
 in the middle, and .20 at most."""
 _ENCLOSED = 0.4
-"""Least share of closed places among the free ones of a room: the corners of its box may be outside,"""
+"""Least share of closed and hazy places among the free ones of a room: the corners of its box may be outside,"""
+_CLEARLY = 0.1
+"""of closed places alone,"""
 _MOSTLY = 0.6
-"""share above which that is certain,"""
-_PARTLY = 0.1
-"""and share of closed and hazy places above which what is no room might be one."""
+"""and of these where that is certain."""
+_PARTLY = 0.2
+"""Share of closed and hazy places above which what is no room might be one."""
 _LEVELS = (0.3, 0.85)
 """Heights, relative to that of the scene, that are looked at, too, where it is closed at eye height: what has legs
 and a neck is open there."""
@@ -78,7 +80,8 @@ class Interior:
         """Whether the scene is a room; else it is an object, or things on a table."""
         if self.side != "auto":
             return self.side == "inside"
-        return self.enclosed >= _ENCLOSED and self.things >= _THINGS
+        drawn = self.enclosed + self.hazy
+        return self.enclosed >= _CLEARLY and drawn >= _ENCLOSED and self.things >= _THINGS
 
     @property
     def is_shell(self) -> bool:
@@ -95,7 +98,7 @@ class Interior:
         if self.side != "auto":
             return True
         if self.is_room:
-            return self.enclosed >= _MOSTLY and self.things >= _CERTAINLY
+            return self.enclosed >= _MOSTLY and self.things >= _CERTAINLY and self.hazy < _ENCLOSED
         return self.places > 0 and self.enclosed + self.hazy < _PARTLY
 
 
@@ -139,8 +142,7 @@ def examine(
     rest = _without_floaters(gaussians)
     looks = [look(rest, camera) for camera in cameras]
     shares = np.array([clear for _, clear in looks], np.float32)
-    without = _examined(rest, found, cameras, [depth for depth, _ in looks], shares)
-    return without if without.is_room else result
+    return _examined(rest, found, cameras, [depth for depth, _ in looks], shares)
 
 
 def _without_floaters(gaussians: Gaussians) -> Gaussians:

@@ -34,7 +34,7 @@ _LEAD = 0.15
 """Difference of the scores of two up directions by which one is certain,"""
 _GROUND = 0.25
 """if a ground lies under this share of the scene as seen from above: under a thing alone there is none,"""
-_WALL = 0.5
+_WALL = 0.65
 """and if, where another side has this share and may be a wall or the ground,"""
 _STANDING = 0.5
 """this share of the things stand on the ground,"""
