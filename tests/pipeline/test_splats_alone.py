@@ -55,13 +55,16 @@ def surroundings(gaussians: Gaussians, up: np.ndarray | None = None) -> Surround
 
 
 @pytest.mark.slow
-def test_a_guessed_up_direction_stays_a_guess_in_the_scene_with_its_warning(tmp_path, capsys):
+def test_a_guessed_up_direction_stays_a_guess_in_the_scene_with_its_warning(tmp_path, capsys, caplog):
     """Chosen cameras are level with the guess: an estimate from them would be certain."""
     splats, output = tmp_path / "ball.ply", tmp_path / "scene"
     write_ply(solid(ball()), splats)
     config = BuildConfig(clip="bundled", dino="none", device="cpu")
     for _ in range(2):  # the second build keeps the views
-        record = build(None, output, config, until="reconstruct", splats=splats).record
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "lexsplat"):
+            record = build(None, output, config, until="reconstruct", splats=splats).record
+        assert caplog.text.count("up direction is a guess") == 1
         assert record["world"]["up"]["from"] == "splats"
         assert record["world"]["up"]["reliable"] is False
         assert any("up direction is a guess" in warning for warning in record["warnings"])

@@ -321,8 +321,8 @@ def test_every_closed_room_of_a_row_has_views(count):
     chosen = choose_views(solid(row_of_rooms(count)), up=UP)
     positions = np.stack([camera.position for camera in chosen.cameras])
     assert np.unique(positions[:, 0] // 5).tolist() == list(range(count))
-    assert chosen.visible > 0.6 * len(row_of_rooms(count))  # ceilings are above all views
-    assert chosen.unseen < 0.05 * chosen.visible
+    assert chosen.visible > 0.75 * len(row_of_rooms(count))  # ceilings are above all views
+    assert chosen.unseen < 0.1 * chosen.visible
 
 
 @pytest.mark.slow
