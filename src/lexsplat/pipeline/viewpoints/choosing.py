@@ -16,6 +16,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
 from lexsplat.pipeline.viewpoints.interior import (
     Interior,
+    Looks,
     Side,
     examine,
     examine_inside,
@@ -211,7 +212,8 @@ def _good_candidates(
             depths.append(depth)
         qualities[done - 1] = 0 if target is not None and is_hidden(depth, camera, target) else clear
         listener(Event("views", done, len(candidates)))
-    interior = replace(examine(gaussians, found, inner, depths, qualities[len(outer) :]), side=side)
+    seen_inside = Looks(inner, depths, qualities[len(outer) :])
+    interior = replace(examine(gaussians, found, seen_inside), side=side)
     cameras = [camera for camera, _ in candidates]
     allowed = _on_its_side(interior, found, cameras, len(outer))
     good = np.zeros(len(candidates), bool)

@@ -102,6 +102,29 @@ class Interior:
         return self.places > 0 and self.enclosed + self.hazy < _PARTLY
 
 
+@dataclass(frozen=True)
+class Looks:
+    """What cameras show.
+
+    Args:
+        cameras: Cameras of `candidates.inside`: as many as `TURNS` at each free place.
+        depths: Depths ``[H, W]`` of each, infinite where nothing is drawn.
+        qualities: Share of surfaces in each.
+    """
+
+    cameras: list[Camera]
+    depths: list[Image]
+    qualities: NDArray[np.float32]
+
+    @classmethod
+    def at(cls, gaussians: Gaussians, cameras: list[Camera]) -> Looks:
+        """What cameras show of Gaussians."""
+        looks = [look(gaussians, camera) for camera in cameras]
+        return cls(
+            cameras, [depth for depth, _ in looks], np.array([clear for _, clear in looks], np.float32)
+        )
+
+
 @torch.no_grad()
 def examine_inside(gaussians: Gaussians, found: Surroundings) -> Interior:
     """Examine the inside of a scene from a part of its free places."""
@@ -111,19 +134,11 @@ def examine_inside(gaussians: Gaussians, found: Surroundings) -> Interior:
         for place in places[:: -(-len(places) // _FEW_PLACES) or 1]
         for camera in all_around(place, found, SMALL)
     ]
-    looks = [look(gaussians, camera) for camera in cameras]
-    qualities = np.array([clear for _, clear in looks], np.float32)
-    return examine(gaussians, found, cameras, [depth for depth, _ in looks], qualities)
+    return examine(gaussians, found, Looks.at(gaussians, cameras))
 
 
 @torch.no_grad()
-def examine(
-    gaussians: Gaussians,
-    found: Surroundings,
-    cameras: list[Camera],
-    depths: list[Image],
-    qualities: NDArray[np.float32],
-) -> Interior:
+def examine(gaussians: Gaussians, found: Surroundings, looks: Looks) -> Interior:
     """Examine the inside of a scene, and again without floaters if it is hazy.
 
     Floaters fill a room like haze; the space above a table has walls of haze only. Lonely Gaussians are left out, and
@@ -132,17 +147,13 @@ def examine(
     Args:
         gaussians: The scene.
         found: Its surroundings.
-        cameras: Cameras of `candidates.inside`: as many as `TURNS` at each free place.
-        depths: What they show, ``[H, W]`` each, infinite where nothing is drawn.
-        qualities: Share of surfaces in each.
+        looks: What its free places show.
     """
-    result = _examined(gaussians, found, cameras, depths, qualities)
+    result = _examined(gaussians, found, looks)
     if result.is_room or not result.hazy:
         return result
     rest = _without_floaters(gaussians)
-    looks = [look(rest, camera) for camera in cameras]
-    shares = np.array([clear for _, clear in looks], np.float32)
-    return _examined(rest, found, cameras, [depth for depth, _ in looks], shares)
+    return _examined(rest, found, Looks.at(rest, looks.cameras))
 
 
 def _without_floaters(gaussians: Gaussians) -> Gaussians:
@@ -162,22 +173,16 @@ def without_lonely_points(found: Surroundings) -> Surroundings:
     return replace(found, tree=cKDTree(points[apart < _LONELY * np.median(apart)]))
 
 
-def _examined(
-    gaussians: Gaussians,
-    found: Surroundings,
-    cameras: list[Camera],
-    depths: list[Image],
-    qualities: NDArray[np.float32],
-) -> Interior:
+def _examined(gaussians: Gaussians, found: Surroundings, looks: Looks) -> Interior:
     found = without_lonely_points(found)
     closed, hazy, things = [], [], []
-    for first in range(0, len(cameras), TURNS):
+    for first in range(0, len(looks.cameras), TURNS):
         views = slice(first, first + TURNS)
-        drawn, clear = _is_closed(depths[views]), float(qualities[views].mean()) >= _CLEAR
+        drawn, clear = _is_closed(looks.depths[views]), float(looks.qualities[views].mean()) >= _CLEAR
         closed.append(drawn and clear)
         hazy.append(drawn and not clear)
         if closed[-1]:
-            things.append(_share_of_things(cameras[views], depths[views], found))
+            things.append(_share_of_things(looks.cameras[views], looks.depths[views], found))
     if not closed:
         return Interior(0, 0.0, 0.0)
     result = Interior(
