@@ -39,7 +39,7 @@ def read_scene(path: Path, device: str) -> SceneContent:
     """The scene in a folder, or its previous version while it is being rebuilt.
 
     Raises:
-        SceneFolderError: If there is neither.
+        SceneFolderError: If there is neither, or builds change it faster than it is read.
         FileFormatError: If a file is damaged.
     """
     attempts = 0
@@ -49,9 +49,16 @@ def read_scene(path: Path, device: str) -> SceneContent:
         try:
             kept = previous_of(folder) if folder.record.get("building") else None
             return _read_content(kept or folder, device)
-        except (SceneFolderError, FileFormatError):
-            if attempts == _ATTEMPTS or _state(SceneFolder.open(path)) == _state(folder):
+        except (SceneFolderError, FileFormatError) as error:
+            if _state(SceneFolder.open(path)) == _state(folder):
                 raise
+            if attempts == _ATTEMPTS:  # what is missing or half there is so because of the builds
+                raise SceneFolderError(
+                    path,
+                    expected="a scene that rests for the time of reading it",
+                    found=f"builds that changed it {_ATTEMPTS} times",
+                    remedy="ask again when they are done",
+                ) from error
 
 
 def _state(folder: SceneFolder) -> tuple[Any, Any]:
