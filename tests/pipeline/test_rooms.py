@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.splats import solid
 
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 from lexsplat.geometry.rotations import rotation_about
@@ -32,14 +33,6 @@ def box(low, high, count: int, seed: int, sides=ALL) -> np.ndarray:
     points = generator.uniform(0, 1, (count, 3))
     points[np.arange(count), chosen // 2] = chosen % 2
     return np.asarray(low) + points * sizes
-
-
-def solid(points: np.ndarray) -> Gaussians:
-    """Opaque Gaussians that close the gaps between points."""
-    colors = np.random.default_rng(0).uniform(0, 1, points.shape)
-    made = gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
-    made.log_scales -= 0.1
-    return made
 
 
 def furniture() -> np.ndarray:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support import splats as made
 from support.schemas import validated
 
 from lexsplat import cli
@@ -25,18 +27,13 @@ from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.scale import store_world
 
 UP = np.array([0.0, 0.0, 1.0])
+solid = partial(made.solid, log_size=0.0)
 
 
 @pytest.fixture(autouse=True)
 def _few_candidates(monkeypatch):
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
-
-
-def solid(points: np.ndarray) -> Gaussians:
-    """Opaque Gaussians that close the gaps between points."""
-    colors = np.random.default_rng(0).uniform(0, 1, points.shape)
-    return gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
 
 
 def ball(radius: float = 1.0, count: int = 3000) -> np.ndarray:

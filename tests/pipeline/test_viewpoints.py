@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from support.splats import solid
 
 from lexsplat.captures import load_capture
 from lexsplat.geometry.cameras import look_at
@@ -33,14 +34,6 @@ UP = np.array([0.0, 0.0, 1.0])
 def _few_candidates(monkeypatch):
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
-
-
-def solid(points: np.ndarray) -> Gaussians:
-    """Opaque Gaussians that close the gaps between points."""
-    colors = np.random.default_rng(0).uniform(0, 1, points.shape)
-    made = gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
-    made.log_scales -= 0.1
-    return made
 
 
 def on_sphere(center, radius: float, count: int, seed: int) -> np.ndarray:

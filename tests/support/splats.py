@@ -1,10 +1,11 @@
-"""Random Gaussians for tests of file formats."""
+"""Gaussians for tests of file formats and of chosen views."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 
 
 def make(count: int, degree: int, seed: int = 0, antialiased: bool = False) -> Gaussians:
@@ -55,3 +56,11 @@ def largest_differences(expected: Gaussians, found: Gaussians) -> dict[str, floa
         "shN": (expected.shN, found.shN), "rotations": ((a * b).sum(1).abs(), torch.ones(len(a))),
     }  # fmt: skip
     return {name: float((x - y).abs().max()) if x.numel() else 0.0 for name, (x, y) in pairs.items()}
+
+
+def solid(points: np.ndarray, log_size: float = -0.1) -> Gaussians:
+    """Opaque Gaussians that close the gaps between points."""
+    colors = np.random.default_rng(0).uniform(0, 1, points.shape)
+    made = gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
+    made.log_scales += log_size
+    return made

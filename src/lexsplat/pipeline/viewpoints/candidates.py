@@ -143,7 +143,7 @@ def _free_spans(surroundings: Surroundings, level: float) -> tuple[Points, Point
 
 
 def _spread(places: Points, distances: Points, rooms: Points) -> list[Points]:
-    """The freest place, and again and again the one that is farthest from those taken."""
+    """Places that are far from each other: the freest one first, then always the one farthest from those taken."""
     chosen = [int(distances.argmax())]
     nearest = np.full(len(places), np.inf)
     while len(chosen) < _MOST_PLACES:

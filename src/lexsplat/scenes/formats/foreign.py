@@ -49,7 +49,7 @@ class Damage(ValueError):
 
 
 def reason(error: Exception) -> str:
-    """What a file's user is told of an error that its content caused: Python's own texts say nothing to them."""
+    """An error from reading damaged content, in words for the user; Python's own texts are left out."""
     text = ""
     if isinstance(error, Damage):
         text = str(error)
