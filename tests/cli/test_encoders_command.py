@@ -17,6 +17,8 @@ from lexsplat.features.estimate import Estimate, count_crops, estimate
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.errors import ModelError
 
+pytestmark = pytest.mark.slow
+
 SCHEMA = Path(__file__).parents[2] / "docs" / "schemas" / "encoders.json"
 
 
@@ -25,7 +27,6 @@ def one_measurement(monkeypatch):
     monkeypatch.setattr("lexsplat.features.estimate._SHORT", 0.0)
 
 
-@pytest.mark.slow
 def test_the_answer_has_its_schema_and_the_time_of_the_capture(tiny_capture, capsys):
     words = ["encoders", "--clip", "bundled", "--dino", "bundled", "--capture", str(tiny_capture), "--json"]
     assert cli.main(words) == 0
@@ -70,7 +71,6 @@ def test_towers_of_different_sizes_and_blind_towers_are_refused(monkeypatch):
         checks.check_dense(dino)
 
 
-@pytest.mark.slow
 def test_the_estimate_counts_the_crops_that_extraction_encodes(tiny_capture, tmp_path):
     from lexsplat.features import extract_features
 

@@ -13,6 +13,8 @@ from support.schemas import validated
 
 from lexsplat import cli
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):

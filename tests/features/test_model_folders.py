@@ -18,7 +18,7 @@ from lexsplat.features import hub
 from lexsplat.features.encoders import load_clip, load_dino
 from lexsplat.runtime.errors import ModelError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
 

@@ -10,7 +10,10 @@ import pytest
 from support.hostile import READERS
 from support.hostile.running import interrupt, run_reader
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory limit needs Linux"),
+]
 
 SLOW = ("compressed_ply", "ksplat")  # each input starts a process
 NAMES = [name for name, make in READERS.items() if make.__module__.endswith(".splats") and name not in SLOW]

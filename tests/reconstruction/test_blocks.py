@@ -28,7 +28,8 @@ from lexsplat.reconstruction.blocks import (
     side_by_side,
 )
 from lexsplat.reconstruction.settings import ReconstructionConfig
-from lexsplat.reconstruction.surroundings import Surroundings, shares_in_images, sizes_in_images
+from lexsplat.reconstruction.surroundings import Surroundings, shares_in_images
+from lexsplat.reconstruction.surroundings_kernels import largest_shares
 from lexsplat.runtime.errors import CaptureError, MemoryBudgetError, WorkersError
 from lexsplat.runtime.workers import open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -233,7 +234,8 @@ def test_gaussians_that_reach_into_an_image_have_a_size_in_it(capture):
     surface = np.random.default_rng(1).normal(size=(2000, 3))
     surface /= np.linalg.norm(surface, axis=1, keepdims=True)
     radius = 0.7
-    found = sizes_in_images([camera], places, np.full(500, radius / 3, np.float32))[0] > 0
+    extents = np.column_stack([places, np.full((500, 2), radius / 3)]).astype(np.float32)
+    found = shares_in_images([camera], extents)[0] > 0
     assert 0 < found.sum() < 400
     for center in local[~found]:
         x, y, z = (center + radius * surface).T
@@ -321,7 +323,22 @@ def test_gaussians_are_thinned_by_the_image_and_not_by_the_nearest_view_of_the_v
     # The same by hand: the share of a Gaussian is its area over that of one of SMALL pixels.
     expected = (50 * 0.1 / (places[:, 1] + 40.0) / surroundings.SMALL) ** 2
     extents = np.column_stack([places, np.full((4000, 2), 0.1)]).astype(np.float32)
-    np.testing.assert_allclose(shares_in_images([near, far], extents)[1], expected, rtol=1e-3)
+    shares = shares_in_images([near, far], extents)
+    np.testing.assert_allclose(shares[1], expected, rtol=1e-3)
+    images = surroundings._images([near, far])
+    assert np.array_equal(largest_shares(images, extents, surroundings.SMALL), shares.max(0))
+
+
+@pytest.mark.parametrize(("steps", "kept"), [(20, False), (60, True)])
+def test_a_visit_keeps_photos_in_memory_only_if_it_takes_them_often(capture, points, steps, kept):
+    cut = cut_blocks(capture, points.points, ground_axes(UP), 1, deal=False)
+    assert len(cut.blocks[0].views) in range(8, 20)
+    (visit,) = (visit for group in plan(cut, steps, 1) for visit in group)
+    start = CellState.untrained(Reconstructor(capture, CONFIG, points).gaussians().map(torch.clone))
+    config = dataclasses.replace(CONFIG, iterations=steps)
+    trainer = VisitReconstructor(capture, config, visit, start, None, 0)
+    trainer.step()
+    assert (trainer._images.cached_bytes > 0) == kept
 
 
 def test_blocks_that_no_view_sees_are_refused(capture):

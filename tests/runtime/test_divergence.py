@@ -22,6 +22,8 @@ from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.training import ATTEMPTS, KEEP_EVERY, DivergenceGuard, run_training
 
+pytestmark = pytest.mark.slow
+
 ITERATIONS = 60
 
 

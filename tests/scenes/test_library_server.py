@@ -23,6 +23,8 @@ from lexsplat.scenes.library import server as served_by
 from lexsplat.scenes.library.entries import Codes
 from lexsplat.scenes.library.searching import candidates
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("kitchen", "office", "lab")
 
 
@@ -68,7 +70,6 @@ def test_the_vectors_give_the_bounds_with_a_linear_offset():
     np.testing.assert_allclose(lengths[lengths < 16.1], 16.0, rtol=1e-4)
 
 
-@pytest.mark.slow
 def test_a_server_gives_the_answers_of_the_files_and_survives_its_death(rooms, chroma, tmp_path):
     library = Library.create(tmp_path / "library", index=chroma.url)
     for name in NAMES:
@@ -93,7 +94,6 @@ def test_a_server_gives_the_answers_of_the_files_and_survives_its_death(rooms, c
     assert hits(library, "candle") == hits(alone, "candle") == [("lab", "yes", pytest.approx(1.3, abs=0.2))]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", ["_delete", "_upsert", "_mark"])
 def test_a_server_that_is_killed_in_the_middle_of_adding_loses_nothing(
     rooms, chroma, tmp_path, monkeypatch, step
@@ -122,7 +122,6 @@ def test_a_server_that_is_killed_in_the_middle_of_adding_loses_nothing(
         assert hits(again, phrase) == hits(Library(library.root), phrase)
 
 
-@pytest.mark.slow
 def test_what_was_added_and_removed_without_the_server_is_noticed_and_brought_to_it(rooms, chroma, tmp_path):
     library = Library.create(tmp_path / "library", index=chroma.url)
     for name in NAMES[:2]:
@@ -140,7 +139,6 @@ def test_what_was_added_and_removed_without_the_server_is_noticed_and_brought_to
     assert (uploaded, deleted) == (0, 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("action", ["add", "remove"])
 def test_a_change_brings_to_the_server_what_it_has_missed(rooms, chroma, tmp_path, action):
     alone = Library.create(tmp_path / "library")
@@ -152,7 +150,6 @@ def test_a_change_brings_to_the_server_what_it_has_missed(rooms, chroma, tmp_pat
         assert hits(library, phrase) == hits(alone, phrase)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("lost", ["a code", "a collection"])
 def test_a_server_that_has_lost_something_is_refused_until_it_is_mended(rooms, chroma, tmp_path, lost):
     library = Library.create(tmp_path / "library", index=chroma.url)
@@ -174,7 +171,6 @@ def test_a_server_that_has_lost_something_is_refused_until_it_is_mended(rooms, c
     assert hits(library, "mug") == hits(Library(library.root), "mug")
 
 
-@pytest.mark.slow
 def test_scenes_beyond_the_proposals_are_counted_where_they_may_hold_the_thing(
     rooms, chroma, tmp_path, monkeypatch
 ):
@@ -192,7 +188,6 @@ def test_scenes_beyond_the_proposals_are_counted_where_they_may_hold_the_thing(
     assert (found.hits, found.unopened) == ((), 0)
 
 
-@pytest.mark.slow
 def test_two_libraries_share_a_server_and_stay_apart(rooms, chroma, tmp_path):
     first, second = (Library.create(tmp_path / name, index=chroma.url) for name in ("first", "second"))
     first.add(rooms / "kitchen")
@@ -201,7 +196,6 @@ def test_two_libraries_share_a_server_and_stay_apart(rooms, chroma, tmp_path):
     assert hits(second, "mug") == []
 
 
-@pytest.mark.slow
 def test_the_server_recalls_the_ten_best_of_two_thousand_mixed_scenes(chroma, tmp_path):
     library = mixed_library(tmp_path / "library", 2000, 8, 64)
     served = Library(library.root, index=chroma.url)

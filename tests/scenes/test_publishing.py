@@ -23,6 +23,8 @@ from lexsplat.scenes.formats.sog import read_sog
 from lexsplat.scenes.publishing import PublishOptions, publish, sidecar, splat_file, vocabulary
 from lexsplat.scenes.publishing.manifest import FORMAT
 
+pytestmark = pytest.mark.slow
+
 WEB = Path(__file__).parents[2] / "web"
 BUNDLE = Path(publishing.__file__).parent / "page"
 
@@ -273,14 +275,12 @@ def _npx(*arguments: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
 def test_the_bundle_is_what_its_source_gives(tmp_path):
     _npx("node", "build.mjs", str(tmp_path))
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (BUNDLE / path.name).read_bytes(), path.name
 
 
-@pytest.mark.slow
 def test_the_source_of_the_page_passes_the_type_checker_and_the_linter():
     _npx("npm", "run", "--silent", "check")
 

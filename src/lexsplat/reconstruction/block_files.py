@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import TENSORS, Gaussians
@@ -221,6 +222,20 @@ class CellFiles:
         tensors = {f"{c}/{name}": t for c, state in cells.items() for name, t in state.tensors().items()}
         write_tensors(self.path(visit), {**tensors, **(others or {})}, {})
 
+    def write_start(self, gaussians: Gaussians, cells: NDArray[np.int64]) -> None:
+        """Write the state before the first visit: no moments and statistics yet, which would be zeros.
+
+        Args:
+            gaussians: Those of the whole.
+            cells: The cell of each ``[N]``.
+        """
+        tensors = {
+            f"{cell}/parameters/{name}": tensor[torch.from_numpy(cells == cell)]
+            for name, tensor in gaussians.tensors().items()
+            for cell in range(self._count)
+        }
+        write_tensors(self.path(-1), tensors, {})
+
     def read(self, visit: int, prefix: str) -> dict[str, Tensor]:
         """The tensors of a visit's file whose names start with ``prefix``, without it.
 
@@ -244,13 +259,18 @@ class CellFiles:
 
     def cell(self, visit: int, cell: int) -> CellState:
         """The state of a cell after a visit."""
+        if visit < 0:
+            return CellState.untrained(self.gaussians(visit, cell, antialiased=False))
         return CellState.of_tensors(self.read(visit, f"{cell}/"))
 
     def all_statistics(self, groups: int) -> list[tuple[Tensor, Tensor]]:
         """Sums of gradients and numbers of views ``[N]`` of each cell, after ``groups`` groups of visits."""
-        latest = self.latest(groups)
-        found = [self.read(latest[str(cell)][0], f"{cell}/statistics/") for cell in range(self._count)]
-        return [(each["grad2d"], each["count"]) for each in found]
+        found, latest = [], self.latest(groups)
+        for cell in range(self._count):
+            visit = latest[str(cell)][0]
+            each = self.cell(visit, cell).statistics if visit < 0 else self.read(visit, f"{cell}/statistics/")
+            found.append((each["grad2d"], each["count"]))
+        return found
 
     def room(self, number: int) -> tuple[int, ...] | None:
         """What `write_room` wrote for a round; None if nothing."""

@@ -62,6 +62,8 @@ FEWEST_STEPS = 4
 """Steps of a visit at least; short trainings have fewer rounds."""
 FIXED_BYTES = 1_000
 """Bytes per Gaussian that takes part with fixed values: its values, a copy beside the trained ones, a gradient."""
+WORTH_CACHING = 3
+"""Steps for each view of a visit from which photos are kept in memory; below, most would be read only once."""
 CALM = (0.7, 0.1)
 """From the first share of the iterations on, all learning rates fall, exponentially, to the second share of them at
 the end: the views of the last visits would otherwise count for more than the others."""
@@ -119,6 +121,7 @@ class VisitReconstructor(Reconstructor):
         state: The Gaussians that are trained, as they are before it.
         around: Gaussians that take part with fixed values; None if there are none.
         seed: Seed of the whole training.
+        photos: Folder that keeps reduced photos for the next visit (`TrainingImages`).
         options: Device, memory and the extent of the whole capture, as in `Reconstructor`.
     """
 
@@ -130,6 +133,8 @@ class VisitReconstructor(Reconstructor):
         state: CellState,
         around: Surroundings | None,
         seed: int,
+        *,
+        photos: Path | None = None,
         **options: Any,
     ) -> None:
         self._visit, self._state, self._order_of_views = visit, state, visit.views(seed)
@@ -137,6 +142,9 @@ class VisitReconstructor(Reconstructor):
         config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
         own = _seed(seed, visit.number)
         super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
+        self._photo_folder = photos
+        if len(self._order_of_views) < WORTH_CACHING * len(set(self._order_of_views)):
+            self._photo_bytes = 0
         self._around = None if around is None else around.to(self.device)
         self.steps_done = visit.start
         self.rate_factor = 1.0  # sets the learning rates of this step
@@ -291,8 +299,9 @@ def _write_start(
     generator = torch.Generator().manual_seed(run.seed)
     config = replace(config, max_gaussians=config.cap(torch.device(run.device)))
     gaussians = initial_gaussians(config, points, torch.device("cpu"), generator)
-    state, cells = CellState.untrained(gaussians), blocks.cells_of(gaussians.means.numpy())
-    files.write(-1, {n: state.select(torch.from_numpy(cells == n)) for n in range(len(blocks.cells))})
+    files.write_start(gaussians, blocks.cells_of(gaussians.means.numpy()))
+    del gaussians
+    budget.give_back_freed()
 
 
 def _room(
@@ -357,8 +366,9 @@ def _trained(shared: _Shared, visit: Visit) -> int:
     own = {name: shared.capture.views[name] for name in block.views}
     part = replace(shared.capture, views=own, train_names=block.views, test_names=())
     options = {"device": run.device, "memory": run.memory, "extent": shared.extent}
-    trainer = VisitReconstructor(part, shared.config, visit, state, around, run.seed, **options)
-    trainer.photo_folder = files.photos
+    trainer = VisitReconstructor(
+        part, shared.config, visit, state, around, run.seed, photos=files.photos, **options
+    )
     before = latest.get(f"{EXPOSURES}{block.number}")
     if before is not None:
         trainer.load_exposures(files.read(before[0], EXPOSURES))

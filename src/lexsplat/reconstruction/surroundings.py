@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 SMALL = 2.0
 """Geometric mean of the two largest standard deviations in pixels below which a Gaussian takes part by chance."""
 
-_AT_ONCE = 1 << 16
-"""Pairs of a Gaussian and an image that are looked at together, which bounds the memory."""
-
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -46,14 +43,13 @@ class Surroundings:
         cls, cells: Iterable[Gaussians], cameras: Sequence[Camera], rng: np.random.Generator
     ) -> Surroundings:
         """What cameras see of the Gaussians of some cells, one cell after the other."""
-        parts, extents, draws = [], [], []
+        from lexsplat.reconstruction.surroundings_kernels import largest_shares
+
+        parts, extents, draws, images = [], [], [], _images(cameras)
         for cell in cells:
             own = extents_of(cell)
             drawn = rng.random(len(cell), np.float32)
-            rows = max(1, _AT_ONCE // len(cameras))
-            starts = range(0, len(cell), rows)
-            largest = [shares_in_images(cameras, own[start : start + rows]).max(0) for start in starts]
-            taking = drawn < np.concatenate([np.zeros(0, np.float32), *largest])
+            taking = drawn < largest_shares(images, own, SMALL)
             parts.append(cell.select(torch.from_numpy(np.flatnonzero(taking))))
             extents.append(own[taking])
             draws.append(drawn[taking])
@@ -82,30 +78,21 @@ def extents_of(gaussians: Gaussians) -> NDArray[np.float32]:
 
 
 def shares_in_images(cameras: Sequence[Camera], extents: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Chance ``[C, N]`` of Gaussians to take part in images: their area over that of `SMALL`, at most 1."""
-    longest, middle = extents[:, 3], extents[:, 4]
-    sizes = sizes_in_images(cameras, extents[:, :3], longest)
-    return np.minimum(1.0, sizes**2 * (middle / longest / SMALL**2), dtype=np.float32)
+    """Chance ``[C, N]`` of Gaussians to take part in images: their area over that of `SMALL`, at most 1.
 
-
-def sizes_in_images(
-    cameras: Sequence[Camera], centers: NDArray[np.float32], deviations: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Standard deviations ``[C, N]`` in pixels of Gaussians in the images of cameras; 0 outside of them.
-
-    They reach three deviations far. Some that are just outside are counted too.
+    It is 0 outside of an image. Gaussians reach three deviations far; some that are just outside count as inside.
     """
-    viewmats = np.array([camera.viewmat for camera in cameras], np.float32)
-    intrinsics = np.array([camera.K for camera in cameras], np.float32)
-    local = centers @ viewmats[:, :3, :3].transpose(0, 2, 1) + viewmats[:, None, :3, 3]
-    depth, radii = np.maximum(local[..., 2], 1e-3), 3 * deviations
-    found = local[..., 2] > -radii
-    for axis in range(2):
-        focal, middle = intrinsics[:, axis, axis, None], intrinsics[:, axis, 2, None]
-        ends = np.array([(camera.width, camera.height)[axis] for camera in cameras], np.float32)[:, None]
-        place = focal * local[..., axis] / depth + middle
-        reach = 1.5 * focal * radii / depth + 2
-        found &= (place > -reach) & (place < ends + reach)
-    found |= np.square(local).sum(-1) < radii**2
-    focal = intrinsics[:, (0, 1), (0, 1)].max(1)[:, None]
-    return np.where(found, focal * deviations / depth, np.float32(0))
+    from lexsplat.reconstruction.surroundings_kernels import shares
+
+    return shares(_images(cameras), extents, SMALL)
+
+
+def _images(cameras: Sequence[Camera]) -> NDArray[np.float32]:
+    """What the kernels read of cameras, ``[C, 18]``."""
+    return np.array(
+        [
+            [*camera.viewmat[:3].ravel(), *camera.K[(0, 1, 0, 1), (0, 1, 2, 2)], camera.width, camera.height]
+            for camera in cameras
+        ],
+        np.float32,
+    )

@@ -60,8 +60,6 @@ class Reconstructor:
     """
 
     parameter_prefixes: tuple[str, ...] = ("parameters/", "exposures/")
-    photo_folder: Path | None = None
-    """Folder that keeps reduced photos for the next training of the same capture (`TrainingImages`)."""
 
     def __init__(
         self,
@@ -80,6 +78,7 @@ class Reconstructor:
         self.device = torch.device(device)
         self.steps_done = 0
         self._photo_bytes = min(PHOTO_BYTES_MAX, memory // 4)
+        self._photo_folder: Path | None = None
         self._views = {view.name: view for view in capture.train_views}
         self._names = sorted(self._views)
         halves = [view.camera.downscaled(2.0) for view in self._views.values()]
@@ -316,7 +315,7 @@ class Reconstructor:
                 memory=self._photo_bytes,
                 shrink=shrink,
                 device=self.device,
-                folder=self.photo_folder,
+                folder=self._photo_folder,
             )
             self._images_shrink = shrink
         return self._images
