@@ -462,7 +462,7 @@ def rolled(capture, folder):
 @pytest.mark.parametrize(
     ("count", "message"),
     [
-        ("200", r"error: block \d+ of 200: expected points, .*; give a smaller --blocks"),
+        ("200", r"error: block \d+ of 200: expected points, .*; give a smaller --blocks, .*"),
         ("2", r"error: --blocks: expected a ground plane, .*; give --up X,Y,Z or --blocks none"),
     ],
 )

@@ -75,5 +75,5 @@ export function best(worth: Float32Array, most: number, marked: Uint8Array): Uin
 export function leftOut({ gaussians, of, budget }: Manifest["scene"]): string {
   const n = (count: number): string => count.toLocaleString("en");
   const sent = of > gaussians ? `This page holds ${n(gaussians)} of the scene's ${n(of)} Gaussians. ` : "";
-  return sent + (gaussians > budget ? `Of ${n(gaussians)} it draws the ${n(budget)} that cover most of the picture from here.` : "");
+  return sent + (gaussians > budget ? `The page leaves out ${n(gaussians - budget)} of ${n(gaussians)}: those that cover least of the picture from here.` : "");
 }

@@ -249,8 +249,6 @@ def reconstruct_blocks(
     cap = config.cap(torch.device(run.device))
     deal = run.device != "cpu" or 2 * cap * budget.GAUSSIAN_BYTES <= run.memory
     blocks = cut_blocks(capture, points.points, ground_axes(up), count, deal=deal)
-    none = capture.points[:0]  # workers get the capture with every group of visits, and need its views only
-    capture = replace(capture, points=none, point_colors=capture.point_colors[:0])
     rounds = ROUNDS_DEALT if all(block.dealt for block in blocks.blocks) else ROUNDS
     rounds = max(rounds, math.ceil(config.iterations / ROUND_STEPS))
     rounds = max(1, min(rounds, config.iterations // (FEWEST_STEPS * count)))
@@ -277,7 +275,8 @@ def reconstruct_blocks(
         for index, group in enumerate(groups[finished:], start=finished):
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
                 room = _room(files, group[0].round, index, config, cap)
-            shared = _Shared(capture, config, blocks, folder, files, own, extent, index, room)
+            part = _seen_by(group, capture)
+            shared = _Shared(part, config, blocks, folder, files, own, extent, index, room)
             names = {f"block {v.block.number + 1} of {count}, round {v.round + 1}": v for v in group}
             items = VisitsOfGroup(names, files, index, None if seen else folder)
             found = results(workers.map(_visit, shared, items, needs))
@@ -290,6 +289,14 @@ def reconstruct_blocks(
         latest = files.latest(len(groups))
         parts = [files.gaussians(latest[str(cell)][0], cell, config.antialiased) for cell in range(count)]
     return merged(parts)
+
+
+def _seen_by(group: list[Visit], capture: Capture) -> Capture:
+    """What workers need of the capture: the views of a group of visits."""
+    views = {name: capture.views[name] for visit in group for name in visit.block.views}
+    none, colors = capture.points[:0], capture.point_colors[:0]
+    names = tuple(sorted(views))
+    return replace(capture, views=views, train_names=names, test_names=(), points=none, point_colors=colors)
 
 
 def _write_start(

@@ -47,6 +47,8 @@ _FEWEST_ALIKE = 3
 """Groups that show the same, at least: two are visited together as they are;"""
 _SHARE_ALIKE = 1 / 3
 """and their least share of all groups: thin blocks of a street show the same as their neighbors, but not all."""
+_POINTS_LOOKED_AT = 100_000
+"""Points that are projected into all views, drawn from those of a larger capture."""
 _FEWEST_VIEWS = 3
 _MOST_BLOCKS = 1024
 
@@ -227,7 +229,11 @@ def cut_blocks(
     views = capture.train_views
     cells = tuple(Cell(*ends) for ends in _cut(points @ axes.T, count))
     homes = _cells_of(points, cells, axes)
-    shares = np.array([_shares(view, points, homes, count) for view in views]).reshape(len(views), count)
+    some = np.arange(len(points))
+    if len(points) > _POINTS_LOOKED_AT:
+        some = np.random.default_rng(0).choice(some, _POINTS_LOOKED_AT, replace=False)
+    looked_at = points[some], homes[some]
+    shares = np.array([_shares(view, *looked_at, count) for view in views]).reshape(len(views), count)
     for number in range(count):
         own, shown = int((homes == number).sum()), int((shares[:, number] > 0).sum())
         if shown < _FEWEST_VIEWS or not own or len(views) < 2 * count:
@@ -235,7 +241,7 @@ def cut_blocks(
                 f"block {number + 1} of {count}",
                 expected=f"points, and at least {_FEWEST_VIEWS} views that show them",
                 found=f"{own:,} points and {min(shown, len(views) // count)} views",
-                remedy="give a smaller --blocks",
+                remedy="give a smaller --blocks, or more --memory where --blocks is auto",
             )
     groups = _groups(np.array([view.camera.position @ axes.T for view in views]), count)
     dealt = np.zeros(count, bool)
@@ -312,7 +318,10 @@ def _cells_of(
 ) -> NDArray[np.int64]:
     """The cell ``[N]`` of each center ``[N, 3]``."""
     ground = means.astype(np.float64) @ axes.T
-    return np.argmax([cell.holds(ground) for cell in cells], axis=0)
+    found = np.zeros(len(means), np.int64)
+    for number, cell in enumerate(cells):  # one mask at a time: a large capture has many cells
+        found[cell.holds(ground)] = number
+    return found
 
 
 def _shown(camera: Camera, points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
