@@ -46,8 +46,9 @@ def test_info_states_the_method_and_its_codes(built, capsys):
     assert "weight_dropped" not in facts
 
 
-def test_ground_truth_that_is_given_and_missing_ends_in_one_line(built, tmp_path, capsys):
-    fails_in_one_line(capsys, ["evaluate", str(built), "--masks", str(tmp_path / "nowhere")], "nowhere")
+@pytest.mark.parametrize("option", ["--ground-truth", "--masks"])
+def test_ground_truth_that_is_given_and_missing_ends_in_one_line(option, built, tmp_path, capsys):
+    fails_in_one_line(capsys, ["evaluate", str(built), option, str(tmp_path / "nowhere")], "nowhere")
 
 
 def without_times(result: dict) -> dict:

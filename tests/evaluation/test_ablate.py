@@ -312,7 +312,11 @@ def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp
 @pytest.mark.parametrize("command", ["ablate", "compare"])
 @pytest.mark.parametrize(
     ("option", "message"),
-    [(("--prompt-list", "paper"), "bonsai, counter"), (("--masks", "nowhere"), "no such folder")],
+    [
+        (("--prompt-list", "paper"), "bonsai, counter"),
+        (("--ground-truth", "nowhere"), "no such folder"),
+        (("--masks", "nowhere"), "no such folder"),
+    ],
 )
 def test_unavailable_ground_truth_is_refused_before_any_work(
     tiny_capture, tmp_path, capsys, command, option, message
@@ -336,7 +340,7 @@ def test_the_command_line_passes_ground_truth_and_protocols(tiny_capture, tmp_pa
     monkeypatch.setattr(experiments, "Bench", bench)
     module = {"ablate": ablation, "compare": comparison}[command]
     monkeypatch.setattr(module, command, lambda *a, **k: [])
-    arguments = ["--masks", str(tmp_path), "--prompt-list", "released"]
+    arguments = ["--ground-truth", str(tmp_path), "--prompt-list", "released"]
     arguments += ["--protocols", "strict", "lerf-2d"] if command == "compare" else []
     assert cli.main([command, str(tiny_capture), "--output", str(tmp_path / "out"), *arguments]) == 0
     assert used["ground_truth"] == GroundTruthSource(tmp_path, "released")

@@ -37,7 +37,7 @@ class Ablate:
         methods: Methods to measure side by side.
         wrong_labels: Stress test: share of the pixels whose code is replaced by a random one, drawn anew for each
             view.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
+        ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         forms: How codes and text are compared, measured side by side. The paper's form is "feature".
         json: Print ablation.json on standard output (docs/schemas/ablation.json).
@@ -50,13 +50,14 @@ class Ablate:
     variants: tuple[VariantName, ...] = ()
     methods: tuple[MethodName, ...] = ()
     wrong_labels: float = 0.0
-    masks: Path | None = None
+    ground_truth: Path | None = None
     prompt_list: PromptListName | None = None
     forms: tuple[Literal["segment", "code", "feature"], ...] = ("feature",)
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    synonyms: ClassVar[dict[str, str]] = {"--masks": "--ground-truth"}
     defaults: ClassVar[dict[str, str]] = {
         "variants": "all that differ for the method",
         "methods": "the method of the settings",

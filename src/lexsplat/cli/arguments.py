@@ -48,7 +48,7 @@ _DEFAULTS = {
     "clip": "the encoder of the build",
     "view": "the view that shows the other thing best",
     "threshold": "chosen for each phrase",
-    "masks": "the ground truth in the capture or beside it",
+    "ground_truth": "the ground truth in the capture or beside it",
     "prompt_list": "the prompts of the ground truth",
     "downscale": "chosen for the device",
     "iterations": "chosen for the device",

@@ -39,7 +39,7 @@ class Compare:
         output: Folder for all results. ``ablate`` with the same folder uses the same Gaussians and features.
         methods: Rows to measure. "-code" answers by single Gaussians, "-feature" in the paper's form.
         seeds: Seeds of codebook and language.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
+        ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
         lpips: Measure LPIPS if it is installed; --no-lpips leaves it out.
@@ -51,7 +51,7 @@ class Compare:
     output: Path
     methods: tuple[ComparedName, ...] = tuple(ComparisonPlan.methods)
     seeds: tuple[int, ...] = (0,)
-    masks: Path | None = None
+    ground_truth: Path | None = None
     prompt_list: PromptListName | None = None
     protocols: tuple[ProtocolName, ...] = ALL_PROTOCOLS
     lpips: bool = True
@@ -59,6 +59,7 @@ class Compare:
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    synonyms: ClassVar[dict[str, str]] = {"--masks": "--ground-truth"}
 
     def check(self) -> None:
         """Refuse invalid options."""

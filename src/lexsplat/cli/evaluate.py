@@ -26,7 +26,7 @@ class Evaluate:
 
     Args:
         scene: A scene folder.
-        masks: Folder with ground truth: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
+        ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         protocols: How to measure (docs/evaluation.md).
         capture: Folder of the photos.
@@ -37,7 +37,7 @@ class Evaluate:
     """
 
     scene: SceneArgument
-    masks: Path | None = None
+    ground_truth: Path | None = None
     prompt_list: PromptListName | None = None
     protocols: tuple[ProtocolName, ...] = ALL_PROTOCOLS
     capture: Path | None = None
@@ -46,6 +46,7 @@ class Evaluate:
     device: Device = "auto"
     json: bool = False
 
+    synonyms: ClassVar[dict[str, str]] = {"--masks": "--ground-truth"}
     defaults: ClassVar[dict[str, str]] = {
         "capture": "where the build found it",
         "form": "the form of the scene",
@@ -63,7 +64,7 @@ class Evaluate:
             result = evaluate_scene(
                 scene,
                 capture=self.capture,
-                masks=self.masks,
+                masks=self.ground_truth,
                 prompt_list=self.prompt_list,
                 protocols=self.protocols,
                 listener=bars,

@@ -20,7 +20,7 @@ class Experiment(Protocol):
     """The options that both commands have."""
 
     output: Path
-    masks: Path | None
+    ground_truth: Path | None
     prompt_list: PromptListName | None
     json: bool
 
@@ -34,7 +34,7 @@ def open_bench(
     from lexsplat.evaluation import GroundTruthSource
     from lexsplat.evaluation.experiments import Bench
 
-    ground_truth = GroundTruthSource(command.masks, command.prompt_list)
+    ground_truth = GroundTruthSource(command.ground_truth, command.prompt_list)
     with ProgressBars() as bars:
         yield Bench(capture, command.output, settings, evaluation, ground_truth, bars)
 

@@ -416,7 +416,7 @@ def detail_of(metrics: Metrics) -> dict[str, Any]:
 def _no_ground_truth(source: Path, origin: GroundTruthSource) -> CaptureError:
     remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
     if origin.masks is not None:
-        remedy = "hold out the views that have masks: list them in test_views.json of the capture"
+        remedy = "hold out the views that have ground truth: list them in test_views.json of the capture"
     if origin.prompt_list is not None:
         remedy = "leave the prompt list out, or name the masks as the released code does"
     return CaptureError(
