@@ -10,7 +10,7 @@ import tyro
 
 from lexsplat import cli
 from lexsplat.cli.arguments import parse
-from lexsplat.cli.build import Reconstruct
+from lexsplat.cli.build import Build, Reconstruct
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.edit import Edit
 from lexsplat.cli.values import parse_length
@@ -244,6 +244,23 @@ def test_other_spellings_are_accepted():
     assert edit.color == pytest.approx((1, 128 / 255, 0))
     assert parse(Edit, "edit", [*words[:-1], "orange"]).color == pytest.approx((1, 165 / 255, 0))
     assert parse(Edit, "edit", [*words[:-1], "1", "0.5", "0"]).color == (1, 0.5, 0)
+
+
+def test_settings_keep_their_spellings_of_the_first_scene_folders():
+    words = [
+        "x",
+        "--output",
+        "y",
+        "--averaging.top=3",
+        "--embedding.iterations",
+        "40",
+        "--embedding.lambda_u",
+        "2",
+    ]
+    settings = parse(Build, "build", [*words, "--embedding.no-normalise-rendering"]).settings
+    assert settings.averaged.top == 3
+    assert (settings.trained.iterations, settings.trained.lambda_u) == (40, 2)
+    assert not settings.trained.normalize_rendering
 
 
 @pytest.mark.parametrize(

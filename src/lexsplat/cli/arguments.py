@@ -56,6 +56,14 @@ _DEFAULTS = {
 }
 """What help pages state as the default of an option that is None or empty, unless the command states another."""
 
+_RENAMED = {
+    "--averaging.": "--averaged.",
+    "--embedding.": "--trained.",
+    "normalise-rendering": "normalize-rendering",
+    "normalise_rendering": "normalize_rendering",
+}
+"""Parts of options in earlier versions, and their present names; `scenes.records` has those of scene folders."""
+
 CommandT = TypeVar("CommandT")
 REGISTRY = ConstructorRegistry()
 
@@ -88,7 +96,11 @@ def parse(command: type[CommandT], name: str, words: Sequence[str]) -> CommandT:
 
 def _in_our_spelling(word: str, synonyms: dict[str, str]) -> str:
     option, equals, value = word.partition("=")
-    return synonyms.get(option, option) + equals + value
+    option = synonyms.get(option, option)
+    if option.startswith("--"):
+        for former, present in _RENAMED.items():
+            option = option.replace(former, present)
+    return option + equals + value
 
 
 def _not_essential(command: type) -> set[str]:
