@@ -14,7 +14,7 @@ from PIL import Image
 from lexsplat.captures import load_capture
 from lexsplat.captures.ground_truth.layouts import load_annotations
 
-SCENES = Path(str(resources.files("lexsplat"))) / "demo" / "scenes"
+CAPTURES = Path(str(resources.files("lexsplat"))) / "demo" / "captures"
 EXPECTED = {
     # size, views, held out, points at least, bytes at most
     "tabletop": ((480, 360), 72, 12, 6000, 6_500_000),
@@ -26,11 +26,11 @@ pytestmark = pytest.mark.parametrize("name", EXPECTED)
 
 
 def held_out(name: str) -> list[str]:
-    return json.loads((SCENES / name / "test_views.json").read_text())
+    return json.loads((CAPTURES / name / "test_views.json").read_text())
 
 
 def masks(name: str) -> list[Path]:
-    return sorted((SCENES / name / "segmentations").glob("*/*.png"))
+    return sorted((CAPTURES / name / "segmentations").glob("*/*.png"))
 
 
 def read_mask(path: Path) -> np.ndarray:
@@ -39,7 +39,7 @@ def read_mask(path: Path) -> np.ndarray:
 
 def test_pictures_are_complete_and_of_one_size(name):
     size, views, _, _, _ = EXPECTED[name]
-    pictures = sorted((SCENES / name / "images").glob("*.jpg"))
+    pictures = sorted((CAPTURES / name / "images").glob("*.jpg"))
     assert len(pictures) == views
     for picture in pictures:
         with Image.open(picture) as image:
@@ -48,7 +48,7 @@ def test_pictures_are_complete_and_of_one_size(name):
 
 
 def test_pictures_are_neither_over_exposed_nor_flat(name):
-    for picture in sorted((SCENES / name / "images").glob("*.jpg"))[::5]:
+    for picture in sorted((CAPTURES / name / "images").glob("*.jpg"))[::5]:
         image = np.asarray(Image.open(picture))
         assert (image.min(-1) >= 250).mean() < 0.01
         assert (image.max(-1) <= 5).mean() < 0.05
@@ -57,7 +57,7 @@ def test_pictures_are_neither_over_exposed_nor_flat(name):
 
 def test_every_held_out_view_lies_between_training_views(name):
     _, views, count, _, _ = EXPECTED[name]
-    stems = sorted(path.stem for path in (SCENES / name / "images").glob("*.jpg"))
+    stems = sorted(path.stem for path in (CAPTURES / name / "images").glob("*.jpg"))
     out = held_out(name)
     assert len(out) == len(set(out)) == count
     assert set(out) < set(stems)
@@ -69,19 +69,19 @@ def test_every_held_out_view_lies_between_training_views(name):
 
 def test_all_views_are_posed_and_points_come_from_training_views_only(name):
     (width, height), views, _, points, _ = EXPECTED[name]
-    model = pycolmap.Reconstruction(SCENES / name / "sparse" / "0")
+    model = pycolmap.Reconstruction(CAPTURES / name / "sparse" / "0")
     assert model.num_reg_images() == views
     assert model.num_points3D() >= points
     (camera,) = model.cameras.values()
     assert (camera.model_name, camera.width, camera.height) == ("PINHOLE", width, height)
     seen_in = {image.name: image.num_points3D for image in model.images.values()}
-    assert set(seen_in) == {path.name for path in (SCENES / name / "images").glob("*.jpg")}
+    assert set(seen_in) == {path.name for path in (CAPTURES / name / "images").glob("*.jpg")}
     out = {f"{stem}.jpg" for stem in held_out(name)}
     assert all((count == 0) == (image in out) for image, count in seen_in.items())
 
 
 def test_points_project_to_where_they_were_seen(name):
-    model = pycolmap.Reconstruction(SCENES / name / "sparse" / "0")
+    model = pycolmap.Reconstruction(CAPTURES / name / "sparse" / "0")
     (camera,) = model.cameras.values()
     K = camera.calibration_matrix()
     errors = []
@@ -106,7 +106,7 @@ def test_masks_are_binary_nonempty_and_of_the_pictures_size(name):
 
 
 def test_every_mask_has_a_prompt_and_every_prompt_a_mask(name):
-    prompts = json.loads((SCENES / name / "prompts.json").read_text())
+    prompts = json.loads((CAPTURES / name / "prompts.json").read_text())
     assert {path.stem.replace("_", " ") for path in masks(name)} == set(prompts)
     assert set(prompts.values()) == KINDS
 
@@ -119,7 +119,7 @@ def test_parts_lie_within_wholes_and_fruit_is_apple_and_banana(name):
     fruits = {"tabletop": ("red_apple", "banana"), "second": ("green_apple",)}[name]
     compared = 0
     for stem in held_out(name):
-        folder = SCENES / name / "segmentations" / stem
+        folder = CAPTURES / name / "segmentations" / stem
         for part, whole in whole_of.items():
             if (folder / f"{part}.png").exists():
                 inside, outside = read_mask(folder / f"{part}.png"), read_mask(folder / f"{whole}.png")
@@ -136,24 +136,24 @@ def test_masks_agree_with_the_colors_in_the_pictures(name):
     """A mask shifted or flipped against its picture would not select a red apple."""
     prompt, channel = {"tabletop": ("red_apple", 0), "second": ("green_apple", 1)}[name]
     for stem in held_out(name):
-        image = np.asarray(Image.open(SCENES / name / "images" / f"{stem}.jpg")).astype(int)
-        mask = read_mask(SCENES / name / "segmentations" / stem / f"{prompt}.png") > 0
+        image = np.asarray(Image.open(CAPTURES / name / "images" / f"{stem}.jpg")).astype(int)
+        mask = read_mask(CAPTURES / name / "segmentations" / stem / f"{prompt}.png") > 0
         assert (image[mask].argmax(-1) == channel).mean() > 0.95
 
 
 def test_scene_is_small(name):
-    files = [path for path in (SCENES / name).rglob("*") if path.is_file()]
+    files = [path for path in (CAPTURES / name).rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < EXPECTED[name][4]
 
 
 def test_loads_as_a_scene_with_its_own_split_and_masks(name):
     _, views, count, points, _ = EXPECTED[name]
-    scene = load_capture(SCENES / name)
+    scene = load_capture(CAPTURES / name)
     assert len(scene.views) == views
     assert {scene.views[view].stem for view in scene.test_names} == set(held_out(name))
     assert len(scene.train_names) == views - count
     assert len(scene.points) >= points
-    prompts = json.loads((SCENES / name / "prompts.json").read_text())
+    prompts = json.loads((CAPTURES / name / "prompts.json").read_text())
     by_view = load_annotations(scene).masks
     assert set(by_view) == set(scene.test_names)
     for view, files in by_view.items():

@@ -16,7 +16,7 @@ from PIL import Image
 pytestmark = pytest.mark.slow
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
-SCENES = Path(str(resources.files("lexsplat"))) / "demo" / "scenes"
+CAPTURES = Path(str(resources.files("lexsplat"))) / "demo" / "captures"
 CLIP = Path(str(resources.files("lexsplat"))) / "demo" / "encoders" / "clip"
 
 
@@ -117,7 +117,7 @@ def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
     qualities = {
         w for q in QUALITIES.values() for phrase in (*q.phrases, *q.adjectives) for w in phrase.split()
     }
-    for prompt in json.loads((SCENES / scene / "prompts.json").read_text()):
+    for prompt in json.loads((CAPTURES / scene / "prompts.json").read_text()):
         assert set(prompt.split()) <= single | qualities, prompt
 
 

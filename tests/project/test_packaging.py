@@ -50,9 +50,9 @@ def test_package_data_take_less_than_38_megabytes():
     "stray",
     [
         "demo/__pycache__/demo.cpython-311.pyc",
-        "demo/scenes/tabletop/truth/view_000.npz",
-        "demo/scenes/tabletop/truth/things.json",
-        "demo/scenes/tabletop/images/.DS_Store",
+        "demo/captures/tabletop/truth/view_000.npz",
+        "demo/captures/tabletop/truth/things.json",
+        "demo/captures/tabletop/images/.DS_Store",
         "demo/scene/codes/view_000.png",
     ],
 )

@@ -11,7 +11,7 @@ from layouts import LAYOUTS
 from quiet import quiet_output
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SCENES = REPOSITORY / "src" / "lexsplat" / "demo" / "scenes"
+CAPTURES = REPOSITORY / "src" / "lexsplat" / "demo" / "captures"
 
 
 def main() -> None:
@@ -19,7 +19,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
     parser.add_argument("--steps", nargs="+", choices=("render", "pack"), default=["render", "pack"])
     parser.add_argument("--work", type=Path, default=REPOSITORY / "output" / "demo_scene", help="work folder")
-    parser.add_argument("--output", type=Path, default=SCENES, help="folder that gets one folder a scene")
+    parser.add_argument("--output", type=Path, default=CAPTURES, help="folder that gets one folder a scene")
     parser.add_argument("--samples", type=int, default=16, help="paths a pixel at most")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument(

@@ -14,24 +14,24 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.scene import open_scene
 
-SceneName = Literal["tabletop", "second"]
+CaptureName = Literal["tabletop", "second"]
 
-SCENES = Path(__file__).resolve().parents[1] / "demo" / "scenes"
+CAPTURES = Path(__file__).resolve().parents[1] / "demo" / "captures"
 """Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
 
 DEMO_CONFIG = BuildConfig(clip="bundled", dino="bundled", codebook=CodebookConfig(num_codes=256))
 """Settings of the demo; docs/results.md states on which views each setting was chosen."""
 
 
-def demo_capture(scene: SceneName = "tabletop") -> Path:
+def demo_capture(scene: CaptureName = "tabletop") -> Path:
     """The folder of a bundled capture."""
-    return SCENES / scene
+    return CAPTURES / scene
 
 
 def run_demo(
     output: Path,
     *,
-    scene: SceneName = "tabletop",
+    scene: CaptureName = "tabletop",
     method: MethodName | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     seed: int = 0,

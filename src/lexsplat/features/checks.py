@@ -13,7 +13,7 @@ from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
 from lexsplat.features.pretrained import resize_images
 from lexsplat.runtime.errors import ModelError
 
-PICTURES = Path(__file__).resolve().parents[1] / "demo" / "scenes" / "tabletop"
+PICTURES = Path(__file__).resolve().parents[1] / "demo" / "captures" / "tabletop"
 """A bundled capture with masks of what its photos show."""
 
 WORDS = (
