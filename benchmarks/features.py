@@ -13,7 +13,7 @@ Encoders: the bundled CLIP, and the image tower of a ViT-B/16 with random weight
 ``--precisions`` runs the ViT-B/16 in float32, in bfloat16 as lexsplat does (autocast) and with its weights in
 bfloat16, in 8-bit integers (torch's dynamic quantization), and in ONNX Runtime in float32 and in 8-bit integers where
 the packages ``onnx``, ``onnxscript`` and ``onnxruntime`` are installed. "cosine" is the lowest of its embeddings of
-bundled pictures with those in float32; weights are random, so it says nothing about published weights.
+bundled images with those in float32; weights are random, so it says nothing about published weights.
 
 Forward passes and products alternate; times are medians of processor time, which other programs hardly disturb.
 """
@@ -40,7 +40,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from lexsplat.captures import load_capture
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features import FeatureConfig
-from lexsplat.features.checks import pictures
+from lexsplat.features.checks import bundled_images
 from lexsplat.features.encoders import load_clip
 from lexsplat.features.extraction import encoded_size
 from lexsplat.features.pyramid import grid_levels, unique_boxes
@@ -181,7 +181,7 @@ def onnx_cases(model: torch.nn.Module, folder: Path, threads: int) -> Iterator[t
 def run_precisions(threads: int, batches: list[int], repeats: int) -> list[dict[str, Any]]:
     """Median processor time of an image in each precision and batch size, and how far the embeddings agree."""
     model, rows = vit_b16(), []
-    seen = pictures(SIDE)[:8]
+    seen = bundled_images(SIDE)[:8]
     exact = functional.normalize(model(pixel_values=seen).image_embeds, dim=-1)
     print(f"{'precision':22} {'batch':>5} {'s/image':>8} {'cosine':>8}")
     for name, encode in precision_cases(model, threads):

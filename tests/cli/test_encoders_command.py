@@ -42,14 +42,17 @@ def test_the_answer_has_its_schema_and_the_time_of_the_capture(tiny_capture, cap
 def test_random_weights_are_refused_with_status_1(clip_folder, capsys):
     assert cli.main(["encoders", "--clip", str(clip_folder)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith(f"error: model {clip_folder}: expected words that match bundled pictures")
+    assert error.startswith(f"error: model {clip_folder}: expected words that match the bundled images")
     assert "where chance is 0.50; choose another model" in error
 
 
 def test_the_rank_of_words_is_that_of_a_loop(clip_folder):
     for name in ("bundled", str(clip_folder)):
         clip = load_clip(name)
-        images, texts = clip.encode_images(checks.pictures(clip.image_size)), clip.encode_text(checks.WORDS)
+        images, texts = (
+            clip.encode_images(checks.bundled_images(clip.image_size)),
+            clip.encode_text(checks.WORDS),
+        )
         below = [
             float(images[i] @ texts[j]) < float(images[i] @ texts[i])
             for i in range(len(texts)) for j in range(len(texts)) if i != j
@@ -63,11 +66,11 @@ def test_towers_of_different_sizes_and_blind_towers_are_refused(monkeypatch):
     with pytest.raises(ModelError, match="of one size, found 64 and 128 numbers"):
         checks.check_words(clip)
     monkeypatch.setattr(clip, "encode_images", lambda images: torch.full((12, 128), 128**-0.5))
-    with pytest.raises(ModelError, match="unlike features for unlike pictures"):
+    with pytest.raises(ModelError, match="different features for different images"):
         checks.check_words(clip)
     checks.check_dense(dino)
     monkeypatch.setattr(dino, "encode_dense", lambda image, **_: torch.full((12, 12, 128), 128**-0.5))
-    with pytest.raises(ModelError, match="unlike features for unlike pictures"):
+    with pytest.raises(ModelError, match="different features for different images"):
         checks.check_dense(dino)
 
 

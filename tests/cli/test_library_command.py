@@ -120,14 +120,14 @@ def test_nothing_is_removed_unless_all_are_known(rooms, capsys):
 
 
 @pytest.mark.parametrize("code", [errno.EROFS, errno.ENOSPC])
-def test_an_answer_is_given_where_its_pictures_cannot_be_written(rooms, capsys, caplog, monkeypatch, code):
+def test_an_answer_is_given_where_its_thumbnails_cannot_be_written(rooms, capsys, caplog, monkeypatch, code):
     def refused(*_):
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr("lexsplat.scenes.library.found.atomic_path", refused)
     assert cli.main(["library", "search", str(rooms / "library"), "mug"]) == 0
     assert "1. kitchen: present: yes" in capsys.readouterr().out
-    assert f"no pictures, {os.strerror(code)}; give --thumbnails FOLDER or none" in caplog.text
+    assert f"no thumbnails, {os.strerror(code)}; give --thumbnails FOLDER or none" in caplog.text
     (mug,) = document(capsys, "search", rooms, "mug")["phrases"]
     assert "thumbnail" not in mug["hits"][0]
 

@@ -26,7 +26,7 @@ def test_query_writes_images_and_json(built, tmp_path, capsys):
         assert 0 <= prompt["threshold"] <= 1
 
 
-def test_query_without_pictures_writes_no_file(built, tmp_path, monkeypatch, capsys):
+def test_query_without_images_writes_no_file(built, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = [
         "query",
@@ -36,7 +36,7 @@ def test_query_without_pictures_writes_no_file(built, tmp_path, monkeypatch, cap
         "view_02.png",
         "--output",
         "images",
-        "--no-pictures",
+        "--no-images",
     ]
     assert cli.main([*arguments, "--json"]) == 0
     assert set(json.loads(capsys.readouterr().out)["prompts"][0]["views"]["view_02.png"]) == {
@@ -64,8 +64,8 @@ def test_query_writes_the_features_of_a_view(built, tmp_path, capsys):
     assert not list(Draft202012Validator(json.loads(schema.read_text())).iter_errors(answer))
     assert Image.open(answer["features"]["view_02.png"]["picture"]).size == (96, 72)
     with pytest.raises(SystemExit):
-        cli.main([*arguments, "--no-pictures"])
-    assert "leave --no-pictures out" in capsys.readouterr().err
+        cli.main([*arguments, "--no-images"])
+    assert "leave --no-images out" in capsys.readouterr().err
 
 
 def test_find_prints_positions_in_3d(built, capsys):

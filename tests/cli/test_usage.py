@@ -13,6 +13,8 @@ from lexsplat.cli.arguments import parse
 from lexsplat.cli.build import Build, Reconstruct
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.edit import Edit
+from lexsplat.cli.listing import List
+from lexsplat.cli.query import Query
 from lexsplat.cli.values import parse_length
 from lexsplat.pipeline.config import BuildConfig
 
@@ -93,6 +95,18 @@ def test_the_help_page_of_language_has_the_options_that_its_warnings_name(capsys
 
 
 STOPPED = "stopped; run the same command again to go on\n"
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")], ids=repr
+)
+def test_a_lack_of_memory_is_named_with_its_remedy(error, monkeypatch, capsys):
+    def exhausted(*_, **__):
+        raise error
+
+    monkeypatch.setattr(tyro, "cli", exhausted)
+    assert cli.main(["info", "demo"]) == 1
+    assert capsys.readouterr().err.startswith("error: out of memory; give a smaller --memory")
 
 
 def test_ctrl_c_during_parsing_ends_in_one_line(monkeypatch, capsys):
@@ -238,6 +252,9 @@ def test_reconstruct_accepts_the_options_of_build():
 
 
 def test_other_spellings_are_accepted():
+    for page in (Query, List):
+        assert parse(page, "page", ["x", *(["cup"] if page is Query else []), "--pictures"]).images
+    assert not parse(Query, "query", ["x", "cup", "--no-pictures"]).images
     words = ["x", "recolour", "--select", "a", "--colour", "#ff8000"]
     edit = parse(Edit, "edit", words)
     assert edit.action == "recolor"

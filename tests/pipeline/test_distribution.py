@@ -153,7 +153,7 @@ def test_many_captures_make_many_scenes_and_one_that_fails_is_told(tiny_capture,
     assert cli.main(arguments) == 1
     said = capsys.readouterr()
     assert "error: " in said.err
-    assert "expected 3 scenes, found 1 failed, told above" in said.err
+    assert "expected 3 scenes, found 1 failed, listed above" in said.err
     assert "attic: " in said.err
     assert "features: " in said.err, "the stages of each scene are shown, not only the number of scenes"
     assert "scenes: 0/3" in said.err

@@ -135,7 +135,7 @@ def test_the_time_of_the_features_is_told_first(clip_folder, tmp_path, caplog):
     # The encoder has patches. Crops of 46 pixels every 27.6 or less: 14 x 11.
     assert "features on cpu: 154 crops and about" in caplog.text
     assert "for 50 training photos" in caplog.text
-    assert "words match bundled pictures by" in caplog.text, "random weights match no words"
+    assert "words match bundled images by" in caplog.text, "random weights match no words"
 
 
 def test_a_build_that_stops_for_its_encoder_goes_on_from_what_was_finished(

@@ -35,7 +35,7 @@ def test_schemas_are_valid_and_describe_every_key(path):
     check(schema, path.stem)
 
 
-@pytest.mark.parametrize("more", [[], ["--no-pictures"]], ids=["images", "no images"])
+@pytest.mark.parametrize("more", [[], ["--no-images"]], ids=["images", "no images"])
 def test_query_answers_in_its_schema(built, tmp_path, capsys, more):
     validated(
         "query", answer(capsys, "query", str(built), "red apple", "x", "--output", str(tmp_path), *more)

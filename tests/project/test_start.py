@@ -24,7 +24,7 @@ ALLOWED = {
     ("view", "--help"): HELP,
     ("query", "demo"): HELP,  # wrong usage
     ("info", "demo"): FACTS,
-    ("query", "demo", "red apple", "--no-pictures"): ANSWER,
+    ("query", "demo", "red apple", "--no-images"): ANSWER,
     ("find", "demo", "red apple"): {*ANSWER, "simplemma"},
     ("find", "demo", "a word that nobody asked before"): {*ANSWER, "simplemma", "tokenizers"},
 }

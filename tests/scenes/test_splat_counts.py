@@ -162,7 +162,7 @@ def test_sog_with_another_count_than_its_pictures_is_refused_with_both_numbers(t
         tmp_path / "g.sog",
         sog(tmp_path / "g.sog", count),
         f"the {count} Gaussians",
-        "found 20 in its pictures",
+        "found 20 in its images",
     )
 
 
@@ -236,7 +236,7 @@ def test_glb_with_smaller_counts_is_refused_with_both_numbers(tmp_path, count):
 def test_glb_with_bytes_after_its_end_is_refused(tmp_path):
     write_glb(tame(3), tmp_path / "g.glb")
     content = (tmp_path / "g.glb").read_bytes()
-    found = f"{len(content) + 5:,} bytes, and a header that tells {len(content):,}"
+    found = f"{len(content) + 5:,} bytes, expected {len(content):,} by the header"
     refused(tmp_path / "g.glb", content + b"12345", found)
 
 

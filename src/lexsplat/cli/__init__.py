@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not (isinstance(error, MemoryError) or out_of_memory):
             raise
         remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
-        print(f"error: memory: expected more, found none left; {remedy}", file=sys.stderr)
+        print(f"error: out of memory; {remedy}", file=sys.stderr)
     except UnicodeEncodeError as error:
         # File names may hold any bytes; camera files, JSON and reports hold text.
         subject = ascii(str(error.object))[1:100]

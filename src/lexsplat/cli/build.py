@@ -115,7 +115,7 @@ class Build:
             raise CaptureError(
                 self.output,
                 expected=f"{len(tasks)} scenes",
-                found=f"{failed} failed, told above",
+                found=f"{failed} failed, listed above",
                 remedy="mend their captures and run the same command again; finished scenes are kept",
             )
 

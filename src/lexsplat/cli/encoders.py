@@ -18,7 +18,7 @@ _PHOTOS, _SIZE = 100, (1440, 1080)
 class EncodersCommand:
     """Fetch, check and time encoders before a long build.
 
-    Downloads what is missing, loads it, checks that words match bundled pictures, and measures the time of the
+    Downloads what is missing, loads it, checks that words match bundled images, and measures the time of the
     features of one photo and of a capture.
 
     Args:

@@ -41,7 +41,7 @@ class LibraryCommand:
         lexsplat library remove rooms office
         lexsplat library verify rooms --repair
 
-    The library is a folder of its own. It keeps the codes, segments and pictures of each scene; the scenes stay where
+    The library is a folder of its own. It keeps the codes, segments and images of each scene; the scenes stay where
     they are. Add a scene again after it was rebuilt or moved (docs/library.md).
 
     Args:
@@ -49,8 +49,8 @@ class LibraryCommand:
         library: The folder of the library; the first "add" makes it.
         words: Scene folders or the word "demo" for add, names or folders for remove, phrases for search.
         limit: Scenes of an answer, at most.
-        thumbnails: Folder of the pictures that search writes; "none" writes none.
-        confirm: Search asks the scenes themselves, also where the library can tell without opening them.
+        thumbnails: Folder of the thumbnails that search writes; "none" writes none.
+        confirm: Search the scenes themselves, also where the index suffices.
         repair: Mend what verify finds.
         index: Address of a Chroma server that proposes scenes, such as http://localhost:8000.
         device: "auto" takes CUDA where there is a GPU.
@@ -165,15 +165,15 @@ class LibraryCommand:
             answers.append(found.to_dict())
             self._say(repr(found))
             if str(self.thumbnails) != "none":
-                self._write_pictures(found, answers[-1]["hits"])
+                self._write_thumbnails(found, answers[-1]["hits"])
         return {"phrases": answers}
 
-    def _write_pictures(self, found: Found, entries: list[dict[str, Any]]) -> None:
+    def _write_thumbnails(self, found: Found, entries: list[dict[str, Any]]) -> None:
         folder = self.thumbnails or self.library / "thumbnails"
         for number, (hit, entry) in enumerate(zip(found.hits, entries), start=1):
             try:
                 entry["thumbnail"] = str(hit.write_picture(folder))
             except OSError as error:
-                log.warning("%s: no pictures, %s; give --thumbnails FOLDER or none", folder, error.strerror)
+                log.warning("%s: no thumbnails, %s; give --thumbnails FOLDER or none", folder, error.strerror)
                 return
-            self._say(f"  picture {number}: {entry['thumbnail']}")
+            self._say(f"  thumbnail {number}: {entry['thumbnail']}")

@@ -24,7 +24,7 @@ class List:
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
         vocabulary: Text file of the names that objects may have, one a line, at most 2,000.
-        pictures: Write a sheet of thumbnails.
+        images: Write a sheet of thumbnails.
         output: PNG file of the sheet.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
@@ -34,13 +34,14 @@ class List:
 
     scene: SceneArgument
     vocabulary: Path | None = None
-    pictures: bool = False
+    images: bool = False
     output: Path | None = None
     clip: str | None = None
     device: Device = "auto"
     csv: bool = False
     json: bool = False
 
+    synonyms: ClassVar[dict[str, str]] = {"--pictures": "--images", "--no-pictures": "--no-images"}
     defaults: ClassVar[dict[str, str]] = {
         "vocabulary": "everyday names",
         "output": 'SCENE/objects.png; demo_objects.png for "demo"',
@@ -50,8 +51,8 @@ class List:
         """Refuse options that exclude each other."""
         if self.csv and self.json:
             raise ValueError("give --csv or --json, not both")
-        if self.output is not None and not self.pictures:
-            raise ValueError("--output needs --pictures")
+        if self.output is not None and not self.images:
+            raise ValueError("--output needs --images")
 
     def run(self) -> None:
         """List and print."""
@@ -59,7 +60,7 @@ class List:
 
         names = read_vocabulary(self.vocabulary) if self.vocabulary else []
         scene = open_scene(self.scene, self.device, self.clip)
-        picture = (self.output or _sheet_of(scene)) if self.pictures else None
+        picture = (self.output or _sheet_of(scene)) if self.images else None
         document = list_document(scene, names, picture)
         if self.json:
             print_json(document)

@@ -121,8 +121,8 @@ def shown_progress(form: str) -> Iterator[Listener]:
         return
     pace, output = Pace(), sys.stdout
 
-    def tell(event: Event) -> None:
+    def print_event(event: Event) -> None:
         print(json.dumps(pace.record(event)), file=output, flush=True)
 
     with redirect_stdout(sys.stderr):  # Ray prints there when a node is lost
-        yield tell
+        yield print_event

@@ -31,7 +31,7 @@ class Query:
         prompts: What to look for, such as "red apple" "something to sit on".
         view: Names of the views to answer in.
         output: Folder for the images.
-        pictures: Write a heatmap and a mask for each prompt and view; --no-pictures writes none.
+        images: Write a heatmap and a mask for each prompt and view; --no-images writes none.
         features: Also write the language features of each view: features/VIEW.safetensors and their principal
             components as colors, features/VIEW.png.
         threshold: Relevancy from which a pixel belongs to the mask. The paper's is 0.5.
@@ -49,7 +49,7 @@ class Query:
     prompts: PhrasesArgument
     view: tuple[str, ...] = ()
     output: Path | None = None
-    pictures: bool = True
+    images: bool = True
     features: bool = False
     threshold: float | None = None
     form: Literal["segment", "code", "feature"] | None = None
@@ -60,6 +60,7 @@ class Query:
     device: Device = "auto"
     json: bool = False
 
+    synonyms: ClassVar[dict[str, str]] = {"--pictures": "--images", "--no-pictures": "--no-images"}
     defaults: ClassVar[dict[str, str]] = {
         "view": "the held-out views",
         "output": 'SCENE/heatmaps; demo_heatmaps for "demo"',
@@ -74,8 +75,8 @@ class Query:
         """Refuse invalid options."""
         check_phrases(self.prompts)
         check_threshold(self.threshold)
-        if self.features and not self.pictures:
-            raise ValueError("--features writes files: leave --no-pictures out")
+        if self.features and not self.images:
+            raise ValueError("--features writes files: leave --no-images out")
         if any((self.form, self.negatives, self.temperature is not None, self.template)):
             from lexsplat.queries.relevancy import QueryConfig
 
@@ -98,7 +99,7 @@ class Query:
         from lexsplat.scenes.feature_maps import write_features
 
         scene.query = self._changed(scene.query)
-        folder = (self.output or _images_folder(scene)) if self.pictures else None
+        folder = (self.output or _images_folder(scene)) if self.images else None
         answers = answer_queries(scene, self.prompts, self.view, self.threshold, folder)
         if self.features and folder is not None:
             names = [scene.view(name).name for name in self.view] or default_views(scene)

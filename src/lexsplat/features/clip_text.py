@@ -37,7 +37,7 @@ _PADDING = 128  # vocabularies are padded to a multiple of at most this
 UNLIKE = 1e-5
 """Distance of two unit vectors that are equal but for rounding."""
 UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
-"""Words that every encoder tells apart."""
+"""Words to which every encoder gives different embeddings."""
 
 
 def open_clip_text(folder: Path, name: str, device: torch.device | str = "cpu") -> ClipText | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lexsplat.features.checks import pictures
+from lexsplat.features.checks import bundled_images
 from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
 from lexsplat.features.extraction import encoded_size
 from lexsplat.features.pyramid import grid_levels, unique_boxes
@@ -44,7 +44,7 @@ class Estimate:
 def estimate(
     clip: ImageTextEncoder, dino: DenseEncoder | None, config: FeatureConfig, capture_size: tuple[int, int]
 ) -> Estimate:
-    """Measure the encoders on bundled pictures and scale the time to a photo.
+    """Measure the encoders on bundled images and scale the time to a photo.
 
     Args:
         clip: Encoder of the crops.
@@ -54,7 +54,7 @@ def estimate(
     """
     crops = count_crops(config, capture_size)
     encode = clip.encode_images if config.tokens == "class" else clip.encode_patches
-    images = pictures(clip.image_size)
+    images = bundled_images(clip.image_size)
     encode(images[:1])  # the first call takes longer
     while True:
         start = time.perf_counter()
@@ -79,7 +79,7 @@ def count_crops(config: FeatureConfig, capture_size: tuple[int, int]) -> int:
 
 def _dense_seconds(dino: DenseEncoder, config: FeatureConfig, capture_size: tuple[int, int]) -> float:
     """Seconds of DINO for a photo: one pass on its own patch grid, times the number of shifted copies."""
-    image = pictures(config.dino_short_side)[0]
+    image = bundled_images(config.dino_short_side)[0]
     start = time.perf_counter()
     grid = dino.encode_dense(image, short_side=config.dino_short_side, max_tokens=config.dino_max_tokens)
     seconds = time.perf_counter() - start

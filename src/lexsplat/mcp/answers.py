@@ -229,7 +229,7 @@ class Heat(Asked):
 
 
 class RenderAnswer(World):
-    """What the picture shows."""
+    """What the image shows."""
 
     view: str
     look_at: Annotated[Asked | None, Field(description="null where the view was given.")]

@@ -25,13 +25,13 @@ class LibraryTools(Tools):
         found = self.library.search(phrase, limit)
         if found.hits:
             listed = "; ".join(hit.without_note() for hit in found.hits)
-            said = f"In {len(found.hits)} of {counted(found.scenes, 'scene')}: {listed}"
+            text = f"In {len(found.hits)} of {counted(found.scenes, 'scene')}: {listed}"
         elif not found.scenes and not found.skipped:
-            said = "The library holds no scene."
+            text = "The library holds no scene."
         else:
             where = "no scene that could be asked" if found.present == "unsure" else "no scene"
-            said = f"In {where}: nothing fits {shortened(found.understood)}."
+            text = f"In {where}: nothing fits {shortened(found.understood)}."
         note = f" Note: {found.note}." if found.note else ""
         more = f" {counted(found.unopened, 'more scene')} may hold it." if found.unopened else ""
         skipped = f" {counted(len(found.skipped), 'scene')} could not be asked." if found.skipped else ""
-        return Reply(said + note + more + skipped, found.to_dict())
+        return Reply(text + note + more + skipped, found.to_dict())

@@ -1,4 +1,4 @@
-"""Two different things of those that two phrases fit: which are nearest to each other, and what to tell of it."""
+"""Two different things of those that two phrases fit: which are nearest to each other, and the note of it."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def measured(*ends: tuple[Selection, Sequence[Selection], dict[str, Any]]) -> st
     fits = [(shortened(asked["understood"]), len(things)) for _, things, asked in ends if len(things) > 1]
     if not fits:
         return ""
-    said = " and ".join(f"{text} fits {count}" for text, count in dict.fromkeys(fits))
+    counts = " and ".join(f"{text} fits {count}" for text, count in dict.fromkeys(fits))
     names = " and ".join(called(one, things) for one, things, _ in ends)
-    return f"{said} things; measured is the nearest pair, {names}"
+    return f"{counts} things; measured is the nearest pair, {names}"
 
 
 def others(things: Sequence[Selection], than: Sequence[Selection]) -> list[Selection]:

@@ -1,4 +1,4 @@
-"""Pictures for a language model: a view with heat and a legend."""
+"""Images for a language model: a view with heat and a legend."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lexsplat.queries.scoring import render_gaussian_scores
 from lexsplat.scenes.scene import Scene
 
 _WIDTH = 640
-"""Width of a picture with one phrase or none; several share twice of it."""
+"""Width of an image with one phrase or none; several share twice of it."""
 _LINE = 18
 
 

@@ -40,7 +40,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 INSTRUCTIONS = (
     "Places that can be searched with words. Positions are in scene units, in the axes of the scene; meters are "
     'given where the scale is known. "present": "no" means that the scene does not hold it: say so, do not guess. '
-    '"understood" tells how a phrase was parsed.'
+    '"understood" is how a phrase was parsed.'
 )
 
 
@@ -236,7 +236,7 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
 
     @server.resource(RESOURCES[1], mime_type="application/json")
     def facts(name: str) -> str:
-        """What describe_scene tells."""
+        """The answer of describe_scene."""
         try:
             return json.dumps(tools.describe_scene(name).document)
         except LexsplatError as error:
@@ -272,7 +272,7 @@ def _add_prompts(server: MCPServer, tools: Tools) -> None:
 
     @server.prompt(name="where_is", title="Where did I leave it?")
     def where_is(thing: str, scene: str = "") -> str:
-        """Find a lost thing and tell where it is in words."""
+        """Find a lost thing and describe in words where it is."""
         if not thing.strip():
             expected, found = "a word or phrase", "an empty text"
             raise _protocol_error(

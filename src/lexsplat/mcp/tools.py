@@ -70,7 +70,7 @@ class Tools:
         names = [
             f"{each['name']} ({each['problem']})" if "problem" in each else each["name"] for each in listed
         ]
-        said = f"{counted(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
+        text = f"{counted(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
         if self.library is not None:
             try:
                 names = self.library.names()
@@ -78,12 +78,12 @@ class Tools:
                 if not listed:
                     raise
                 document["library"] = {"problem": str(error)}
-                return Reply(f"{said} A library that cannot be asked ({error}).", document)
+                return Reply(f"{text} A library that cannot be asked ({error}).", document)
             document["library"] = {"scenes": len(names), "names": names[:_LISTED]}
-            said = (
-                f"{said} A library of {counted(len(names), 'scene')}: {', '.join(names[:_LISTED])}.".strip()
+            text = (
+                f"{text} A library of {counted(len(names), 'scene')}: {', '.join(names[:_LISTED])}.".strip()
             )
-        return Reply(said, document)
+        return Reply(text, document)
 
     def describe_scene(self, scene: SceneName = "") -> Annotated[Reply, answers.SceneAnswer]:
         """Describe a place: its size, its up direction, its unit of length, its views and the things it holds."""
@@ -161,12 +161,12 @@ class Tools:
             "holds": holds.lower(),
             "seen_from": found.seen_from or None,
         }
-        said = sentence(answer, place.world.meters_per_unit)
+        text = sentence(answer, place.world.meters_per_unit)
         if found.present == "no":
-            said = said.replace("Not here", "No", 1)
+            text = text.replace("Not here", "No", 1)
         elif found.present == "yes":
-            said = f"Yes: {said}"
-        return Reply(said, answer)
+            text = f"Yes: {text}"
+        return Reply(text, answer)
 
     def nearest(
         self,
@@ -215,8 +215,8 @@ class Tools:
         }
         only = f"the only {'other ' if len(things) > 1 else ''}one for {understood}"
         among = only if len(candidates) == 1 else f"of {len(candidates)} for {understood}"
-        said = f"{called(best, things)} is nearest to {where}: {_length(place, gap)} away, {among}."
-        return Reply(qualified(said, asked), document)
+        text = f"{called(best, things)} is nearest to {where}: {_length(place, gap)} away, {among}."
+        return Reply(qualified(text, asked), document)
 
     def measure(
         self, first: PhraseText, second: PhraseText, scene: SceneName = ""
@@ -237,12 +237,12 @@ class Tools:
             "second": other.geometry(),
             **{name: _lengths(place, value) for name, value in lengths.items()},
         }
-        said = (
+        text = (
             f"{shortened(asked['understood'])}: {_length(place, lengths['centers'])} between their centers, "
             f"{_length(place, lengths['gap'])} between their surfaces; the second is {_length(place, abs(rise))} "
             f"{'higher' if rise >= 0 else 'lower'}."
         )
-        return Reply(qualified(said, asked), document)
+        return Reply(qualified(text, asked), document)
 
     def what_is_at(
         self,
@@ -290,7 +290,7 @@ class Tools:
         ] = [],  # noqa: B006
         scene: SceneName = "",
     ) -> Annotated[Reply, answers.RenderAnswer]:
-        """Show a picture of a place: a view, or the view that shows a thing best; with a heatmap for each phrase."""
+        """Show an image of a place: a view, or the view that shows a thing best; with a heatmap for each phrase."""
         if view or look_at:
             _one_of({"view": view, "look_at": look_at})
         place = self._scene(scene)
@@ -308,8 +308,8 @@ class Tools:
             + (f" Note: {each['note']}." if each["note"] else "")
             for each in legend
         )
-        said = qualified(shown, looked_at) if looked_at else shown
-        return Reply(" ".join((said, *heat)), document, png)
+        text = qualified(shown, looked_at) if looked_at else shown
+        return Reply(" ".join((text, *heat)), document, png)
 
     def _scene(self, name: str) -> Scene:
         if not name and len(self.scenes) == 1:

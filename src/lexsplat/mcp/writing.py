@@ -45,11 +45,11 @@ class WritingTools(Tools):
         with _writing(path):
             files = export_scene(place, path, found=[replace(found, phrase=phrase)])
         written = [str(each) for each in files]
-        said = (
+        text = (
             f"{counted(len(found), 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
         )
         return Reply(
-            qualified(said, asked),
+            qualified(text, asked),
             {**place.world.to_json(), **asked, "files": written, "gaussians": len(found)},
         )
 
@@ -99,8 +99,8 @@ class WritingTools(Tools):
             "gaussians": len(found),
         }
         what = f"{shortened(asked['understood'])}{' (unsure)' if asked['present'] == 'unsure' else ''}"
-        said = f"{action} {what}: {counted(len(found), 'Gaussian')}; the result is the scene {saved.root}."
-        return Reply(said + (f" Note: {asked['note']}." if asked["note"] else ""), document)
+        text = f"{action} {what}: {counted(len(found), 'Gaussian')}; the result is the scene {saved.root}."
+        return Reply(text + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
     def _new(self, argument: str, name: str) -> Path:
         path = self.output / name

@@ -112,7 +112,7 @@ def check_encoders(
         right < ENOUGH
     ):  # a warning only: an encoder may be made for other things than the bundled pictures show
         log.warning(
-            "model %s: words match bundled pictures by %.2f only (expected %.2f, chance 0.50); answers may be wrong",
+            "model %s: words match bundled images by %.2f only (expected %.2f, chance 0.50); answers may be wrong",
             config.clip,
             right,
             ENOUGH,

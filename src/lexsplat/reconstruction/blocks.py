@@ -197,13 +197,13 @@ def ground_axes(up: Up) -> NDArray[np.float64]:
     """Two unit vectors ``[2, 3]`` that span the ground plane.
 
     Raises:
-        CaptureError: If the cameras do not tell which way is up.
+        CaptureError: If the up direction cannot be estimated from the cameras.
     """
     if not up.reliable:
         raise CaptureError(
             "--blocks",
             expected="a ground plane, to cut the capture on",
-            found="cameras that do not tell which way is up",
+            found="no reliable up direction in the cameras",
             remedy="give --up X,Y,Z or --blocks none",
         )
     first = np.cross(up.direction, np.eye(3)[np.abs(up.direction).argmin()])

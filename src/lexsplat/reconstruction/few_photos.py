@@ -90,20 +90,20 @@ def _points_of(
 
 def warn_of_few_photos(capture: Capture, gaussians: Gaussians) -> None:
     """Log how far new views of few photos can be trusted: by the held-out photos, if there are any."""
-    told = ""
+    measured = ""
     if capture.test_views:
         trained, held_out = (
             _psnr(capture, gaussians, views) for views in (capture.train_views, capture.test_views)
         )
         count = len(capture.test_views)
-        told = (
+        measured = (
             f": {count} held-out photos are rendered at {held_out:.1f} dB, trained ones at {trained:.1f} dB"
         )
     log.warning(
         "%d training photos are few%s; views far from every photo are guessed, so take 30 photos or more that overlap"
         " by 60 to 80 percent",
         len(capture.train_views),
-        told,
+        measured,
     )
 
 

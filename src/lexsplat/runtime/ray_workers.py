@@ -313,7 +313,7 @@ def _check_probe(node: str, found: str, code: str, missing: list[str]) -> None:
 
 
 def _unreachable(place: str, error: Exception, *, answers: bool = False) -> WorkersError:
-    """The error to tell; ``answers`` if something listens at the address, so that a token may be missing."""
+    """The error to raise; ``answers`` if something listens at the address, so that a token may be missing."""
     reason = " ".join(str(error).split())[:200]
     if "ersion mismatch" in reason:
         remedy = "use the same versions of Ray and Python on every machine"

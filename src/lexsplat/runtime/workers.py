@@ -63,7 +63,7 @@ class Workers(Protocol):
 
     @property
     def metrics(self) -> dict[str, float]:
-        """What progress tells of them: the number of tasks that run at a time, as "workers"."""
+        """Values that progress events carry: the number of tasks that run at a time, as "workers"."""
 
     def see(self, folder: SharedFolder) -> bool:
         """Whether every worker sees a folder of this process."""
@@ -76,8 +76,8 @@ class Workers(Protocol):
         Args:
             work: A function of a module. It may run more than once for an item, so it writes files atomically.
             shared: What all tasks read, sent to each worker once.
-            items: What tells the tasks apart, by name. An item is looked up when its task begins, so that a mapping
-                may load large ones then.
+            items: The inputs that differ between tasks, by name of the task. An item is looked up when its task
+                begins, so that a mapping may load large ones then.
             needs: What one task needs.
 
         Yields:

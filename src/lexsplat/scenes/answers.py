@@ -207,7 +207,7 @@ def answer_queries(
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
             "present": present,
-            "note": _heard_by_find(prompt),
+            "note": _note_of_grammar(prompt),
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
@@ -229,7 +229,7 @@ def answer_queries(
     }
 
 
-def _heard_by_find(prompt: str) -> str:
+def _note_of_grammar(prompt: str) -> str:
     """What to ask in place of a question or a phrase with grammar, which is asked here in its own words."""
     with contextlib.suppress(QueryError):
         parsed = understand(prompt)

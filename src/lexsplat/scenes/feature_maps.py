@@ -1,6 +1,6 @@
-"""The language feature map F of a view, and its picture: the three directions in which features vary most as colors.
+"""The language feature map F of a view, and its image: the three directions in which features vary most as colors.
 
-F = p S blends the codewords S by the rendered distribution over codes p (section 3.4, Fig. 1). The picture is the
+F = p S blends the codewords S by the rendered distribution over codes p (section 3.4, Fig. 1). The image is the
 principal component analysis of the codewords, weighted by how many Gaussians carry them, so that a thing has the same
 color in every view.
 """

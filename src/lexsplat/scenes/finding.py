@@ -36,8 +36,8 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     understood = understand(phrase)
     cut = max((_tokens_over(scene, text) for text in things_of(understood.phrase)), default=0)
     if cut:
-        told = f"longer than the encoder reads: the last {cut} of its tokens are left out"
-        understood = replace(understood, note="; ".join(filter(None, (understood.note, told))))
+        cut_off = f"longer than the encoder reads: the last {cut} of its tokens are left out"
+        understood = replace(understood, note="; ".join(filter(None, (understood.note, cut_off))))
     if understood.unknown:
         return understood
     vocabulary = words_of_things(scene.clip)
@@ -75,7 +75,7 @@ def unknown_note(phrase: Phrase, clip: str) -> str:
 
 
 def _tokens_over(scene: Scene, text: str) -> int:
-    """How many tokens of a text the encoder cuts off; 0 if the encoder does not tell."""
+    """How many tokens of a text the encoder cuts off; 0 if the encoder has no limit that is known."""
     if len(text) <= _SHORT or scene.given_encode_text is not None:
         return 0
     return int(getattr(scene.preload(), "tokens_over", lambda _: 0)(text))
@@ -114,7 +114,7 @@ def find_in(
 
 
 def middle_camera(scene: Scene) -> Camera | None:
-    """The camera closest to the middle of all: where somebody stands who says "me" and gives no view."""
+    """The camera closest to the middle of all: the viewpoint of "me" in a phrase without a view."""
     cameras = list(scene.cameras.values())
     if not cameras:
         return None

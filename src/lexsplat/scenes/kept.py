@@ -69,19 +69,19 @@ def keep(scene: Scene) -> None:
         words = scene.embed(everyday_words())  # its cache of texts keeps them
         if words.shape[1] != scene.field.codebook.clip.shape[1]:
             return  # no question can be asked with this encoder
-        judge = scene.presence_classifier
-        scene.embed(judge.colored or ["object"])
+        classifier = scene.presence_classifier
+        scene.embed(classifier.colored or ["object"])
         if scene.kept is None and scene.field.segments is not None:
-            write_objects(scene, KeptObjects(scene.objects, judge.places), path.with_name(FILE))
+            write_objects(scene, KeptObjects(scene.objects, classifier.places), path.with_name(FILE))
     except (
         OSError,
         LexsplatError,
-    ) as error:  # nothing is lost: questions compute it, and tell of a missing encoder
+    ) as error:  # nothing is lost: questions compute it, and report a missing encoder
         log.debug("%s: not kept (%s)", path, str(error)[:200])
 
 
 def keep_for(folder: SceneFolder, device: str, listener: Listener) -> None:
-    """`keep` for a finished scene folder, on a device; the listener hears of stages "words" and "views"."""
+    """`keep` for a finished scene folder, on a device; the listener receives the stages "words" and "views"."""
     from lexsplat.scenes.scene import open_scene
 
     scene = open_scene(folder.root, device=device)

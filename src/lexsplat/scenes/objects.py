@@ -1,4 +1,4 @@
-"""Everything in a scene: its objects with names, colors, places and sizes, as selections, data and a picture."""
+"""Everything in a scene: objects with names, colors, places and sizes, as selections, data and thumbnails."""
 
 from __future__ import annotations
 
@@ -90,11 +90,13 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     words = check_prompts(list(vocabulary) or default_vocabulary(scene.clip))
     if scene.field.segments is None:
         return _named_by_words(scene, words)
-    judge, segments, texts = scene.presence_classifier, scene.field.segments, scene.embed(words)
-    codes = judge.segment_codes
+    classifier, segments, texts = scene.presence_classifier, scene.field.segments, scene.embed(words)
+    codes = classifier.segment_codes
     if codes is None:
         return ()
-    whole = whole_segments(codes, lambda part: judge.strengths(texts[part], codes.distributions), len(words))
+    whole = whole_segments(
+        codes, lambda part: classifier.strengths(texts[part], codes.distributions), len(words)
+    )
     named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
     found: list[Selection] = []
     scores, shown = (
@@ -115,7 +117,9 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         for each in [both] if name in STUFF else both.instances:
             each = each.within(shown)
             if each:  # nothing is left of what no view shows
-                found.append(_named(each, words, judge.strengths(texts, _mean_codes(scene, each)[None])[0]))
+                found.append(
+                    _named(each, words, classifier.strengths(texts, _mean_codes(scene, each)[None])[0])
+                )
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 

@@ -29,7 +29,7 @@ class SceneContent:
 
     @property
     def query(self) -> QueryConfig:
-        """How it is asked unless the user says otherwise: as in the paper if it was built so."""
+        """The default settings of queries: as in the paper if it was built so."""
         if self.folder.record.get("config", {}).get("as_in_paper"):
             return QueryConfig(form="feature", fixed=True)
         return QueryConfig()

@@ -45,7 +45,7 @@ class OpenScene:
 
     def warm(self) -> None:
         """Load and compute what the first questions would wait for: the encoder, the dictionary, the objects."""
-        with contextlib.suppress(LexsplatError):  # the question that meets it tells it
+        with contextlib.suppress(LexsplatError):  # the first question reports it
             scene = self.scene
             scene.preload()
             corrected("thing", ())
@@ -108,21 +108,21 @@ def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) ->
     """An answer of `find_phrase` in one plain sentence."""
     understood = shortened(answer["understood"])
     if answer["present"] == "no":
-        said = f"Not here: nothing fits {understood}."
+        text = f"Not here: nothing fits {understood}."
     elif not answer["instances"]:
-        said = f"Nothing reaches the threshold {answer['threshold']:g} for {understood}."
+        text = f"Nothing reaches the threshold {answer['threshold']:g} for {understood}."
     else:
         things = "; ".join(placed(thing, meters_per_unit) for thing in answer["instances"][:8])
         more = f"; and {answer['count'] - 8} more" if answer["count"] > 8 else ""
-        said = f"{answer['count']} found for {understood}: {things}{more}."
-        return qualified(said, answer)
-    return qualified(said, {**answer, "present": "yes"})
+        text = f"{answer['count']} found for {understood}: {things}{more}."
+        return qualified(text, answer)
+    return qualified(text, {**answer, "present": "yes"})
 
 
-def qualified(said: str, answer: Mapping[str, Any]) -> str:
+def qualified(text: str, answer: Mapping[str, Any]) -> str:
     """A sentence with "Perhaps" where the "present" of an answer is "unsure", and with its "note"."""
-    said = f"Perhaps {said}" if answer["present"] == "unsure" else said
-    return f"{said} Note: {answer['note']}." if answer.get("note") else said
+    text = f"Perhaps {text}" if answer["present"] == "unsure" else text
+    return f"{text} Note: {answer['note']}." if answer.get("note") else text
 
 
 def placed(thing: Mapping[str, Any], meters_per_unit: float | None, link: str = " at ") -> str:

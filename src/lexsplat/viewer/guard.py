@@ -110,7 +110,7 @@ def _cookies(headers: Headers) -> list[str]:
 
 
 def body_size(headers: Headers) -> int | None:
-    """The length of a request's body; None if it is not told."""
+    """The length of a request's body; None if the request does not state it."""
     length = headers.get("content-length", "0")
     chunked = "transfer-encoding" in headers
     return int(length) if length.isascii() and length.isdigit() and len(length) < 12 and not chunked else None

@@ -25,7 +25,7 @@ class Asked:
 
     Args:
         prompt: The phrase; "" for a click.
-        camera: The camera of the page, which says where left and right are; None takes one of the views.
+        camera: The camera of the page, which defines left and right; None takes one of the views.
         click: The pixel that was clicked, from the left and from the top.
         threshold: Smallest score of a selected Gaussian; None takes the automatic one.
         instance: Number of the only instance that is meant, from 0; None means all.

@@ -97,7 +97,7 @@ class Session:
                 with self.lock:  # one phrase at a time, so that a prompt waits for one phrase at most
                     self.scene.preload()
                     self.scene.embed([phrase])
-        except LexsplatError as error:  # the first question says it to the page
+        except LexsplatError as error:  # the first question reports it to the page
             logging.getLogger("lexsplat").warning("%s", error)
 
     # -- answers

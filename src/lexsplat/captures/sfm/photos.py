@@ -149,15 +149,15 @@ def poses_from_photos(
     work = _work_folder(output, photos, config, seed)
     database = work / "database.db"
 
-    def tell(done: int) -> None:
+    def report(done: int) -> None:
         listener(Event(STAGE, min(done, total - 1), total))
 
     with quiet_pycolmap(seed):
-        tell(0)
-        mapping.extract_features(database, photos, config, memory, tell)
+        report(0)
+        mapping.extract_features(database, photos, config, memory, report)
         mapping.match_photos(database, len(names), config, seed, memory)
-        tell(len(names) + 1)
-        best = _best_attempt(database, photos, config, seed, memory, tell)
+        report(len(names) + 1)
+        best = _best_attempt(database, photos, config, seed, memory, report)
         if best is None:
             _discard(work, output)
             raise CaptureError(
@@ -184,7 +184,7 @@ def _best_attempt(
     config: PoseConfig,
     seed: int,
     memory: int,
-    tell: Callable[[int], None],
+    report: Callable[[int], None],
 ) -> Attempt | None:
     """The mapper that registers the most photos, with the least error on a tie.
 
@@ -204,13 +204,13 @@ def _best_attempt(
         ):
             continue
         check_mapping(database, memory)
-        found = _attempt(database, photos, mapper, seed, tell)
+        found = _attempt(database, photos, mapper, seed, report)
         missing = mapping.unregistered(names, found)
         if missing and not every_pair:
             every_pair = True
             mapping.match_leftover(database, names, missing, seed, memory)
             check_mapping(database, memory)
-            found = _attempt(database, photos, mapper, seed, tell) or found
+            found = _attempt(database, photos, mapper, seed, report) or found
         best = max(filter(None, (best, found)), key=lambda attempt: attempt.rank, default=None)
         if mapping.matched(database).isdisjoint(mapping.unregistered(names, best)):
             break
@@ -218,12 +218,12 @@ def _best_attempt(
 
 
 def _attempt(
-    database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int, tell: Callable[[int], None]
+    database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int, report: Callable[[int], None]
 ) -> Attempt | None:
     from lexsplat.captures.sfm.mapping import map_photos
 
     done = itertools.count(len(photos.names) + 2)
-    return map_photos(database, photos, mapper, seed, lambda: tell(next(done)))
+    return map_photos(database, photos, mapper, seed, lambda: report(next(done)))
 
 
 def _check_mapper(config: PoseConfig) -> None:

@@ -136,10 +136,10 @@ def triangulate(
     total = len(views) + 3
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
 
-        def tell(done: int) -> None:
+        def report(done: int) -> None:
             listener(Event(STAGE, done, total))
 
-        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, tell)
+        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, report)
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
         _write_cache(cached, points, colors)
@@ -271,7 +271,7 @@ def _write_photo(view: View, folder: Path, name: str) -> None:
 
 
 def _run_pycolmap(
-    views: tuple[View, ...], folder: Path, seed: int, memory: int, tell: Callable[[int], None]
+    views: tuple[View, ...], folder: Path, seed: int, memory: int, report: Callable[[int], None]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Extract and match features, verify matches with the known poses, triangulate."""
     from lexsplat.captures.sfm import mapping
@@ -279,22 +279,22 @@ def _run_pycolmap(
 
     names = tuple(_file_name(index) for index in range(len(views)))
     for done, (view, name) in enumerate(zip(views, names)):
-        tell(done)
+        report(done)
         _write_photo(view, folder, name)
-    tell(len(views))
+    report(len(views))
     database, images, masks = folder / "database.db", folder / "images", folder / "masks"
     largest = max(map(_working_size, views), key=lambda size: size[0] * size[1])
     lenses = tuple((name,) for name in names)
     photos = PreparedPhotos(images, names, lenses, masks if masks.is_dir() else None, largest)
     mapping.extract_features(database, photos, FEATURES, memory, lambda _: None, camera_model="PINHOLE")
     known = _known_reconstruction(database, views)
-    tell(len(views) + 1)
+    report(len(views) + 1)
     pairs = [(names[first], names[second]) for first, second in matching_pairs(views)]
     mapping.match_pairs(database, pairs, memory, seed=None)
     # Drops matches that violate the epipolar geometry of the known poses; estimates nothing.
     pycolmap.guided_geometric_verification(known, database)
     check_mapping(database, memory)
-    tell(len(views) + 2)
+    report(len(views) + 2)
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
     (folder / "model").mkdir()
     try:

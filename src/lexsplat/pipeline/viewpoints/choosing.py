@@ -58,7 +58,7 @@ _SOME = 1 / 3
 _USUALLY_VISIBLE = 0.5
 """Least share of the opaque Gaussians that some view should show: of captures it is .9, of made-up rooms .6."""
 _MOST_OTHERS = 128
-"""Views that are not good enough to be chosen, at most, that tell which Gaussians can be seen at all."""
+"""Largest number of views that are not good enough to be chosen, but show which Gaussians are visible at all."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Gaussians that float free of all surfaces: where they are many, a scene without a capture leaves them out.
 
-Small floaters are far from everything. Large ones are as near to others as the large Gaussians of walls are. What
-tells them apart is that surfaces are seen behind floaters, and nothing is seen behind walls. The largest engulf parts
+Small floaters are far from everything. Large ones are as near to others as the large Gaussians of walls are. They
+differ in that surfaces are seen behind floaters, and nothing is seen behind walls. The largest engulf parts
 of the scene, so surfaces lie before, on and behind them; what belongs to the scene and has details within its own
 radius, such as a table top with a pattern, lies on surfaces everywhere.
 """

@@ -66,7 +66,7 @@ class Interior:
         enclosed: Share of those that are closed all around, in 0..1.
         things: Share of what closed places show that stands free of the shell around them, in 0..1.
         hazy: Share of the places around which something is drawn everywhere that is no clear surface.
-        side: What the user says; "auto" leaves it to the shares.
+        side: The setting of the user; "auto" leaves it to the shares.
     """
 
     places: int
@@ -90,7 +90,7 @@ class Interior:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the user says it, or the evidence is clear.
+        """Whether the user set it, or the evidence is clear.
 
         It is for a closed place with things in it, and for free places that are hardly ever closed. A closed shell
         without things may be an empty room, and where there is no free place, nothing is known.

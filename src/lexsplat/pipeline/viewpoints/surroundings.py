@@ -160,7 +160,7 @@ def _warn(upward: UpwardDirections, given: Points | None, points: Points, subjec
     direction = ",".join(f"{value + 0.0:.2g}" for value in np.round(upward.directions[0], 2))
     if given is None and not upward.reliable:
         log.warning(
-            "%s: the up direction is a guess (%s); give it with --up x,y,z if pictures are tilted",
+            "%s: the up direction is a guess (%s); give it with --up x,y,z if the views are tilted",
             subject,
             direction,
         )
@@ -170,7 +170,7 @@ def _warn(upward: UpwardDirections, given: Points | None, points: Points, subjec
     values = np.linalg.eigvalsh(np.cov(points.T))
     if values[0] < _FLAT**3 * values[1]:
         log.warning(
-            "%s: all Gaussians lie in one plane, like a picture; depth tells nothing apart in it", subject
+            "%s: all Gaussians lie in one plane, as in an image; depth separates nothing in it", subject
         )
 
 

@@ -88,7 +88,7 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     scores = np.array([score + look(direction) for direction, score in candidates])
     scores += np.where(
         grounds > _WALL, standing * grounds, 0
-    )  # elsewhere there are no walls to tell from a floor
+    )  # elsewhere there are no walls to take for a floor
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable"):
         if not kept or (directions[kept] @ directions[index]).max() < _SAME:

@@ -36,7 +36,7 @@ AROUND = 5
 AGAIN = "copy the file again or export it again"
 """The remedy for damage."""
 
-_told: ContextVar[set[str] | None] = ContextVar("told", default=None)
+_logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
 _SMALLEST_LOG_SCALE = math.log(1e-12)
 _SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
@@ -67,20 +67,20 @@ def reason(error: Exception) -> str:
 @contextlib.contextmanager
 def warnings_once() -> Iterator[None]:
     """What is read more than once in this block is warned of once."""
-    token = _told.set(set())
+    token = _logged.set(set())
     try:
         yield
     finally:
-        _told.reset(token)
+        _logged.reset(token)
 
 
 def warn(message: str, path: Path, *values: object) -> None:
     """Log a warning of a file; see `warnings_once`."""
-    text, told = message % (path, *values), _told.get()
-    if told is None or text not in told:
+    text, logged = message % (path, *values), _logged.get()
+    if logged is None or text not in logged:
         logger.warning("%s", text)
-    if told is not None:
-        told.add(text)
+    if logged is not None:
+        logged.add(text)
 
 
 def renderable(gaussians: Gaussians, path: Path) -> Gaussians:

@@ -86,7 +86,7 @@ def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
     if version != 2 or kind != b"JSON" or 20 + length > total:
         raise Damage(f"version {version} with {length:,} bytes of JSON in {total:,}")
     if total != len(content):
-        raise Damage(f"{len(content):,} bytes, and a header that tells {total:,}")
+        raise Damage(f"{len(content):,} bytes, expected {total:,} by the header")
     binary, start = b"", 20 + length
     if start + 8 <= total:
         size, kind = struct.unpack_from("<I4s", content, start)
@@ -245,7 +245,7 @@ class _Document:
 
 
 def _refuse_compression(part: dict[str, Any]) -> None:
-    """Refuse data in another form, such as meshopt or SPZ; files need not say that they require it."""
+    """Refuse data in another form, such as meshopt or SPZ; files need not list it as required."""
     if part.get("extensions"):
         raise Damage(f"{', '.join(part['extensions'])} is not supported, export it uncompressed")
 

@@ -156,7 +156,7 @@ def _check_left(left: int, vertices: Element, order: str, path: Path) -> None:
 
 
 def is_antialiased(lines: Sequence[str]) -> bool:
-    """Whether the last comment on it in a header says that the Gaussians were trained with the mip filter."""
+    """Whether the last comment on it in a header states that the Gaussians were trained with the mip filter."""
     modes = [_MODES[line] for line in lines if line in _MODES]
     return bool(modes) and modes[-1]
 

@@ -25,7 +25,7 @@ ENCODINGS = {
     "format binary_little_endian 1.0": "<",
     "format binary_big_endian 1.0": ">",
 }
-"""Byte order of the numbers, "" for text, by the line of the header that tells it."""
+"""Byte order of the numbers, "" for text, by the line of the header that states it."""
 
 SPLATS = "use a .ply of 3D Gaussians; a mesh or a point cloud has none"
 """The remedy for a PLY of something else."""

@@ -1,9 +1,9 @@
-"""SOG, PlayCanvas's splats in WebP pictures: ``meta.json`` with pictures beside it, or all in one zip archive.
+"""SOG, PlayCanvas's splats in WebP images: ``meta.json`` with images beside it, or all in one zip archive.
 
-Pixel i of each picture belongs to Gaussian i. Positions are 16-bit steps between bounds of sign(x) ln(1 + |x|), low
-and high bytes in two pictures. Scales and colors are indices into tables of up to 256 numbers. Rotations are the
-smallest three components, and alpha tells which one is left out. Spherical harmonics are indices into a palette,
-itself a picture. Version 2 is read and written. Version 1, which has even steps between two bounds in place of
+Pixel i of each image belongs to Gaussian i. Positions are 16-bit steps between bounds of sign(x) ln(1 + |x|), low
+and high bytes in two images. Scales and colors are indices into tables of up to 256 numbers. Rotations are the
+smallest three components, and alpha states which one is left out. Spherical harmonics are indices into a palette,
+itself an image. Version 2 is read and written. Version 1, which has even steps between two bounds in place of
 tables, and opacities as logits, is read. GaussForge is not used: damaged files crash its reader, and its writer mixes
 up the components of rotations.
 """
@@ -37,10 +37,10 @@ from lexsplat.scenes.formats.foreign import (
 )
 
 META = "meta.json"
-"""The part that names the others; alone in a folder with pictures, the name of the file."""
+"""The part that names the others; alone in a folder with images, the name of the file."""
 
 PALETTE_WIDTH = 64
-"""Entries in a row of the palette's picture."""
+"""Entries in a row of the palette's image."""
 
 COEFFICIENTS = (0, 3, 8, 15)
 """Coefficients of the spherical harmonics for each number of bands."""
@@ -130,7 +130,7 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
         raise FileFormatError(
             path,
             expected=f"the {count:,} Gaussians of its count",
-            found=f"{held:,} in its pictures",
+            found=f"{held:,} in its images",
             remedy="the count is wrong: export the file again",
         )
     table = _table if version == 2 else _even_steps
@@ -150,7 +150,7 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
 
 
 def _pixels(load: _Load, name: str, count: int) -> NDArray[np.uint8]:
-    """A picture ``[H, W, 4]`` of at least ``count`` pixels, and not of many more."""
+    """An image ``[H, W, 4]`` of at least ``count`` pixels, and not of many more."""
     if not isinstance(name, str) or Path(name).name != name or "\\" in name:
         raise Damage(f"a part named {str(name)[:80]!r}")
     content = load(name, _BYTES_A_PIXEL * count + _FURTHER_BYTES)
@@ -160,11 +160,11 @@ def _pixels(load: _Load, name: str, count: int) -> NDArray[np.uint8]:
             raise Damage(f"{name} of {picture.width} x {picture.height} pixels for {count:,}")
         return np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise Damage(f"{name} is no whole WebP picture") from error
+        raise Damage(f"{name} is no whole WebP image") from error
 
 
 def _table(part: dict[str, Any]) -> NDArray[np.float32]:
-    """The 256 numbers that a picture's bytes are indices of ``[256, 1]``; a shorter table ends in NaN."""
+    """The 256 numbers that an image's bytes are indices of ``[256, 1]``; a shorter table ends in NaN."""
     numbers = list(part["codebook"])
     if len(numbers) == 256 and numbers[0] is None:  # early versions of SuperSplat: the steps are nearly equal
         numbers[0] = numbers[1] + (numbers[1] - numbers[255]) / 255
@@ -197,10 +197,10 @@ def _positions(low: NDArray[np.uint8], high: NDArray[np.uint8], part: dict[str, 
 
 
 def _held(turns: NDArray[np.uint8], places: Sequence[NDArray[np.uint8]], count: int) -> int:
-    """Number of Gaussians whose rotations are in a picture ``[P, 4]``: no rotation is four zeros.
+    """Number of Gaussians whose rotations are in an image ``[P, 4]``: no rotation is four zeros.
 
     What fills up the last rows is not among them: zeros, opaque black, and copies of the last Gaussian, which are at
-    the same place in the pictures of positions.
+    the same place in the images of positions.
     """
     used, last = np.asarray(turns.any(1)), max(count - 1, 0)
     copies = (turns[count:] == turns[last]).all(1)
@@ -228,7 +228,7 @@ def _harmonics(
 ) -> NDArray[np.float32]:
     """Coefficients ``[N, 3 | 8 | 15, 3]`` of the palette's entries."""
     picture = _pixels(load, part["files"][0], COEFFICIENTS[3])
-    bands = part.get("bands", _BANDS.get(picture.shape[1]))  # version 1 has the width of the picture alone
+    bands = part.get("bands", _BANDS.get(picture.shape[1]))  # version 1 has the width of the image alone
     width, entries = COEFFICIENTS[bands] if bands in (1, 2, 3) else 0, part.get("count", 1 << 16)
     if not width or type(entries) is not int or not 0 < entries <= 1 << 16:
         raise Damage(f"a palette of {entries!r:.40} entries with {bands!r:.40} bands")

@@ -88,7 +88,7 @@ def _opaque(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _positions(means: NDArray[np.float64]) -> tuple[dict[str, NDArray[np.uint8]], dict[str, Any]]:
-    """Pictures of low and high bytes, and their entry of ``meta.json``."""
+    """Images of low and high bytes, and their entry of ``meta.json``."""
     values = np.sign(means) * np.log1p(np.abs(means))
     first, last = values.min(0), values.max(0)
     span = np.where(last > first, last - first, 1)

@@ -1,11 +1,11 @@
 """What a library keeps of a scene with segments, so that most questions are answered without opening it.
 
-Language, places and pictures are kept by segment, not by Gaussian: a phrase takes or leaves whole segments
+Language, places and images are kept by segment, not by Gaussian: a phrase takes or leaves whole segments
 (`lexsplat.queries.segments`), and `lexsplat.scenes.library.indexed` finds out which from what is here. Segments are
 those of the lowest level that has at most `_MOST`. Everything is in one file of tensors, named after its hash.
 
 Dimension letters: L levels, S segments of the lowest kept level, K codes, D dimensions, V objects, M sampled points,
-E links between segments, W pictures.
+E links between segments, W images.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _MOST = 2048
 """Segments of the lowest kept level, at most, unless the coarsest level has more."""
 _POINTS, _ALL_POINTS = 16, 12_000
 """Points of a segment that are kept, at most, unless fewer than the latter would be: they give boxes and frames."""
-_PICTURES = 8
-"""Pictures of a scene, at most: one bit of a byte tells whether a picture shows a point."""
+_IMAGES = 8
+"""Largest number of images of a scene: the bits of a byte hold which images show a point."""
 _SIDE, _QUALITY = 320, 70
-"""Longer side of a picture in pixels, and quality of its JPEG."""
+"""Longer side of an image in pixels, and quality of its JPEG."""
 _BEHIND = 0.05
-"""A picture shows a point that lies at most this share of its distance behind what is drawn there."""
+"""An image shows a point that lies at most this share of its distance behind what is drawn there."""
 _NEIGHBORS = 8
 _FAINT = 0.1
 """Gaussians of lower opacity link nothing, as in `lexsplat.queries.selection`."""
@@ -53,7 +53,7 @@ Array = NDArray[Any]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contents:
-    """The segments, objects and pictures of a scene.
+    """The segments, objects and images of a scene.
 
     Args:
         levels: Segment at each level of each segment ``[L, S]`` int32, the lowest level first.
@@ -75,13 +75,13 @@ class Contents:
         starts: First point of each segment ``[S + 1]`` int32.
         offsets: Points relative to these centers ``[M, 3]`` float16.
         weights: Their opacities ``[M]`` float16.
-        seen: Which pictures show each point ``[M]`` uint8, one bit for each picture.
-        sizes: Width and height of the pictures in pixels ``[W, 2]`` int32.
-        intrinsics: Of the pictures, in pixels ``[W, 3, 3]``.
+        seen: Which images show each point ``[M]`` uint8, one bit for each image.
+        sizes: Width and height of the images in pixels ``[W, 2]`` int32.
+        intrinsics: Of the images, in pixels ``[W, 3, 3]``.
         poses: World to camera ``[W, 4, 4]``.
-        ends: Where the files of the pictures end ``[W]`` int32.
+        ends: Where the files of the images end ``[W]`` int32.
         pictures: The files, JPEG, one after the other, uint8.
-        facts: Names of the pictures ("views"), up direction ("world"), and the objects with name, place and size.
+        facts: Names of the images ("views"), up direction ("world"), and the objects with name, place and size.
     """
 
     levels: Tensor
@@ -122,12 +122,12 @@ class Contents:
         return _content(self.tensors())
 
     def camera(self, number: int) -> Camera:
-        """The camera of a picture."""
+        """The camera of an image."""
         width, height = self.sizes[number].tolist()
         return Camera(width, height, self.intrinsics[number].numpy(), self.poses[number].numpy())
 
     def picture(self, number: int) -> Image.Image:
-        """A picture of the scene."""
+        """An image of the scene."""
         start = int(self.ends[number - 1]) if number else 0
         file = self.pictures[start : int(self.ends[number])].numpy().tobytes()
         return Image.open(io.BytesIO(file)).convert("RGB")
@@ -145,7 +145,7 @@ class Contents:
             return None
         segments = _kept_levels(scene.field.segments)
         points = _points(scene, segments)
-        pictures = _pictures(scene, points.pop("means"))
+        pictures = _images(scene, points.pop("means"))
         return cls(
             **_language(scene, segments),
             **_neighbors(scene, segments),
@@ -277,9 +277,9 @@ def _points(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     }
 
 
-def _pictures(scene: Scene, means: Tensor) -> dict[str, Any]:
-    """Pictures of the scene and which of the points ``[M, 3]`` they show."""
-    names, files, cameras = evenly(list(scene.views), _PICTURES), [], []
+def _images(scene: Scene, means: Tensor) -> dict[str, Any]:
+    """Images of the scene and which of the points ``[M, 3]`` they show."""
+    names, files, cameras = evenly(list(scene.views), _IMAGES), [], []
     seen = np.zeros(len(means), np.uint8)
     for number, name in enumerate(names):
         camera = scene.camera(name)

@@ -5,7 +5,7 @@
     library.json                       format_version and the library's own name on a server
     scenes/NAME.json                   the record: where the scene is, which version of it, its encoder
     scenes/NAME.CONTENT.safetensors    the codes, named after their hash, and the record again
-    scenes/NAME.CONTENTS.objects.safetensors    segments, objects and pictures, of scenes with segments
+    scenes/NAME.CONTENTS.objects.safetensors    segments, objects and images, of scenes with segments
     texts/                             embeddings of the texts that were asked
 
 The record is written last and replaced as a whole: a scene is in the library when its record is. Codes of earlier

@@ -55,9 +55,9 @@ class Hit:
         return f"{self.scene}: present: {self.present}. {self.sentence}{self._sizes()}"
 
     def without_note(self) -> str:
-        """The lines for people without the note, which the answer of the library tells."""
-        said = sentence({**self.answer, "note": ""}, self.world.meters_per_unit)
-        return f"{self.scene}: present: {self.present}. {said}{self._sizes()}"
+        """The answer as text without the note, which is part of the library's answer."""
+        text = sentence({**self.answer, "note": ""}, self.world.meters_per_unit)
+        return f"{self.scene}: present: {self.present}. {text}{self._sizes()}"
 
     def _sizes(self) -> str:
         scale, unit = (
@@ -65,8 +65,8 @@ class Hit:
             "m" if self.world.meters_per_unit else "scene units",
         )
         sizes = [each["size"] for each in self.answer["instances"][:8]]
-        told = "; ".join(" x ".join(f"{side * scale:.2f}" for side in size) for size in sizes)
-        return f" Size: {told} {unit}." if told else ""
+        listed = "; ".join(" x ".join(f"{side * scale:.2f}" for side in size) for size in sizes)
+        return f" Size: {listed} {unit}." if listed else ""
 
     @property
     def opened(self) -> Scene:

@@ -57,7 +57,7 @@ class Indexed:
     Args:
         answer: As of `lexsplat.scenes.answers.find_phrase`.
         contents: What it was made from.
-        view: Number of the picture that shows the first thing best; -1 if none does.
+        view: Number of the image that shows the first thing best; -1 if none does.
         frame: Left, upper, right and lower pixel of that thing in it.
     """
 
@@ -67,7 +67,7 @@ class Indexed:
     frame: tuple[int, int, int, int] = (0, 0, 0, 0)
 
     def picture(self, side: int) -> Image.Image | None:
-        """The picture with the frame; None if the library has none of this thing."""
+        """The image with the frame; None if the library has none of this thing."""
         if self.view < 0:
             return None
         image = self.contents.picture(self.view)
@@ -144,7 +144,7 @@ def _spread(contents: Contents) -> csr_array:
 
 
 def decidable(phrase: str, clip: str) -> Thing | None:
-    """The thing that a phrase names, if the index can tell of it; None if scenes must be asked themselves.
+    """The thing that a phrase names, if the index can answer it; None if scenes must be searched themselves.
 
     Args:
         phrase: What is looked for.
@@ -182,12 +182,12 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
         known = [each for each in contents.facts["objects"] if is_of_kind(each["name"], thing.text)]
         if known:
             return _of_objects(contents, known, common)
-    judge, unit, words = _KeptPresence(contents, codes), text[None].float(), thing.text.lower().split()
-    (presence,) = judge.classify([thing.text], unit, torch.zeros(1, 1))
+    classifier, unit, words = _KeptPresence(contents, codes), text[None].float(), thing.text.lower().split()
+    (presence,) = classifier.classify([thing.text], unit, torch.zeros(1, 1))
     if presence == "no":
         return Indexed({**_answer([], presence), **common}, contents)
-    best = judge.best_heights([thing.text])
-    by_code = judge.scale.relevancy(judge.language.codebook.clip, unit, best)[:, 0].numpy()
+    best = classifier.best_heights([thing.text])
+    by_code = classifier.scale.relevancy(classifier.language.codebook.clip, unit, best)[:, 0].numpy()
     own = torch.from_numpy(np.clip(_spread(contents) @ by_code, 0, 1))[None]
     scores, counts = segment_relevancy(own, _segments(contents))[0].numpy(), contents.counts.numpy()
     taken = np.flatnonzero((scores >= SEGMENT_THRESHOLD) & (counts > 0))
@@ -264,7 +264,7 @@ def _point_rows(contents: Contents, part: Array) -> tuple[Array, Array]:
 def _instance(
     contents: Contents, part: Array, scores: Array, name: str
 ) -> tuple[dict[str, Any], int, tuple[int, int, int, int]]:
-    """An instance as plain data (`Selection.geometry`), its best picture and its frame there."""
+    """An instance as plain data (`Selection.geometry`), its best image and its frame there."""
     rows, points = _point_rows(contents, part)
     of = np.repeat(part, np.diff(contents.starts.numpy())[part])
     kept = np.diff(contents.starts.numpy())[of]
@@ -287,7 +287,7 @@ def _instance(
 
 
 def _best_view(contents: Contents, part: Array) -> tuple[int, tuple[int, int, int, int]]:
-    """The picture that shows most of segments, and the frame around what it shows; -1 if none does."""
+    """The image that shows most of segments, and the frame around what it shows; -1 if none does."""
     if not len(part):
         return -1, (0, 0, 0, 0)
     rows, points = _point_rows(contents, part)

@@ -410,7 +410,7 @@ class Library:
         Args:
             phrase: What to look for; with relations as in `Scene.find`.
             limit: Number of scenes, at most.
-            confirm: Ask the scenes themselves also where the index can tell.
+            confirm: Search the scenes themselves, also where the index suffices.
 
         Raises:
             QueryError: If the phrase is empty.

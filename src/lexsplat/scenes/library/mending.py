@@ -104,5 +104,5 @@ def _repair(library: Library, name: str) -> None:
         return
     place = library.folder(record)
     if (place / "scene.json").is_file():
-        with contextlib.suppress(LexsplatError):  # `mended` tells what is still wrong
+        with contextlib.suppress(LexsplatError):  # `mended` reports what is still wrong
             library.enter(place, name)

@@ -17,7 +17,7 @@ _NAMED = 3
 
 
 def note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) -> str:
-    """What the notes of the hits tell, each once, and what encoders without a hit do not know.
+    """The notes of the hits, each once, and the words that encoders without a hit do not know.
 
     A note that holds for some hits only names their scenes.
 
@@ -31,10 +31,10 @@ def note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) -> 
     """
     scenes: dict[str, list[str]] = {}
     for hit in hits:
-        told = hit.answer["note"].split("; ") if hit.answer["note"] else []
+        parts = hit.answer["note"].split("; ") if hit.answer["note"] else []
         if hit.answer["understood"] != hits[0].answer["understood"]:
-            told.append(f"understood as {shortened(hit.answer['understood'])}")
-        for part in dict.fromkeys(told):
+            parts.append(f"understood as {shortened(hit.answer['understood'])}")
+        for part in dict.fromkeys(parts):
             scenes.setdefault(part, []).append(hit.scene)
     notes = [
         part if len(named) == len(hits) else f"{part} (in {_listed(named)})" for part, named in scenes.items()
@@ -44,17 +44,17 @@ def note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) -> 
     answered = {hit.clip for hit in hits}
     for clip in encoders if not asked.unknown else ():
         if clip not in answered:
-            notes += _not_heard(asked.phrase, clip, mended=not hits)
+            notes += _notes_without_hits(asked.phrase, clip, mended=not hits)
     return "; ".join(dict.fromkeys(notes))
 
 
-def _not_heard(phrase: Phrase, clip: str, mended: bool) -> Iterator[str]:
-    """What is to be told of an encoder without a hit.
+def _notes_without_hits(phrase: Phrase, clip: str, mended: bool) -> Iterator[str]:
+    """Notes of an encoder without a hit.
 
     Args:
         phrase: What was asked for.
         clip: Name of the encoder.
-        mended: Whether to tell what was searched in place of typing errors.
+        mended: Whether to note what was searched in place of typing errors.
     """
     known = words_of_things(clip)
 

@@ -1,4 +1,4 @@
-"""The English words for the page, which tells typing errors from words: a Bloom filter."""
+"""The English words for the page, which finds typing errors with them: a Bloom filter."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from lexsplat.scenes.scene import Scene
 
 FORMAT, FORMAT_VERSION = "lexsplat-page", 5
 DRAWN_SPLATS = 1_000_000
-"""Gaussians that a page draws at once, at most; of more, those that cover most of the picture."""
+"""Gaussians that a page draws at once, at most; of more, those that cover most of the image."""
 MOST_OBJECTS = 200
 """Entries of the list of objects, at most."""
 
@@ -34,7 +34,7 @@ def scene_manifest(
     title: str,
     budget: int,
 ) -> dict[str, Any]:
-    """What every page says of its scene.
+    """The facts of a scene that every page contains.
 
     Args:
         scene: The scene.
