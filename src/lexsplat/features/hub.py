@@ -214,9 +214,8 @@ def _download(name: str, tower: str, lacking: str) -> Path:
         folder = snapshot_download(name, revision=facts.sha, allow_patterns=files, etag_timeout=_HUB_TIMEOUT)
     except ModelError:
         raise
-    except (
-        Exception
-    ) as error:  # a missing network raises many types, depending on the HTTP library and the proxy
+    except Exception as error:
+        # A missing network raises many types, depending on the HTTP library and the proxy.
         raise _refusal(name, tower, error, cache, lacking) from error
     return Path(folder)
 

@@ -209,9 +209,8 @@ def _axis_weights(level: CropLevel, starts: NDArray, positions: NDArray) -> Tens
     side = level.size / level.patches
     places = (np.arange(level.patches) + 0.5) * side
     centers = (starts[:, None] + places).ravel()
-    inside = np.clip(
-        positions, centers.min(), centers.max()
-    )  # beyond the outermost centers, the nearest ones are used
+    # Beyond the outermost centers, the nearest ones are used.
+    inside = np.clip(positions, centers.min(), centers.max())
     tents = np.maximum(0, 1 - np.abs(inside[:, None] - centers) / side)
     weights = tents * np.tile(np.minimum(places, level.size - places), len(starts))
     return torch.from_numpy((weights / weights.sum(1, keepdims=True)).astype(np.float32))

@@ -321,10 +321,8 @@ class _Builder:
     def _extract_features(self) -> dict[str, Any]:
         maps = self._feature_maps()
         if self.config.features_from is not None:
-            for done, name in enumerate(
-                maps, start=1
-            ):  # reading checks them, before anything is made of them
-                _ = maps[name]
+            for done, name in enumerate(maps, start=1):
+                _ = maps[name]  # reading checks them, before anything is made of them
                 self.listener(Event("features", done, len(maps)))
         return {"views": len(maps), "clip_hash": self._clip_hash, "dino": self.config.uses_dino}
 

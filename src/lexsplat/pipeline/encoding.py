@@ -108,9 +108,8 @@ def check_encoders(
         return
     log.log(NOTE, "the encoders are loaded, checked and timed")
     right = rank_words(encoders.clip)
-    if (
-        right < ENOUGH
-    ):  # a warning only: an encoder may be made for other things than the bundled pictures show
+    if right < ENOUGH:
+        # Only a warning: an encoder may be made for other things than the bundled images show.
         log.warning(
             "model %s: words match bundled images by %.2f only (expected %.2f, chance 0.50); answers may be wrong",
             config.clip,

@@ -90,9 +90,8 @@ def render(
     if color:
         degree = gaussians.sh_degree if sh_degree is None else max(0, min(sh_degree, gaussians.sh_degree))
         shaded, seen = gaussians, projection
-        if (
-            viewmat is not None
-        ):  # colors depend on directions in the world, and the projection is in camera axes
+        if viewmat is not None:
+            # Colors depend on directions in the world, and the projection is in camera axes.
             shaded = posing.around_the_camera(gaussians, viewmat)
             seen = replace(projection, means=shaded.means)
         colors = module.shade(shaded, camera, seen, degree)

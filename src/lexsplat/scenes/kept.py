@@ -73,10 +73,8 @@ def keep(scene: Scene) -> None:
         scene.embed(classifier.colored or ["object"])
         if scene.kept is None and scene.field.segments is not None:
             write_objects(scene, KeptObjects(scene.objects, classifier.places), path.with_name(FILE))
-    except (
-        OSError,
-        LexsplatError,
-    ) as error:  # nothing is lost: questions compute it, and report a missing encoder
+    except (OSError, LexsplatError) as error:
+        # Nothing is lost: questions compute it, and report a missing encoder.
         log.debug("%s: not kept (%s)", path, str(error)[:200])
 
 

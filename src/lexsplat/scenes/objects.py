@@ -99,10 +99,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     )
     named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
     found: list[Selection] = []
-    scores, shown = (
-        torch.zeros_like(segments.masses),
-        ~scene.hidden,
-    )  # objects share no Gaussian, so they share scores
+    # Objects share no Gaussian, so they share scores.
+    scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
     for number in named[named >= 0].unique().tolist():
         mask, name = named[segments.labels] == number, words[number]
         both = Selection(

@@ -86,9 +86,8 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     grounds = np.array([ground_share(points, direction) for direction in directions])
     standing = standing_shares(points, directions)
     scores = np.array([score + look(direction) for direction, score in candidates])
-    scores += np.where(
-        grounds > _WALL, standing * grounds, 0
-    )  # elsewhere there are no walls to take for a floor
+    # Elsewhere there are no walls to take for a floor.
+    scores += np.where(grounds > _WALL, standing * grounds, 0)
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable"):
         if not kept or (directions[kept] @ directions[index]).max() < _SAME:

@@ -122,9 +122,8 @@ def _indexed(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], list[float
     centers = np.sort(np.append(np.quantile(sample, np.linspace(0, 1, _TABLE // 2)), even))
     for _ in range(_LLOYD_STEPS):
         ends = np.searchsorted(sample, (centers[1:] + centers[:-1]) / 2)
-        ends = np.concatenate(
-            [[0], ends, [len(sample)]]
-        )  # the nearest values of a center are a run of the sample
+        # The nearest values of a center are a run of the sample.
+        ends = np.concatenate([[0], ends, [len(sample)]])
         counts = np.diff(ends)
         centers = np.sort(np.where(counts, np.diff(sums[ends]) / np.maximum(counts, 1), centers))
     labels = np.searchsorted((centers[1:] + centers[:-1]) / 2, flat)

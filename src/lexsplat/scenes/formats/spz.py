@@ -207,7 +207,7 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
         path: The file.
         version: 4, or 3 for programs that read no newer one.
 
-    All centers have the precision that the farthest one leaves. If it is too coarse for the others, a warning is logged.
+    All centers have the precision that the farthest one leaves. A warning follows if it is too coarse for the others.
 
     Raises:
         ValueError: If a value is NaN or infinite, a center is farther than 8,388,607 units from the origin, or the

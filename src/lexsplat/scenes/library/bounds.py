@@ -55,9 +55,8 @@ def presence_bounds(codes: Sequence[Codes], texts: Tensor) -> FloatArray:
     with one_thread(), torch.no_grad():
         for count, places in sizes.items():
             heights = np.empty((len(places), count, len(texts)), np.float32)
-            wide = torch.empty(
-                codes[places[0]].units.shape
-            )  # one buffer: a new one for each scene costs page faults
+            # One buffer: a new one for each scene costs page faults.
+            wide = torch.empty(codes[places[0]].units.shape)
             for row, place in zip(heights, places):
                 wide.copy_(codes[place].units)
                 row[:] = (wide @ unit - codes[place].shared[:, None]).numpy()

@@ -104,9 +104,8 @@ class Codes:
         for rows in torch.arange(len(masses), device=masses.device).split(_GAUSSIANS):
             probabilities = field.select(rows).code_probabilities().cpu()
             weights += masses[rows].cpu().double() @ probabilities.double()
-            seen |= (probabilities > 0).any(
-                0
-            )  # also where next to nothing is visible: the bound holds for any place
+            # Also where next to nothing is visible: the bound holds for any place.
+            seen |= (probabilities > 0).any(0)
         shares = (weights / weights.sum().clamp_min(1e-12)).clamp_min(1e-9) * seen
         words = scene.embed(everyday_words()).cpu()
         return cls.made(field.codebook.clip.cpu(), words, scene.everyday_scale, shares.float())
