@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def kept_rooms(tmp_path_factory):
     """Two scenes and a library of them; read-only."""
     root = tmp_path_factory.mktemp("rooms")
     write_scene(root / "kitchen")
@@ -29,9 +30,9 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def rooms(made, tmp_path, monkeypatch):
+def rooms(kept_rooms, tmp_path, monkeypatch) -> Path:
     install(monkeypatch)
-    return copied(made, tmp_path / "rooms")
+    return copied(kept_rooms, tmp_path / "rooms")
 
 
 def run(capsys, action, rooms, *arguments):

@@ -13,6 +13,7 @@ from support.schemas import validated
 
 from lexsplat import cli, open_scene
 from lexsplat.scenes.objects import MAX_WORDS, list_document, objects_of
+from lexsplat.scenes.scene import Scene
 
 PLACES = {  # tools/demo_scene/layouts.py
     "apple": (-0.55, -0.75), "rubber duck": (0.35, -0.8), "mug": (-0.15, -0.1), "stack of books": (1.25, 0.2),
@@ -26,7 +27,7 @@ COLORS = {"apple": "red", "rubber duck": "yellow", "mug": "blue", "vase": "white
 
 
 @pytest.fixture(scope="module")
-def demo():
+def demo() -> Scene:
     return open_scene("demo", device="cpu")
 
 

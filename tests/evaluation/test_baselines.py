@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
-from support.language_scene import CENTERS, IGNORED, make_scene
+from support.language_scene import CENTERS, IGNORED, LanguageScene, make_scene
 
 from lexsplat.evaluation import Method
 from lexsplat.evaluation.baselines import (
@@ -39,7 +39,7 @@ OTHER = torch.eye(DIM)[BALLS:]
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene(per_ball=40, views=6)
 
 

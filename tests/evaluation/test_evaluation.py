@@ -12,7 +12,7 @@ import pytest
 import torch
 from support.tiny_capture import SPHERES, trace
 
-from lexsplat.captures import load_annotations, load_capture
+from lexsplat.captures import Capture, load_annotations, load_capture
 from lexsplat.evaluation import (
     EvaluationConfig,
     GroundTruth,
@@ -87,7 +87,7 @@ class PerfectField:
 
 
 @pytest.fixture(scope="module")
-def capture(tiny_capture):
+def capture(tiny_capture) -> Capture:
     return load_capture(tiny_capture)
 
 

@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no 
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def reports(tmp_path_factory):
     """The report of a scene and that of a comparison."""
     folder = tmp_path_factory.mktemp("reports")
     metrics, gallery = evaluated()
@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", params=[1280, 400])
-def opened(request, folder):
+def opened(request, reports):
     """The report in a window of some width; failed requests and console messages are in ``refused``."""
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
@@ -39,7 +39,7 @@ def opened(request, folder):
         page.refused = []
         page.on("console", lambda message: page.refused.append(message.text))
         page.on("requestfailed", lambda request: page.refused.append(request.url))
-        page.goto((folder / "report.html").as_uri())
+        page.goto((reports / "report.html").as_uri())
         yield page
         browser.close()
 
@@ -65,8 +65,8 @@ def test_images_of_a_case_are_large_enough(opened):
     assert min(widths) >= 120
 
 
-def test_a_comparison_is_no_wider_than_its_window_and_requests_nothing(opened, folder):
-    opened.goto((folder / "comparison.html").as_uri())
+def test_a_comparison_is_no_wider_than_its_window_and_requests_nothing(opened, reports):
+    opened.goto((reports / "comparison.html").as_uri())
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert opened.evaluate("document.querySelectorAll('.versus .answer').length") == 6 * 6
     assert opened.refused == []

@@ -15,6 +15,7 @@ from support.noise_photos import HEIGHT, WIDTH, make_capture
 from support.tiny_capture import SPHERES, camera_poses, trace
 
 from lexsplat import cli
+from lexsplat.captures import Capture
 from lexsplat.codebook import Codebook
 from lexsplat.features import FeatureMap, external_identity, load_external_features
 from lexsplat.features.encoders import load_clip
@@ -24,7 +25,7 @@ VIEWS, SIZE = 12, (96, 72)
 
 
 @pytest.fixture
-def capture(tmp_path):
+def capture(tmp_path) -> Capture:
     return make_capture(tmp_path / "images", count=2)
 
 

@@ -15,6 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from support.noise_photos import HEIGHT, WIDTH, FakeLens, FakeView, make_capture
 
+from lexsplat.captures import Capture
 from lexsplat.features import (
     FeatureConfig,
     FeatureMap,
@@ -91,7 +92,7 @@ CONFIG = FeatureConfig(
 
 
 @pytest.fixture
-def capture(tmp_path):
+def capture(tmp_path) -> Capture:
     return make_capture(tmp_path / "images")
 
 

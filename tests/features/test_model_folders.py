@@ -24,7 +24,7 @@ TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
 
 
 @pytest.fixture
-def copy(clip_folder, tmp_path) -> Path:
+def clip_copy(clip_folder, tmp_path) -> Path:
     """A copy of the tiny CLIP to damage."""
     return shutil.copytree(clip_folder, tmp_path / "copy")
 
@@ -62,24 +62,24 @@ def assert_same_model(found, folder: Path) -> None:
 # -- what loads
 
 
-def test_weights_in_the_names_of_open_clip_give_every_tensor_its_place(clip_folder, copy):
+def test_weights_in_the_names_of_open_clip_give_every_tensor_its_place(clip_folder, clip_copy):
     from transformers import CLIPModel
 
     foreign = in_open_clip_names(CLIPModel.from_pretrained(clip_folder))
-    rewrite(copy, lambda state: foreign, "open_clip_model.safetensors")
-    assert_same_model(load_clip(str(copy)), clip_folder)
+    rewrite(clip_copy, lambda state: foreign, "open_clip_model.safetensors")
+    assert_same_model(load_clip(str(clip_copy)), clip_folder)
     newer = {
         f"text.{name}": value for name, value in foreign.items() if not name.startswith(("visual", "logit"))
     }
     newer |= {name: value for name, value in foreign.items() if name.startswith(("visual", "logit"))}
-    save_file(newer, copy / "open_clip_model.safetensors")
-    assert_same_model(load_clip(str(copy)), clip_folder)
+    save_file(newer, clip_copy / "open_clip_model.safetensors")
+    assert_same_model(load_clip(str(clip_copy)), clip_folder)
 
 
-def test_the_weights_of_transformers_are_preferred_to_those_of_open_clip(clip_folder, copy):
-    save_file({"visual.proj": torch.zeros(1)}, copy / "open_clip_model.safetensors")
-    (copy / "pytorch_model.bin").write_bytes(b"no pickle")
-    assert_same_model(load_clip(str(copy)), clip_folder)
+def test_the_weights_of_transformers_are_preferred_to_those_of_open_clip(clip_folder, clip_copy):
+    save_file({"visual.proj": torch.zeros(1)}, clip_copy / "open_clip_model.safetensors")
+    (clip_copy / "pytorch_model.bin").write_bytes(b"no pickle")
+    assert_same_model(load_clip(str(clip_copy)), clip_folder)
 
 
 def test_weights_in_the_names_of_timm_give_every_tensor_its_place(vit_folder, tmp_path):
@@ -89,28 +89,28 @@ def test_weights_in_the_names_of_timm_give_every_tensor_its_place(vit_folder, tm
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_pickled_weights_are_read_with_a_note(clip_folder, copy, caplog, wrapped):
-    state = load_file(copy / "model.safetensors")
-    (copy / "model.safetensors").unlink()
+def test_pickled_weights_are_read_with_a_note(clip_folder, clip_copy, caplog, wrapped):
+    state = load_file(clip_copy / "model.safetensors")
+    (clip_copy / "model.safetensors").unlink()
     content = {"state_dict": {f"module.{name}": value for name, value in state.items()}} if wrapped else state
-    torch.save(content, copy / "pytorch_model.bin")
+    torch.save(content, clip_copy / "pytorch_model.bin")
     with caplog.at_level(logging.WARNING, logger="lexsplat"):
-        assert_same_model(load_clip(str(copy)), clip_folder)
+        assert_same_model(load_clip(str(clip_copy)), clip_folder)
     assert "pytorch_model.bin is read without running its code" in caplog.text
 
 
-def test_pickled_code_does_not_run(copy, tmp_path):
+def test_pickled_code_does_not_run(clip_copy, tmp_path):
     class Trap:
         def __reduce__(self):
             return Path.touch, (tmp_path / "ran",)
 
-    (copy / "model.safetensors").unlink()
-    torch.save({"weight": Trap()}, copy / "pytorch_model.bin")
-    refused(copy, "pytorch_model.bin", "tensors only")
+    (clip_copy / "model.safetensors").unlink()
+    torch.save({"weight": Trap()}, clip_copy / "pytorch_model.bin")
+    refused(clip_copy, "pytorch_model.bin", "tensors only")
     assert not (tmp_path / "ran").exists()
 
 
-def test_old_and_new_layouts_of_transformers_load_whole(vit_folder, clip_folder, copy, tmp_path):
+def test_old_and_new_layouts_of_transformers_load_whole(vit_folder, clip_folder, clip_copy, tmp_path):
     from transformers import ViTConfig, ViTForImageClassification
 
     names = list(load_file(vit_folder / "model.safetensors"))
@@ -128,98 +128,98 @@ def test_old_and_new_layouts_of_transformers_load_whole(vit_folder, clip_folder,
         if "pooler" not in name:
             torch.testing.assert_close(tensor, classifier.vit.state_dict()[name], atol=0, rtol=0)
     # Old CLIP files hold positions, which newer versions compute.
-    rewrite(copy, lambda state: {**state, "text_model.embeddings.position_ids": torch.arange(11)[None]})
-    assert_same_model(load_clip(str(copy)), clip_folder)
+    rewrite(clip_copy, lambda state: {**state, "text_model.embeddings.position_ids": torch.arange(11)[None]})
+    assert_same_model(load_clip(str(clip_copy)), clip_folder)
 
 
-def test_shards_load_whole_and_every_shard_is_needed(clip_folder, copy):
-    state = load_file(copy / "model.safetensors")
-    (copy / "model.safetensors").unlink()
+def test_shards_load_whole_and_every_shard_is_needed(clip_folder, clip_copy):
+    state = load_file(clip_copy / "model.safetensors")
+    (clip_copy / "model.safetensors").unlink()
     shards = [f"model-0000{number}-of-00002.safetensors" for number in (1, 2)]
     table = {name: shards[place % 2] for place, name in enumerate(state)}
     for shard in shards:
-        save_file({name: state[name] for name in table if table[name] == shard}, copy / shard)
-    (copy / "model.safetensors.index.json").write_text(json.dumps({"weight_map": table}))
-    assert_same_model(load_clip(str(copy)), clip_folder)
-    (copy / shards[1]).unlink()
-    refused(copy, "all shards of model.safetensors", "save_pretrained")
-    (copy / "model.safetensors.index.json").write_text('{"weight_map": {"a": "../copy/config.json"}}')
-    refused(copy, "all shards of model.safetensors")
+        save_file({name: state[name] for name in table if table[name] == shard}, clip_copy / shard)
+    (clip_copy / "model.safetensors.index.json").write_text(json.dumps({"weight_map": table}))
+    assert_same_model(load_clip(str(clip_copy)), clip_folder)
+    (clip_copy / shards[1]).unlink()
+    refused(clip_copy, "all shards of model.safetensors", "save_pretrained")
+    (clip_copy / "model.safetensors.index.json").write_text('{"weight_map": {"a": "../copy/config.json"}}')
+    refused(clip_copy, "all shards of model.safetensors")
 
 
 # -- what is refused
 
 
-def test_a_model_saved_without_its_tokenizer_is_refused(copy):
+def test_a_model_saved_without_its_tokenizer_is_refused(clip_copy):
     for name in TOKENIZER:
-        (copy / name).unlink()
-    refused(copy, "a tokenizer (tokenizer.json)", "copy the tokenizer files")
-    (copy / "vocab.json").write_text("{}")
-    refused(copy, "a tokenizer (tokenizer.json)")  # without its merges
+        (clip_copy / name).unlink()
+    refused(clip_copy, "a tokenizer (tokenizer.json)", "copy the tokenizer files")
+    (clip_copy / "vocab.json").write_text("{}")
+    refused(clip_copy, "a tokenizer (tokenizer.json)")  # without its merges
 
 
-def test_the_tokenizer_of_another_model_is_refused(copy):
-    content = json.loads((copy / "tokenizer.json").read_text())
+def test_the_tokenizer_of_another_model_is_refused(clip_copy):
+    content = json.loads((clip_copy / "tokenizer.json").read_text())
     vocabulary = content["model"]["vocab"]
     kept = dict(sorted(vocabulary.items(), key=lambda item: item[1])[:600])
     content["model"] |= {"vocab": kept, "merges": []}
     content["added_tokens"] = []
-    (copy / "tokenizer.json").write_text(json.dumps(content))
-    refused(copy, f"a tokenizer with the {len(vocabulary):,} words of the model", "fetch")
+    (clip_copy / "tokenizer.json").write_text(json.dumps(content))
+    refused(clip_copy, f"a tokenizer with the {len(vocabulary):,} words of the model", "fetch")
 
 
-def test_a_layer_without_its_attention_is_refused(copy):
+def test_a_layer_without_its_attention_is_refused(clip_copy):
     rewrite(
-        copy,
+        clip_copy,
         lambda state: {n: t for n, t in state.items() if "vision_model.encoder.layers.1.self" not in n},
     )
     refused(
-        copy,
+        clip_copy,
         "model.safetensors",
         "all 78 tensors",
         "8 missing: vision_model.encoder.layers.1.self_attn.k_proj",
     )
 
 
-def test_names_that_do_not_match_are_refused(copy, vit_folder, tmp_path):
-    rewrite(copy, lambda state: {f"tower.{name}": tensor for name, tensor in state.items()})
-    refused(copy, "model.safetensors", "missing")
+def test_names_that_do_not_match_are_refused(clip_copy, vit_folder, tmp_path):
+    rewrite(clip_copy, lambda state: {f"tower.{name}": tensor for name, tensor in state.items()})
+    refused(clip_copy, "model.safetensors", "missing")
     folder = shutil.copytree(vit_folder, tmp_path / "vit")
     rewrite(folder, lambda state: {f"backbone.{name}": tensor for name, tensor in state.items()})
     refused(folder, "model.safetensors", "missing", load=load_dino)
 
 
-def test_a_configuration_with_fewer_layers_than_the_weights_is_refused(copy):
-    config = json.loads((copy / "config.json").read_text())
+def test_a_configuration_with_fewer_layers_than_the_weights_is_refused(clip_copy):
+    config = json.loads((clip_copy / "config.json").read_text())
     config["vision_config"]["num_hidden_layers"] = 1
-    (copy / "config.json").write_text(json.dumps(config))
-    refused(copy, "all layers of the weights", "vision_model.encoder.layers.1")
+    (clip_copy / "config.json").write_text(json.dumps(config))
+    refused(clip_copy, "all layers of the weights", "vision_model.encoder.layers.1")
 
 
-def test_weights_of_another_size_are_refused(copy):
-    rewrite(copy, lambda state: {**state, "visual_projection.weight": torch.ones(7, 32)})
-    refused(copy, "sizes in config.json", "visual_projection.weight")
+def test_weights_of_another_size_are_refused(clip_copy):
+    rewrite(clip_copy, lambda state: {**state, "visual_projection.weight": torch.ones(7, 32)})
+    refused(clip_copy, "sizes in config.json", "visual_projection.weight")
 
 
-def test_unlike_words_with_one_vector_are_refused(copy):
+def test_unlike_words_with_one_vector_are_refused(clip_copy):
     def blind(state: dict) -> dict:
         return {
             n: torch.zeros_like(t) if n.endswith("token_embedding.weight") else t for n, t in state.items()
         }
 
-    rewrite(copy, blind)
-    refused(copy, "unlike words with unlike embeddings", "an apple")
+    rewrite(clip_copy, blind)
+    refused(clip_copy, "unlike words with unlike embeddings", "an apple")
 
 
-def test_weights_that_are_not_finite_are_refused(copy, vit_folder, tmp_path):
+def test_weights_that_are_not_finite_are_refused(clip_copy, vit_folder, tmp_path):
     def spoiled(state: dict) -> dict:
         return {
             **state,
             "visual_projection.weight": torch.full_like(state["visual_projection.weight"], torch.nan),
         }
 
-    rewrite(copy, spoiled)
-    encoder = load_clip(str(copy))
+    rewrite(clip_copy, spoiled)
+    encoder = load_clip(str(clip_copy))
     with pytest.raises(ModelError) as caught:
         encoder.encode_images(torch.rand(1, 3, 40, 40))
     assert_tells(caught.value, "finite features")
@@ -252,27 +252,27 @@ def test_an_overflow_in_half_precision_is_computed_again_in_full(clip_folder, mo
 
 
 @pytest.mark.parametrize("content", ["damaged", "empty", "missing", "a list"])
-def test_a_damaged_folder_is_refused(copy, content):
-    weights, config = copy / "model.safetensors", copy / "config.json"
+def test_a_damaged_folder_is_refused(clip_copy, content):
+    weights, config = clip_copy / "model.safetensors", clip_copy / "config.json"
     if content == "damaged":
         weights.write_bytes(weights.read_bytes()[: weights.stat().st_size // 2])
-        refused(copy, "model.safetensors", "expected safetensors", "fetch it again")
+        refused(clip_copy, "model.safetensors", "expected safetensors", "fetch it again")
     elif content == "missing":
         weights.unlink()
-        refused(copy, "a model folder with model.safetensors", "config.json", "--clip bundled")
+        refused(clip_copy, "a model folder with model.safetensors", "config.json", "--clip bundled")
     elif content == "a list":
         config.write_text("[]")
-        refused(copy, "transformers can load")
+        refused(clip_copy, "transformers can load")
     else:
-        shutil.rmtree(copy)
-        copy.mkdir()
-        refused(copy, "an empty folder")
+        shutil.rmtree(clip_copy)
+        clip_copy.mkdir()
+        refused(clip_copy, "an empty folder")
 
 
-def test_a_clone_without_its_large_files_is_told(copy):
+def test_a_clone_without_its_large_files_is_told(clip_copy):
     pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 598641023\n"
-    (copy / "model.safetensors").write_text(pointer)
-    refused(copy, "model.safetensors", "a pointer of Git LFS", f"git -C {copy} lfs pull")
+    (clip_copy / "model.safetensors").write_text(pointer)
+    refused(clip_copy, "model.safetensors", "a pointer of Git LFS", f"git -C {clip_copy} lfs pull")
 
 
 def test_an_empty_name_is_not_the_working_directory(clip_folder, monkeypatch):
@@ -306,25 +306,25 @@ def test_the_tokenizer_of_siglip_is_exported_with_its_tokens(tmp_path, text):
     assert exported.encode(text).ids == encoder._tokenizer(text)["input_ids"]
 
 
-def test_the_tokenizer_of_siglip_needs_an_extra(copy, monkeypatch):
-    (copy / "tokenizer.json").unlink()
-    (copy / "spiece.model").write_bytes(b"")
-    (copy / "tokenizer_config.json").write_text('{"tokenizer_class": "SiglipTokenizer"}')
+def test_the_tokenizer_of_siglip_needs_an_extra(clip_copy, monkeypatch):
+    (clip_copy / "tokenizer.json").unlink()
+    (clip_copy / "spiece.model").write_bytes(b"")
+    (clip_copy / "tokenizer_config.json").write_text('{"tokenizer_class": "SiglipTokenizer"}')
     monkeypatch.setattr("lexsplat.features.clip._is_installed", lambda module: False)
-    refused(copy, "SentencePiece, which is not installed", 'pip install "lexsplat[siglip]"')
+    refused(clip_copy, "SentencePiece, which is not installed", 'pip install "lexsplat[siglip]"')
 
 
-def test_the_content_hash_covers_the_loaded_files_alone(clip_folder, copy):
+def test_the_content_hash_covers_the_loaded_files_alone(clip_folder, clip_copy):
     expected = hub.content_hash(clip_folder, "clip")
-    assert hub.content_hash(copy, "clip") == expected
+    assert hub.content_hash(clip_copy, "clip") == expected
     # What other programs add to a snapshot of the Hub.
-    (copy / "README.md").write_text("prose")
-    (copy / "open_clip_config.json").write_text("{}")
-    (copy / "open_clip_model.safetensors").write_bytes(b"another format")
-    (copy / "vocab.txt").write_text("another tokenizer")
-    assert hub.content_hash(copy, "clip") == expected
+    (clip_copy / "README.md").write_text("prose")
+    (clip_copy / "open_clip_config.json").write_text("{}")
+    (clip_copy / "open_clip_model.safetensors").write_bytes(b"another format")
+    (clip_copy / "vocab.txt").write_text("another tokenizer")
+    assert hub.content_hash(clip_copy, "clip") == expected
     for name in ("model.safetensors", "config.json", "tokenizer.json", "preprocessor_config.json"):
-        content = (copy / name).read_bytes()
-        (copy / name).write_bytes(content + b" ")
-        assert hub.content_hash(copy, "clip") != expected, name
-        (copy / name).write_bytes(content)
+        content = (clip_copy / name).read_bytes()
+        (clip_copy / name).write_bytes(content + b" ")
+        assert hub.content_hash(clip_copy, "clip") != expected, name
+        (clip_copy / name).write_bytes(content)

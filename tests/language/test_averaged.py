@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from support.language_scene import label_accuracy, make_scene
+from support.language_scene import LanguageScene, label_accuracy, make_scene
 from support.rendering_reference import blend, front_camera, project, random_gaussians, to_float64
 from torch.nn.functional import normalize
 
@@ -35,7 +35,7 @@ FULL_SIZE = AveragedConfig(shortest_side=10_000)
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene()
 
 

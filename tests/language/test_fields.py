@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
-from support.language_scene import make_codebook, make_scene
+from support.language_scene import LanguageScene, make_codebook, make_scene
 from support.rendering_reference import blend, project, to_float64
 from torch import nn
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene(per_ball=8, views=2, width=16, height=12, num_codes=70)
 
 

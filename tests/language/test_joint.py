@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from lexsplat.captures import load_capture
-from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.captures import Capture, load_capture
+from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import Codebook
 from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.language.methods.trained_settings import TrainedConfig
@@ -23,12 +23,12 @@ CODES = 4
 
 
 @pytest.fixture(scope="module")
-def capture(tiny_capture):
+def capture(tiny_capture) -> Capture:
     return load_capture(tiny_capture, downscale=2.0)
 
 
 @pytest.fixture(scope="module")
-def points(capture):
+def points(capture) -> InitialPoints:
     return initial_points(capture)
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.language_scene import IGNORED, label_accuracy, make_scene
+from support.language_scene import IGNORED, LanguageScene, label_accuracy, make_scene
 
 from lexsplat.language.code_maps import codes_at_pixels
 from lexsplat.language.methods.trained import _prepare_views, train_field
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene()
 
 

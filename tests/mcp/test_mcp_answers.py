@@ -3,6 +3,7 @@
 import pytest
 
 pytest.importorskip("mcp")
+from mcp.server import MCPServer
 from support.mcp_clients import ask, talk
 
 from lexsplat import open_scene
@@ -25,7 +26,7 @@ ASKED = {"understood", "note", "present", "threshold", "best_view"}
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory):
+def server(tmp_path_factory) -> MCPServer:
     return make_server(open_scenes(["demo"]), tmp_path_factory.mktemp("output"))
 
 

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("mcp")
 from mcp import MCPError
+from mcp.server import MCPServer
 from support.library_scenes import OTHERS, install, write_scene
 from support.mcp_clients import ask, talk
 from support.schemas import validated
@@ -22,7 +23,7 @@ SCHEMA = Path(__file__).parents[2] / "docs" / "schemas" / "library.json"
 
 
 @pytest.fixture(autouse=True)
-def _encoders(monkeypatch):
+def _encoders(monkeypatch) -> None:
     install(monkeypatch)
 
 
@@ -35,7 +36,7 @@ def library(tmp_path):
 
 
 @pytest.fixture
-def server(library):
+def server(library) -> MCPServer:
     return make_server({}, library=library)
 
 

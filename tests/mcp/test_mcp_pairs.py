@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mcp")
+from mcp.server import MCPServer
 from support.mcp_clients import ask
 
 from lexsplat import open_scene
@@ -12,12 +13,12 @@ from lexsplat.scenes.serving import open_scenes
 
 
 @pytest.fixture(scope="module")
-def server():
+def server() -> MCPServer:
     return make_server(open_scenes(["demo"]))
 
 
 @pytest.fixture(scope="module")
-def points():
+def points_of_things():
     """The points of things of the bundled scene, by name."""
     scene = open_scene("demo")
     names = ("apple", "banana", "teddy bear", "toy car", "rubber duck")
@@ -43,26 +44,31 @@ def names(document):
     ],
 )
 def test_a_thing_is_not_measured_against_itself_but_against_the_nearest_other(
-    server, points, first, second, ends
+    server, points_of_things, first, second, ends
 ):
     reply, text = ask(server, "measure", first=first, second=second)
     document = reply.structured_content
     if "teddy bear" in ends:  # which toy is nearer to the bear follows from the points
         toys = ("toy car", "rubber duck")
-        ends = {"teddy bear", min(toys, key=lambda toy: gap(points["teddy bear"], points[toy]))}
+        ends = {
+            "teddy bear",
+            min(toys, key=lambda toy: gap(points_of_things["teddy bear"], points_of_things[toy])),
+        }
     assert names(document) == ends
     assert document["centers"]["units"] > 0.3
-    assert document["gap"]["units"] == pytest.approx(gap(*(points[name] for name in ends)), abs=0.05)
+    assert document["gap"]["units"] == pytest.approx(
+        gap(*(points_of_things[name] for name in ends)), abs=0.05
+    )
     taken = next(iter(ends - {first, second}))
     assert taken in document["note"]
     assert document["note"] in text
 
 
-def test_of_several_things_the_nearest_pair_is_measured_and_named(server, points):
+def test_of_several_things_the_nearest_pair_is_measured_and_named(server, points_of_things):
     reply, text = ask(server, "measure", first="fruit", second="toy")
     document = reply.structured_content
     pairs = [(a, b) for a in ("apple", "banana") for b in ("teddy bear", "toy car", "rubber duck")]
-    nearest = min(pairs, key=lambda pair: gap(points[pair[0]], points[pair[1]]))
+    nearest = min(pairs, key=lambda pair: gap(points_of_things[pair[0]], points_of_things[pair[1]]))
     assert (document["first"]["name"], document["second"]["name"]) == nearest
     assert document["note"] == (
         f'"fruit" fits 2 and "toy" fits 3 things; measured is the nearest pair, {nearest[0]} and {nearest[1]}'
@@ -81,13 +87,13 @@ def test_one_thing_alone_has_no_distance(server, pair):
     assert reply.structured_content["error"]["remedy"]
 
 
-def test_a_thing_is_nearest_to_another_of_the_kind_that_it_is_of(server, points):
+def test_a_thing_is_nearest_to_another_of_the_kind_that_it_is_of(server, points_of_things):
     for target, to in (("apple", "fruit"), ("fruit", "apple"), ("fruit", "fruit")):
         reply, text = ask(server, "nearest", target=target, to=to)
         document = reply.structured_content
         assert {document["nearest"]["name"], document["to"]["name"]} == {"apple", "banana"}, text
         assert document["distance"]["units"] == pytest.approx(
-            gap(points["apple"], points["banana"]), abs=0.02
+            gap(points_of_things["apple"], points_of_things["banana"]), abs=0.02
         )
     reply, text = ask(server, "nearest", target="fruit", to="apple")
     assert text.startswith("banana is nearest to apple: ")

@@ -6,22 +6,23 @@ import pytest
 
 pytest.importorskip("mcp")
 from mcp import MCPError
+from mcp.server import MCPServer
 from support.mcp_clients import ask, talk
 
 from lexsplat.cli import main
 from lexsplat.mcp import writing
 from lexsplat.mcp.server import make_server
 from lexsplat.scenes.editing import Editor
-from lexsplat.scenes.serving import open_scenes
+from lexsplat.scenes.serving import OpenScene, open_scenes
 
 
 @pytest.fixture(scope="module")
-def scenes():
+def scenes() -> dict[str, OpenScene]:
     return open_scenes(["demo"])
 
 
 @pytest.fixture(scope="module")
-def server(scenes):
+def server(scenes) -> MCPServer:
     return make_server(scenes)
 
 

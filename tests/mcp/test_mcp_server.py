@@ -18,6 +18,7 @@ pytest.importorskip("mcp")
 import httpx2
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters
+from mcp.server import MCPServer
 from support.mcp_clients import ask, served, talk
 from support.schemas import validated
 
@@ -25,7 +26,7 @@ from lexsplat.mcp.server import http_app, make_server
 from lexsplat.runtime.files import read_json
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.library import Library
-from lexsplat.scenes.serving import open_scenes
+from lexsplat.scenes.serving import OpenScene, open_scenes
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
 TOKEN = "a token of sufficient length"
@@ -36,12 +37,12 @@ READING = {
 
 
 @pytest.fixture(scope="module")
-def scenes():
+def scenes() -> dict[str, OpenScene]:
     return open_scenes(["demo"])
 
 
 @pytest.fixture(scope="module")
-def server(scenes):
+def server(scenes) -> MCPServer:
     return make_server(scenes)
 
 

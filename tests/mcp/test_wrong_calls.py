@@ -11,20 +11,21 @@ import pytest
 pytest.importorskip("mcp")
 from mcp import Client, MCPError
 from mcp.client.stdio import StdioServerParameters
+from mcp.server import MCPServer
 from support.mcp_clients import ask, served, talk
 
 from lexsplat.mcp.server import http_app, make_server
 from lexsplat.mcp.tools import Tools
-from lexsplat.scenes.serving import open_scenes
+from lexsplat.scenes.serving import OpenScene, open_scenes
 
 
 @pytest.fixture(scope="module")
-def scenes():
+def scenes() -> dict[str, OpenScene]:
     return open_scenes(["demo"])
 
 
 @pytest.fixture(scope="module")
-def server(scenes, tmp_path_factory):
+def server(scenes, tmp_path_factory) -> MCPServer:
     return make_server(scenes, tmp_path_factory.mktemp("output"))
 
 

@@ -24,7 +24,7 @@ TRAINED = replace(CONFIG, iterations=4)
 
 
 @pytest.fixture(scope="module")
-def scenes(tiny_capture, tmp_path_factory):
+def built_by_method(tiny_capture, tmp_path_factory):
     """A scene by each method; its files must not be changed."""
     folder = tmp_path_factory.mktemp("scenes")
     for config in (AVERAGED, TRAINED):
@@ -64,12 +64,14 @@ def test_every_method_has_a_name_that_settings_accept_and_stages_that_exist():
 
 
 @pytest.mark.parametrize("config", [AVERAGED, TRAINED], ids=lambda config: config.method)
-def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(scenes, tiny_capture, tmp_path, config):
+def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(
+    built_by_method, tiny_capture, tmp_path, config
+):
     expected = ["reconstruct", *METHODS[config.method].needs, "language"]
-    record = SceneFolder.open(scenes / config.method).record
+    record = SceneFolder.open(built_by_method / config.method).record
     assert list(record["stages"]) == expected
     assert record["stages"]["language"]["method"] == config.method
-    copy = shutil.copytree(scenes / config.method, tmp_path / "copy")
+    copy = shutil.copytree(built_by_method / config.method, tmp_path / "copy")
     assert stages_run(tiny_capture, copy, config) == dict.fromkeys(expected, True)
 
 
@@ -88,19 +90,21 @@ def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(scenes, tin
         (TRAINED, {"seed": 1}, {"reconstruct", "codebook", "language"}),
     ],
 )
-def test_a_changed_setting_redoes_what_depends_on_it(scenes, tiny_capture, tmp_path, base, change, redone):
-    copy = shutil.copytree(scenes / base.method, tmp_path / "copy")
+def test_a_changed_setting_redoes_what_depends_on_it(
+    built_by_method, tiny_capture, tmp_path, base, change, redone
+):
+    copy = shutil.copytree(built_by_method / base.method, tmp_path / "copy")
     finished = stages_run(tiny_capture, copy, replace(base, **change))
     assert {name for name, kept in finished.items() if not kept} == redone
 
 
-def test_a_missing_result_is_made_again(scenes, tiny_capture, tmp_path):
-    copy = shutil.copytree(scenes / "averaged", tmp_path / "copy")
+def test_a_missing_result_is_made_again(built_by_method, tiny_capture, tmp_path):
+    copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
     (copy / "language.safetensors").unlink()
     finished = stages_run(tiny_capture, copy, AVERAGED)
     assert finished == {"reconstruct": True, "features": True, "language": False}
     for name in ("gaussians.ply", "language.safetensors"):
-        assert (copy / name).read_bytes()[-500:] == (scenes / "averaged" / name).read_bytes()[-500:]
+        assert (copy / name).read_bytes()[-500:] == (built_by_method / "averaged" / name).read_bytes()[-500:]
 
 
 def test_a_build_stops_after_the_stage_asked_for(tiny_capture, tmp_path):

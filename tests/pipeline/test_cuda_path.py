@@ -15,12 +15,12 @@ import torch
 from support import color_encoder
 from support.encoder_folders import save_model, seeded, tiny_vit
 from support.held_out import held_out_psnr
-from support.language_scene import make_scene
+from support.language_scene import LanguageScene, make_scene
 from support.tiny_capture import write_capture
 from support.viewer_scene import WORDS, ball_scene
 
-from lexsplat.captures import load_capture
-from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.captures import Capture, load_capture
+from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.features import FeatureConfig, extract_features
 from lexsplat.features.clip import ClipEncoder
@@ -50,18 +50,18 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 
 @pytest.fixture(scope="module")
-def capture(tiny_capture):
+def capture(tiny_capture) -> Capture:
     return load_capture(tiny_capture, downscale=3.0)
 
 
 @pytest.fixture(scope="module")
-def points(capture):
+def points(capture) -> InitialPoints:
     found = initial_points(capture)
     return dataclasses.replace(found, points=found.points[::5], colors=found.colors[::5])
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene(per_ball=12, views=3, width=24, height=18)
 
 

@@ -15,7 +15,7 @@ from support.schemas import SCHEMAS
 from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
-from lexsplat.captures import load_capture
+from lexsplat.captures import Capture, load_capture
 from lexsplat.features import FeatureMap, FeatureMaps, extract_features
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.averaging import MOST_SHARDS, SHARD_VIEWS, average_features, view_shards
@@ -33,7 +33,7 @@ class Encoders:
 
 
 @pytest.fixture
-def capture(tiny_capture, tmp_path, monkeypatch):
+def capture(tiny_capture, tmp_path, monkeypatch) -> Capture:
     monkeypatch.setattr(distribution, "_encoders", lambda *_: Encoders())
     return load_capture(shutil.copytree(tiny_capture, tmp_path / "capture"))
 

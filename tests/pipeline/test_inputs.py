@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def run(command: str, capture, output, *further: str) -> int:
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory):
+def photos(tmp_path_factory) -> Path:
     """The room as a phone stores it, with ground truth for one photo and a mask for another."""
     folder = tmp_path_factory.mktemp("phone")
     for index, camera in enumerate(room_cameras()):
@@ -49,26 +50,26 @@ def photos(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def scene_folder(photos, tmp_path_factory):
+def room_scene(photos, tmp_path_factory):
     output = tmp_path_factory.mktemp("scene") / "room"
     assert run("reconstruct", photos, output) == 0
     return output
 
 
-def test_photos_alone_become_a_scene_of_upright_views(photos, scene_folder):
-    record = json.loads((scene_folder / "scene.json").read_text())
+def test_photos_alone_become_a_scene_of_upright_views(photos, room_scene):
+    record = json.loads((room_scene / "scene.json").read_text())
     assert record["capture"] == str(photos)
     assert record["stages"]["poses"]["registered"] == COUNT
     assert record["stages"]["poses"]["unregistered"] == ["unrelated.png"]
-    views = SceneFolder.open(scene_folder).read_cameras()
+    views = SceneFolder.open(room_scene).read_cameras()
     assert {name: view.split for name, view in views.items()} == {
         f"{index}.jpg": "test" if index == 3 else "train" for index in range(COUNT)
     }, "the photo with ground truth is held out"
     assert_same_up_to_a_similarity([views[f"{index}.jpg"].camera for index in range(COUNT)], room_cameras())
 
 
-def test_reloading_finds_photos_ground_truth_and_masks(photos, scene_folder, tmp_path):
-    capture = reload_capture(SceneFolder.open(scene_folder))
+def test_reloading_finds_photos_ground_truth_and_masks(photos, room_scene, tmp_path):
+    capture = reload_capture(SceneFolder.open(room_scene))
     assert len(capture.views) == COUNT
     assert capture.test_names == ("3.jpg",)
     assert list(load_annotations(capture).masks["3.jpg"]) == ["wall"]
@@ -76,11 +77,11 @@ def test_reloading_finds_photos_ground_truth_and_masks(photos, scene_folder, tmp
     assert [name for name in valid if valid[name] is not None] == ["5.jpg"]
     assert 0.6 < valid["5.jpg"].mean() < 0.8
     moved = shutil.copytree(photos, tmp_path / "moved")
-    assert reload_capture(SceneFolder.open(scene_folder), moved).root == moved
+    assert reload_capture(SceneFolder.open(room_scene), moved).root == moved
 
 
-def test_photos_are_registered_once_until_a_setting_changes(photos, scene_folder, tmp_path):
-    copy = shutil.copytree(scene_folder, tmp_path / "copy")
+def test_photos_are_registered_once_until_a_setting_changes(photos, room_scene, tmp_path):
+    copy = shutil.copytree(room_scene, tmp_path / "copy")
     model = copy / "poses" / "sparse" / "0" / "images.bin"
     before = model.stat().st_mtime_ns
     assert run("reconstruct", photos, copy) == 0

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def scene_folder(built, tmp_path):
+def built_copy(built, tmp_path):
     return shutil.copytree(built, tmp_path / "scene")
 
 
@@ -66,21 +66,21 @@ def version_of(scene, start) -> tuple[int, int]:
     return round(moved), round(float(scene.field.uncertainties.mean()))
 
 
-def test_the_previous_scene_answers_during_a_rebuild(scene_folder):
-    builder = Builder(scene_folder)
+def test_the_previous_scene_answers_during_a_rebuild(built_copy):
+    builder = Builder(built_copy)
     builder.begin(1)
     builder.end(1)
     builder.begin(2)
-    opened = open_scene(scene_folder, device="cpu")
+    opened = open_scene(built_copy, device="cpu")
     assert version_of(opened, builder.start) == (1, 1)
-    assert opened.folder.root == scene_folder, "what is written goes to the scene itself"
+    assert opened.folder.root == built_copy, "what is written goes to the scene itself"
     builder.end(2)
-    assert version_of(open_scene(scene_folder, device="cpu"), builder.start) == (2, 2)
-    assert not list(scene_folder.glob("*previous*"))
+    assert version_of(open_scene(built_copy, device="cpu"), builder.start) == (2, 2)
+    assert not list(built_copy.glob("*previous*"))
 
 
-def test_gaussians_that_change_during_opening_are_detected(scene_folder, monkeypatch):
-    builder = Builder(scene_folder)
+def test_gaussians_that_change_during_opening_are_detected(built_copy, monkeypatch):
+    builder = Builder(built_copy)
     builder.begin(1)
     builder.end(1)
     read = SceneFolder.read_gaussians
@@ -92,67 +92,67 @@ def test_gaussians_that_change_during_opening_are_detected(scene_folder, monkeyp
         return read(folder)
 
     monkeypatch.setattr(SceneFolder, "read_gaussians", as_if_a_build_began)
-    assert version_of(open_scene(scene_folder, device="cpu"), builder.start) == (1, 1)
+    assert version_of(open_scene(built_copy, device="cpu"), builder.start) == (1, 1)
     assert begun
 
 
-def test_without_a_previous_scene_a_partial_rebuild_is_refused(scene_folder):
-    builder = Builder(scene_folder)
+def test_without_a_previous_scene_a_partial_rebuild_is_refused(built_copy):
+    builder = Builder(built_copy)
     builder.begin(1)
-    shutil.rmtree(scene_folder / "previous")  # as if the folder was copied without it
+    shutil.rmtree(built_copy / "previous")  # as if the folder was copied without it
     with pytest.raises(SceneFolderError, match="language of an earlier reconstruction"):
-        open_scene(scene_folder, device="cpu")
+        open_scene(built_copy, device="cpu")
 
 
-def test_the_previous_scene_has_the_permissions_of_the_scene(scene_folder):
-    scene_folder.chmod(0o755)
-    keep_previous(SceneFolder.open(scene_folder))
-    assert (scene_folder / "previous").stat().st_mode & 0o777 == 0o755
+def test_the_previous_scene_has_the_permissions_of_the_scene(built_copy):
+    built_copy.chmod(0o755)
+    keep_previous(SceneFolder.open(built_copy))
+    assert (built_copy / "previous").stat().st_mode & 0o777 == 0o755
 
 
-def test_an_interrupted_build_leaves_the_last_complete_scene(scene_folder):
-    builder = Builder(scene_folder)
+def test_an_interrupted_build_leaves_the_last_complete_scene(built_copy):
+    builder = Builder(built_copy)
     builder.begin(1)
     builder.end(1)
     builder.begin(2)
     again = Builder(
-        scene_folder
+        built_copy
     )  # another build goes on: what it finds is not whole and must not replace what is kept
     again.begin(3)
-    assert version_of(open_scene(scene_folder, device="cpu"), builder.start) == (1, 1)
+    assert version_of(open_scene(built_copy, device="cpu"), builder.start) == (1, 1)
 
 
-def test_a_scene_being_rebuilt_is_neither_evaluated_nor_edited(scene_folder, capsys):
-    builder = Builder(scene_folder)
+def test_a_scene_being_rebuilt_is_neither_evaluated_nor_edited(built_copy, capsys):
+    builder = Builder(built_copy)
     builder.begin(1)
     for command in (["evaluate"], ["edit"]):
-        arguments = [str(scene_folder), *(["delete", "--select", "red ball"] if command == ["edit"] else [])]
+        arguments = [str(built_copy), *(["delete", "--select", "red ball"] if command == ["edit"] else [])]
         assert cli.main([*command, *arguments]) == 1
         assert "one at work, or stopped half way" in capsys.readouterr().err
-    assert cli.main(["query", str(scene_folder), "red ball", "--json"]) == 0
+    assert cli.main(["query", str(built_copy), "red ball", "--json"]) == 0
 
 
-def test_a_build_keeps_the_previous_scene_until_it_is_complete(scene_folder, tiny_capture, monkeypatch):
+def test_a_build_keeps_the_previous_scene_until_it_is_complete(built_copy, tiny_capture, monkeypatch):
     seen = []
 
     def stop(*_, **__):
-        seen.append(open_scene(scene_folder, device="cpu").folder.content.name)
+        seen.append(open_scene(built_copy, device="cpu").folder.content.name)
         raise KeyboardInterrupt
 
-    before = open_scene(scene_folder, device="cpu").gaussians.means
+    before = open_scene(built_copy, device="cpu").gaussians.means
     monkeypatch.setattr(Averaged, "fit", stop)
     changed = [*QUICK_BUILD, "--seed", "5"]
-    assert cli.main(["build", str(tiny_capture), "--output", str(scene_folder), *changed]) == 130
+    assert cli.main(["build", str(tiny_capture), "--output", str(built_copy), *changed]) == 130
     assert seen == ["previous"]
-    assert torch.equal(open_scene(scene_folder, device="cpu").gaussians.means, before)
+    assert torch.equal(open_scene(built_copy, device="cpu").gaussians.means, before)
     monkeypatch.undo()
-    assert cli.main(["build", str(tiny_capture), "--output", str(scene_folder), *changed]) == 0
-    assert not (scene_folder / "previous").exists()
-    assert not torch.equal(open_scene(scene_folder, device="cpu").gaussians.means, before)
+    assert cli.main(["build", str(tiny_capture), "--output", str(built_copy), *changed]) == 0
+    assert not (built_copy / "previous").exists()
+    assert not torch.equal(open_scene(built_copy, device="cpu").gaussians.means, before)
 
 
-def test_builds_that_outrun_a_reader_are_told_and_not_taken_for_damage(scene_folder, monkeypatch):
-    builder, version = Builder(scene_folder), itertools.count(1)
+def test_builds_that_outrun_a_reader_are_told_and_not_taken_for_damage(built_copy, monkeypatch):
+    builder, version = Builder(built_copy), itertools.count(1)
 
     def as_if_builds_never_rest(folder):
         number = next(version)
@@ -164,11 +164,11 @@ def test_builds_that_outrun_a_reader_are_told_and_not_taken_for_damage(scene_fol
     with pytest.raises(
         SceneFolderError, match="builds that changed it 5 times; ask again when they are done"
     ):
-        open_scene(scene_folder, device="cpu")
+        open_scene(built_copy, device="cpu")
 
 
-def test_many_questions_beside_many_builds_see_one_version_each(scene_folder):
-    builder = Builder(scene_folder)
+def test_many_questions_beside_many_builds_see_one_version_each(built_copy):
+    builder = Builder(built_copy)
     builder.begin(1)
     builder.end(1)
     stop, wrong, seen = threading.Event(), [], []
@@ -176,7 +176,7 @@ def test_many_questions_beside_many_builds_see_one_version_each(scene_folder):
     def ask() -> None:
         while not stop.is_set():
             try:
-                opened = open_scene(scene_folder, device="cpu")
+                opened = open_scene(built_copy, device="cpu")
             except SceneFolderError as error:
                 seen.append(str(error))
                 continue
@@ -209,4 +209,4 @@ def test_many_questions_beside_many_builds_see_one_version_each(scene_folder):
     assert len(refused) <= len(seen) / 10, (
         "builds of hundredths of a second, without end, may outrun a reader"
     )
-    assert version_of(open_scene(scene_folder, device="cpu"), builder.start) == (version, version)
+    assert version_of(open_scene(built_copy, device="cpu"), builder.start) == (version, version)

@@ -31,7 +31,7 @@ solid = partial(made.solid, log_size=0.0)
 
 
 @pytest.fixture(autouse=True)
-def _few_candidates(monkeypatch):
+def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
 

@@ -1,5 +1,7 @@
 """Answers to unions, counts and widths, on groups of points at known places."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -21,7 +23,7 @@ CAMERAS = {"front": look_at([0.0, -9.0, 1.5], [0.0, 0.0, 0.0], UP, 64, 48, 0.8)}
 
 
 @pytest.fixture(scope="module")
-def select():
+def select() -> Callable[..., Selection]:
     rng = np.random.default_rng(0)
     points = [
         rng.uniform(-1, 1, (200, 3)) * size * np.where(np.arange(200) < 20, 0.2, 1.0)[:, None]

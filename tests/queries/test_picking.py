@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from support.language_scene import CENTERS, RADIUS, make_scene
+from support.language_scene import CENTERS, RADIUS, LanguageScene, make_scene
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.language.fields import CodeField
@@ -12,14 +12,14 @@ from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     made = make_scene(per_ball=900)
     made.gaussians.log_scales += 0.7  # no holes to look through
     return made
 
 
 @pytest.fixture(scope="module")
-def field(balls):
+def field(balls) -> CodeField:
     codes = torch.from_numpy(balls.labels.astype(np.uint8))[:, None]
     count = len(balls.labels)
     return CodeField(balls.codebook, codes, torch.ones(count, 1), torch.zeros(count))

@@ -1,5 +1,6 @@
 """Relations between balls and plates at known places."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +39,7 @@ BACK = look_at([0.0, 5.0, 1.5], [0.0, 0.0, 0.0], UP, 64, 48, 0.8)
 
 
 @pytest.fixture(scope="module")
-def things():
+def select() -> Callable[..., Selection]:
     rng = np.random.default_rng(0)
     points, labels = [], []
     for number, (kind, place, size) in enumerate(THINGS.values()):
@@ -88,17 +89,17 @@ FALSE = [
 
 
 @pytest.mark.parametrize(("first", "relation", "second"), TRUE)
-def test_what_is_so_holds(things, first, relation, second):
-    assert holds(relation, things(first), things(second), frame_of(FRONT, UP))
+def test_what_is_so_holds(select, first, relation, second):
+    assert holds(relation, select(first), select(second), frame_of(FRONT, UP))
 
 
 @pytest.mark.parametrize(("first", "relation", "second"), FALSE)
-def test_what_is_not_so_does_not_hold(things, first, relation, second):
-    assert not holds(relation, things(first), things(second), frame_of(FRONT, UP))
+def test_what_is_not_so_does_not_hold(select, first, relation, second):
+    assert not holds(relation, select(first), select(second), frame_of(FRONT, UP))
 
 
-def test_left_is_the_viewers_left(things):
-    left, right = things("left ball"), things("right ball")
+def test_left_is_the_viewers_left(select):
+    left, right = select("left ball"), select("right ball")
     assert holds("left of", right, left, frame_of(BACK, UP))
     assert not holds("left of", left, right, frame_of(BACK, UP))
     assert holds("behind", left, right, frame_of(look_at([5, 0, 1], [0, 0, 0], UP, 64, 48, 0.8), UP))
@@ -120,60 +121,60 @@ def test_somebody_who_looks_straight_down_has_the_top_of_the_picture_ahead():
     assert frame.right == pytest.approx([1, 0, 0], abs=1e-9)
 
 
-def test_distance_is_that_between_surfaces(things):
-    assert distance(things("left ball"), things("right ball")) == pytest.approx(1.6 - 0.5, abs=0.06)
-    assert distance(things("lamp"), things("table")) == pytest.approx(2.0 - 0.3, abs=0.06)
+def test_distance_is_that_between_surfaces(select):
+    assert distance(select("left ball"), select("right ball")) == pytest.approx(1.6 - 0.5, abs=0.06)
+    assert distance(select("lamp"), select("table")) == pytest.approx(2.0 - 0.3, abs=0.06)
 
 
-def test_of_several_instances_those_that_fit_are_kept(things):
-    balls = things("left ball", "right ball", "floor ball")
+def test_of_several_instances_those_that_fit_are_kept(select):
+    balls = select("left ball", "right ball", "floor ball")
     frame = frame_of(FRONT, UP)
-    on_table = related("on", balls, things("table"), frame)
-    assert torch.equal(on_table.mask, things("left ball", "right ball").mask)
+    on_table = related("on", balls, select("table"), frame)
+    assert torch.equal(on_table.mask, select("left ball", "right ball").mask)
     assert torch.equal(
-        nearest(balls, things("far ball", "lamp")).mask & things("floor ball").mask,
+        nearest(balls, select("far ball", "lamp")).mask & select("floor ball").mask,
         torch.zeros_like(balls.mask),
     )
-    assert torch.equal(nearest(things("lamp", "floor ball"), things("right ball")).mask, things("lamp").mask)
-    assert related("on", things("floor ball"), things("table"), frame).present == "no"
+    assert torch.equal(nearest(select("lamp", "floor ball"), select("right ball")).mask, select("lamp").mask)
+    assert related("on", select("floor ball"), select("table"), frame).present == "no"
 
 
-def test_a_small_thing_that_a_large_ones_selection_takes_in_still_stands_on_it(things):
+def test_a_small_thing_that_a_large_ones_selection_takes_in_still_stands_on_it(select):
     """A coin lies so close to its table that it answers to "table" as well."""
-    found = related("on", things("coin"), things("table", "coin"), frame_of(None, UP))
-    assert len(found) == len(things("coin"))
+    found = related("on", select("coin"), select("table", "coin"), frame_of(None, UP))
+    assert len(found) == len(select("coin"))
 
 
-def test_a_thing_is_not_next_to_itself_under_another_name(things):
-    assert not related("next to", things("cup"), things("cup", "left ball"), frame_of(None, UP))
+def test_a_thing_is_not_next_to_itself_under_another_name(select):
+    assert not related("next to", select("cup"), select("cup", "left ball"), frame_of(None, UP))
 
 
-def test_a_phrase_is_answered_with_what_it_asks_for(things):
+def test_a_phrase_is_answered_with_what_it_asks_for(select):
     words = {"ball": ("left ball", "right ball", "floor ball"), "table": ("table",), "lamp": ("lamp",)}
 
     def ask(text: str) -> Selection:
-        return answer(parse(text), Searched(lambda word: things(*words[word]), lambda _: FRONT))
+        return answer(parse(text), Searched(lambda word: select(*words[word]), lambda _: FRONT))
 
-    assert torch.equal(ask("ball on the table").mask, things("left ball", "right ball").mask)
+    assert torch.equal(ask("ball on the table").mask, select("left ball", "right ball").mask)
     assert torch.equal(
-        ask("ball right of the lamp").mask & things("left ball").mask, torch.zeros_like(ask("ball").mask)
+        ask("ball right of the lamp").mask & select("left ball").mask, torch.zeros_like(ask("ball").mask)
     )
-    assert torch.equal(ask("ball but not the ball on the table").mask, things("floor ball").mask)
-    assert torch.equal(ask("ball and lamp").mask, things(*words["ball"], "lamp").mask)
+    assert torch.equal(ask("ball but not the ball on the table").mask, select("floor ball").mask)
+    assert torch.equal(ask("ball and lamp").mask, select(*words["ball"], "lamp").mask)
     assert len(ask("how many ball").instances) == 3
     assert ask("lamp on the table").present == "no"
     assert len(ask("largest ball")) == 200
     assert ask("ball on the table").phrase == '("ball" on "table")'
 
 
-def test_what_fits_is_as_sure_as_the_least_sure_of_the_words(things):
+def test_what_fits_is_as_sure_as_the_least_sure_of_the_words(select):
     sure = {"ball": "yes", "table": "unsure", "bowl": "no", "lamp": "yes", "bear": "yes"}
     words = {"ball": ("left ball", "right ball"), "table": ("table",), "bowl": ("bowl",), "lamp": ("lamp",)}
 
     def ask(text: str) -> Selection:
         return answer(
             parse(text),
-            Searched(lambda word: replace(things(*words[word]), present=sure[word]), lambda _: FRONT),
+            Searched(lambda word: replace(select(*words[word]), present=sure[word]), lambda _: FRONT),
         )
 
     assert ask("ball on the table").present == "unsure"
@@ -231,13 +232,13 @@ NAMES = {
         ("balls on the left side of the table", ("left ball",)),
     ],
 )
-def test_questions_are_answered_with_the_things_that_fit(things, text, expected):
+def test_questions_are_answered_with_the_things_that_fit(select, text, expected):
     words = {**NAMES, "far ball": ("far ball",)}
-    objects = [replace(things(name), phrase=word) for word, names in NAMES.items() for name in names]
-    searched = Searched(lambda word: things(*words[word]), lambda _: FRONT, lambda: objects)
+    objects = [replace(select(name), phrase=word) for word, names in NAMES.items() for name in names]
+    searched = Searched(lambda word: select(*words[word]), lambda _: FRONT, lambda: objects)
     found = answer(parse(text), searched)
     empty = torch.zeros_like(found.mask)
-    assert torch.equal(found.mask, things(*expected).mask if expected else empty)
+    assert torch.equal(found.mask, select(*expected).mask if expected else empty)
     assert len(found.instances) == len(expected)
     assert (found.present == "no") == (not expected)
 
@@ -253,30 +254,30 @@ def test_questions_are_answered_with_the_things_that_fit(things, text, expected)
         ("which is bigger, the ball or the bear?", "no", 'nothing fits "bear"'),
     ],
 )
-def test_what_is_missing_of_several_is_told(things, text, present, note):
+def test_what_is_missing_of_several_is_told(select, text, present, note):
     sure = {"ball": "yes", "table": "unsure", "bear": "no"}
     words = {**NAMES, "bear": ("lamp",)}
-    searched = Searched(lambda word: replace(things(*words[word]), present=sure[word]), lambda _: FRONT)
+    searched = Searched(lambda word: replace(select(*words[word]), present=sure[word]), lambda _: FRONT)
     found = answer(parse(text), searched)
     assert (found.present, found.note) == (present, note)
     assert bool(found) == (present != "no")
 
 
-def test_a_cluster_of_several_known_objects_is_answered_by_those_that_score_as_wholes(things):
+def test_a_cluster_of_several_known_objects_is_answered_by_those_that_score_as_wholes(select):
     toys = ("left ball", "right ball", "bowl")
-    whole = things(*toys, "table")
+    whole = select(*toys, "table")
     scores = whole.scores * 0.6
     for name in toys[:2]:
-        scores = torch.where(things(name).mask, 0.9, scores)
-    objects = [replace(things(name), phrase=name) for name in (*toys, "table")]
+        scores = torch.where(select(name).mask, 0.9, scores)
+    objects = [replace(select(name), phrase=name) for name in (*toys, "table")]
     searched = Searched(
         lambda word: replace(whole, scores=scores, phrase=word), lambda _: None, lambda: objects
     )
     assert [each.phrase for each in answer(parse("toy"), searched).instances] == ["left ball", "right ball"]
 
 
-def test_a_place_that_a_viewer_cannot_be_at_is_refused(things):
-    searched = Searched(lambda word: things("lamp"), lambda _: FRONT)
+def test_a_place_that_a_viewer_cannot_be_at_is_refused(select):
+    searched = Searched(lambda word: select("lamp"), lambda _: FRONT)
     with pytest.raises(QueryError, match="closest to me"):
         answer(Related("on", Thing("lamp"), Viewer()), searched)
     with pytest.raises(QueryError, match="in front of me"):

@@ -5,6 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.question_scene import coded_cloud, texts
 
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields import CodeField
 from lexsplat.queries import relevancy as queries
 from lexsplat.queries.relevancy import QueryConfig, Question
 from lexsplat.runtime.errors import QueryError
@@ -28,7 +31,7 @@ def distributions(shape, seed, sharpness=3.0):
 
 
 @pytest.fixture(scope="module")
-def cloud():
+def cloud() -> tuple[CodeField, Gaussians, Camera]:
     return coded_cloud()
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from support.language_scene import CENTERS, RADIUS, make_scene
+from support.language_scene import CENTERS, RADIUS, LanguageScene, make_scene
 
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene(per_ball=200)
 
 

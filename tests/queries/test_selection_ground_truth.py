@@ -13,7 +13,7 @@ from selection_ground_truth import (
     surface_points,
     true_box,
 )
-from support.language_scene import CENTERS, RADIUS, make_scene, trace
+from support.language_scene import CENTERS, RADIUS, LanguageScene, make_scene, trace
 
 from lexsplat.geometry.boxes import Box
 from lexsplat.geometry.cameras import Camera
@@ -36,7 +36,7 @@ def traced(camera: Camera) -> GroundTruthView:
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene(per_ball=150, width=96, height=72)
 
 

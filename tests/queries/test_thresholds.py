@@ -5,7 +5,9 @@ import pytest
 import torch
 from support.question_scene import coded_cloud, texts
 
-from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.cameras import Camera, look_at
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.fields import CodeField
 from lexsplat.queries import relevancy as queries
 from lexsplat.queries import thresholds
 from lexsplat.queries.relevancy import Question
@@ -13,7 +15,7 @@ from lexsplat.runtime.errors import QueryError
 
 
 @pytest.fixture(scope="module")
-def cloud():
+def cloud() -> tuple[CodeField, Gaussians, Camera]:
     return coded_cloud()
 
 

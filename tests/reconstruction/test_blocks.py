@@ -12,7 +12,7 @@ from support.blind_workers import BlindWorkers
 from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
-from lexsplat.captures import load_capture
+from lexsplat.captures import Capture, load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
@@ -39,12 +39,12 @@ CONFIG = ReconstructionConfig(iterations=30, max_gaussians=600, sh_degree=0)
 
 
 @pytest.fixture(scope="module")
-def capture(tiny_capture):
+def capture(tiny_capture) -> Capture:
     return load_capture(tiny_capture)
 
 
 @pytest.fixture
-def points(capture):
+def points(capture) -> InitialPoints:
     return InitialPoints(capture.points, capture.point_colors, "capture", "")
 
 

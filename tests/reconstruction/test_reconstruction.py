@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from support.held_out import held_out_psnr
 
-from lexsplat.captures import load_capture
+from lexsplat.captures import Capture, load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, reconstruct
 from lexsplat.runtime.errors import TrainingError
@@ -20,12 +20,12 @@ SHORT = ReconstructionConfig(
 
 
 @pytest.fixture(scope="module")
-def capture(tiny_capture):
+def capture(tiny_capture) -> Capture:
     return load_capture(tiny_capture)
 
 
 @pytest.fixture(scope="module")
-def points(capture):
+def points(capture) -> InitialPoints:
     return initial_points(capture)
 
 

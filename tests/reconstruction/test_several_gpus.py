@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import distributed
 
-from lexsplat.captures import load_capture
+from lexsplat.captures import Capture, load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, several_gpus
 from lexsplat.reconstruction.several_gpus import PartReconstructor
@@ -21,12 +21,12 @@ CONFIG = ReconstructionConfig(
 
 
 @pytest.fixture(scope="module")
-def capture(tiny_capture):
+def capture(tiny_capture) -> Capture:
     return load_capture(tiny_capture).downscaled(2.0)
 
 
 @pytest.fixture(scope="module")
-def points(capture):
+def points(capture) -> InitialPoints:
     return InitialPoints(capture.points[::5], capture.point_colors[::5], "capture", "")
 
 

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 
 import pytest
 from support import two_nodes
@@ -36,7 +37,7 @@ def free_port() -> int:
 
 
 @pytest.fixture(scope="module")
-def nodes():
+def nodes() -> Iterator[two_nodes.TwoNodes]:
     pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
     pytest.importorskip("grpc", reason="needs Ray's client: pip install 'lexsplat[cluster]'")
     started = two_nodes.TwoNodes(client_port=free_port())

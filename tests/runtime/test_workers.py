@@ -5,6 +5,7 @@ import random
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def total(workers, work=two_nodes.noisy_sum, items=SEEDS) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def nodes():
+def nodes() -> Iterator[two_nodes.TwoNodes]:
     pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
     started = two_nodes.TwoNodes()
     yield started

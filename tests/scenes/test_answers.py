@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.viewer_scene import ball_scene
+from support.viewer_scene import BallScene, ball_scene
 
 from lexsplat.scenes.answers import Answers, answer_queries, file_name
 
@@ -12,7 +12,7 @@ PROMPTS = ["ball 0", "ball 3"]
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> BallScene:
     return ball_scene(per_ball=80)[0]
 
 

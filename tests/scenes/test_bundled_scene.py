@@ -18,10 +18,11 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
+from lexsplat.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scene():
+def demo() -> Scene:
     return open_scene("demo", device="cpu")
 
 
@@ -44,16 +45,16 @@ def test_it_contains_no_information_about_the_build_machine():
     assert json.loads(text)["capture"] is None
 
 
-def test_its_language_uses_the_bundled_encoder(scene):
-    assert scene.folder.record["stages"]["features"]["clip_hash"] == load_clip("bundled").content_hash
+def test_its_language_uses_the_bundled_encoder(demo):
+    assert demo.folder.record["stages"]["features"]["clip_hash"] == load_clip("bundled").content_hash
 
 
 @pytest.mark.parametrize("prompt", ["red apple", "blue mug", "rubber duck", "pumpkin"])
-def test_relevancy_agrees_with_the_exact_mask(scene, prompt):
+def test_relevancy_agrees_with_the_exact_mask(demo, prompt):
     found = []
     for folder in sorted((demo_capture() / "segmentations").iterdir())[::4]:
         mask = read_mask(folder / f"{prompt.replace(' ', '_')}.png")
-        relevancy = scene.relevancy([prompt], folder.name)[0]
+        relevancy = demo.relevancy([prompt], folder.name)[0]
         y, x = np.unravel_index(int(torch.argmax(relevancy)), relevancy.shape)
         scale = mask.shape[0] / relevancy.shape[0]
         found.append(bool(mask[int((y + 0.5) * scale), int((x + 0.5) * scale)]))

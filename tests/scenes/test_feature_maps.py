@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 from safetensors.torch import load_file
-from support.viewer_scene import ball_scene
+from support.viewer_scene import BallScene, ball_scene
 
 from lexsplat.codebook import Codebook
 from lexsplat.language.fields import CodeField
@@ -14,7 +14,7 @@ from lexsplat.scenes.feature_maps import code_colors, feature_map, feature_pictu
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> BallScene:
     return ball_scene(per_ball=80)[0]
 
 

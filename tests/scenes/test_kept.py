@@ -17,7 +17,7 @@ from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.kept import keep, scene_key
-from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.serving import OpenScene, answer_line
 
 SEEN = "checkpoints/seen.safetensors"
@@ -25,7 +25,7 @@ OBJECTS = "checkpoints/objects.safetensors"
 
 
 @pytest.fixture(scope="module")
-def demo():
+def demo() -> Scene:
     return open_scene("demo", device="cpu")
 
 
@@ -46,32 +46,32 @@ def test_the_share_of_a_view_is_that_of_a_rendering(demo, phrase):
 
 
 @pytest.fixture
-def copy(tmp_path):
+def demo_copy(tmp_path):
     folder = tmp_path / "scene"
     shutil.copytree(BUNDLED_SCENE, folder)
     return folder
 
 
 @pytest.mark.slow
-def test_what_is_kept_is_what_is_computed_without_it(copy, demo):
-    (copy / SEEN).unlink()
-    scene = open_scene(copy, device="cpu")
+def test_what_is_kept_is_what_is_computed_without_it(demo_copy, demo):
+    (demo_copy / SEEN).unlink()
+    scene = open_scene(demo_copy, device="cpu")
     assert not scene.seen.complete
     assert torch.equal(scene.hidden, demo.hidden)
     assert scene.select("mug").best_view == demo.select("mug").best_view
     keep(scene)
-    again = open_scene(copy, device="cpu")
+    again = open_scene(demo_copy, device="cpu")
     assert again.seen.complete
     assert torch.equal(again.hidden, demo.hidden)
     assert again.select("mug").view_shares == demo.select("mug").view_shares
 
 
-def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(copy, demo):
+def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(demo_copy, demo):
     assert demo.kept is not None, (
         "run tools/demo_scene/ship.py, or lexsplat.scenes.kept.keep on the bundled scene"
     )
-    (copy / OBJECTS).unlink()
-    scene = open_scene(copy, device="cpu")
+    (demo_copy / OBJECTS).unlink()
+    scene = open_scene(demo_copy, device="cpu")
     assert scene.kept is None
     assert len(scene.objects) == len(demo.objects) > 10
     for found, kept in zip(scene.objects, demo.objects):
@@ -92,13 +92,13 @@ def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(
     assert torch.allclose(places.distributions, demo.kept.places.distributions, atol=1e-6)
 
 
-def test_kept_objects_are_those_of_one_encoder_query_and_scene_or_none(copy, demo):
-    content = (copy / OBJECTS).read_bytes()
+def test_kept_objects_are_those_of_one_encoder_query_and_scene_or_none(demo_copy, demo):
+    content = (demo_copy / OBJECTS).read_bytes()
     for damaged in (content[:1000], b"", content[:-1] + bytes([content[-1] ^ 1])):
-        (copy / OBJECTS).write_bytes(damaged)
-        assert open_scene(copy, device="cpu").kept is None
-    (copy / OBJECTS).write_bytes(content)
-    scene = open_scene(copy, device="cpu")
+        (demo_copy / OBJECTS).write_bytes(damaged)
+        assert open_scene(demo_copy, device="cpu").kept is None
+    (demo_copy / OBJECTS).write_bytes(content)
+    scene = open_scene(demo_copy, device="cpu")
     assert scene.kept is not None
     scene.query = QueryConfig(temperature=5.0)
     assert scene.kept is None, "another query"
@@ -114,8 +114,8 @@ def changed(tensor):
     tensor.view(-1)[0] = not tensor.view(-1)[0] if tensor.dtype == torch.bool else tensor.view(-1)[0] + 1
 
 
-def test_the_key_of_a_scene_depends_on_everything_that_its_views_show(copy):
-    scene = open_scene(copy, device="cpu")
+def test_the_key_of_a_scene_depends_on_everything_that_its_views_show(demo_copy):
+    scene = open_scene(demo_copy, device="cpu")
     gaussians, segments = scene.gaussians, scene.field.segments
     keys = [scene_key(scene)]
     for tensor in (
@@ -174,9 +174,9 @@ def test_the_key_of_a_scene_depends_on_everything_that_its_views_show(copy):
         "version",
     ],
 )
-def test_kept_objects_depend_on_everything_that_they_come_from(copy, monkeypatch, change):
-    assert open_scene(copy, device="cpu").kept is not None
-    scene = open_scene(copy, device="cpu")
+def test_kept_objects_depend_on_everything_that_they_come_from(demo_copy, monkeypatch, change):
+    assert open_scene(demo_copy, device="cpu").kept is not None
+    scene = open_scene(demo_copy, device="cpu")
     change(scene, monkeypatch)
     assert scene.kept is None
 
@@ -203,8 +203,8 @@ def test_a_kept_answer_depends_on_what_was_understood_and_the_view_and_the_thres
 
 
 @pytest.mark.slow
-def test_a_saved_edit_keeps_what_its_views_show(copy, tmp_path):
-    editor = Editor(open_scene(copy, device="cpu"))
+def test_a_saved_edit_keeps_what_its_views_show(demo_copy, tmp_path):
+    editor = Editor(open_scene(demo_copy, device="cpu"))
     editor.delete(editor.scene.find("mug"))
     editor.save(tmp_path / "saved")
     saved = open_scene(tmp_path / "saved", device="cpu")
@@ -213,13 +213,13 @@ def test_a_saved_edit_keeps_what_its_views_show(copy, tmp_path):
     assert "mug" not in [each.phrase for each in saved.objects]
 
 
-def test_a_damaged_file_or_one_of_another_scene_counts_as_none(copy):
-    content = (copy / SEEN).read_bytes()
+def test_a_damaged_file_or_one_of_another_scene_counts_as_none(demo_copy):
+    content = (demo_copy / SEEN).read_bytes()
     for damaged in (content[:1000], b"", content[:-1] + bytes([content[-1] ^ 1])):
-        (copy / SEEN).write_bytes(damaged)
-        assert not open_scene(copy, device="cpu").seen.complete
-    (copy / SEEN).write_bytes(content)
-    scene = open_scene(copy, device="cpu")
+        (demo_copy / SEEN).write_bytes(damaged)
+        assert not open_scene(demo_copy, device="cpu").seen.complete
+    (demo_copy / SEEN).write_bytes(content)
+    scene = open_scene(demo_copy, device="cpu")
     scene.gaussians.means[0, 0] += 1  # before it is asked
     assert not scene.seen.complete
 

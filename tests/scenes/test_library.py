@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def _encoders(monkeypatch):
+def _encoders(monkeypatch) -> None:
     install(monkeypatch)
 
 
@@ -54,7 +54,7 @@ def rooms(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def copy(rooms, tmp_path) -> Path:
+def rooms_copy(rooms, tmp_path) -> Path:
     """A copy of scenes and library that may be changed."""
     return copied(rooms, tmp_path / "rooms")
 
@@ -199,7 +199,7 @@ def test_no_phrase_is_refused(rooms, phrase):
         lexsplat.open_library(rooms / "library").search(phrase)
 
 
-def test_scenes_whose_encoder_is_gone_are_told_and_the_others_answer(copy, monkeypatch):
+def test_scenes_whose_encoder_is_gone_are_told_and_the_others_answer(rooms_copy, monkeypatch):
     from lexsplat.runtime.errors import ModelError
 
     known = Library.create.__globals__["load_text"]
@@ -210,16 +210,16 @@ def test_scenes_whose_encoder_is_gone_are_told_and_the_others_answer(copy, monke
         return known(name, *rest)
 
     monkeypatch.setattr("lexsplat.scenes.library.library.load_text", load)
-    found = Library(copy / "library").search("mug and griffin")  # a word that is in no cache
+    found = Library(rooms_copy / "library").search("mug and griffin")  # a word that is in no cache
     assert [hit.scene for hit in found.hits] == ["kitchen"]
     assert "expected a model" in found.skipped["lab"]
 
 
-def test_another_encoder_under_the_same_name_is_refused(copy, monkeypatch):
+def test_another_encoder_under_the_same_name_is_refused(rooms_copy, monkeypatch):
     from support.library_scenes import Tower
 
     monkeypatch.setattr("lexsplat.scenes.library.library.load_text", lambda *_: Tower("other"))
-    found = Library(copy / "library").search("griffin")
+    found = Library(rooms_copy / "library").search("griffin")
     assert set(found.skipped) == {"kitchen", "office", "lab"}
     assert all("found another one" in problem for problem in found.skipped.values())
 
@@ -227,15 +227,15 @@ def test_another_encoder_under_the_same_name_is_refused(copy, monkeypatch):
 # -- changing
 
 
-def test_equal_additions_make_equal_files_and_touch_no_other_scene(copy):
-    first, second = Library.create(copy / "first"), Library.create(copy / "second")
-    first.add(copy / "kitchen")
+def test_equal_additions_make_equal_files_and_touch_no_other_scene(rooms_copy):
+    first, second = Library.create(rooms_copy / "first"), Library.create(rooms_copy / "second")
+    first.add(rooms_copy / "kitchen")
     before = contents(first.stage)
-    first.add(copy / "office")
+    first.add(rooms_copy / "office")
     after = contents(first.stage)
     assert {name: after[name] for name in before} == before
     for name in ("office", "kitchen"):
-        second.add(copy / name)
+        second.add(rooms_copy / name)
     assert contents(second.stage) == after
 
 
@@ -249,22 +249,22 @@ def test_scenes_of_one_name_get_numbers_and_one_folder_is_one_scene(tmp_path):
     assert library.names() == ["room_1", "room_1-2"]
 
 
-def test_a_removed_scene_leaves_no_file_and_stays_itself(copy):
-    library = Library(copy / "library")
-    assert library.remove(str(copy / "kitchen")) == "kitchen"
+def test_a_removed_scene_leaves_no_file_and_stays_itself(rooms_copy):
+    library = Library(rooms_copy / "library")
+    assert library.remove(str(rooms_copy / "kitchen")) == "kitchen"
     assert not list(library.stage.glob("kitchen*"))
     assert hits(library, "vase") == []
-    open_scene(copy / "kitchen")
+    open_scene(rooms_copy / "kitchen")
     with pytest.raises(LibraryError, match="no such scene; it has 2 scenes: lab, office"):
         library.remove("kitchen")
 
 
-def test_an_open_library_sees_what_another_process_adds_and_removes(copy):
-    reader, writer = Library(copy / "library"), Library(copy / "library")
+def test_an_open_library_sees_what_another_process_adds_and_removes(rooms_copy):
+    reader, writer = Library(rooms_copy / "library"), Library(rooms_copy / "library")
     assert hits(reader, "vase") == ["kitchen"]
     writer.remove("kitchen")
     assert hits(reader, "vase") == []
-    writer.add(copy / "kitchen")
+    writer.add(rooms_copy / "kitchen")
     assert hits(reader, "vase") == ["kitchen"]
 
 
@@ -278,62 +278,62 @@ def test_the_bundled_scene_is_known_by_its_word(tmp_path):
 # -- what happens to scenes
 
 
-def test_a_library_that_moved_with_its_scenes_finds_them(copy):
-    moved = copy.rename(copy.with_name("elsewhere"))
+def test_a_library_that_moved_with_its_scenes_finds_them(rooms_copy):
+    moved = rooms_copy.rename(rooms_copy.with_name("elsewhere"))
     library = Library(moved / "library")
     assert hits(library, "vase") == ["kitchen"]
     assert library.verify() == {}
 
 
-def test_a_scene_that_moved_alone_is_told_and_added_under_its_name(copy):
-    library = Library(copy / "library")
-    (copy / "kitchen").rename(copy / "galley")
+def test_a_scene_that_moved_alone_is_told_and_added_under_its_name(rooms_copy):
+    library = Library(rooms_copy / "library")
+    (rooms_copy / "kitchen").rename(rooms_copy / "galley")
     for told in (library.search("griffin").skipped["kitchen"], library.verify()["kitchen"]):
         assert "no such folder; if it was moved: lexsplat library add" in told
         assert told.endswith(f"if it is gone: lexsplat library remove {library.root} kitchen")
     assert library.verify(repair=True).keys() == {"kitchen"}  # nothing is dropped
-    assert library.add(copy / "galley").name == "kitchen"
+    assert library.add(rooms_copy / "galley").name == "kitchen"
     assert library.verify() == {}
     assert hits(library, "vase") == ["kitchen"]
 
 
-def test_a_rebuilt_scene_is_told_and_its_old_codes_are_dropped(copy):
-    library = Library(copy / "library")
-    write_scene(copy / "kitchen", OTHERS, build=2)
+def test_a_rebuilt_scene_is_told_and_its_old_codes_are_dropped(rooms_copy):
+    library = Library(rooms_copy / "library")
+    write_scene(rooms_copy / "kitchen", OTHERS, build=2)
     assert "rebuilt since it was added" in library.verify()["kitchen"]
     assert hits(library, "vase") == []  # the scene itself is asked
     assert sorted(hits(library, "candle")) == ["kitchen", "lab", "office"]  # its old codes lack a candle
     found = Library(library.root).search("candle")
     assert found.rebuilt.keys() == {"kitchen"}
     assert f"note: {found.rebuilt['kitchen']}" in repr(found)
-    assert f"lexsplat library add {library.root} {copy / 'kitchen'}" in found.rebuilt["kitchen"]
+    assert f"lexsplat library add {library.root} {rooms_copy / 'kitchen'}" in found.rebuilt["kitchen"]
     assert library.verify(repair=True) == {}
     assert library.search("candle").rebuilt == {}
     assert sorted(hits(library, "candle")) == ["kitchen", "lab", "office"]
     assert len(list(library.stage.glob("kitchen.*.safetensors"))) == 1
 
 
-def test_a_scene_that_was_only_copied_is_not_rebuilt(copy):
-    (copy / "kitchen" / "scene.json").touch()
-    library = Library(copy / "library")
+def test_a_scene_that_was_only_copied_is_not_rebuilt(rooms_copy):
+    (rooms_copy / "kitchen" / "scene.json").touch()
+    library = Library(rooms_copy / "library")
     assert library.search("mug").rebuilt == library.verify() == {}
 
 
-def test_a_scene_with_a_cut_record_is_told_with_a_remedy(copy):
-    (copy / "kitchen" / "scene.json").write_text("{")
-    library = Library(copy / "library")
+def test_a_scene_with_a_cut_record_is_told_with_a_remedy(rooms_copy):
+    (rooms_copy / "kitchen" / "scene.json").write_text("{")
+    library = Library(rooms_copy / "library")
     for told in (library.search("griffin").skipped["kitchen"], library.verify()["kitchen"]):
         assert "scene.json: expected JSON" in told
         assert told.endswith(f"; build it again, or: lexsplat library remove {library.root} kitchen")
 
 
-def test_a_scene_of_another_format_version_is_told(copy):
-    record = read_json(copy / "kitchen" / "scene.json")
-    write_json(copy / "kitchen" / "scene.json", {**record, "format_version": 99})
-    library = Library(copy / "library")
+def test_a_scene_of_another_format_version_is_told(rooms_copy):
+    record = read_json(rooms_copy / "kitchen" / "scene.json")
+    write_json(rooms_copy / "kitchen" / "scene.json", {**record, "format_version": 99})
+    library = Library(rooms_copy / "library")
     assert "format_version 1, found 99" in library.search("vase").skipped["kitchen"]
     with pytest.raises(SceneFolderError, match="found 99"):
-        library.add(copy / "kitchen")
+        library.add(rooms_copy / "kitchen")
 
 
 # -- damage
@@ -355,11 +355,11 @@ def damage(path: Path) -> None:
     ],
     ids=["one bit", "empty", "truncated", "missing"],
 )
-def test_damaged_codes_are_refused_and_repaired_from_the_scene(copy, harm):
-    before = contents(copy / "library" / "scenes")
-    (file,) = (copy / "library" / "scenes").glob("kitchen.*.safetensors")
+def test_damaged_codes_are_refused_and_repaired_from_the_scene(rooms_copy, harm):
+    before = contents(rooms_copy / "library" / "scenes")
+    (file,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")
     harm(file)
-    library = Library(copy / "library")
+    library = Library(rooms_copy / "library")
     found = library.search("mug")
     assert [hit.scene for hit in found.hits] == ["lab"]
     assert "--repair" in found.skipped["kitchen"]
@@ -369,55 +369,56 @@ def test_damaged_codes_are_refused_and_repaired_from_the_scene(copy, harm):
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
 
 
-def test_every_byte_of_the_codes_is_checked_before_it_answers(copy):
+def test_every_byte_of_the_codes_is_checked_before_it_answers(rooms_copy):
     """Also where the byte makes no code larger: a scene that damage rules out would be missed without a word."""
-    (file,) = (copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    (file,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")
     whole = file.read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
     for place in np.random.default_rng(0).integers(header, len(whole), 40):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
-        library = Library(copy / "library")
+        library = Library(rooms_copy / "library")
         assert library.codes(library.record("kitchen")) is None
         assert "damaged" in str(library.damaged["kitchen"])
 
 
-def test_verify_finds_damage_that_keeps_the_checksum(copy):
+def test_verify_finds_damage_that_keeps_the_checksum(rooms_copy):
     """A checksum is no hash: whoever knows it can change codes and keep it. `verify` compares hashes."""
-    (file,) = (copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    (file,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")
     damage(file)
-    known = Library(copy / "library").record("kitchen")
+    known = Library(rooms_copy / "library").record("kitchen")
     with pytest.raises(FileFormatError, match="the checksum differs"):
         map_codes(file, known)
     with safe_open(file, framework="pt") as changed:
         codes = Codes(*(changed.get_tensor(field.name) for field in dataclasses.fields(Codes)))
     write_record(
-        dataclasses.replace(known, checksum=codes.checksum()), copy / "library" / "scenes" / "kitchen.json"
+        dataclasses.replace(known, checksum=codes.checksum()),
+        rooms_copy / "library" / "scenes" / "kitchen.json",
     )
-    library = Library(copy / "library")
+    library = Library(rooms_copy / "library")
     assert library.codes(library.record("kitchen")) is not None
     assert "the hash differs" in library.verify()["kitchen"]
     assert library.verify(repair=True) == {}
 
 
-def test_libraries_that_were_made_without_checksums_are_checked_by_hashes(copy):
-    path = copy / "library" / "scenes" / "kitchen.json"
+def test_libraries_that_were_made_without_checksums_are_checked_by_hashes(rooms_copy):
+    path = rooms_copy / "library" / "scenes" / "kitchen.json"
     record = read_json(path)
     for name in ("checksum", "stamp", "hash"):
         record.pop(name)
     write_json(path, record)
-    assert sorted(hits(Library(copy / "library"), "mug")) == ["kitchen", "lab"]
-    damage(next((copy / "library" / "scenes").glob("kitchen.*.safetensors")))
-    assert "the hash differs" in Library(copy / "library").search("mug").skipped["kitchen"]
+    assert sorted(hits(Library(rooms_copy / "library"), "mug")) == ["kitchen", "lab"]
+    damage(next((rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")))
+    assert "the hash differs" in Library(rooms_copy / "library").search("mug").skipped["kitchen"]
 
 
 @pytest.mark.parametrize(
     "text",
     ["", "{", "[]", "{}", "null", '{"name": "office"}', '{"name": "../../x"}', "\0\0\0\0"],
 )
-def test_a_damaged_record_is_told_and_recovered_from_the_codes(copy, text):
-    before = contents(copy / "library" / "scenes")
-    (copy / "library" / "scenes" / "kitchen.json").write_text(text)
-    library = Library(copy / "library")
+def test_a_damaged_record_is_told_and_recovered_from_the_codes(rooms_copy, text):
+    before = contents(rooms_copy / "library" / "scenes")
+    (rooms_copy / "library" / "scenes" / "kitchen.json").write_text(text)
+    library = Library(rooms_copy / "library")
     assert library.search("mug").skipped.keys() == {"kitchen"}
     library.remove("office")  # other work goes on, and keeps what repairs the record
     assert library.verify(repair=True) == {}
@@ -427,14 +428,14 @@ def test_a_damaged_record_is_told_and_recovered_from_the_codes(copy, text):
     )
 
 
-def test_every_changed_byte_of_a_record_is_found_and_mended(copy):
+def test_every_changed_byte_of_a_record_is_found_and_mended(rooms_copy):
     """A record without its hash is taken as one of an earlier library: only its own name can be lost that way."""
-    path = copy / "library" / "scenes" / "kitchen.json"
-    expected = Library(copy / "library").add(copy / "kitchen")
+    path = rooms_copy / "library" / "scenes" / "kitchen.json"
+    expected = Library(rooms_copy / "library").add(rooms_copy / "kitchen")
     whole = path.read_bytes()
     for place in range(0, len(whole), 3):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        library = Library(copy / "library")
+        library = Library(rooms_copy / "library")
         assert library.record("kitchen") in (expected, None)
         if library.record("kitchen") is None:
             assert "--repair" in library.search("griffin").skipped["kitchen"]
@@ -442,19 +443,19 @@ def test_every_changed_byte_of_a_record_is_found_and_mended(copy):
     assert library.record("kitchen") == expected
 
 
-def test_a_record_is_recovered_without_its_scene(copy):
-    Library(copy / "library").add(copy / "kitchen")
-    shutil.rmtree(copy / "kitchen")
-    path = copy / "library" / "scenes" / "kitchen.json"
+def test_a_record_is_recovered_without_its_scene(rooms_copy):
+    Library(rooms_copy / "library").add(rooms_copy / "kitchen")
+    shutil.rmtree(rooms_copy / "kitchen")
+    path = rooms_copy / "library" / "scenes" / "kitchen.json"
     before = path.read_bytes()
     path.write_bytes(b"")
-    (problem,) = Library(copy / "library").verify(repair=True).values()
+    (problem,) = Library(rooms_copy / "library").verify(repair=True).values()
     assert "no such folder" in problem
     assert path.read_bytes() == before
 
 
-def test_a_lost_record_is_told_and_written_again(copy):
-    library = Library(copy / "library")
+def test_a_lost_record_is_told_and_written_again(rooms_copy):
+    library = Library(rooms_copy / "library")
     before = (library.stage / "kitchen.json").read_bytes()
     (library.stage / "kitchen.json").unlink()
     library.remove("office")  # other changes keep its codes
@@ -466,8 +467,8 @@ def test_a_lost_record_is_told_and_written_again(copy):
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
 
 
-def test_files_that_nothing_can_be_recovered_from_are_told_with_another_remedy(copy):
-    library = Library(copy / "library")
+def test_files_that_nothing_can_be_recovered_from_are_told_with_another_remedy(rooms_copy):
+    library = Library(rooms_copy / "library")
     damage(library.stage / library.record("kitchen").codes_file)
     (library.stage / "kitchen.json").unlink()
     told = library.verify(repair=True)["kitchen"]
@@ -478,36 +479,36 @@ def test_files_that_nothing_can_be_recovered_from_are_told_with_another_remedy(c
 
 
 @pytest.mark.parametrize("text", [None, "{}"])
-def test_a_scene_whose_record_is_lost_keeps_its_name_from_others(copy, text):
-    library = Library(copy / "library")
+def test_a_scene_whose_record_is_lost_keeps_its_name_from_others(rooms_copy, text):
+    library = Library(rooms_copy / "library")
     path = library.stage / "kitchen.json"
     path.unlink() if text is None else path.write_text(text)
-    shutil.copytree(copy / "office", copy / "other" / "kitchen")
-    assert library.add(copy / "other" / "kitchen").name == "kitchen-2"
-    assert library.add(copy / "kitchen").name == "kitchen"
+    shutil.copytree(rooms_copy / "office", rooms_copy / "other" / "kitchen")
+    assert library.add(rooms_copy / "other" / "kitchen").name == "kitchen-2"
+    assert library.add(rooms_copy / "kitchen").name == "kitchen"
     assert library.verify(repair=True) == {}
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
 
 
-def test_codes_that_a_damaged_record_of_an_early_library_does_not_name_stay(copy):
-    path = copy / "library" / "scenes" / "kitchen.json"
+def test_codes_that_a_damaged_record_of_an_early_library_does_not_name_stay(rooms_copy):
+    path = rooms_copy / "library" / "scenes" / "kitchen.json"
     record = read_json(path)
     record.pop("hash")
     write_json(path, {**record, "content": "0" * 24})
-    library = Library(copy / "library")
-    shutil.rmtree(copy / "kitchen")
+    library = Library(rooms_copy / "library")
+    shutil.rmtree(rooms_copy / "kitchen")
     library.remove("office")
     assert list(library.stage.glob("kitchen.*.safetensors"))
 
 
-def test_a_record_with_a_path_that_no_file_can_have_is_told(copy):
-    path = copy / "library" / "scenes" / "kitchen.json"
+def test_a_record_with_a_path_that_no_file_can_have_is_told(rooms_copy):
+    path = rooms_copy / "library" / "scenes" / "kitchen.json"
     write_record(dataclasses.replace(read_record(path), path="/a\0b", beside="../nowhere"), path)
-    assert "no such folder" in Library(copy / "library").search("griffin").skipped["kitchen"]
+    assert "no such folder" in Library(rooms_copy / "library").search("griffin").skipped["kitchen"]
 
 
-def test_a_removal_that_was_killed_is_finished_and_not_undone(copy, monkeypatch):
-    library = Library(copy / "library")
+def test_a_removal_that_was_killed_is_finished_and_not_undone(rooms_copy, monkeypatch):
+    library = Library(rooms_copy / "library")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -517,17 +518,17 @@ def test_a_removal_that_was_killed_is_finished_and_not_undone(copy, monkeypatch)
     assert not list(library.stage.glob("kitchen*"))
 
 
-def test_a_scene_with_a_damaged_record_is_removed_with_all_its_files(copy):
-    (copy / "library" / "scenes" / "kitchen.json").write_text("[]")
-    library = Library(copy / "library")
+def test_a_scene_with_a_damaged_record_is_removed_with_all_its_files(rooms_copy):
+    (rooms_copy / "library" / "scenes" / "kitchen.json").write_text("[]")
+    library = Library(rooms_copy / "library")
     library.search("mug")
     assert library.remove("kitchen") == "kitchen"
     assert not list(library.stage.glob("kitchen*"))
     assert library.verify() == {}
 
 
-def test_a_record_whose_copy_is_damaged_as_well_is_told_with_another_remedy(copy):
-    library = Library(copy / "library")
+def test_a_record_whose_copy_is_damaged_as_well_is_told_with_another_remedy(rooms_copy):
+    library = Library(rooms_copy / "library")
     codes = library.stage / library.record("kitchen").codes_file
     write_tensors(codes, read_tensors(codes)[0], {"record": "{}"})
     assert "expected the copy of the record" in library.verify()["kitchen"]
@@ -536,8 +537,8 @@ def test_a_record_whose_copy_is_damaged_as_well_is_told_with_another_remedy(copy
     assert told.endswith(f"; lexsplat library remove {library.root} kitchen, and add the scene again")
 
 
-def test_a_damaged_copy_of_a_record_is_written_again(copy):
-    library = Library(copy / "library")
+def test_a_damaged_copy_of_a_record_is_written_again(rooms_copy):
+    library = Library(rooms_copy / "library")
     codes = library.stage / library.record("kitchen").codes_file
     whole = codes.read_bytes()
     codes.write_bytes(whole.replace(b"kitchen", b"kitchem", 1))
@@ -545,18 +546,18 @@ def test_a_damaged_copy_of_a_record_is_written_again(copy):
     assert library.verify(repair=True) == {}
 
 
-def test_verify_finds_a_rebuilt_scene_whose_file_has_kept_size_and_time(copy):
-    library, path = Library(copy / "library"), copy / "kitchen" / "scene.json"
+def test_verify_finds_a_rebuilt_scene_whose_file_has_kept_size_and_time(rooms_copy):
+    library, path = Library(rooms_copy / "library"), rooms_copy / "kitchen" / "scene.json"
     times = path.stat()
     path.write_text(path.read_text().replace('"l1"', '"l2"'))
     os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
     assert "rebuilt" in library.verify()["kitchen"]
 
 
-def test_files_of_others_are_never_deleted(copy):
+def test_files_of_others_are_never_deleted(rooms_copy):
     """A folder named ``scenes`` of a project is no library, and what a library did not write stays."""
-    project = copy / "project"
-    shutil.copytree(copy / "kitchen", project / "scenes")
+    project = rooms_copy / "project"
+    shutil.copytree(rooms_copy / "kitchen", project / "scenes")
     (project / "scenes" / "photo.jpg").write_bytes(b"mine")
     before = contents(project / "scenes")
     with pytest.raises(LibraryError, match="other files"):
@@ -564,82 +565,82 @@ def test_files_of_others_are_never_deleted(copy):
     with pytest.raises(LibraryError, match="make one with"):
         Library(project)
     assert contents(project / "scenes") == before
-    library = Library(copy / "library")
+    library = Library(rooms_copy / "library")
     for name in ("photo.jpg", "features.safetensors", "notes.json.txt"):
         (library.stage / name).write_bytes(b"mine")
     library.remove("office")
-    library.add(copy / "office")
+    library.add(rooms_copy / "office")
     assert library.verify(repair=True) == {}
     assert {"photo.jpg", "features.safetensors", "notes.json.txt"} <= contents(library.stage).keys()
-    (copy / "photos" / "thumbnails" / "kitchen").mkdir(parents=True)
-    (copy / "photos" / "thumbnails" / "kitchen" / "mine.jpg").write_bytes(b"mine")
-    photos = Library.create(copy / "photos")
-    photos.add(copy / "kitchen")
+    (rooms_copy / "photos" / "thumbnails" / "kitchen").mkdir(parents=True)
+    (rooms_copy / "photos" / "thumbnails" / "kitchen" / "mine.jpg").write_bytes(b"mine")
+    photos = Library.create(rooms_copy / "photos")
+    photos.add(rooms_copy / "kitchen")
     (photos.stage / "notes.removed").write_bytes(b"mine")
     (photos.stage / "old.removed").mkdir()
     photos.remove("kitchen")
-    photos.add(copy / "office")
-    assert (copy / "photos" / "thumbnails" / "kitchen" / "mine.jpg").read_bytes() == b"mine"
+    photos.add(rooms_copy / "office")
+    assert (rooms_copy / "photos" / "thumbnails" / "kitchen" / "mine.jpg").read_bytes() == b"mine"
     assert (photos.stage / "notes.removed").read_bytes() == b"mine"
     assert (photos.stage / "old.removed").is_dir()
-    (copy / "songs").mkdir()
-    (copy / "songs" / "library.json").write_text('{"songs": []}')
+    (rooms_copy / "songs").mkdir()
+    (rooms_copy / "songs" / "library.json").write_text('{"songs": []}')
     for text in (
         '{"songs": []}',
         '{"format_version": 1, "name": "abc"}',
         '["\\ud800"]',
         "[" * 600 + "]" * 600,
     ):
-        (copy / "songs" / "library.json").write_text(text)
+        (rooms_copy / "songs" / "library.json").write_text(text)
         with pytest.raises(LibraryError, match=r"library\.json: expected .* give another folder"):
-            Library.create(copy / "songs")
-        assert (copy / "songs" / "library.json").read_text() == text
+            Library.create(rooms_copy / "songs")
+        assert (rooms_copy / "songs" / "library.json").read_text() == text
 
 
-def test_every_changed_byte_of_the_library_file_is_harmless_or_mended(copy):
-    path = copy / "library" / "library.json"
+def test_every_changed_byte_of_the_library_file_is_harmless_or_mended(rooms_copy):
+    path = rooms_copy / "library" / "library.json"
     whole = path.read_bytes()
     for place in range(len(whole)):
         for bit in (1, 4, 64):
             path.write_bytes(whole[:place] + bytes([whole[place] ^ bit]) + whole[place + 1 :])
             told = ""
             try:
-                Library(copy / "library")
+                Library(rooms_copy / "library")
             except LibraryError as error:
                 told = str(error)
             assert not told or "--repair" in told
-            assert len(Library.create(copy / "library").names()) == 3
+            assert len(Library.create(rooms_copy / "library").names()) == 3
 
 
-def test_many_rebuilt_scenes_leave_room_for_the_others(copy):
+def test_many_rebuilt_scenes_leave_room_for_the_others(rooms_copy):
     for number in range(5):
-        write_scene(copy / f"room{number}", OTHERS)
-    library = Library(copy / "library")
+        write_scene(rooms_copy / f"room{number}", OTHERS)
+    library = Library(rooms_copy / "library")
     for number in range(5):
-        library.add(copy / f"room{number}")
-        write_scene(copy / f"room{number}", OTHERS, build=2)
+        library.add(rooms_copy / f"room{number}")
+        write_scene(rooms_copy / f"room{number}", OTHERS, build=2)
     found = library.search("vase", limit=1)  # four scenes are looked at, two of them rebuilt ones
     assert [hit.scene for hit in found.hits] == ["kitchen"]
     assert len(found.rebuilt) == 5
 
 
 @pytest.mark.parametrize("text", [None, "", "{"])
-def test_a_lost_library_file_is_written_again(copy, text):
-    path = copy / "library" / "library.json"
+def test_a_lost_library_file_is_written_again(rooms_copy, text):
+    path = rooms_copy / "library" / "library.json"
     path.unlink() if text is None else path.write_text(text)
-    with pytest.raises(LibraryError, match=f"lexsplat library verify {copy / 'library'} --repair"):
-        Library(copy / "library")
-    library = Library.create(copy / "library")
+    with pytest.raises(LibraryError, match=f"lexsplat library verify {rooms_copy / 'library'} --repair"):
+        Library(rooms_copy / "library")
+    library = Library.create(rooms_copy / "library")
     assert library.verify(repair=True) == {}
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
 
 
 @pytest.mark.parametrize("left", [".lock", ".library.json.99999999.140.tmp"])
-def test_a_first_addition_that_was_killed_goes_on(copy, left):
-    (copy / "new").mkdir()
-    (copy / "new" / left).touch()
-    Library.create(copy / "new").add(copy / "kitchen")
-    assert sorted(path.name for path in (copy / "new").iterdir() if path.name[0] != ".") == [
+def test_a_first_addition_that_was_killed_goes_on(rooms_copy, left):
+    (rooms_copy / "new").mkdir()
+    (rooms_copy / "new" / left).touch()
+    Library.create(rooms_copy / "new").add(rooms_copy / "kitchen")
+    assert sorted(path.name for path in (rooms_copy / "new").iterdir() if path.name[0] != ".") == [
         "library.json", "scenes", "texts",
     ]  # fmt: skip
 
@@ -651,14 +652,14 @@ def test_long_names_of_any_alphabet_are_names(tmp_path):
     assert hits(library, "mug") == [name]
 
 
-def test_people_read_a_few_problems_and_their_number(copy):
+def test_people_read_a_few_problems_and_their_number(rooms_copy):
     for number in range(8):
-        shutil.copytree(copy / "kitchen", copy / f"room{number}")
-    library = Library(copy / "library")
+        shutil.copytree(rooms_copy / "kitchen", rooms_copy / f"room{number}")
+    library = Library(rooms_copy / "library")
     for number in range(8):
-        library.add(copy / f"room{number}")
+        library.add(rooms_copy / f"room{number}")
     for number in range(8):
-        shutil.rmtree(copy / f"room{number}")
+        shutil.rmtree(rooms_copy / f"room{number}")
     found = library.search("griffin")
     assert len(found.skipped) == 8
     assert repr(found).count("\n  skipped: ") == 6
@@ -670,36 +671,36 @@ def test_people_read_a_few_problems_and_their_number(copy):
 @pytest.mark.parametrize(
     "change", [{"content": "../x"}, {"encoder": "a/b"}, {"codes": -1}, {"codes": "many"}]
 )
-def test_a_record_with_values_that_no_library_writes_is_refused(copy, change):
-    path = copy / "library" / "scenes" / "kitchen.json"
+def test_a_record_with_values_that_no_library_writes_is_refused(rooms_copy, change):
+    path = rooms_copy / "library" / "scenes" / "kitchen.json"
     write_record(dataclasses.replace(read_record(path), **change), path)
-    library = Library(copy / "library")
+    library = Library(rooms_copy / "library")
     assert library.record("kitchen") is None
     assert isinstance(library.damaged["kitchen"], FileFormatError)
 
 
-def test_a_folder_that_is_no_library_is_refused(tmp_path, copy):
+def test_a_folder_that_is_no_library_is_refused(tmp_path, rooms_copy):
     with pytest.raises(LibraryError, match="no such folder; make one with: lexsplat library add"):
         lexsplat.open_library(tmp_path / "nowhere")
     with pytest.raises(LibraryError, match="other files"):
-        Library.create(copy / "kitchen")
+        Library.create(rooms_copy / "kitchen")
     for facts in ({"format_version": 1, "name": "../x"}, [], {}, {"a": "\ud800"}):
-        (copy / "library" / "library.json").write_text(json.dumps(facts))
+        (rooms_copy / "library" / "library.json").write_text(json.dumps(facts))
         with pytest.raises(LibraryError, match=r"expected format_version 1 .* --repair"):
-            Library(copy / "library")
+            Library(rooms_copy / "library")
     later = {"format_version": 2, "name": "x"}
-    write_json(copy / "library" / "library.json", {**later, "hash": fingerprint(later)})
+    write_json(rooms_copy / "library" / "library.json", {**later, "hash": fingerprint(later)})
     for make in (Library, Library.create):
         with pytest.raises(LibraryError, match="found version 2; add the scenes to a new library"):
-            make(copy / "library")
+            make(rooms_copy / "library")
 
 
-def test_a_scene_that_is_not_finished_is_refused_and_nothing_changes(copy):
-    before = contents(copy / "library" / "scenes")
-    SceneFolder(copy / "begun").save()
+def test_a_scene_that_is_not_finished_is_refused_and_nothing_changes(rooms_copy):
+    before = contents(rooms_copy / "library" / "scenes")
+    SceneFolder(rooms_copy / "begun").save()
     with pytest.raises(SceneFolderError, match="finished stages"):
-        Library(copy / "library").add(copy / "begun")
-    assert contents(copy / "library" / "scenes") == before
+        Library(rooms_copy / "library").add(rooms_copy / "begun")
+    assert contents(rooms_copy / "library" / "scenes") == before
 
 
 def _hold(root, ready, release):
@@ -709,37 +710,37 @@ def _hold(root, ready, release):
 
 
 @pytest.mark.slow
-def test_a_second_writer_is_refused_and_readers_are_not(copy):
+def test_a_second_writer_is_refused_and_readers_are_not(rooms_copy):
     context = multiprocessing.get_context("spawn")
     ready, release = context.Event(), context.Event()
-    process = context.Process(target=_hold, args=(copy / "library", ready, release))
+    process = context.Process(target=_hold, args=(rooms_copy / "library", ready, release))
     process.start()
     try:
         assert ready.wait(120)
-        library = Library(copy / "library")
-        for change in (lambda: library.add(copy / "kitchen"), lambda: library.remove("kitchen")):
+        library = Library(rooms_copy / "library")
+        for change in (lambda: library.add(rooms_copy / "kitchen"), lambda: library.remove("kitchen")):
             with pytest.raises(LibraryError, match=f"process {process.pid} at work"):
                 change()
         assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
     finally:
         release.set()
         process.join()
-    library.add(copy / "kitchen")
+    library.add(rooms_copy / "kitchen")
 
 
-def test_a_full_disk_is_told_and_the_entry_stays(copy, monkeypatch):
-    before = contents(copy / "library" / "scenes")
-    write_scene(copy / "kitchen", OTHERS, build=2)
-    library = Library(copy / "library")
+def test_a_full_disk_is_told_and_the_entry_stays(rooms_copy, monkeypatch):
+    before = contents(rooms_copy / "library" / "scenes")
+    write_scene(rooms_copy / "kitchen", OTHERS, build=2)
+    library = Library(rooms_copy / "library")
     full = OSError(28, "No space left on device", "scenes/kitchen.json")
     for step in ("write_tensors", "write_record"):
         with monkeypatch.context() as patch:
             patch.setattr(f"lexsplat.scenes.library.entries.{step}", lambda *_: (_ for _ in ()).throw(full))
             with pytest.raises(LibraryError, match="No space left on device; run the command again"):
-                library.add(copy / "kitchen")
+                library.add(rooms_copy / "kitchen")
         kept = {name: data for name, data in contents(library.stage).items() if name in before}
         assert kept == before
-    library.add(copy / "kitchen")
+    library.add(rooms_copy / "kitchen")
     assert library.verify() == {}
 
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def _encoders(monkeypatch):
+def _encoders(monkeypatch) -> None:
     install(monkeypatch)
 
 
@@ -44,7 +44,7 @@ def rooms(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def copy(rooms, tmp_path) -> Path:
+def rooms_copy(rooms, tmp_path) -> Path:
     return copied(rooms, tmp_path / "rooms")
 
 
@@ -168,26 +168,26 @@ def test_to_confirm_is_to_ask_the_scene(rooms):
     assert found.hits[0].answer == find_phrase(open_scene(rooms / "kitchen"), "mug")
 
 
-def test_a_rebuilt_scene_is_asked_itself(copy):
-    write_scene(copy / "kitchen", THINGS[::-1], build=2, segments=True)
-    (hit,) = Library(copy / "library").search("mug").hits
+def test_a_rebuilt_scene_is_asked_itself(rooms_copy):
+    write_scene(rooms_copy / "kitchen", THINGS[::-1], build=2, segments=True)
+    (hit,) = Library(rooms_copy / "library").search("mug").hits
     assert (hit.scene, hit.source) == ("kitchen", "scene")
     np.testing.assert_allclose(hit.answer["instances"][0]["center"], CENTERS[3], atol=0.2 * RADIUS)
 
 
-def test_a_vanished_scene_is_told_and_not_answered_from_memory(copy):
-    shutil.rmtree(copy / "kitchen")
-    found = Library(copy / "library").search("mug")
+def test_a_vanished_scene_is_told_and_not_answered_from_memory(rooms_copy):
+    shutil.rmtree(rooms_copy / "kitchen")
+    found = Library(rooms_copy / "library").search("mug")
     assert found.hits == ()
     assert "no such folder" in found.skipped["kitchen"]
 
 
-def test_a_scale_that_was_set_after_adding_gives_meters(copy):
-    library = closed(Library(copy / "library"))
-    record = read_json(copy / "kitchen" / "scene.json")
+def test_a_scale_that_was_set_after_adding_gives_meters(rooms_copy):
+    library = closed(Library(rooms_copy / "library"))
+    record = read_json(rooms_copy / "kitchen" / "scene.json")
     (before,) = library.search("mug").hits[0].answer["instances"]
-    world = {**open_scene(copy / "kitchen").world.to_json(), "meters_per_unit": 0.5, "poses": "x"}
-    write_json(copy / "kitchen" / "scene.json", {**record, "world": world})
+    world = {**open_scene(rooms_copy / "kitchen").world.to_json(), "meters_per_unit": 0.5, "poses": "x"}
+    write_json(rooms_copy / "kitchen" / "scene.json", {**record, "world": world})
     hit = library.search("mug").hits[0]
     assert hit.to_dict()["meters_per_unit"] == 0.5
     assert hit.answer["instances"][0]["size_meters"] == pytest.approx(
@@ -196,12 +196,12 @@ def test_a_scale_that_was_set_after_adding_gives_meters(copy):
     assert "m." in repr(hit)
 
 
-def test_entries_of_a_library_without_segments_answer_by_their_scenes(copy):
-    for path in (copy / "library" / "scenes").glob("*.json"):
+def test_entries_of_a_library_without_segments_answer_by_their_scenes(rooms_copy):
+    for path in (rooms_copy / "library" / "scenes").glob("*.json"):
         record = read_json(path)
         record.pop("contents"), record.pop("hash")
         write_json(path, record)
-    (hit,) = Library(copy / "library").search("mug").hits
+    (hit,) = Library(rooms_copy / "library").search("mug").hits
     assert (hit.scene, hit.source) == ("kitchen", "scene")
 
 
@@ -209,8 +209,8 @@ def test_entries_of_a_library_without_segments_answer_by_their_scenes(copy):
 
 
 @pytest.mark.parametrize("harm", ["bit", "cut", "gone", "empty"])
-def test_damaged_objects_are_refused_and_repaired(copy, harm):
-    (path,) = (copy / "library" / "scenes").glob("kitchen.*.objects.safetensors")
+def test_damaged_objects_are_refused_and_repaired(rooms_copy, harm):
+    (path,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.objects.safetensors")
     before = path.read_bytes()
     middle = len(before) // 2
     changed = {
@@ -218,7 +218,7 @@ def test_damaged_objects_are_refused_and_repaired(copy, harm):
         "cut": before[:-9],
     }
     path.write_bytes(changed.get(harm, b"")) if harm != "gone" else path.unlink()
-    library = Library(copy / "library")
+    library = Library(rooms_copy / "library")
     found = library.search("mug")
     assert found.hits == ()
     assert "--repair" in found.skipped["kitchen"]

@@ -19,7 +19,7 @@ QUESTIONS = ("🍎🦆", "где утка", "why is the sky blue", "bananna", "m
 
 
 @pytest.fixture(autouse=True)
-def _encoders(monkeypatch):
+def _encoders(monkeypatch) -> None:
     install(monkeypatch)
 
 

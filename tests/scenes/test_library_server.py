@@ -5,6 +5,7 @@ import json
 import shutil
 import signal
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,12 +30,12 @@ NAMES = ("kitchen", "office", "lab")
 
 
 @pytest.fixture(autouse=True)
-def _encoders(monkeypatch):
+def _encoders(monkeypatch) -> None:
     install(monkeypatch)
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
+def rooms(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("rooms")
     for name, things in zip(NAMES, (THINGS, OTHERS, (*OTHERS[:3], *THINGS[:2]))):
         write_scene(root / name, things, encoder="def" if name == "lab" else "abc")

@@ -3,11 +3,11 @@
 import pytest
 
 from lexsplat.scenes.answers import find_phrases
-from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.scene import Scene, open_scene
 
 
 @pytest.fixture(scope="module")
-def demo():
+def demo() -> Scene:
     return open_scene("demo", device="cpu")
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import pytest
 from support.page_browser import CHROMIUM, ask, covered_tools, open_page, serving, until
 from support.viewer_scene import ball_scene
@@ -21,7 +24,7 @@ LIST = """() => {
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
+def address(tmp_path_factory) -> Iterator[str]:
     target = tmp_path_factory.mktemp("balls") / "page"
     words = [*(f"ball {n}" for n in range(5)), "chair"]
     with pytest.MonkeyPatch.context() as patch:
@@ -33,7 +36,7 @@ def address(tmp_path_factory):
 
 
 @pytest.fixture
-def page(browser, address):
+def page(browser, address) -> Iterator[Any]:
     opened = open_page(browser, address, 720, 480)
     yield opened
     opened.close()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import pytest
 from questions import questions
 from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
 
 from lexsplat.queries.phrases import Anything, Both, Colored, Thing, Together, parts_of
 from lexsplat.scenes.publishing import PublishOptions, publish
-from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.scene import Scene, open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
@@ -47,12 +50,12 @@ ASK = """async (prompts) => {
 
 
 @pytest.fixture(scope="module")
-def demo():
+def demo() -> Scene:
     return open_scene("demo")
 
 
 @pytest.fixture(scope="module")
-def page(demo, tmp_path_factory):
+def page(demo, tmp_path_factory) -> Iterator[Any]:
     pytest.importorskip("playwright.sync_api")
     folder = tmp_path_factory.mktemp("published") / "demo"
     publish(demo, folder, PublishOptions())

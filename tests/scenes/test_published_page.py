@@ -6,6 +6,8 @@ import base64
 import io
 import json
 import shutil
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from lexsplat.queries.picking import surface_at
 from lexsplat.rendering import render
 from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
 from lexsplat.scenes.publishing.manifest import checksums
-from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.scene import Scene, open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
@@ -46,25 +48,25 @@ HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</
 
 
 @pytest.fixture(scope="module")
-def demo():
+def demo() -> Scene:
     return open_scene("demo")
 
 
 @pytest.fixture(scope="module")
-def folder(demo, tmp_path_factory):
+def published_demo(demo, tmp_path_factory):
     target = tmp_path_factory.mktemp("published") / "demo"
     publish(demo, target, PublishOptions(title="A table top"))
     return target
 
 
 @pytest.fixture(scope="module")
-def address(folder):
-    with serving(folder) as found:
+def address(published_demo) -> Iterator[str]:
+    with serving(published_demo) as found:
         yield found
 
 
 @pytest.fixture(scope="module")
-def page(browser, address):
+def page(browser, address) -> Iterator[Any]:
     opened = open_page(browser, address)
     yield opened
     opened.close()
@@ -91,9 +93,9 @@ def picture(page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(folder):
-    assert (folder / "text.safetensors").exists()
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 8e6
+def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(published_demo):
+    assert (published_demo / "text.safetensors").exists()
+    assert sum(path.stat().st_size for path in published_demo.iterdir()) < 8e6
 
 
 def test_answers_are_those_of_python(page, demo):
@@ -289,7 +291,7 @@ def test_the_search_box_completes_and_the_keyboard_suffices(page):
 
 
 def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_text_tower(
-    browser, folder, ball_page
+    browser, published_demo, ball_page
 ):
     with serving(ball_page()) as address:
         page = open_page(browser, address)

@@ -30,7 +30,7 @@ BUNDLE = Path(publishing.__file__).parent / "page"
 
 
 @pytest.fixture(scope="module")
-def balls():
+def scene_of_balls():
     return ball_scene()[0]
 
 
@@ -52,12 +52,12 @@ def test_there_are_five_thousand_everyday_phrases_without_repetition():
     assert all(phrase == " ".join(phrase.split()).lower() for phrase in phrases)
 
 
-def test_the_codes_of_the_page_give_the_scores_of_the_field(balls):
+def test_the_codes_of_the_page_give_the_scores_of_the_field(scene_of_balls):
     generator = torch.Generator().manual_seed(0)
     weights = torch.rand(500, 4, generator=generator).sort(1, descending=True).values
     weights /= weights.sum(1, keepdim=True)
     weights[:50] = 0  # seen by no view
-    language = stored_language(balls.field, {}).select(torch.arange(500))
+    language = stored_language(scene_of_balls.field, {}).select(torch.arange(500))
     exact = type(language)(language.codes, weights, language.uncertainties, language.codewords, {})
     content = np.frombuffer(sidecar.splat_codes(exact), np.uint8).reshape(2, 500, 4)
     shares = content[1].astype(float) / 255 / [1, 2, 3, 4]
@@ -69,8 +69,8 @@ def test_the_codes_of_the_page_give_the_scores_of_the_field(balls):
     assert np.maximum(-errors, 0).sum(1).max() <= 0.55 / 255
 
 
-def test_the_manifest_lists_every_file_with_its_checksum(balls, tmp_path, small_dictionary):
-    manifest = published(balls, tmp_path / "page", words_only=True, title="Balls")
+def test_the_manifest_lists_every_file_with_its_checksum(scene_of_balls, tmp_path, small_dictionary):
+    manifest = published(scene_of_balls, tmp_path / "page", words_only=True, title="Balls")
     files = {path.name for path in (tmp_path / "page").iterdir()} - {"manifest.json", "index.html"}
     assert files == set(manifest["files"]) - {"index.html"}
     for name in files:
@@ -84,24 +84,24 @@ def test_the_manifest_lists_every_file_with_its_checksum(balls, tmp_path, small_
     )
 
 
-def test_the_splats_are_an_spz_in_the_order_of_the_codes(balls, tmp_path, monkeypatch):
+def test_the_splats_are_an_spz_in_the_order_of_the_codes(scene_of_balls, tmp_path, monkeypatch):
     monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
-    path, rotation = splat_file.write_splats(balls.gaussians, tmp_path)
+    path, rotation = splat_file.write_splats(scene_of_balls.gaussians, tmp_path)
     assert (path.name, rotation) == ("scene.spz", (1, 0, 0, 0))
     assert path.read_bytes()[:2] == b"\x1f\x8b", "the page's renderer reads gzip, not version 4"
-    assert np.allclose(read_splats(path).means, balls.gaussians.means, atol=1e-4)
+    assert np.allclose(read_splats(path).means, scene_of_balls.gaussians.means, atol=1e-4)
 
 
 def test_small_scenes_are_a_ply_without_loss_and_large_ones_the_smaller_of_spz_and_sog(
-    balls, tmp_path, monkeypatch
+    scene_of_balls, tmp_path, monkeypatch
 ):
-    path, rotation = splat_file.write_splats(balls.gaussians, tmp_path, shrink=True)
+    path, rotation = splat_file.write_splats(scene_of_balls.gaussians, tmp_path, shrink=True)
     assert (path.name, rotation) == ("scene.ply", (0, 0, 0, 1))
-    assert torch.equal(read_splats(path).means, balls.gaussians.means)
+    assert torch.equal(read_splats(path).means, scene_of_balls.gaussians.means)
     path.unlink()
     monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
     monkeypatch.setattr(splat_file, "LARGE_BYTES", 0)
-    gaussians = balls.gaussians.map(torch.clone)
+    gaussians = scene_of_balls.gaussians.map(torch.clone)
     gaussians.shN = torch.randn(len(gaussians), 15, 3, generator=torch.Generator().manual_seed(0))
     sizes = {}
     for shrink in (False, True):
@@ -114,9 +114,9 @@ def test_small_scenes_are_a_ply_without_loss_and_large_ones_the_smaller_of_spz_a
 
 
 @pytest.mark.parametrize("far", [1e6, 1e8])
-def test_one_far_gaussian_does_not_make_the_others_coarse(balls, tmp_path, monkeypatch, far):
+def test_one_far_gaussian_does_not_make_the_others_coarse(scene_of_balls, tmp_path, monkeypatch, far):
     monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
-    gaussians = balls.gaussians.map(torch.clone)
+    gaussians = scene_of_balls.gaussians.map(torch.clone)
     gaussians.means[7, 0] = far
     path, _ = splat_file.write_splats(gaussians, tmp_path)
     found = read_sog(path).means  # read as splats of others, one at 1e8 would be dropped with a warning
@@ -125,10 +125,10 @@ def test_one_far_gaussian_does_not_make_the_others_coarse(balls, tmp_path, monke
     assert found[7, 0] == pytest.approx(far, rel=1e-2)
 
 
-def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, small_dictionary):
-    gaussians = balls.gaussians.map(torch.clone)
+def test_max_splats_keeps_those_that_cover_most_in_their_order(scene_of_balls, tmp_path, small_dictionary):
+    gaussians = scene_of_balls.gaussians.map(torch.clone)
     gaussians.log_scales[1::2] -= 3
-    thinned = type(balls)(gaussians, balls.field, balls.views, balls.clip)
+    thinned = type(scene_of_balls)(gaussians, scene_of_balls.field, scene_of_balls.views, scene_of_balls.clip)
     half = (len(gaussians) + 1) // 2
     assert splat_file.most_visible(gaussians, half).tolist() == list(range(0, len(gaussians), 2))
     manifest = published(thinned, tmp_path / "page", words_only=True, max_splats=half)
@@ -137,20 +137,20 @@ def test_max_splats_keeps_those_that_cover_most_in_their_order(balls, tmp_path, 
 
 
 def test_publishing_again_replaces_the_page_and_keeps_no_file_of_before(
-    balls, tmp_path, small_dictionary, monkeypatch
+    scene_of_balls, tmp_path, small_dictionary, monkeypatch
 ):
     folder = tmp_path / "page"
-    published(balls, folder, words_only=True)
+    published(scene_of_balls, folder, words_only=True)
     monkeypatch.setattr(splat_file, "NAME", "other")
-    manifest = published(balls, folder, words_only=True, title="again")
+    manifest = published(scene_of_balls, folder, words_only=True, title="again")
     assert {path.name for path in folder.iterdir()} == set(manifest["files"]) | {"manifest.json"}
     assert not (folder / "scene.ply").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
 
 
-def test_what_was_asked_in_the_viewer_comes_first_as_plain_text(balls, tmp_path):
+def test_what_was_asked_in_the_viewer_comes_first_as_plain_text(scene_of_balls, tmp_path):
     write_json(tmp_path / "viewer.json", {"history": ["Blue\n<b>Ball</b>", "ball  2", 7, "x" * 300]})
-    scene = balls.with_content(balls.gaussians, balls.field)
+    scene = scene_of_balls.with_content(scene_of_balls.gaussians, scene_of_balls.field)
     scene.folder = SceneFolder(tmp_path)
     phrases = vocabulary.page_phrases(vocabulary.asked_phrases(scene))
     assert list(phrases)[:2] == ["blue <b>ball</b>", "ball 2"]
@@ -183,73 +183,77 @@ def test_only_things_that_were_asked_for_are_in_the_dictionary_as_a_table_answer
         ),
     ],
 )
-def test_a_folder_with_files_of_others_is_refused_and_left_alone(balls, tmp_path, make, found):
+def test_a_folder_with_files_of_others_is_refused_and_left_alone(scene_of_balls, tmp_path, make, found):
     make(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(SceneFolderError, match=found):
-        publish(balls, tmp_path)
+        publish(scene_of_balls, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("files", [{"../mine.txt": {}}, {"..": {}}, [["scene.spz"]], 7])
-def test_a_manifest_that_names_files_outside_its_folder_is_not_an_earlier_page(balls, tmp_path, files):
+def test_a_manifest_that_names_files_outside_its_folder_is_not_an_earlier_page(
+    scene_of_balls, tmp_path, files
+):
     (tmp_path / "mine.txt").write_text("mine")
     folder = tmp_path / "page"
     folder.mkdir()
     write_json(folder / "manifest.json", {"format": FORMAT, "files": files})
     with pytest.raises(SceneFolderError, match=r"foreign files: manifest\.json"):
-        publish(balls, folder, PublishOptions(words_only=True))
+        publish(scene_of_balls, folder, PublishOptions(words_only=True))
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
-def test_a_folder_that_has_the_name_of_a_file_of_the_page_is_refused(balls, tmp_path):
+def test_a_folder_that_has_the_name_of_a_file_of_the_page_is_refused(scene_of_balls, tmp_path):
     write_json(tmp_path / "manifest.json", {"format": FORMAT, "files": {"page.js": {}}})
     (tmp_path / "page.js").mkdir()
     with pytest.raises(SceneFolderError, match=r"foreign files: page\.js"):
-        publish(balls, tmp_path, PublishOptions(words_only=True))
+        publish(scene_of_balls, tmp_path, PublishOptions(words_only=True))
     assert (tmp_path / "page.js").is_dir()
 
 
-def test_single_files_need_a_name_in_html_and_replace_no_other_file(balls, tmp_path):
+def test_single_files_need_a_name_in_html_and_replace_no_other_file(scene_of_balls, tmp_path):
     single = PublishOptions(single_file=True)
     with pytest.raises(SceneFolderError, match=r"\.html"):
-        publish(balls, tmp_path / "page", single)
+        publish(scene_of_balls, tmp_path / "page", single)
     (tmp_path / "mine.html").write_text("<p>mine</p>")
     with pytest.raises(SceneFolderError, match="another file"):
-        publish(balls, tmp_path / "mine.html", single)
+        publish(scene_of_balls, tmp_path / "mine.html", single)
 
 
-def test_a_single_file_that_would_be_too_large_is_refused(balls, tmp_path, small_dictionary, monkeypatch):
+def test_a_single_file_that_would_be_too_large_is_refused(
+    scene_of_balls, tmp_path, small_dictionary, monkeypatch
+):
     monkeypatch.setattr("lexsplat.scenes.publishing.writing.SINGLE_FILE_BYTES", 1000)
     with pytest.raises(SceneFolderError, match="for a single file"):
-        publish(balls, tmp_path / "page.html", PublishOptions(single_file=True, words_only=True))
+        publish(scene_of_balls, tmp_path / "page.html", PublishOptions(single_file=True, words_only=True))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_a_scene_of_no_or_one_gaussian_is_refused(balls, tmp_path, count):
-    few = balls.with_content(
-        balls.gaussians.select(torch.arange(count)), balls.field.select(torch.arange(count))
+def test_a_scene_of_no_or_one_gaussian_is_refused(scene_of_balls, tmp_path, count):
+    few = scene_of_balls.with_content(
+        scene_of_balls.gaussians.select(torch.arange(count)), scene_of_balls.field.select(torch.arange(count))
     )
     with pytest.raises(QueryError, match=f"at least 2 Gaussians, found {count}"):
         publish(few, tmp_path / "page")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_scene_with_nan_and_one_too_large_are_refused(balls, tmp_path, monkeypatch):
-    gaussians = balls.gaussians.map(torch.clone)
+def test_a_scene_with_nan_and_one_too_large_are_refused(scene_of_balls, tmp_path, monkeypatch):
+    gaussians = scene_of_balls.gaussians.map(torch.clone)
     gaussians.means[3] = torch.nan
     with pytest.raises(QueryError, match="NaN or Inf in means"):
-        publish(balls.with_content(gaussians, balls.field), tmp_path / "page")
+        publish(scene_of_balls.with_content(gaussians, scene_of_balls.field), tmp_path / "page")
     monkeypatch.setattr("lexsplat.scenes.publishing.writing.MOST_SPLATS", 100)
     with pytest.raises(QueryError, match="--max-splats"):
-        publish(balls, tmp_path / "page")
+        publish(scene_of_balls, tmp_path / "page")
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unknown_start_view_is_refused(balls, tmp_path):
+def test_an_unknown_start_view_is_refused(scene_of_balls, tmp_path):
     with pytest.raises(QueryError, match="view 'nowhere'"):
-        publish(balls, tmp_path / "page", PublishOptions(start_view="nowhere"))
+        publish(scene_of_balls, tmp_path / "page", PublishOptions(start_view="nowhere"))
     assert not list(tmp_path.iterdir())
 
 

@@ -12,7 +12,7 @@ from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 
 
 @pytest.fixture
-def scene_folder(tmp_path):
+def old_demo_copy(tmp_path):
     """A copy of the scene that ships; one built before worlds were stored."""
     folder = shutil.copytree(BUNDLED_SCENE, tmp_path / "scene")
     record = json.loads((folder / "scene.json").read_text())
@@ -25,66 +25,66 @@ def run(*arguments) -> int:
     return cli.main([str(argument) for argument in arguments])
 
 
-def stored(scene_folder) -> dict:
-    return json.loads((scene_folder / "scene.json").read_text())["world"]
+def stored(old_demo_copy) -> dict:
+    return json.loads((old_demo_copy / "scene.json").read_text())["world"]
 
 
-def test_up_is_estimated_from_the_cameras_and_the_scale_is_unknown(scene_folder, capsys):
-    assert run("scale", scene_folder) == 0
+def test_up_is_estimated_from_the_cameras_and_the_scale_is_unknown(old_demo_copy, capsys):
+    assert run("scale", old_demo_copy) == 0
     assert "scale: not known" in capsys.readouterr().out
-    assert run("info", scene_folder, "--json") == 0
+    assert run("info", old_demo_copy, "--json") == 0
     facts = json.loads(capsys.readouterr().out)
-    expected = gravity_up(view.camera for view in SceneFolder.open(scene_folder).read_cameras().values())
+    expected = gravity_up(view.camera for view in SceneFolder.open(old_demo_copy).read_cameras().values())
     assert facts["up"]["direction"] == pytest.approx(expected.direction, abs=1e-5)
     assert (facts["up"]["from"], facts["meters_per_unit"]) == ("cameras", None)
 
 
 @pytest.mark.slow
-def test_one_known_distance_gives_sizes_in_meters(scene_folder, capsys):
+def test_one_known_distance_gives_sizes_in_meters(old_demo_copy, capsys):
     pygltflib = pytest.importorskip("pygltflib")
-    assert run("scale", scene_folder, "--distance", 0.35, "--points", "0,0,0", "0,-0.7,0") == 0
-    assert stored(scene_folder)["meters_per_unit"] == pytest.approx(0.5)
-    assert run("find", scene_folder, "red apple", "--json") == 0
+    assert run("scale", old_demo_copy, "--distance", 0.35, "--points", "0,0,0", "0,-0.7,0") == 0
+    assert stored(old_demo_copy)["meters_per_unit"] == pytest.approx(0.5)
+    assert run("find", old_demo_copy, "red apple", "--json") == 0
     answer = json.loads("{" + capsys.readouterr().out.partition("{")[2])
     assert answer["meters_per_unit"] == pytest.approx(0.5)
     thing = answer["phrases"][0]["instances"][0]
     assert thing["size_meters"] == pytest.approx([side / 2 for side in thing["size"]], abs=1e-4)
-    assert run("find", scene_folder, "red apple") == 0
+    assert run("find", old_demo_copy, "red apple") == 0
     assert " m, score" in capsys.readouterr().out
-    found = open_scene(scene_folder).select("red apple")
+    found = open_scene(old_demo_copy).select("red apple")
     assert found.size_meters == pytest.approx(found.size / 2)
-    assert run("export", scene_folder, scene_folder.parent / "all.glb") == 0
-    assert pygltflib.GLTF2().load(str(scene_folder.parent / "all.glb")).nodes[0].scale == pytest.approx(
+    assert run("export", old_demo_copy, old_demo_copy.parent / "all.glb") == 0
+    assert pygltflib.GLTF2().load(str(old_demo_copy.parent / "all.glb")).nodes[0].scale == pytest.approx(
         [0.5] * 3
     )
-    assert run("export", scene_folder, scene_folder.parent / "all.ply") == 0
-    files = (scene_folder.parent / "all.ply", scene_folder / "gaussians.ply")
+    assert run("export", old_demo_copy, old_demo_copy.parent / "all.ply") == 0
+    files = (old_demo_copy.parent / "all.ply", old_demo_copy / "gaussians.ply")
     exported, kept = (file.read_bytes().partition(b"end_header\n")[2] for file in files)
     is_same = exported == kept  # a plain value: a difference of megabytes takes minutes to print
     assert is_same
 
 
 @pytest.mark.slow
-def test_a_distance_can_be_given_between_two_phrases(scene_folder, capsys):
-    assert run("scale", scene_folder, "--distance", 0.3, "--between", "red apple", "banana", "--json") == 0
+def test_a_distance_can_be_given_between_two_phrases(old_demo_copy, capsys):
+    assert run("scale", old_demo_copy, "--distance", 0.3, "--between", "red apple", "banana", "--json") == 0
     world = json.loads(capsys.readouterr().out)
-    found = [open_scene(scene_folder).find(phrase).largest() for phrase in ("red apple", "banana")]
+    found = [open_scene(old_demo_copy).find(phrase).largest() for phrase in ("red apple", "banana")]
     measured = float(np.linalg.norm(found[0].center - found[1].center))
     assert world["meters_per_unit"] == pytest.approx(0.3 / measured)
-    assert run("scale", scene_folder, "--distance", 0.08, "--height-of", "red apple") == 0
-    assert stored(scene_folder)["meters_per_unit"] == pytest.approx(0.08 / found[0].size[2])
+    assert run("scale", old_demo_copy, "--distance", 0.08, "--height-of", "red apple") == 0
+    assert stored(old_demo_copy)["meters_per_unit"] == pytest.approx(0.08 / found[0].size[2])
 
 
 @pytest.mark.slow
-def test_up_can_be_set_and_is_used_everywhere(scene_folder, capsys):
+def test_up_can_be_set_and_is_used_everywhere(old_demo_copy, capsys):
     pygltflib = pytest.importorskip("pygltflib")
-    assert run("scale", scene_folder, "--up=-1,0,0") == 0
+    assert run("scale", old_demo_copy, "--up=-1,0,0") == 0
     assert "from the user" in capsys.readouterr().out
-    opened = open_scene(scene_folder)
+    opened = open_scene(old_demo_copy)
     assert opened.world.up.direction.tolist() == [-1, 0, 0]
     assert opened.select("red apple").box.axes[2] == pytest.approx([-1, 0, 0])
-    assert run("export", scene_folder, scene_folder.parent / "all.glb") == 0
-    x, y, z, w = pygltflib.GLTF2().load(str(scene_folder.parent / "all.glb")).nodes[0].rotation
+    assert run("export", old_demo_copy, old_demo_copy.parent / "all.glb") == 0
+    x, y, z, w = pygltflib.GLTF2().load(str(old_demo_copy.parent / "all.glb")).nodes[0].rotation
     turned = np.array([[1 - 2 * (y * y + z * z)], [2 * (x * y + w * z)], [2 * (x * z - w * y)]]) @ [-1.0]
     assert turned == pytest.approx([0, 1, 0], abs=1e-6), "glTF has y up"
 
@@ -108,7 +108,7 @@ def test_a_rebuild_keeps_up_and_scale_while_the_cameras_are_unchanged(tiny_captu
     assert "the scale no longer holds" in caplog.text
 
 
-def test_invalid_up_and_scale_are_refused(scene_folder, capsys):
+def test_invalid_up_and_scale_are_refused(old_demo_copy, capsys):
     for arguments in (
         ["--distance", "1"],
         ["--between", "a", "b"],
@@ -118,9 +118,9 @@ def test_invalid_up_and_scale_are_refused(scene_folder, capsys):
         ["--up", "0,0,0,0"],
     ):
         with pytest.raises(SystemExit) as caught:
-            run("scale", scene_folder, *arguments)
+            run("scale", old_demo_copy, *arguments)
         assert caught.value.code == 2
-    assert run("scale", scene_folder, "--distance", 1, "--points", "1,1,1", "1,1,1") == 1
+    assert run("scale", old_demo_copy, "--distance", 1, "--points", "1,1,1", "1,1,1") == 1
     assert "expected a positive distance, found 0" in capsys.readouterr().err
     assert run("scale", "demo", "--distance", 1, "--points", "1,1,1", "1,1,0") == 1
     assert "found the bundled scene" in capsys.readouterr().err

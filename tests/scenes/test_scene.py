@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.viewer_scene import ball_scene
+from support.viewer_scene import BallScene, ball_scene
 
 import lexsplat
 from lexsplat.queries import thresholds as threshold_rule
@@ -21,14 +21,14 @@ BALLS = ["ball 0", "ball 1", "ball 2"]
 
 
 @pytest.fixture
-def made():
+def scene_with_facts():
     """A scene of five balls, "ball 0" to "ball 4", and what is known about it."""
     return ball_scene(per_ball=80)
 
 
 @pytest.fixture
-def scene(made):
-    return made[0]
+def scene(scene_with_facts) -> BallScene:
+    return scene_with_facts[0]
 
 
 def test_answers_contain_scores_thresholds_and_presences(scene):
@@ -70,8 +70,8 @@ def test_threshold_and_presence_are_the_same_everywhere(scene):
         assert entry["present"] == answers.presences[index]
 
 
-def test_the_requested_ball_is_selected(made):
-    scene, ground_truth = made
+def test_the_requested_ball_is_selected(scene_with_facts):
+    scene, ground_truth = scene_with_facts
     found = scene.find("ball 2")
     assert (found.count, len(found), found.num_gaussians) == (1, 80, 80)
     assert np.array_equal(found.mask.numpy(), ground_truth.labels == 2)

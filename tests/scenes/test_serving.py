@@ -21,7 +21,7 @@ SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "ask.json"
 
 
 @pytest.fixture(scope="module")
-def demo():
+def served_demo():
     return OpenScene("demo")
 
 
@@ -65,8 +65,8 @@ def test_what_was_used_least_recently_is_forgotten():
         ("x" * (2 << 20), "at most"),
     ],
 )
-def test_each_line_is_answered_in_the_schema_and_errors_tell_what_was_expected(demo, line, told):
-    answer = answer_line(demo, line)
+def test_each_line_is_answered_in_the_schema_and_errors_tell_what_was_expected(served_demo, line, told):
+    answer = answer_line(served_demo, line)
     errors = [error.message for error in Draft202012Validator(SCHEMA).iter_errors(answer)]
     assert not errors, errors
     assert json.loads(json.dumps(answer, allow_nan=False)) == answer
@@ -74,24 +74,27 @@ def test_each_line_is_answered_in_the_schema_and_errors_tell_what_was_expected(d
     assert bool(told) == ("error" in answer)
 
 
-def test_a_line_that_meets_an_unforeseen_error_is_answered_as_well(demo, monkeypatch):
+def test_a_line_that_meets_an_unforeseen_error_is_answered_as_well(served_demo, monkeypatch):
     monkeypatch.setattr("lexsplat.scenes.serving.find_phrase", lambda *_: 1 / 0)
-    answer = answer_line(demo, '{"ask": "mug", "id": 3}')
+    answer = answer_line(served_demo, '{"ask": "mug", "id": 3}')
     assert (answer["id"], "division" in answer["error"]["message"]) == (3, True)
 
 
 @pytest.mark.parametrize("threshold", [[1], {}, "1", 10**400, float("nan"), True])
-def test_a_threshold_that_is_no_number_in_its_range_is_refused_by_the_scene(demo, threshold):
+def test_a_threshold_that_is_no_number_in_its_range_is_refused_by_the_scene(served_demo, threshold):
     with pytest.raises(QueryError, match=r"0\.\.1"):
-        demo.scene.find("mug", threshold=threshold)
+        served_demo.scene.find("mug", threshold=threshold)
 
 
-def test_an_answer_has_the_id_of_its_question_also_if_it_is_an_error(demo):
-    assert answer_line(demo, '{"ask": "mug", "id": [1, "a"]}')["id"] == [1, "a"]
-    assert answer_line(demo, '{"ask": "mug", "view": "nope", "id": 3}')["id"] == 3
+def test_an_answer_has_the_id_of_its_question_also_if_it_is_an_error(served_demo):
+    assert answer_line(served_demo, '{"ask": "mug", "id": [1, "a"]}')["id"] == [1, "a"]
+    assert answer_line(served_demo, '{"ask": "mug", "view": "nope", "id": 3}')["id"] == 3
     for wrong in ('{"ask": 5, "id": 3}', '{"ask": "mug", "vew": "", "id": 3}', '{"id": 3}'):
-        assert (answer_line(demo, wrong)["id"], "error" in answer_line(demo, wrong)) == (3, True)
-    assert "id" not in answer_line(demo, "mug")
+        assert (answer_line(served_demo, wrong)["id"], "error" in answer_line(served_demo, wrong)) == (
+            3,
+            True,
+        )
+    assert "id" not in answer_line(served_demo, "mug")
 
 
 def test_a_line_beyond_the_limit_is_never_held_as_a_whole():
@@ -111,18 +114,18 @@ def test_a_line_beyond_the_limit_is_never_held_as_a_whole():
         assert stream.longest <= MAX_LINE + 1
 
 
-def test_an_answer_is_one_line_for_readers_that_split_at_unicode_separators(demo):
+def test_an_answer_is_one_line_for_readers_that_split_at_unicode_separators(served_demo):
     for text in ("mug\u2028lamp", "mug\u2029lamp", "mug\x85lamp"):
-        line = json_line(answer_line(demo, text))
+        line = json_line(answer_line(served_demo, text))
         assert len(line.splitlines()) == 1
         assert json.loads(line)["phrase"] == text
 
 
-def test_a_no_has_no_instances_and_says_so(demo):
-    answer = answer_line(demo, "is there a bicycle?")
+def test_a_no_has_no_instances_and_says_so(served_demo):
+    answer = answer_line(served_demo, "is there a bicycle?")
     assert (answer["present"], answer["count"], answer["gaussians"], answer["instances"]) == ("no", 0, 0, [])
     assert answer["sentence"].startswith("Not here")
-    assert not demo.scene.find("is there a bicycle?")
+    assert not served_demo.scene.find("is there a bicycle?")
 
 
 @pytest.mark.parametrize(
@@ -131,17 +134,17 @@ def test_a_no_has_no_instances_and_says_so(demo):
      ("mug left of the \ufffd", "\ufffd")],
 )  # fmt: skip
 def test_words_that_the_bundled_encoder_does_not_know_are_named_and_nothing_is_certainly_here(
-    demo, line, unknown
+    served_demo, line, unknown
 ):
-    answer = answer_line(demo, line)
+    answer = answer_line(served_demo, line)
     assert f'the bundled encoder knows English words alone, not "{unknown}"' in answer["note"]
     assert answer["present"] in ("no", "unsure")
     assert answer["note"] in answer["sentence"]
 
 
 @pytest.mark.parametrize("line", ["x" * 100_000, "where is the " * 7000])
-def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(demo, line):
-    answer = answer_line(demo, line)
+def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(served_demo, line):
+    answer = answer_line(served_demo, line)
     assert "too long for grammar" in answer["note"]
     assert answer["present"] in ("no", "unsure")
     assert len(answer["sentence"]) < 1000
@@ -156,13 +159,13 @@ def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(demo, line):
         ("mug", ""),
     ],
 )
-def test_a_query_that_is_a_question_tells_how_find_understands_it(demo, prompt, understood):
-    (answer,) = answer_queries(demo.scene, prompt, ["view_033"], None, None)["prompts"]
+def test_a_query_that_is_a_question_tells_how_find_understands_it(served_demo, prompt, understood):
+    (answer,) = answer_queries(served_demo.scene, prompt, ["view_033"], None, None)["prompts"]
     assert answer["note"] == (understood and f"asked in these words; lexsplat find understands {understood}")
 
 
-def test_a_query_that_is_not_understood_is_told(demo):
-    (answer,) = answer_queries(demo.scene, "the first mug", ["view_033"], None, None)["prompts"]
+def test_a_query_that_is_not_understood_is_told(served_demo):
+    (answer,) = answer_queries(served_demo.scene, "the first mug", ["view_033"], None, None)["prompts"]
     assert answer["note"] == 'not understood ("first"): asked for as one thing, in these words'
 
 
@@ -179,9 +182,9 @@ def test_a_query_that_is_not_understood_is_told(demo):
     ],
 )
 def test_a_thing_or_kind_in_a_color_is_the_objects_that_the_list_has_in_this_color(
-    demo, phrase, understood, names
+    served_demo, phrase, understood, names
 ):
-    answer = answer_line(demo, phrase)
+    answer = answer_line(served_demo, phrase)
     assert answer["understood"] == understood
     assert {thing["name"] for thing in answer["instances"]} == names
 
@@ -191,10 +194,10 @@ def test_a_thing_or_kind_in_a_color_is_the_objects_that_the_list_has_in_this_col
     [("blu mug", "blue mug"), ("duk", "duck"), ("mgu", "mug"), ("appel", "apple"),
      ("teh mug", "mug"), ("whre is the bannana", "banana"), ("orang cone", "orange cone")],
 )  # fmt: skip
-def test_typing_errors_find_what_is_meant_and_are_told(demo, typed, understood):
-    answer = answer_line(demo, typed)
+def test_typing_errors_find_what_is_meant_and_are_told(served_demo, typed, understood):
+    answer = answer_line(served_demo, typed)
     (thing,) = answer["instances"]
-    (meant,) = answer_line(demo, understood)["instances"]
+    (meant,) = answer_line(served_demo, understood)["instances"]
     assert (answer["present"], answer["understood"]) == ("yes", f'"{understood}"')
     assert thing["center"] == meant["center"]
     assert "may be a typing error" in answer["note"]
@@ -210,22 +213,25 @@ def test_typing_errors_find_what_is_meant_and_are_told(demo, typed, understood):
     ],
 )
 def test_plurals_with_typing_errors_are_mended_and_the_word_is_told_as_it_was_typed(
-    demo, typed, understood, word, meant
+    served_demo, typed, understood, word, meant
 ):
-    answer = answer_line(demo, typed)
+    answer = answer_line(served_demo, typed)
     assert answer["understood"] == understood
     assert f'"{word}" may be a typing error: asked for "{meant}"' in answer["note"]
 
 
 @pytest.mark.parametrize("phrase", ["mug 3", '"apple 42"'])
-def test_numbers_are_no_words_that_the_bundled_encoder_knows(demo, phrase):
-    answer = answer_line(demo, phrase)
+def test_numbers_are_no_words_that_the_bundled_encoder_knows(served_demo, phrase):
+    answer = answer_line(served_demo, phrase)
     assert answer["present"] != "yes"
     assert "the bundled encoder knows English words alone" in answer["note"]
 
 
-def test_what_is_not_understood_stays_unsure_whatever_was_asked_before(demo):
-    certain, stated = answer_line(demo, "the smallest duck"), answer_line(demo, "is the duck small?")
+def test_what_is_not_understood_stays_unsure_whatever_was_asked_before(served_demo):
+    certain, stated = (
+        answer_line(served_demo, "the smallest duck"),
+        answer_line(served_demo, "is the duck small?"),
+    )
     assert certain["understood"] == stated["understood"] == '(smallest "duck")'
     assert (certain["present"], stated["present"]) == ("yes", "unsure")
 
@@ -239,28 +245,28 @@ def test_what_is_not_understood_stays_unsure_whatever_was_asked_before(demo):
         ("is everything on the floor?", "no", '0 of 14 are (any object on "floor")'),
     ],
 )
-def test_what_is_missing_of_a_question_is_told(demo, phrase, present, note):
-    answer = answer_line(demo, phrase)
+def test_what_is_missing_of_a_question_is_told(served_demo, phrase, present, note):
+    answer = answer_line(served_demo, phrase)
     assert (answer["present"], answer["note"]) == (present, note)
 
 
 @pytest.mark.parametrize("typed", ["qzx", "kup", "tape duk"])
-def test_a_word_that_is_none_and_resembles_nothing_here_is_told(demo, typed):
-    answer = answer_line(demo, typed)
+def test_a_word_that_is_none_and_resembles_nothing_here_is_told(served_demo, typed):
+    answer = answer_line(served_demo, typed)
     assert f'"{typed.split()[-1]}"' in answer["note"]
     assert answer["present"] != "yes"
 
 
-def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(demo):
-    answer = answer_line(demo, '{"ask": "mug", "threshold": 1}')
+def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(served_demo):
+    answer = answer_line(served_demo, '{"ask": "mug", "threshold": 1}')
     assert (answer["count"], answer["instances"]) == (0, [])
     assert answer["sentence"] == 'Nothing reaches the threshold 1 for "mug".'
 
 
 @pytest.mark.slow
-def test_threads_get_the_answers_of_a_single_one(demo):
+def test_threads_get_the_answers_of_a_single_one(served_demo):
     phrases = ["red apple", "toys", "what is on the cloth?", "vase left of the bear", "pumpkin", "mugs"]
-    alone = {phrase: demo.scene.find(phrase).mask for phrase in phrases}
+    alone = {phrase: served_demo.scene.find(phrase).mask for phrase in phrases}
     scene, found, failed = open_scene("demo"), [], []
 
     def ask(number):
@@ -282,7 +288,7 @@ def test_threads_get_the_answers_of_a_single_one(demo):
 
 
 @pytest.mark.slow
-def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(demo, monkeypatch):
+def test_what_is_kept_is_bounded_and_belongs_to_one_way_of_asking(served_demo, monkeypatch):
     from lexsplat.queries.relevancy import QueryConfig
     from lexsplat.scenes import scene as module
 

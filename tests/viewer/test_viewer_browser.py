@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ PIXELS = """(points) => points.map((point) => {
 
 
 @pytest.fixture
-def viewer(monkeypatch):
+def viewer(monkeypatch) -> Iterator[ViewerServer]:
     monkeypatch.setattr(History, "load", lambda *_: History(prompts=["ball 4"], vocabulary=[*WORDS, "spoon"]))
     scene, ground_truth = ball_scene()
     running = ViewerServer(scene, ViewerConfig(port=0))
@@ -33,7 +35,7 @@ def viewer(monkeypatch):
 
 
 @pytest.fixture
-def page(browser, viewer):
+def page(browser, viewer) -> Iterator[Any]:
     opened = open_page(browser, f"{viewer.url}/#view=view0", 720, 480)  # wider than a phone
     yield opened
     opened.close()

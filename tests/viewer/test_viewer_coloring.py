@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from sklearn.decomposition import PCA
-from support.language_scene import make_codebook, make_scene
+from support.language_scene import LanguageScene, make_codebook, make_scene
 
 from lexsplat.language.fields import CodeField
 from lexsplat.viewer.coloring import (
@@ -17,12 +17,12 @@ from lexsplat.viewer.coloring import (
 
 
 @pytest.fixture(scope="module")
-def balls():
+def balls() -> LanguageScene:
     return make_scene(per_ball=80)
 
 
 @pytest.fixture(scope="module")
-def field(balls):
+def field(balls) -> CodeField:
     """Each Gaussian has its ball's code with weight 0.7 to 1, the next code with the rest; the last has none."""
     count = len(balls.labels)
     main = torch.from_numpy(0.7 + 0.3 * np.random.default_rng(0).random(count)).float()

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
@@ -75,7 +76,7 @@ def test_arbitrary_headers_pass_only_by_the_rules(host, origin):
 
 
 @pytest.fixture(scope="module")
-def viewer():
+def viewer() -> Iterator[ViewerServer]:
     running = ViewerServer(ball_scene(per_ball=20)[0], ViewerConfig(port=0))
     yield running
     running.stop()

@@ -3,6 +3,7 @@
 import http.client
 import json
 import socket
+from collections.abc import Iterator
 
 import pytest
 from support.viewer_scene import ball_scene
@@ -12,7 +13,7 @@ from lexsplat.viewer.server import ViewerConfig, ViewerServer
 
 
 @pytest.fixture(scope="module")
-def viewer():
+def viewer() -> Iterator[ViewerServer]:
     running = ViewerServer(ball_scene(per_ball=60)[0], ViewerConfig(port=0))
     yield running
     running.stop()

@@ -1,0 +1,43 @@
+"""A fixture name has one meaning over all test files: fixtures of one name give one type."""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+def types_of_fixtures(sources: dict[str, str]) -> dict[str, dict[str, str | None]]:
+    """The return annotation of each fixture, by name and file; None where there is none."""
+    found: dict[str, dict[str, str | None]] = defaultdict(dict)
+    for file, source in sources.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.FunctionDef) and any(
+                ast.unparse(decorator).startswith("pytest.fixture") for decorator in node.decorator_list
+            ):
+                found[node.name][file] = ast.unparse(node.returns) if node.returns else None
+    return found
+
+
+def ambiguous(sources: dict[str, str]) -> dict[str, dict[str, str | None]]:
+    """Fixtures of several files that have no annotation, or not the same one."""
+    return {
+        name: types
+        for name, types in types_of_fixtures(sources).items()
+        if len(types) > 1 and (None in types.values() or len(set(types.values())) > 1)
+    }
+
+
+def test_fixtures_of_one_name_give_one_annotated_type():
+    sources = {str(path.relative_to(TESTS)): path.read_text() for path in TESTS.rglob("*.py")}
+    assert len(types_of_fixtures(sources)) > 50
+    assert ambiguous(sources) == {}
+
+
+def test_a_name_with_two_types_or_none_is_noticed():
+    fixture = "import pytest\n@pytest.fixture\ndef points(){}: ...\n"
+    number, text, nothing = (fixture.replace("{}", each) for each in (" -> int", " -> str", ""))
+    assert ambiguous({"a": number, "b": number}) == {}
+    assert set(ambiguous({"a": number, "b": text})) == {"points"}
+    assert set(ambiguous({"a": nothing, "b": nothing})) == {"points"}
+    assert ambiguous({"a": nothing}) == {}
