@@ -223,7 +223,23 @@ def test_help_pages_have_words_for_placeholders_and_defaults(command, capsys):
     assert "(default: )" not in page
     assert "None" not in page
     assert "`" not in page
-    assert len(options_of(page)) <= 30
+    assert len(options_of(page)) <= 16
+
+
+@pytest.mark.parametrize(
+    ("command", "rare"),
+    [
+        ("ablate", {"--forms", "--wrong-labels", "--prompt-list", "--as-in-paper"}),
+        ("compare", {"--protocols", "--prompt-list", "--no-lpips"}),
+        ("language", {"--progress", "--test-views", "--test-every"}),
+        ("edit", {"--grow", "--shrink", "--no-fill", "--strength", "--clip"}),
+    ],
+)
+def test_rare_options_are_on_the_whole_page_only(command, rare, capsys):
+    short = help_page(capsys, command, "--help")
+    assert f"lexsplat {command} --help-all" in short
+    assert not rare & options_of(short)
+    assert rare <= options_of(help_page(capsys, command, "--help-all"))
 
 
 @pytest.mark.parametrize("command", ["build", "reconstruct", "language", "compare", "ablate"])
@@ -243,7 +259,24 @@ def test_the_help_page_that_an_error_names_is_that_of_the_command(capsys):
         cli.main(["query", "x", "apple", "--threshold", "abc"])
     error = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert "expected a number, found 'abc'" in error
-    assert "lexsplat query --help" in error
+    assert "All options: lexsplat query --help" in error
+    assert "--help-all" not in error, "its help page has all options"
+    assert "(default: none)" not in error
+
+
+@pytest.mark.parametrize("columns", ["60", "80", "200"])
+@pytest.mark.parametrize(
+    "wrong", [["--reconstruction.max-gaussians", "many"], ["--seedd", "3"]], ids=" ".join
+)
+def test_an_error_names_the_help_page_that_lists_every_option(wrong, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["build", "x", "--output", "y", *wrong])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert "All options: lexsplat build --help-all " in error
+    assert "none)" not in error
+    assert len(set(map(len, error.splitlines()))) == 1, "the panel keeps its frame"
 
 
 def test_reconstruct_accepts_the_options_of_build():

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
+from lexsplat.cli.arguments import MEASURED_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.experiments import open_bench, print_table
 from lexsplat.cli.options import CaptureArgument, PromptListName, check_seeds
@@ -56,7 +56,8 @@ class Ablate:
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
 
-    essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    essential: ClassVar[tuple[str, ...]] = MEASURED_SETTINGS
+    rare: ClassVar[tuple[str, ...]] = ("wrong_labels", "prompt_list", "forms")
     synonyms: ClassVar[dict[str, str]] = {"--masks": "--ground-truth"}
     defaults: ClassVar[dict[str, str]] = {
         "variants": "all that differ for the method",

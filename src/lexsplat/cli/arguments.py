@@ -3,6 +3,7 @@
 A command class may have these attributes beside its fields:
 
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
+- ``rare``: names of the command's own options that only ``--help-all`` shows;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
 - ``defaults``: defaults of options that are None or empty, in words, beside the usual ones;
 - ``synonyms``: other spellings of options;
@@ -13,8 +14,10 @@ Its method ``check``, if it has one, raises ValueError for options that are inva
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
+import io
 import re
 import shutil
 import sys
@@ -33,11 +36,16 @@ ESSENTIAL_SETTINGS = (
     "workers",
 )  # fmt: skip
 """Settings of a build that people use."""
+MEASURED_SETTINGS = tuple(
+    name for name in ESSENTIAL_SETTINGS if name not in ("method", "as_in_paper", "test_every", "workers")
+)
+"""Those that people use to measure methods, which are options of their own there."""
 
 _PLACEHOLDERS = {
     "title": "TEXT",
     "description": "TEXT",
     "start_view": "VIEW",
+    "ground_truth": "FOLDER",
     "clip": "NAME", "dino": "NAME", "view": "NAME", "test_views": "NAME", "name": "NAME", "host": "ADDRESS",
     "select": "PHRASE", "height_of": "PHRASE", "between": "PHRASE PHRASE", "negatives": "PHRASE",
     "workers": "none|ray|ray://HOST:PORT", "blocks": "auto|N|none",
@@ -85,13 +93,36 @@ def parse(command: type[CommandT], name: str, words: Sequence[str]) -> CommandT:
     if any(word in HELP for word in words):
         _print_help(command, program, _not_essential(command))
     try:
-        parsed = tyro.cli(command, prog=program, args=words, registry=REGISTRY)
+        parsed = _parsed(command, program, words)
         if hasattr(parsed, "check"):
             parsed.check()
         return parsed
     except ValueError as error:  # raised by the checks of a command or of its settings
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _parsed(command: type[CommandT], program: str, words: Sequence[str]) -> CommandT:
+    """The command; errors name the help page that lists every option, and no default of "none"."""
+    whole = HELP_ALL if _not_essential(command) else HELP[-1]
+    written = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(written):
+            return tyro.cli(command, prog=program, args=words, registry=REGISTRY)
+    finally:
+        text = re.sub(
+            rf"For full helptext, (run|see) {program} --help",
+            lambda found: f"All options: {program} {whole}".ljust(
+                len(found.group())
+            ),  # the panel keeps its width
+            written.getvalue(),
+        )
+        nothing = r"\(default:[\s│]*none\)"
+        print(
+            re.sub(nothing, lambda found: re.sub(r"[^\s│]", " ", found.group()), text),
+            end="",
+            file=sys.stderr,
+        )
 
 
 def _in_our_spelling(word: str, synonyms: dict[str, str]) -> str:
@@ -105,11 +136,12 @@ def _in_our_spelling(word: str, synonyms: dict[str, str]) -> str:
 
 def _not_essential(command: type) -> set[str]:
     """Names of the fields, of a command and of its settings, that the short help page leaves out."""
+    rare = set(getattr(command, "rare", ()))
     essential = getattr(command, "essential", None)
     settings = _settings_class(command)
     if essential is None or settings is None:
-        return set()
-    return {field.name for field in dataclasses.fields(settings)} - set(essential)
+        return rare
+    return rare | {field.name for field in dataclasses.fields(settings)} - set(essential)
 
 
 def _settings_class(command: type) -> type | None:

@@ -53,6 +53,7 @@ class Build:
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
     essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    rare: ClassVar[tuple[str, ...]] = ("progress", "test_views")
     unused: ClassVar[tuple[str, ...]] = ("keep_floaters", "views_from")
     until: ClassVar[Literal["reconstruct", "language"]] = "language"
     elsewhere: ClassVar[dict[str, str]] = {"--splats": _OF_SPLATS}
@@ -153,7 +154,10 @@ class Language(Build):
     capture: OptionalCaptureArgument = dataclasses.field(default="", kw_only=True)
     splats: Path | None = None
 
-    essential: ClassVar[tuple[str, ...]] = (*ESSENTIAL_SETTINGS, "up", "keep_floaters", "views_from")
+    essential: ClassVar[tuple[str, ...]] = (
+        "clip", "dino", "device", "method", "iterations", "downscale", "seed", "memory",
+        "up", "keep_floaters", "views_from",
+    )  # fmt: skip
     unused: ClassVar[tuple[str, ...]] = ()
     elsewhere: ClassVar[dict[str, str]] = {}
 

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
+from lexsplat.cli.arguments import MEASURED_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.experiments import open_bench, print_table
 from lexsplat.cli.options import (
@@ -58,7 +58,8 @@ class Compare:
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=BuildConfig)
 
-    essential: ClassVar[tuple[str, ...]] = ESSENTIAL_SETTINGS
+    essential: ClassVar[tuple[str, ...]] = MEASURED_SETTINGS
+    rare: ClassVar[tuple[str, ...]] = ("prompt_list", "protocols", "lpips")
     synonyms: ClassVar[dict[str, str]] = {"--masks": "--ground-truth"}
 
     def check(self) -> None:

@@ -87,6 +87,7 @@ class Edit:
     clip: str | None = None
     device: Device = "auto"
 
+    rare: ClassVar[tuple[str, ...]] = ("threshold", "grow", "shrink", "fill", "strength", "clip", "device")
     synonyms: ClassVar[dict[str, str]] = {"--colour": "--color"}
 
     def check(self) -> None:
