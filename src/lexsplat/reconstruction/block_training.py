@@ -125,6 +125,7 @@ class VisitReconstructor(Reconstructor):
         options: Device, memory and the extent of the whole capture, as in `Reconstructor`.
     """
 
+    # The arguments of a reconstruction, and what a visit starts from.
     def __init__(
         self,
         capture: Capture,
