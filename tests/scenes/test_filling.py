@@ -14,7 +14,7 @@ from lexsplat.language.fields import CodeField
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.editing import Editor
-from lexsplat.scenes.filling import Fill, fill_for, painted_hole
+from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.scene import Scene
 
 LEFT, RIGHT = np.array([0.8, 0.3, 0.1]), np.array([0.2, 0.5, 0.7])
@@ -71,7 +71,9 @@ def test_a_deleted_thing_leaves_a_closed_surface_with_the_colors_around(turned):
 
 def test_nothing_is_filled_where_a_thing_stands_on_nothing_or_a_fill_is_not_wanted():
     hanging, world = table_with_a_ball(ball_height=2.0)
-    assert fill_for(ball_of(hanging, world)) is None
+    fill, gone = fill_for(ball_of(hanging, world))
+    assert fill is None
+    assert torch.equal(gone, ball_of(hanging, world).mask)
     scene, world = table_with_a_ball()
     editor = Editor(scene)
     editor.delete(ball_of(scene, world), fill=False)
@@ -117,12 +119,3 @@ def test_a_damaged_fill_is_told_in_one_line(tmp_path, broken):
     with pytest.raises(FileFormatError) as error:
         Editor(scene, journal)
     assert "\n" not in str(error.value)
-
-
-def test_a_hole_takes_the_colors_around_by_inverse_squared_distance():
-    picture = np.zeros((1, 5, 3))
-    picture[0, 0], picture[0, 4] = 0.2, 0.8
-    hole = np.array([[False, True, True, True, False]])
-    found = painted_hole(picture, hole, ~hole)[:, 0]
-    expected = [(0.2 + 0.8 / 9) / (1 + 1 / 9), 0.5, (0.2 / 9 + 0.8) / (1 / 9 + 1)]
-    np.testing.assert_allclose(found, expected)

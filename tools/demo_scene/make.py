@@ -29,7 +29,9 @@ def main() -> None:
         "--truth", action="store_true", help="also write OUTPUT/SCENE/truth: depths and indices of all views"
     )
     parser.add_argument(
-        "--without", metavar="KIND", help="only render the held-out views without a thing, to WORK/SCENE-without-KIND"
+        "--without",
+        metavar="KIND",
+        help="only render the held-out views without a thing, to WORK/SCENE-without-KIND",
     )
     options = parser.parse_args()
     say = quiet_output()

@@ -1,12 +1,12 @@
 """Completes a picture of a surface where a part of it is missing: its pattern goes on.
 
 A pattern looks like itself some way further. Shifts by which a picture resembles itself are found by masked
-correlation, and a missing pixel takes the weighted median of what these shifts lead to (K. He and J. Sun, "Statistics
+correlation, and a missing pixel takes the weighted median of what these shifts lead to (after K. He and J. Sun, "Statistics
 of Patch Offsets for Image Completion", ECCV 2012, who choose one shift for each pixel by graph cuts instead). A shift
 counts as much as it explains the rim of the hole near a pixel, so that edges between two patterns go on too.
 
-Shifts are found in the picture over its brightness, in which shadows weigh less. Colors are taken from the picture as it
-is: those of a shadow near the hole are outvoted.
+Shifts are found in the picture over its brightness, in which shadows weigh less. Colors are taken from the picture as
+it is: those of a shadow near the hole are outvoted. How far the vote is believed follows from what it says of the rim.
 """
 
 from __future__ import annotations
@@ -22,12 +22,16 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _SHIFTS = 40
 _LEAST = 5
 """Shortest shift in pixels: neighbors are alike without any pattern."""
-_OVERLAP = 0.25
+_OVERLAP = 0.15
 """Share of the rim that a shift must map into the known picture."""
-_BRIGHTNESS, _RIM, _NEAR, _LOCAL = 0.7, 1.5, 1.0, 0.35
-"""Widths in radii of the hole: of the brightness, of the rim for which shifts are sought, of the rim on which they are
-compared for one pixel, and of the neighborhood of that pixel."""
-_SOFT = 0.25
+_BRIGHTNESS, _RIM, _NEAR, _LOCAL = 0.7, 1.5, 1.0, 0.45
+"""Widths in radii of the hole: of the brightness, of the rim for which shifts are sought, of the rim on which they
+are compared for one pixel, and of the neighborhood of that pixel."""
+_SHARE = 0.3
+"""Width in radii of the hole in which predictions are judged."""
+_CHANCE, _CERTAIN = 0.1, 0.7
+"""Shares of a prediction that are right around a pixel: up to the first nothing of it is taken, from the second all."""
+_SOFT = 1.0
 """Excess of a shift's error over the least error, as a share of the latter, that reduces its weight to 1/e."""
 
 
@@ -54,16 +58,27 @@ def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     if not shifts or variance < 1e-8:
         return smooth
     near = np.exp(-((away / _NEAR) ** 2))
+    asked = hole | ((trust > 0) & (away <= _NEAR))
     values, errors, trusts = [], [], []
     for shift in shifts:
-        there = _moved(trust, shift)
-        error = ((pattern - _moved(pattern, shift)) ** 2).sum(-1).clip(0, 4 * variance)
-        errors.append(_mean_around(error, trust * there * near, _LOCAL * radius)[hole])
-        values.append(_moved(picture, shift)[hole])
-        trusts.append(there[hole])
-    found, least = _voted(np.stack(values, 1), np.stack(errors, 1), np.stack(trusts, 1))
-    explained = (1 - least / (2 * variance)).clip(0, 1)[:, None]
-    return np.asarray((explained * found + (1 - explained) * smooth).clip(0, 1))
+        there, moved = _moved(trust, shift), _moved(pattern, shift)
+        error = ((pattern - moved) ** 2).sum(-1).clip(0, 4 * variance)
+        errors.append(_mean_around(error, trust * there * near, _LOCAL * radius)[asked])
+        values.append(np.concatenate([_moved(picture, shift)[asked], moved[asked]], 1))
+        trusts.append(there[asked])
+    found = np.zeros((*hole.shape, 6))
+    found[asked] = _voted(np.stack(values, 1), np.stack(errors, 1), np.stack(trusts, 1))
+    right = _predictable(pattern, found[..., 3:], trust * asked, _SHARE * radius)[hole][:, None]
+    share = ((right - _CHANCE) / (_CERTAIN - _CHANCE)).clip(0, 1)
+    return np.asarray((share * found[hole][:, :3] + (1 - share) * smooth).clip(0, 1))
+
+
+def _predictable(picture: FloatArray, found: FloatArray, weights: FloatArray, width: float) -> FloatArray:
+    """Which share of what a prediction adds to the mean around is right nearby ``[H, W]``: a local regression."""
+    mean = np.stack([_mean_around(channel, weights, width) for channel in np.moveaxis(picture, -1, 0)], -1)
+    right = _mean_around(((picture - mean) * (found - mean)).sum(-1), weights, width)
+    added = _mean_around(((found - mean) ** 2).sum(-1), weights, width)
+    return np.asarray((right / np.maximum(added, 1e-9)).clip(0, 1))
 
 
 def self_similar_shifts(pattern: FloatArray, weights: FloatArray, trust: FloatArray) -> list[tuple[int, int]]:
@@ -98,8 +113,8 @@ def painted(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     return np.asarray(weights @ picture[tuple(points.T)] / weights.sum(1, keepdims=True))
 
 
-def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The weighted medians ``[F, 3]`` of values ``[F, K, 3]``, and the least error of those that count ``[F]``.
+def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray) -> FloatArray:
+    """The values ``[F, C]`` of median brightness among ``[F, K, C]``, weighted; the first three are RGB.
 
     Args:
         values: What each of K shifts leads to.
@@ -107,12 +122,13 @@ def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray) -> tuple[
         trusts: How much the values are trusted ``[F, K]``; 0 are left out.
     """
     least = np.where(trusts > 0, errors, np.inf).min(1)
-    safe = np.where(np.isfinite(least), least, 0.0)[:, None]
-    weights = trusts * np.exp(-(errors - safe) / (_SOFT * safe + 1e-9))
-    order = values.argsort(1)
-    sums = np.take_along_axis(np.repeat(weights[..., None], 3, 2), order, 1).cumsum(1)
-    middle = (sums >= 0.5 * sums[:, -1:]).argmax(1)[:, None]
-    return np.take_along_axis(np.take_along_axis(values, order, 1), middle, 1)[:, 0], least
+    least = np.where(np.isfinite(least), least, 0.0)[:, None]
+    weights = trusts * np.exp(-(errors - least) / (_SOFT * least + 1e-9))
+    order = (values[..., :3] @ _LUMINANCE).argsort(1)
+    sums = np.take_along_axis(weights, order, 1).cumsum(1)
+    middle = (sums >= 0.5 * sums[:, -1:]).argmax(1)
+    rows = np.arange(len(values))
+    return np.asarray(values[rows, order[rows, middle]])
 
 
 def _correlation(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -127,7 +143,10 @@ def _moved(picture: NDArray, shift: tuple[int, int]) -> NDArray:
     (height, width), (down, right) = picture.shape[:2], shift
     moved = np.zeros_like(picture)
     if abs(down) < height and abs(right) < width:
-        rows, columns = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
+        rows, columns = (
+            slice(max(0, -down), height - max(0, down)),
+            slice(max(0, -right), width - max(0, right)),
+        )
         moved[rows, columns] = picture[
             max(0, down) : height + min(0, down), max(0, right) : width + min(0, right)
         ]

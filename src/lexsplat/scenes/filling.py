@@ -3,8 +3,8 @@
 1. A thing stands on a surface (`lexsplat.scenes.surfaces`). Its place is what hardly any view sees of it, because the
    thing is before it.
 2. What the reconstruction put there goes: nothing shows it.
-3. The pattern of the surface goes on in its place (`lexsplat.scenes.completing`), in a picture from above. Each painted
-   pixel becomes a flat Gaussian. It keeps the language of its nearest neighbor in the surface.
+3. The pattern of the surface goes on in its place (`lexsplat.scenes.completing`), in a picture from above. Each
+   painted pixel becomes a flat Gaussian. It keeps the language of its nearest neighbor in the surface.
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
 """
@@ -30,7 +30,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.completing import completed
-from lexsplat.scenes.surfaces import FEWEST, Orthophoto, Surface, below, from_above, photographed, surface_below
+from lexsplat.scenes.surfaces import FEWEST, Orthophoto, below, from_above, photographed, surface_below
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,15 +38,15 @@ Mask = NDArray[np.bool_]
 _FAINT = 0.1
 _THICK = 0.3
 """Gaussians within this distance of the plane are the surface, in radii of the foot."""
-_UNSEEN = 0.12
-"""Share of the views that see a pixel below which its place is unknown, where the thing is before it in most others."""
-_SHOWN = 0.05
-"""Trust in a pixel that no view sees; each other one is trusted by the share of the views that see it besides."""
+_HIDDEN = 0.88
+"""Share of the views that have the thing before a place, above which what the reconstruction put there goes."""
+_BORDER, _OVERLAP, _RIM = 3, 2, 3
+"""Pixels around such places where it goes too, where the fill covers what stays, and where colors are not trusted."""
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
-_RIM = 3
-"""Pixels around the hole whose colors are not trusted."""
-_SIZES = (0.7, 0.7, 0.1)
+_UNSEEN = 0.3
+"""Trust in a pixel that no view sees. Another one gains the share of the views that see it."""
+_SIZES = (0.8, 0.8, 0.1)
 """Standard deviations of a disk along its axes, in pixels."""
 _OPAQUE = 3.0
 _COLUMNS = 13
@@ -163,33 +163,26 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
     local = (means - surface.origin) @ surface.axes.T
     flat = ~gone & solid & (np.abs(local[:, 2]) <= _THICK * surface.radius)
     photo = photographed(gaussians, gone, surface, flat, cameras)
-    hole = _hole(photo, below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells))
-    top = float(np.quantile(local[own, 2], 0.98))
-    inside = _at(hole, local[:, :2], photo) & (local[:, 2] >= -_THICK * surface.radius) & (local[:, 2] <= top)
-    colors, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
-    hole |= binary_dilation(hole, iterations=_RIM) & (coverage < _BARE)
-    rim = binary_dilation(hole, iterations=_RIM)
-    level = np.abs(photo.heights) <= _THICK * surface.radius
-    known = (coverage >= _BARE) & level & ~rim
+    unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
+    inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= _THICK * surface.radius)
+    _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
+    near = below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
+    filled = binary_dilation(unseen, iterations=_OVERLAP)
+    hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
+    level = np.abs(heights) <= _THICK * surface.radius
+    known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
     if not hole.any() or known.sum() < FEWEST:
         return None
-    painted = completed(photo.colors, hole, known * (_SHOWN + photo.shown))
+    painted = completed(photo.colors, hole, known * (_UNSEEN + photo.shown))
     members = np.flatnonzero(flat & ~inside)
     gone |= inside
-    raised = _continued(photo.heights, hole, known)
+    raised = _continued(heights, hole, known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
     _, nearest = cKDTree(local[members, :2]).query(photo.cells[hole])
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks)
-
-
-def _hole(photo: Orthophoto, under: Mask) -> Mask:
-    """The pixels ``[P, P]`` of a surface that the thing keeps from being seen."""
-    if not photo.covered.any():  # no views
-        return under & (photo.coverage < _BARE)
-    return np.asarray(binary_dilation(photo.covered > 1 - _UNSEEN, iterations=1))
 
 
 def _at(mask: Mask, points: FloatArray, photo: Orthophoto) -> Mask:

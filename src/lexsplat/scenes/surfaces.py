@@ -161,7 +161,9 @@ def photographed(
         with torch.no_grad():
             view = render(gaussians, small, features=thing, depth=True)
         assert view.depth is not None
-        x, y, depth = np.moveaxis((places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T, -1, 0)
+        x, y, depth = np.moveaxis(
+            (places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T, -1, 0
+        )
         front = np.maximum(depth, 1e-9)
         x, y = np.floor(x / front), np.floor(y / front)
         inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < small.width) & (y < small.height)
