@@ -36,7 +36,9 @@ def test_checkers_go_on_in_a_hole_and_end_where_they_ended_around_it(edge):
     picture = np.where(hole[..., None], [1.0, 0, 0], truth)
     found = completed(picture, hole, trust_outside(hole))
     assert psnr(found, truth[hole]) > (20 if edge == np.inf else 16)
-    assert psnr(painted(picture, hole, trust_outside(hole)), truth[hole]) < 15, "the colors around are no pattern"
+    assert psnr(painted(picture, hole, trust_outside(hole)), truth[hole]) < 15, (
+        "the colors around are no pattern"
+    )
 
 
 def test_a_shadow_and_remains_around_the_hole_do_not_spoil_the_pattern():
