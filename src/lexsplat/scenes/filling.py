@@ -30,7 +30,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.completing import completed
-from lexsplat.scenes.surfaces import FEWEST, Orthophoto, below, from_above, photographed, surface_below
+from lexsplat.scenes.surfaces import FEWEST, Orthophoto, below, from_above, looked_up, photographed, surface_below
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,6 +40,8 @@ _THICK = 0.3
 """Gaussians within this distance of the plane are the surface, in radii of the foot."""
 _HIDDEN = 0.88
 """Share of the views that have the thing before a place, above which what the reconstruction put there goes."""
+_STUFFED = 0.5
+"""The same for what lies within the thing."""
 _BORDER, _OVERLAP, _RIM = 3, 2, 3
 """Pixels around such places where it goes too, where the fill covers what stays, and where colors are not trusted."""
 _BARE = 0.6
@@ -165,6 +167,7 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
     photo = photographed(gaussians, gone, surface, flat, cameras)
     unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
     inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= _THICK * surface.radius)
+    inside |= _stuffing(gaussians, own, gone | inside, cameras)
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
     near = below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
     filled = binary_dilation(unseen, iterations=_OVERLAP)
@@ -183,6 +186,17 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks)
+
+
+def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
+    """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, as the thing is there or before them."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    places = np.flatnonzero(inside_hull(means, own) & ~gone)
+    found = np.zeros(len(gone), bool)
+    if len(places) and cameras:
+        _, covered, _ = looked_up(gaussians, gone, means[places], cameras, 0.0)
+        found[places] = covered > _STUFFED
+    return found
 
 
 def _at(mask: Mask, points: FloatArray, photo: Orthophoto) -> Mask:

@@ -125,7 +125,7 @@ class Orthophoto(NamedTuple):
         colors: RGB ``[P, P, 3]``, divided by the coverage.
         coverage: Share of each pixel that Gaussians cover ``[P, P]``.
         heights: Mean height above the plane ``[P, P]``, world units.
-        shown: Share of the views that see the surface there, those with the thing before it counted ``[P, P]``.
+        shown: Share of the views that see the surface there ``[P, P]``.
         covered: Share of the views that have the thing before it ``[P, P]``.
     """
 
@@ -152,41 +152,55 @@ def photographed(
     """
     cells, size = _cells(surface, cameras)
     colors, coverage, heights = from_above(gaussians, surface, members, cells)
-    places = surface.origin + cells @ surface.axes[:2]
-    shown, covered, counts = (np.zeros(cells.shape[:2]) for _ in range(3))
-    seen_colors = np.zeros_like(colors)
+    places = (surface.origin + cells @ surface.axes[:2]).reshape(-1, 3)
+    shown, covered, seen = looked_up(gaussians, gone, places, cameras, _THICK * surface.radius)
+    shape = cells.shape[:2]
+    shown, covered, seen = shown.reshape(shape), covered.reshape(shape), seen.reshape(colors.shape)
+    if not cameras:
+        return Orthophoto(cells, size, colors, coverage, heights, np.ones_like(shown), covered)
+    known = (coverage > 0.5) & (shown > 0)
+    width = surface.radius / size / 2
+    gain = _mean_of(seen, known, width) / np.maximum(_mean_of(colors, known, width), 0.02)
+    return Orthophoto(cells, size, colors * gain.clip(0.5, 2), coverage, heights, shown, covered)
+
+
+def looked_up(
+    gaussians: Gaussians, gone: Mask, places: FloatArray, cameras: Sequence[Camera], slack: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What some of the views see at places ``[M, 3]``.
+
+    Args:
+        gaussians: The scene.
+        gone: The Gaussians of a thing ``[N]``.
+        places: Points of the world.
+        cameras: The views.
+        slack: How far before a place a surface may lie that is taken for it, world units.
+
+    Returns:
+        The share of the views that see each place ``[M]``, the share that have the thing there or before it ``[M]``,
+        and the mean color of the former ``[M, 3]``, 0 without any.
+    """
+    counts, shown, covered = (np.zeros(len(places)) for _ in range(3))
+    colors = np.zeros((len(places), 3))
     thing = torch.from_numpy(gone)[:, None].to(gaussians.means)
     for camera in evenly(cameras, _VIEWS):
         small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
         with torch.no_grad():
             view = render(gaussians, small, features=thing, depth=True)
         assert view.depth is not None
-        x, y, depth = np.moveaxis(
-            (places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T, -1, 0
-        )
+        x, y, depth = ((places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T).T
         front = np.maximum(depth, 1e-9)
         x, y = np.floor(x / front), np.floor(y / front)
-        inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < small.width) & (y < small.height)
-        pixels = y[inside].astype(int), x[inside].astype(int)
-        before = np.zeros_like(inside)
-        before[inside] = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
-        free = np.zeros_like(inside)
-        free[inside] = view.depth.cpu().numpy()[pixels] > depth[inside] - _THICK * surface.radius
-        free &= ~before
-        counts += inside
-        covered += before
-        shown += free
-        seen_colors[inside] += free[inside][:, None] * view.image.cpu().double().numpy()[pixels]
-    if not cameras:
-        return Orthophoto(cells, size, colors, coverage, heights, np.ones_like(shown), covered)
-    known = (coverage > 0.5) & (shown > 0)
-    seen_colors /= np.maximum(shown, 1)[..., None]
-    width = surface.radius / size / 2
-    gain = _mean_of(seen_colors, known, width) / np.maximum(_mean_of(colors, known, width), 0.02)
-    counts = np.maximum(counts, 1)
-    return Orthophoto(
-        cells, size, colors * gain.clip(0.5, 2), coverage, heights, shown / counts, covered / counts
-    )
+        here = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < small.width) & (y < small.height))
+        pixels = y[here].astype(int), x[here].astype(int)
+        there = view.depth.cpu().numpy()[pixels] > depth[here] - slack
+        before = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
+        counts[here] += 1
+        covered[here] += before
+        shown[here] += there & ~before
+        colors[here] += (there & ~before)[:, None] * view.image.cpu().double().numpy()[pixels]
+    colors /= np.maximum(shown, 1)[:, None]
+    return shown / np.maximum(counts, 1), covered / np.maximum(counts, 1), colors
 
 
 def from_above(
