@@ -74,7 +74,7 @@ def test_the_best_shifts_are_the_periods_of_the_pattern():
 
 
 def test_what_is_not_trusted_is_not_copied():
-    truth, (hole, away) = checkers(), disk()
+    truth, (hole, _) = checkers(), disk()
     picture, trust = truth.copy(), trust_outside(hole)
     picture[:, : SIZE // 4] = [0, 1, 0]
     trust[:, : SIZE // 4] = 0

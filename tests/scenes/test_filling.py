@@ -136,7 +136,7 @@ def checkered_table_with_a_box(shadow=False):
     table = np.concatenate([table, np.zeros((len(table), 1))], 1)
     face = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, 26)] * 2), -1).reshape(-1, 2)
     sides = [
-        np.insert(face + [0, 0.25 * (axis != 2)], axis, value, 1)
+        np.insert(face + np.array([0, 0.25]), axis, value, 1)
         for axis, value in ((0, -0.25), (0, 0.25), (1, -0.25), (1, 0.25))
     ]
     box = np.concatenate([*sides, np.insert(face, 2, 0.5, 1)])

@@ -1,12 +1,12 @@
 """Completes a picture of a surface where a part of it is missing: its pattern goes on.
 
 A pattern looks like itself some way further. Shifts by which a picture resembles itself are found by masked
-correlation, and a missing pixel takes the weighted median of what these shifts lead to (after K. He and J. Sun, "Statistics
-of Patch Offsets for Image Completion", ECCV 2012, who choose one shift for each pixel by graph cuts instead). A shift
-counts as much as it explains the rim of the hole near a pixel, so that edges between two patterns go on too.
+correlation, and a missing pixel takes the weighted median of what these shifts lead to (after K. He and J. Sun,
+"Statistics of Patch Offsets for Image Completion", ECCV 2012, who choose one shift for each pixel by graph cuts). A
+shift counts as much as it explains the rim of the hole near a pixel, so that edges between two patterns go on too.
 
 Shifts are found in the picture over its brightness, in which shadows weigh less. Colors are taken from the picture as
-it is: those of a shadow near the hole are outvoted. How far the vote is believed follows from what it says of the rim.
+it is: those of a shadow near the hole are outvoted. What the vote says of the rim decides how far it is believed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ are compared for one pixel, and of the neighborhood of that pixel."""
 _SHARE = 0.3
 """Width in radii of the hole in which predictions are judged."""
 _CHANCE, _CERTAIN = 0.1, 0.7
-"""Shares of a prediction that are right around a pixel: up to the first nothing of it is taken, from the second all."""
+"""Right shares of a prediction around a pixel: up to the first nothing of it is taken, from the second all."""
 _SOFT = 1.0
 """Excess of a shift's error over the least error, as a share of the latter, that reduces its weight to 1/e."""
 

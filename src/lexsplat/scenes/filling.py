@@ -30,7 +30,15 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.completing import completed
-from lexsplat.scenes.surfaces import FEWEST, Orthophoto, below, from_above, looked_up, photographed, surface_below
+from lexsplat.scenes.surfaces import (
+    FEWEST,
+    Orthophoto,
+    below,
+    from_above,
+    looked_up,
+    photographed,
+    surface_below,
+)
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,7 +50,7 @@ _HIDDEN = 0.88
 """Share of the views that have the thing before a place, above which what the reconstruction put there goes."""
 _STUFFED = 0.5
 """The same for what lies within the thing."""
-_BORDER, _OVERLAP, _RIM = 3, 2, 3
+_BORDER, _OVERLAP, _RIM = 3, 4, 3
 """Pixels around such places where it goes too, where the fill covers what stays, and where colors are not trusted."""
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
