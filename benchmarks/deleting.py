@@ -31,6 +31,7 @@ from scipy.ndimage import map_coordinates
 from skimage.color import rgb2lab
 
 import lexsplat
+from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0
 from lexsplat.queries.selection import Selection
 from lexsplat.rendering import render
@@ -96,8 +97,8 @@ def measured(
     left: dict[str, list[Array]] = {name: [] for name in ("without fill", "with fill")}
     rows = []
     for name, (truth, mask) in views.items():
-        unedited = _rendered(scene, name)
-        pictures = {key: _rendered(each, name) for key, each in scenes.items()}
+        unedited = _rendered(scene, name, truth)
+        pictures = {key: _rendered(each, name, truth) for key, each in scenes.items()}
         errors["unedited"].append(((unedited - truth)[~mask] ** 2).ravel())
         for key, picture in pictures.items():
             errors[key].append(((picture - truth)[mask] ** 2).ravel())
@@ -140,7 +141,7 @@ def with_true_colors(filled: Scene, count: int, truths: dict[str, Array]) -> Sce
     centers = gaussians.means[len(gaussians) - count :].double().numpy()
     total, seen = np.zeros((count, 3)), np.zeros(count)
     for name, truth in truths.items():
-        camera = filled.camera(name)
+        camera = _camera(filled, name, truth)
         depths = render(gaussians, camera, depth=True).depth
         assert depths is not None
         x, y, depth = ((centers @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T).T
@@ -156,8 +157,13 @@ def with_true_colors(filled: Scene, count: int, truths: dict[str, Array]) -> Sce
     return filled.with_content(replace(gaussians, sh0=sh0), filled.field)
 
 
-def _rendered(scene: Scene, name: str) -> Array:
-    return scene.render(name).image.cpu().double().numpy().clip(0, 1)
+def _rendered(scene: Scene, name: str, truth: Array) -> Array:
+    """A view in the size of its rendering."""
+    return scene.render(_camera(scene, name, truth)).image.cpu().double().numpy().clip(0, 1)
+
+
+def _camera(scene: Scene, name: str, truth: Array) -> Camera:
+    return scene.camera(name).resized(truth.shape[1], truth.shape[0])
 
 
 def _read(path: Path) -> Array:
