@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -187,13 +187,13 @@ def looked_up(
         small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
         with torch.no_grad():
             view = render(gaussians, small, features=thing, depth=True)
-        assert view.depth is not None
+        nearest = cast(torch.Tensor, view.depth).cpu().numpy()
         x, y, depth = ((places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T).T
         front = np.maximum(depth, 1e-9)
         x, y = np.floor(x / front), np.floor(y / front)
         here = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < small.width) & (y < small.height))
         pixels = y[here].astype(int), x[here].astype(int)
-        there = view.depth.cpu().numpy()[pixels] > depth[here] - slack
+        there = nearest[pixels] > depth[here] - slack
         before = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
         counts[here] += 1
         covered[here] += before
