@@ -8,13 +8,16 @@ import torch
 from support.language_scene import make_codebook
 
 from lexsplat.geometry.boxes import Up
+from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.geometry.world import World
 from lexsplat.language.fields import CodeField
 from lexsplat.queries.selection import Selection
+from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.editing import Editor
-from lexsplat.scenes.filling import Fill, fill_for, painted_hole
+from lexsplat.scenes.filling import Fill, fill_for
+from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
 
 LEFT, RIGHT = np.array([0.8, 0.3, 0.1]), np.array([0.2, 0.5, 0.7])
@@ -71,7 +74,9 @@ def test_a_deleted_thing_leaves_a_closed_surface_with_the_colors_around(turned):
 
 def test_nothing_is_filled_where_a_thing_stands_on_nothing_or_a_fill_is_not_wanted():
     hanging, world = table_with_a_ball(ball_height=2.0)
-    assert fill_for(ball_of(hanging, world)) is None
+    fill, gone = fill_for(ball_of(hanging, world))
+    assert fill is None
+    assert torch.equal(gone, ball_of(hanging, world).mask)
     scene, world = table_with_a_ball()
     editor = Editor(scene)
     editor.delete(ball_of(scene, world), fill=False)
@@ -119,10 +124,66 @@ def test_a_damaged_fill_is_told_in_one_line(tmp_path, broken):
     assert "\n" not in str(error.value)
 
 
-def test_a_hole_takes_the_colors_around_by_inverse_squared_distance():
-    picture = np.zeros((1, 5, 3))
-    picture[0, 0], picture[0, 4] = 0.2, 0.8
-    hole = np.array([[False, True, True, True, False]])
-    found = painted_hole(picture, hole, ~hole)[:, 0]
-    expected = [(0.2 + 0.8 / 9) / (1 + 1 / 9), 0.5, (0.2 / 9 + 0.8) / (1 / 9 + 1)]
-    np.testing.assert_allclose(found, expected)
+def checkered_table_with_a_box(shadow=False):
+    """A checkered table, and a red box (code 1) on it with red remains under it; and the table alone, without shadow.
+
+    The places under the box have no Gaussians of the table, as no view shows them.
+    """
+    side = np.linspace(-1.5, 1.5, 101)
+    table = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    squares = np.floor((table @ [[0.96, -0.28], [0.28, 0.96]] + 0.07) / 0.2).sum(1) % 2 == 0
+    colors = np.where(squares[:, None], [0.85, 0.82, 0.8], [0.15, 0.35, 0.7])
+    table = np.concatenate([table, np.zeros((len(table), 1))], 1)
+    face = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, 26)] * 2), -1).reshape(-1, 2)
+    sides = [
+        np.insert(face + np.array([0, 0.25]), axis, value, 1)
+        for axis, value in ((0, -0.25), (0, 0.25), (1, -0.25), (1, 0.25))
+    ]
+    box = np.concatenate([*sides, np.insert(face, 2, 0.5, 1)])
+    remains = np.insert(np.random.default_rng(3).uniform(-0.2, 0.2, (30, 2)), 2, -0.01, 1)
+    free = np.abs(table[:, :2]).max(1) > 0.26
+    dark = (
+        1 - 0.4 * np.exp(-(np.abs(table[:, :2]).max(1) - 0.25).clip(0) / 0.1)
+        if shadow
+        else np.ones(len(table))
+    )
+    points = np.concatenate([table[free], remains, box])
+    paint = np.concatenate([(colors * dark[:, None])[free], np.tile([0.8, 0.1, 0.1], (30 + len(box), 1))])
+    return solid(points, paint, len(box)), solid(table, colors, 0)
+
+
+def solid(points, colors, last):
+    """A scene of these points, the last of which have code 1, with views around it."""
+    gaussians = gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
+    gaussians.log_scales.fill_(float(np.log(0.018)))
+    codes = (torch.arange(len(points)) >= len(points) - last).to(torch.uint8)[:, None]
+    field = CodeField(make_codebook(2), codes, torch.ones(len(codes), 1), torch.zeros(len(codes)))
+    views = {}
+    for number, angle in enumerate(np.linspace(-0.7, 0.7, 9)):
+        eye = 2.5 * np.array([np.sin(angle), -np.cos(angle), 0.5 + 0.05 * (number % 3)])
+        camera = look_at(eye, np.zeros(3), np.array([0, 0, 1.0]), 160, 120, 0.7)
+        views[f"v{number}"] = StoredView(f"v{number}", camera, "test" if number == 4 else "train")
+    return Scene(gaussians, field, views, "bundled")
+
+
+@pytest.mark.parametrize("shadow", [False, True])
+def test_checkers_go_on_where_a_box_stood_and_nothing_of_its_color_stays(shadow):
+    scene, alone = checkered_table_with_a_box(shadow)
+    mask = scene.field.codes[:, 0] == 1
+    chosen = Selection(
+        scene.gaussians, scene.cameras, mask, mask.float(), world=World(Up(np.array([0, 0, 1.0]), True))
+    )
+    editors = {fill: Editor(scene) for fill in (True, False)}
+    for fill, editor in editors.items():
+        editor.delete(chosen, fill=fill)
+    truth = alone.render("v4").image.numpy()
+    place = render(scene.gaussians, scene.camera("v4"), features=mask[:, None].float(), color=False)
+    seen = place.features[..., 0].numpy() > 0.5
+    psnr, pictures = {}, {}
+    for fill, editor in editors.items():
+        pictures[fill] = editor.scene.render("v4").image.numpy()
+        psnr[fill] = -10 * np.log10(((pictures[fill] - truth)[seen] ** 2).mean())
+    assert psnr[True] > 25, psnr
+    assert psnr[False] < 15, psnr
+    red = pictures[True][..., 0] - pictures[True][..., 1:].max(-1)
+    assert (red[seen] < 0.2).all(), "neither the box nor the remains under it"

@@ -28,15 +28,31 @@ def main() -> None:
     parser.add_argument(
         "--truth", action="store_true", help="also write OUTPUT/SCENE/truth: depths and indices of all views"
     )
+    parser.add_argument(
+        "--without",
+        metavar="KIND",
+        help="only render the held-out views without a thing, to WORK/SCENE-without-KIND",
+    )
     options = parser.parse_args()
     say = quiet_output()
     for name in options.scenes:
         layout, work = LAYOUTS[name], options.work / name
+        if options.without:
+            kinds = {place.kind for place in layout.placements}
+            if options.without not in kinds:
+                parser.error(f"{name} has no {options.without!r}; it has {', '.join(sorted(kinds))}")
+            options.steps, work = ["render"], options.work / f"{name}-without-{options.without}"
         if "render" in options.steps:
             from render import render  # needs Blender
 
             render(
-                layout, work, samples=options.samples, threads=options.threads, say=say, every=options.every
+                layout,
+                work,
+                samples=options.samples,
+                threads=options.threads,
+                say=say,
+                every=options.every,
+                without=options.without,
             )
         if "pack" in options.steps:
             from pack import pack  # needs pycolmap and Pillow

@@ -25,8 +25,11 @@ from surroundings import light_room, make_cloth, make_floor, make_table, make_wa
 from things import Thing, make
 
 
-def build(layout: Layout) -> list[Thing]:
-    """Fill an empty Blender file with the layout. Each object has its own random generator."""
+def build(layout: Layout, without: str | None = None) -> list[Thing]:
+    """Fill an empty Blender file with the layout, but for the objects of one kind.
+
+    Each object has its own random generator, so that the others do not depend on which are there.
+    """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     number = 0
 
@@ -39,6 +42,10 @@ def build(layout: Layout) -> list[Thing]:
     for place in layout.placements:
         thing = make(place.kind, place.color, *next_thing())
         thing.place(place.x, place.y, place.z, place.turn, place.scale)
+        if place.kind == without:
+            for each in thing.objects:
+                bpy.data.objects.remove(each)
+            continue
         things.append(thing)
     things.append(make_table(*next_thing()))
     color, x, y, turn = layout.cloth
@@ -125,7 +132,14 @@ def intrinsics(layout: Layout) -> list[list[float]]:
 
 
 def render(
-    layout: Layout, work: Path, *, samples: int, threads: int, say: Callable[[str], None], every: int = 1
+    layout: Layout,
+    work: Path,
+    *,
+    samples: int,
+    threads: int,
+    say: Callable[[str], None],
+    every: int = 1,
+    without: str | None = None,
 ) -> None:
     """Render the layout into ``work``; existing views are kept.
 
@@ -136,8 +150,9 @@ def render(
         threads: Threads of the renderer.
         say: Takes a line of progress (Blender floods standard output).
         every: Only every so many views, to have a look.
+        without: A kind of object that is left out; then only images of the held-out views are made.
     """
-    things = build(layout)
+    things = build(layout, without)
     scratch = work / "scratch"
     set_up(layout, scratch, threads)
     for folder in (scratch, work / "images", work / "truth"):
@@ -155,8 +170,10 @@ def render(
     (work / "things.json").write_text(json.dumps(meaning, indent=1))
 
     chosen = list(zip(layout.names(), poses))[::every]
+    if without:
+        chosen = [(name, pose) for name, pose in chosen if name in layout.test_names()]
     use_truth_quality()
-    for name, pose in chosen:
+    for name, pose in () if without else chosen:
         if not (work / "truth" / f"{name}.npz").exists():
             shoot(pose, scratch / "discarded.png")
             index = np.rint(read_pass(scratch / "index0001.exr")).astype(np.uint8)

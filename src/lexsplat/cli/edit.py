@@ -56,7 +56,7 @@ class Edit:
         grow: Widen the selection by this distance in units of the scene.
         shrink: Narrow the selection by this distance in units of the scene.
         largest: Change only the largest of the things found.
-        fill: Close the surface under a deleted thing with the colors around, as no photo shows it.
+        fill: Close the surface under a deleted thing, which no photo shows: the pattern around it goes on.
         color: New color for recolor: three numbers in 0..1, "#ff8800" or a name such as orange.
         strength: Share of the new color, in 0..1.
         by: Shift in units of the scene, for move and duplicate.

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.selection import Selection
@@ -260,7 +261,10 @@ class Editor:
     # -- inside
 
     def planned_mask(self, kind: Kind, chosen: Selection) -> Tensor:
-        """The Gaussians that a step would apply to ``[N]`` bool; it changes nothing."""
+        """The Gaussians that a step would apply to ``[N]`` bool; it changes nothing.
+
+        A deletion with a fill also takes remains under the thing that no view shows (`lexsplat.scenes.filling`).
+        """
         return self._whole(chosen, fill=kind == "delete").mask
 
     def _whole(self, chosen: Selection, fill: bool) -> Selection:
@@ -282,12 +286,15 @@ class Editor:
             )
         whole = self._whole(chosen, "fill" in values)
         if "fill" in values:
-            fill = fill_for(whole)
-            values = {} if fill is None else {"fill": fill.to_json()}
+            fill, mask = fill_for(whole, self._photographed_from())
+            values, whole = {} if fill is None else {"fill": fill.to_json()}, replace(whole, mask=mask)
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):
             self._advance(step)
             self.undone.clear()
+
+    def _photographed_from(self) -> list[Camera]:
+        return [view.camera for view in self.original.views.values() if view.split == "train"]
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

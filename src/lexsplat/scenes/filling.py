@@ -1,9 +1,10 @@
 """Fills the hole that a deleted thing leaves in the surface under it, which no photo shows.
 
-1. A thing stands on a surface: a plane is fitted to the Gaussians around its foot.
-2. The surface without the thing is rendered from above. Where the picture is bare, it takes the colors around. A
-   pattern does not go on there.
-3. Each painted pixel becomes a flat Gaussian. It keeps the language of its nearest neighbor in the surface.
+1. A thing stands on a surface (`lexsplat.scenes.surfaces`). Its place is what hardly any view sees of it, because the
+   thing is before it.
+2. What the reconstruction put there goes: nothing shows it.
+3. The pattern of the surface goes on in its place (`lexsplat.scenes.completing`), in a picture from above. Each
+   painted pixel becomes a flat Gaussian. It keeps the language of its nearest neighbor in the surface.
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 import base64
 import binascii
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -27,51 +29,38 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.selection import Selection
-from lexsplat.rendering import render
+from lexsplat.scenes.completing import completed
+from lexsplat.scenes.surfaces import (
+    FEWEST,
+    Orthophoto,
+    below,
+    from_above,
+    looked_up,
+    photographed,
+    surface_below,
+)
 
 FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _FAINT = 0.1
-_FOOT = 0.15
-"""The foot of a thing: its lowest share by height."""
-_RING = 1.0
-"""Width of the ring around the foot whose Gaussians make the plane, in radii of the foot."""
-_LEVEL = 0.1
-"""Gaussians of the ring within this distance of the plane belong to it, in radii of the foot."""
 _THICK = 0.3
-"""The same for the Gaussians that are seen from above."""
-_STEEPEST = 0.8
-"""Least cosine of the plane's normal with up."""
-_FEWEST = 30
-_PIXELS = 112
-"""Width of the picture from above."""
-_REACH = 3.0
-"""Half of its width, in radii of the foot."""
+"""Gaussians within this distance of the plane are the surface, in radii of the foot."""
+_HIDDEN = 0.88
+"""Share of the views that have the thing before a place, above which what the reconstruction put there goes."""
+_STUFFED = 0.5
+"""The same for what lies within the thing."""
+_BORDER, _OVERLAP, _RIM = 3, 4, 3
+"""Pixels around such places where it goes too, where the fill covers what stays, and where colors are not trusted."""
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
-_SIZES = (0.7, 0.7, 0.1)
+_UNSEEN = 0.3
+"""Trust in a pixel that no view sees. Another one gains the share of the views that see it."""
+_SIZES = (0.8, 0.8, 0.1)
 """Standard deviations of a disk along its axes, in pixels."""
 _OPAQUE = 3.0
 _COLUMNS = 13
 _MOST = 1 << 20
-_MARGIN = 10
-"""Width of the rim of the hole whose colors are taken, in pixels."""
-
-
-class Surface(NamedTuple):
-    """The plane that a thing stands on.
-
-    Args:
-        origin: A point of it ``[3]``.
-        axes: Two unit vectors in it, and its normal, which points up ``[3, 3]`` in rows.
-        foot: Center of the thing's foot in the two vectors ``[2]``.
-        radius: Radius of the foot, world units.
-    """
-
-    origin: FloatArray
-    axes: FloatArray
-    foot: FloatArray
-    radius: float
 
 
 def inside_hull(means: FloatArray, thing: NDArray[np.bool_], grown: float = 1.05) -> NDArray[np.bool_]:
@@ -83,58 +72,6 @@ def inside_hull(means: FloatArray, thing: NDArray[np.bool_], grown: float = 1.05
         return np.asarray(Delaunay(center + grown * (corners - center)).find_simplex(means) >= 0)
     except (QhullError, ValueError, IndexError):  # flat or too few
         return thing.copy()
-
-
-def surface_below(own: FloatArray, others: FloatArray, up: FloatArray) -> Surface | None:
-    """The plane around the foot of a thing; None if there is none.
-
-    Args:
-        own: Means of the Gaussians of the thing ``[M, 3]``.
-        others: Those of the Gaussians around it ``[R, 3]``.
-        up: Unit vector ``[3]``.
-    """
-    if len(own) < 4:
-        return None
-    right, ahead = _across(up)
-    heights = own @ up
-    low, high = np.quantile(heights, [0.02, 0.98])
-    foot = own[heights <= low + _FOOT * (high - low)]
-    flat = foot @ np.stack([right, ahead]).T
-    center = np.median(flat, 0)
-    radius = max(float(np.quantile(np.linalg.norm(flat - center, axis=1), 0.9)), 1e-9)
-    apart = np.linalg.norm(others @ np.stack([right, ahead]).T - center, axis=1)
-    near = np.abs(others @ up - low) <= 0.5 * radius
-    ring = others[near & (apart <= (1 + _RING) * radius)]
-    plane = _fitted_plane(ring, up, _LEVEL * radius) if len(ring) >= _FEWEST else None
-    if plane is None:
-        return None
-    origin, normal = plane
-    axes = np.stack([*_across(normal), normal])
-    middle = np.median((foot - origin) @ axes[:2].T, 0)
-    return Surface(origin, axes, middle, radius)
-
-
-def _fitted_plane(points: FloatArray, up: FloatArray, level: float) -> tuple[FloatArray, FloatArray] | None:
-    """The plane through most points near a level, as origin and normal; None if too few lie in it."""
-    heights = points @ up
-    counts = [(np.abs(heights - height) <= level).sum() for height in heights]
-    fits = np.abs(heights - heights[int(np.argmax(counts))]) <= level
-    origin, normal = points.mean(0), up
-    for _ in range(5):
-        if fits.sum() < _FEWEST:
-            return None
-        origin = points[fits].mean(0)
-        normal = np.linalg.svd(points[fits] - origin, full_matrices=False)[2][2]
-        normal = normal if normal @ up > 0 else -normal
-        fits = np.abs((points - origin) @ normal) <= level
-    return (origin, normal) if normal @ up >= _STEEPEST else None
-
-
-def _across(up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors that are square to ``up`` and to each other."""
-    right = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
-    right /= np.linalg.norm(right)
-    return right, np.cross(up, right)
 
 
 class Fill(NamedTuple):
@@ -207,80 +144,88 @@ def hidden_inside(chosen: Selection, hidden: Tensor) -> Tensor:
     return torch.from_numpy(inside).to(hidden.device) & hidden
 
 
-def fill_for(chosen: Selection) -> Fill | None:
-    """What closes the surfaces under the instances of a selection once it is gone; None if there is nothing."""
-    found = [fill for each in chosen.instances if (fill := _fill_below(each, chosen.mask)) is not None]
+def fill_for(chosen: Selection, cameras: Sequence[Camera] = ()) -> tuple[Fill | None, Tensor]:
+    """What closes the surfaces under the instances of a selection once it is gone, and what goes besides.
+
+    Args:
+        chosen: The selection.
+        cameras: The views that the scene was made from.
+
+    Returns:
+        The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
+    """
+    gone = chosen.mask.cpu().numpy().copy()
+    found = [fill for each in chosen.instances if (fill := _fill_below(each, gone, cameras)) is not None]
+    mask = torch.from_numpy(gone).to(chosen.mask.device)
     if not found:
-        return None
-    return Fill(*(np.concatenate(rows)[:_MOST] for rows in zip(*found)))
+        return None, mask
+    return Fill(*(np.concatenate(rows)[:_MOST] for rows in zip(*found))), mask
 
 
-def _fill_below(thing: Selection, gone: Tensor) -> Fill | None:
-    """What closes the surface under one thing, where all Gaussians of ``gone [N]`` are gone."""
+def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill | None:
+    """What closes the surface under one thing; remains there are added to ``gone [N]``."""
     gaussians = thing.gaussians
     means = gaussians.means.detach().cpu().double().numpy()
-    own, away = thing.mask.cpu().numpy(), gone.cpu().numpy()
-    opacities = gaussians.opacities.detach().cpu().double().numpy()
-    firm = np.flatnonzero(~away & (opacities >= _FAINT))
-    surface = surface_below(means[own & (opacities >= _FAINT)], means[firm], thing.up.direction)
+    own, solid = thing.mask.cpu().numpy(), gaussians.opacities.detach().cpu().numpy() >= _FAINT
+    surface = surface_below(means[own & solid], means[~gone & solid], thing.up.direction)
     if surface is None:
         return None
     local = (means - surface.origin) @ surface.axes.T
-    reach = _REACH * surface.radius
-    near = np.asarray((np.abs(local[:, :2] - surface.foot) <= reach).all(1))
-    members = firm[near[firm] & (np.abs(local[firm, 2]) <= _THICK * surface.radius)]
-    picture, coverage = _seen_from_above(gaussians.select(torch.from_numpy(members).to(gone.device)), surface)
-    side = (np.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
-    cells = surface.foot + reach * np.stack(np.meshgrid(side, -side), -1)
-    low = own & near & (local[:, 2] <= 2 * surface.radius)
-    bare = coverage < _BARE
-    hole, known = bare & _below(local[low, :2], cells), ~bare
-    if not hole.any() or known.sum() < _FEWEST:
+    flat = ~gone & solid & (np.abs(local[:, 2]) <= _THICK * surface.radius)
+    photo = photographed(gaussians, gone, surface, flat, cameras)
+    unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
+    inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= _THICK * surface.radius)
+    inside |= _stuffing(gaussians, own, gone | inside, cameras)
+    _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
+    near = below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
+    filled = binary_dilation(unseen, iterations=_OVERLAP)
+    hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
+    level = np.abs(heights) <= _THICK * surface.radius
+    known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
+    if not hole.any() or known.sum() < FEWEST:
         return None
-    colors = painted_hole(picture / np.maximum(coverage, 1e-6)[..., None], hole, known)
-    _, nearest = cKDTree(local[members, :2]).query(cells[hole])
+    painted = completed(photo.colors, hole, known * (_UNSEEN + photo.shown))
+    members = np.flatnonzero(flat & ~inside)
+    gone |= inside
+    raised = _continued(heights, hole, known)
+    places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
+    _, nearest = cKDTree(local[members, :2]).query(photo.cells[hole])
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
-    sizes = np.log(2 * reach / _PIXELS * np.array(_SIZES))
-    same = np.tile([w, x, y, z, *sizes], (len(colors), 1))
-    places = surface.origin + cells[hole] @ surface.axes[:2]
-    disks = np.concatenate([places, same, colors], 1).astype("<f4")
+    same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
+    disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks)
 
 
-def _seen_from_above(members: Gaussians, surface: Surface) -> tuple[FloatArray, FloatArray]:
-    """A picture ``[P, P, 3]`` of a surface from far above, its columns and rows along its axes, and its coverage."""
-    away, reach = 100 * surface.radius, _REACH * surface.radius
-    rotation = surface.axes * np.array([[1.0], [-1.0], [-1.0]])
-    eye = surface.origin + surface.foot @ surface.axes[:2] + away * surface.axes[2]
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    focal = _PIXELS / 2 * away / reach
-    K = np.array([[focal, 0, _PIXELS / 2], [0, focal, _PIXELS / 2], [0, 0, 1]])
-    plain = replace(members, shN=torch.zeros_like(members.shN))
-    with torch.no_grad():
-        found = render(plain, Camera(_PIXELS, _PIXELS, K, viewmat))
-    image, alpha = (one.cpu().double().numpy() for one in (found.image, found.alpha))
-    return image, alpha.reshape(_PIXELS, _PIXELS)
+def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
+    """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, as the thing is there or before them."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    places = np.flatnonzero(inside_hull(means, own) & ~gone)
+    found = np.zeros(len(gone), bool)
+    if len(places) and cameras:
+        _, covered, _ = looked_up(gaussians, gone, means[places], cameras, 0.0)
+        found[places] = covered > _STUFFED
+    return found
 
 
-def _below(points: FloatArray, cells: FloatArray) -> NDArray[np.bool_]:
-    """Which cells ``[P, P, 2]`` lie in the convex hull of points ``[M, 2]``."""
-    try:
-        return np.asarray(Delaunay(points).find_simplex(cells) >= 0)
-    except (QhullError, ValueError):
-        return np.zeros(cells.shape[:2], bool)
+def _at(mask: Mask, points: FloatArray, photo: Orthophoto) -> Mask:
+    """Whether points ``[N, 2]`` of the plane lie in pixels of a mask."""
+    (first, *_), count = photo.cells[0], len(mask)
+    columns = np.round((points[:, 0] - first[0]) / photo.size).astype(int)
+    rows = np.round((first[1] - points[:, 1]) / photo.size).astype(int)
+    inside = (columns >= 0) & (columns < count) & (rows >= 0) & (rows < count)
+    return inside & mask[rows.clip(0, count - 1), columns.clip(0, count - 1)]
 
 
-def painted_hole(picture: FloatArray, hole: NDArray[np.bool_], known: NDArray[np.bool_]) -> FloatArray:
-    """Colors ``[F, 3]`` in 0..1 for the F pixels of a hole: those around, weighted by inverse squared distance.
-
-    Args:
-        picture: RGB ``[H, W, 3]``.
-        hole: Pixels to paint ``[H, W]``.
-        known: Pixels whose color is known ``[H, W]``, at least one; none is in the hole.
-    """
-    rim = np.asarray(known & binary_dilation(hole, iterations=_MARGIN))
-    points, places = np.argwhere(rim if rim.any() else known), np.argwhere(hole)
-    weights = 1 / ((places[:, None] - points[None]) ** 2).sum(-1)
-    colors = picture[tuple(points.T)]
-    return np.asarray((weights @ colors / weights.sum(1, keepdims=True)).clip(0, 1))
+def _continued(heights: FloatArray, hole: Mask, known: Mask) -> FloatArray:
+    """Heights ``[F]`` for the pixels of a hole: a quadratic patch through those around."""
+    rows, columns = np.mgrid[: hole.shape[0], : hole.shape[1]]
+    center = np.argwhere(hole).mean(0)
+    radius = max(float(np.sqrt(hole.sum() / np.pi)), 2.0)
+    u, v = (rows - center[0]) / radius, (columns - center[1]) / radius
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
+    weights = np.exp(-(u[known] ** 2 + v[known] ** 2) / 8)
+    solution = np.linalg.lstsq(
+        terms[known] * weights[:, None] ** 0.5, heights[known] * weights**0.5, rcond=None
+    )[0]
+    low, high = np.quantile(heights[known], [0.02, 0.98])
+    return np.asarray((terms[hole] @ solution).clip(low, high))

@@ -1,0 +1,161 @@
+"""Completes a picture of a surface where a part of it is missing: its pattern goes on.
+
+A pattern looks like itself some way further. Shifts by which a picture resembles itself are found by masked
+correlation, and a missing pixel takes the weighted median of what these shifts lead to (after K. He and J. Sun,
+"Statistics of Patch Offsets for Image Completion", ECCV 2012, who choose one shift for each pixel by graph cuts). A
+shift counts as much as it explains the rim of the hole near a pixel, so that edges between two patterns go on too.
+
+Shifts are found in the picture over its brightness, in which shadows weigh less. Colors are taken from the picture as
+it is: those of a shadow near the hole are outvoted. What the vote says of the rim decides how far it is believed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_SHIFTS = 40
+_LEAST = 5
+"""Shortest shift in pixels: neighbors are alike without any pattern."""
+_OVERLAP = 0.15
+"""Share of the rim that a shift must map into the known picture."""
+_BRIGHTNESS, _RIM, _NEAR, _LOCAL = 0.7, 1.5, 1.0, 0.45
+"""Widths in radii of the hole: of the brightness, of the rim for which shifts are sought, of the rim on which they
+are compared for one pixel, and of the neighborhood of that pixel."""
+_SHARE = 0.3
+"""Width in radii of the hole in which predictions are judged."""
+_CHANCE, _CERTAIN = 0.1, 0.7
+"""Right shares of a prediction around a pixel: up to the first nothing of it is taken, from the second all."""
+_SOFT = 1.0
+"""Excess of a shift's error over the least error, as a share of the latter, that reduces its weight to 1/e."""
+
+
+def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
+    """Colors ``[F, 3]`` in 0..1 for the F pixels of a hole.
+
+    Where no shift explains the rim, they are the colors around (`painted`).
+
+    Args:
+        picture: RGB ``[H, W, 3]``.
+        hole: Pixels to paint ``[H, W]``, at least one.
+        trust: How much the color of a pixel counts ``[H, W]``, 0 where it is unknown and in the hole.
+    """
+    picture = picture.clip(0, 1)
+    radius = max(float(np.sqrt(hole.sum() / np.pi)), 2.0)
+    away = np.asarray(distance_transform_edt(~hole)) / radius
+    brightness = _mean_around(picture @ _LUMINANCE, trust, _BRIGHTNESS * radius)
+    pattern = (picture / np.maximum(brightness, 0.02)[..., None]).clip(0, 3)
+    rim = trust * np.exp(-((away / _RIM) ** 2))
+    mean = (rim[..., None] * pattern).sum((0, 1)) / rim.sum()
+    variance = float((rim[..., None] * (pattern - mean) ** 2).sum() / rim.sum())
+    smooth = painted(picture, hole, trust)
+    shifts = self_similar_shifts(pattern, rim, trust)
+    if not shifts or variance < 1e-8:
+        return smooth
+    near = np.exp(-((away / _NEAR) ** 2))
+    asked = hole | ((trust > 0) & (away <= _NEAR))
+    values, errors, trusts = [], [], []
+    for shift in shifts:
+        there, moved = _moved(trust, shift), _moved(pattern, shift)
+        error = ((pattern - moved) ** 2).sum(-1).clip(0, 4 * variance)
+        errors.append(_mean_around(error, trust * there * near, _LOCAL * radius)[asked])
+        values.append(np.concatenate([_moved(picture, shift)[asked], moved[asked]], 1))
+        trusts.append(there[asked])
+    found = np.zeros((*hole.shape, 6))
+    found[asked] = _voted(np.stack(values, 1), np.stack(errors, 1), np.stack(trusts, 1))
+    right = _predictable(pattern, found[..., 3:], trust * asked, _SHARE * radius)[hole][:, None]
+    share = ((right - _CHANCE) / (_CERTAIN - _CHANCE)).clip(0, 1)
+    return np.asarray((share * found[hole][:, :3] + (1 - share) * smooth).clip(0, 1))
+
+
+def _predictable(picture: FloatArray, found: FloatArray, weights: FloatArray, width: float) -> FloatArray:
+    """Which share of what a prediction adds to the mean around is right nearby ``[H, W]``: a local regression."""
+    mean = np.stack([_mean_around(channel, weights, width) for channel in np.moveaxis(picture, -1, 0)], -1)
+    right = _mean_around(((picture - mean) * (found - mean)).sum(-1), weights, width)
+    added = _mean_around(((found - mean) ** 2).sum(-1), weights, width)
+    return np.asarray((right / np.maximum(added, 1e-9)).clip(0, 1))
+
+
+def self_similar_shifts(pattern: FloatArray, weights: FloatArray, trust: FloatArray) -> list[tuple[int, int]]:
+    """The shifts (rows, columns) by which a picture resembles itself best, best first.
+
+    Args:
+        pattern: The picture ``[H, W, C]``.
+        weights: How much a pixel counts ``[H, W]``.
+        trust: How much a pixel counts that it is compared with ``[H, W]``.
+    """
+    overlap = _correlation(weights, trust)
+    total = np.zeros_like(overlap)
+    for channel in np.moveaxis(pattern, -1, 0):
+        total += _correlation(weights * channel**2, trust) + _correlation(weights, trust * channel**2)
+        total -= 2 * _correlation(weights * channel, trust * channel)
+    height, width = trust.shape
+    rows, columns = np.mgrid[-height:height, -width:width]
+    enough = (overlap > _OVERLAP * weights.sum()) & (np.hypot(rows, columns) >= _LEAST)
+    errors = np.where(enough, total / np.maximum(overlap, 1e-9), np.inf)
+    places = np.argwhere(enough & (errors <= minimum_filter(errors, 7)))
+    order = np.argsort(errors[tuple(places.T)], kind="stable")[:_SHIFTS]
+    return [(int(row) - height, int(column) - width) for row, column in places[order]]
+
+
+def painted(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
+    """Colors ``[F, 3]`` for the F pixels of a hole: those of its rim, weighted by inverse squared distance."""
+    away = np.asarray(distance_transform_edt(~hole))
+    limit = max(10.0, float(away[trust > 0].min()) + 1)
+    points, places = np.argwhere((trust > 0) & (away <= limit)), np.argwhere(hole)
+    points = points[:: 1 + len(points) // 1000]
+    weights = trust[tuple(points.T)] / ((places[:, None] - points[None]) ** 2).sum(-1)
+    return np.asarray(weights @ picture[tuple(points.T)] / weights.sum(1, keepdims=True))
+
+
+def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray) -> FloatArray:
+    """The values ``[F, C]`` of median brightness among ``[F, K, C]``, weighted; the first three are RGB.
+
+    Args:
+        values: What each of K shifts leads to.
+        errors: Their errors ``[F, K]``.
+        trusts: How much the values are trusted ``[F, K]``; 0 are left out.
+    """
+    least = np.where(trusts > 0, errors, np.inf).min(1)
+    least = np.where(np.isfinite(least), least, 0.0)[:, None]
+    weights = trusts * np.exp(-(errors - least) / (_SOFT * least + 1e-9))
+    order = (values[..., :3] @ _LUMINANCE).argsort(1)
+    sums = np.take_along_axis(weights, order, 1).cumsum(1)
+    middle = (sums >= 0.5 * sums[:, -1:]).argmax(1)
+    rows = np.arange(len(values))
+    return np.asarray(values[rows, order[rows, middle]])
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Sum over p of first(p) second(p + s) for every shift s ``[2 H, 2 W]``; s = 0 is at (H, W)."""
+    size = (2 * first.shape[0], 2 * first.shape[1])
+    product = np.fft.rfft2(first, size).conj() * np.fft.rfft2(second, size)
+    return np.fft.fftshift(np.fft.irfft2(product, size))
+
+
+def _moved(picture: NDArray, shift: tuple[int, int]) -> NDArray:
+    """The picture at p + s for each pixel p; 0 outside."""
+    (height, width), (down, right) = picture.shape[:2], shift
+    moved = np.zeros_like(picture)
+    if abs(down) < height and abs(right) < width:
+        rows, columns = (
+            slice(max(0, -down), height - max(0, down)),
+            slice(max(0, -right), width - max(0, right)),
+        )
+        moved[rows, columns] = picture[
+            max(0, down) : height + min(0, down), max(0, right) : width + min(0, right)
+        ]
+    return moved
+
+
+def _mean_around(values: FloatArray, weights: FloatArray, width: float) -> FloatArray:
+    """Gaussian mean ``[H, W]`` of weighted pixels; far from all it is the mean of all."""
+    total = gaussian_filter(weights, width, mode="constant", truncate=6)
+    summed = gaussian_filter(values * weights, width, mode="constant", truncate=6)
+    everywhere = (values * weights).sum() / max(weights.sum(), 1e-12)
+    return np.asarray((summed + 1e-6 * everywhere) / (total + 1e-6))

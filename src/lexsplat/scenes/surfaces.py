@@ -1,0 +1,258 @@
+"""The surface that a thing stands on, as the photos show it: a plane, and a picture of it from above.
+
+1. A plane is fitted to the Gaussians around the thing's foot.
+2. The Gaussians near it are drawn from far above, in the mean color that the cameras see.
+3. Each pixel of this picture is looked up in the views: how many see the surface there, and how many the thing before
+   it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import Delaunay, QhullError
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering import render
+from lexsplat.runtime.sampling import evenly
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_FOOT = 0.15
+"""The foot of a thing: its lowest share by height."""
+_RING = 1.0
+"""Width of the ring around the foot whose Gaussians make the plane, in radii of the foot."""
+_LEVEL = 0.1
+"""Gaussians of the ring within this distance of the plane belong to it, in radii of the foot."""
+_THICK = 0.3
+"""The same for the Gaussians that are seen from above."""
+_STEEPEST = 0.8
+"""Least cosine of the plane's normal with up."""
+FEWEST = 30
+"""Fewest Gaussians that make a plane, and fewest pixels that make a fill."""
+_PIXELS = (64, 112, 224)
+"""Width of the picture from above: at least, without views, and at most."""
+_REACH = 3.0
+"""Half of its width, in radii of the foot."""
+_VIEWS, _LONG_SIDE = 16, 240
+"""Number and longer side of the views that are looked at."""
+_BEFORE = 0.2
+"""Share of a pixel of a view from which the thing is before what lies there."""
+
+
+class Surface(NamedTuple):
+    """The plane that a thing stands on.
+
+    Args:
+        origin: A point of it ``[3]``.
+        axes: Two unit vectors in it, and its normal, which points up ``[3, 3]`` in rows.
+        foot: Center of the thing's foot in the two vectors ``[2]``.
+        radius: Radius of the foot, world units.
+    """
+
+    origin: FloatArray
+    axes: FloatArray
+    foot: FloatArray
+    radius: float
+
+
+def surface_below(own: FloatArray, others: FloatArray, up: FloatArray) -> Surface | None:
+    """The plane around the foot of a thing; None if there is none.
+
+    Args:
+        own: Means of the Gaussians of the thing ``[M, 3]``.
+        others: Those of the Gaussians around it ``[R, 3]``.
+        up: Unit vector ``[3]``.
+    """
+    if len(own) < 4:
+        return None
+    right, ahead = _across(up)
+    heights = own @ up
+    low, high = np.quantile(heights, [0.02, 0.98])
+    foot = own[heights <= low + _FOOT * (high - low)]
+    flat = foot @ np.stack([right, ahead]).T
+    center = np.median(flat, 0)
+    radius = max(float(np.quantile(np.linalg.norm(flat - center, axis=1), 0.9)), 1e-9)
+    apart = np.linalg.norm(others @ np.stack([right, ahead]).T - center, axis=1)
+    near = np.abs(others @ up - low) <= 0.5 * radius
+    ring = others[near & (apart <= (1 + _RING) * radius)]
+    plane = _fitted_plane(ring, up, _LEVEL * radius) if len(ring) >= FEWEST else None
+    if plane is None:
+        return None
+    origin, normal = plane
+    axes = np.stack([*_across(normal), normal])
+    middle = np.median((foot - origin) @ axes[:2].T, 0)
+    return Surface(origin, axes, middle, radius)
+
+
+def _fitted_plane(points: FloatArray, up: FloatArray, level: float) -> tuple[FloatArray, FloatArray] | None:
+    """The plane through most points near a level, as origin and normal; None if too few lie in it."""
+    heights = points @ up
+    counts = [(np.abs(heights - height) <= level).sum() for height in heights]
+    fits = np.abs(heights - heights[int(np.argmax(counts))]) <= level
+    origin, normal = points.mean(0), up
+    for _ in range(5):
+        if fits.sum() < FEWEST:
+            return None
+        origin = points[fits].mean(0)
+        normal = np.linalg.svd(points[fits] - origin, full_matrices=False)[2][2]
+        normal = normal if normal @ up > 0 else -normal
+        fits = np.abs((points - origin) @ normal) <= level
+    return (origin, normal) if normal @ up >= _STEEPEST else None
+
+
+def _across(up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors that are square to ``up`` and to each other."""
+    right = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
+    right /= np.linalg.norm(right)
+    return right, np.cross(up, right)
+
+
+class Orthophoto(NamedTuple):
+    """A surface from far above; rows and columns run along its axes.
+
+    Args:
+        cells: Places of the pixels in the two vectors of the plane ``[P, P, 2]``.
+        size: Width of a pixel, world units.
+        colors: RGB ``[P, P, 3]``, divided by the coverage.
+        coverage: Share of each pixel that Gaussians cover ``[P, P]``.
+        heights: Mean height above the plane ``[P, P]``, world units.
+        shown: Share of the views that see the surface there ``[P, P]``.
+        covered: Share of the views that have the thing before it ``[P, P]``.
+    """
+
+    cells: FloatArray
+    size: float
+    colors: FloatArray
+    coverage: FloatArray
+    heights: FloatArray
+    shown: FloatArray
+    covered: FloatArray
+
+
+def photographed(
+    gaussians: Gaussians, gone: Mask, surface: Surface, members: Mask, cameras: Sequence[Camera]
+) -> Orthophoto:
+    """A picture of the surface under a thing from above, and what the views see of it.
+
+    Args:
+        gaussians: The scene with the thing.
+        gone: The Gaussians of the thing and of others that go with it ``[N]``.
+        surface: The plane.
+        members: The Gaussians that are drawn ``[N]``.
+        cameras: The views that the scene was made from; without any, the surface is shown everywhere.
+    """
+    cells, size = _cells(surface, cameras)
+    colors, coverage, heights = from_above(gaussians, surface, members, cells)
+    places = (surface.origin + cells @ surface.axes[:2]).reshape(-1, 3)
+    shown, covered, seen = looked_up(gaussians, gone, places, cameras, _THICK * surface.radius)
+    shape = cells.shape[:2]
+    shown, covered, seen = shown.reshape(shape), covered.reshape(shape), seen.reshape(colors.shape)
+    if not cameras:
+        return Orthophoto(cells, size, colors, coverage, heights, np.ones_like(shown), covered)
+    known = (coverage > 0.5) & (shown > 0)
+    width = surface.radius / size / 2
+    gain = _mean_of(seen, known, width) / np.maximum(_mean_of(colors, known, width), 0.02)
+    return Orthophoto(cells, size, colors * gain.clip(0.5, 2), coverage, heights, shown, covered)
+
+
+def looked_up(
+    gaussians: Gaussians, gone: Mask, places: FloatArray, cameras: Sequence[Camera], slack: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What some of the views see at places ``[M, 3]``.
+
+    Args:
+        gaussians: The scene.
+        gone: The Gaussians of a thing ``[N]``.
+        places: Points of the world.
+        cameras: The views.
+        slack: How far before a place a surface may lie that is taken for it, world units.
+
+    Returns:
+        The share of the views that see each place ``[M]``, the share that have the thing there or before it ``[M]``,
+        and the mean color of the former ``[M, 3]``, 0 without any.
+    """
+    counts, shown, covered = (np.zeros(len(places)) for _ in range(3))
+    colors = np.zeros((len(places), 3))
+    thing = torch.from_numpy(gone)[:, None].to(gaussians.means)
+    for camera in evenly(cameras, _VIEWS):
+        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
+        with torch.no_grad():
+            view = render(gaussians, small, features=thing, depth=True)
+        nearest = cast(torch.Tensor, view.depth).cpu().numpy()
+        x, y, depth = ((places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T).T
+        front = np.maximum(depth, 1e-9)
+        x, y = np.floor(x / front), np.floor(y / front)
+        here = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < small.width) & (y < small.height))
+        pixels = y[here].astype(int), x[here].astype(int)
+        there = nearest[pixels] > depth[here] - slack
+        before = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
+        counts[here] += 1
+        covered[here] += before
+        shown[here] += there & ~before
+        colors[here] += (there & ~before)[:, None] * view.image.cpu().double().numpy()[pixels]
+    colors /= np.maximum(shown, 1)[:, None]
+    return shown / np.maximum(counts, 1), covered / np.maximum(counts, 1), colors
+
+
+def from_above(
+    gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Colors ``[P, P, 3]``, coverage and heights over the plane ``[P, P]`` of some Gaussians from far above."""
+    count, reach = len(cells), _REACH * surface.radius
+    away = 100 * surface.radius
+    rotation = surface.axes * np.array([[1.0], [-1.0], [-1.0]])
+    eye = surface.origin + surface.foot @ surface.axes[:2] + away * surface.axes[2]
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    focal = count / 2 * away / reach
+    K = np.array([[focal, 0, count / 2], [0, focal, count / 2], [0, 0, 1]])
+    drawn = gaussians.select(torch.from_numpy(members).to(gaussians.device))
+    drawn = replace(drawn, shN=torch.zeros_like(drawn.shN))
+    local = (drawn.means.detach().cpu().double().numpy() - surface.origin) @ surface.axes[2]
+    with torch.no_grad():
+        height = torch.from_numpy(local)[:, None].to(drawn.means)
+        found = render(drawn, Camera(count, count, K, viewmat), features=height)
+    image, alpha, heights = (
+        one.cpu().double().numpy() for one in (found.image, found.alpha, found.features[..., 0])
+    )
+    alpha = alpha.reshape(count, count)
+    safe = np.maximum(alpha, 1e-6)
+    return image / safe[..., None], alpha, heights / safe
+
+
+def below(points: FloatArray, cells: FloatArray) -> Mask:
+    """Which cells ``[P, P, 2]`` lie in the convex hull of points ``[M, 2]``."""
+    try:
+        return np.asarray(Delaunay(points).find_simplex(cells) >= 0)
+    except (QhullError, ValueError):
+        return np.zeros(cells.shape[:2], bool)
+
+
+def _cells(surface: Surface, cameras: Sequence[Camera]) -> tuple[FloatArray, float]:
+    """The pixels of a picture from above, about as fine as the views, and their width."""
+    reach = _REACH * surface.radius
+    least, count, most = _PIXELS
+    place = surface.origin + surface.foot @ surface.axes[:2]
+    depths = [(camera.viewmat[2, :3] @ place + camera.viewmat[2, 3], camera.K[0, 0]) for camera in cameras]
+    sizes = [depth / focal for depth, focal in depths if depth > 0]
+    if sizes:
+        count = int(np.clip(2 * reach / np.median(sizes), least, most))
+    side = (np.arange(count) + 0.5) / count * 2 - 1
+    return surface.foot + reach * np.stack(np.meshgrid(side, -side), -1), 2 * reach / count
+
+
+def _mean_of(colors: FloatArray, known: Mask, width: float) -> FloatArray:
+    """Gaussian mean of the known pixels of a picture ``[H, W, 3]``, that of all far from them."""
+    weights = gaussian_filter(known.astype(float), width, mode="constant") + 1e-6
+    means = colors[known].mean(0) if known.any() else np.ones(3)
+    summed = gaussian_filter(colors * known[..., None], (width, width, 0), mode="constant")
+    return np.asarray((summed + 1e-6 * means) / weights[..., None])

@@ -1,0 +1,91 @@
+"""Patterns that go on in a hole: pictures from formulas, without any reconstruction."""
+
+import numpy as np
+import pytest
+
+from lexsplat.scenes.completing import completed, painted, self_similar_shifts
+
+SIZE, SQUARE, TURN = 112, 9.3, 0.4
+WHITE, BLUE, WOOD = np.array([0.8, 0.78, 0.75]), np.array([0.15, 0.35, 0.75]), np.array([0.6, 0.4, 0.25])
+
+
+def checkers(edge=np.inf):
+    """A turned checker pattern ``[H, W, 3]``; wood beyond an edge."""
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
+    u, v = np.cos(TURN) * x + np.sin(TURN) * y, np.cos(TURN) * y - np.sin(TURN) * x
+    even = (np.floor(u / SQUARE) + np.floor(v / SQUARE)) % 2 == 0
+    return np.where((u > edge)[..., None], WOOD, np.where(even[..., None], WHITE, BLUE))
+
+
+def disk(radius=20):
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2 + 3
+    return np.hypot(x, y) < radius, np.hypot(x, y)
+
+
+def psnr(found, truth):
+    return -10 * np.log10(((found - truth) ** 2).mean())
+
+
+def trust_outside(hole):
+    return (~hole).astype(float)
+
+
+@pytest.mark.parametrize("edge", [np.inf, 4.0])
+def test_checkers_go_on_in_a_hole_and_end_where_they_ended_around_it(edge):
+    truth, (hole, _) = checkers(edge), disk()
+    picture = np.where(hole[..., None], [1.0, 0, 0], truth)
+    found = completed(picture, hole, trust_outside(hole))
+    assert psnr(found, truth[hole]) > (20 if edge == np.inf else 16)
+    assert psnr(painted(picture, hole, trust_outside(hole)), truth[hole]) < 15, (
+        "the colors around are no pattern"
+    )
+
+
+def test_a_shadow_and_remains_around_the_hole_do_not_spoil_the_pattern():
+    truth, (hole, away) = checkers(), disk()
+    random = np.random.default_rng(0)
+    shaded = truth * (1 - 0.5 * np.exp(-np.maximum(away - 20, 0) / 8))[..., None]
+    picture = (shaded + random.normal(0, 0.05, truth.shape)).clip(0, 1)
+    remains = (away < 23) & (random.random(away.shape) < 0.5)
+    picture[remains] = [0.9, 0.1, 0.1]
+    found = completed(picture, hole, (away >= 23).astype(float))
+    assert psnr(found, truth[hole]) > 18
+    assert found.mean() > 0.9 * truth[hole].mean(), "as bright as without the shadow"
+
+
+def test_a_surface_without_a_pattern_takes_the_colors_around():
+    truth = np.linspace(0.3, 0.7, SIZE)[None, :, None] * np.ones((SIZE, 1, 3))
+    hole, _ = disk()
+    noisy = (truth + np.random.default_rng(1).normal(0, 0.05, truth.shape)).clip(0, 1)
+    assert psnr(completed(noisy, hole, trust_outside(hole)), truth[hole]) > 24
+    plain = np.full((SIZE, SIZE, 3), 0.4)
+    np.testing.assert_allclose(completed(plain, hole, trust_outside(hole)), 0.4, atol=1e-6)
+
+
+def test_the_best_shifts_are_the_periods_of_the_pattern():
+    picture = checkers()
+    weights = np.ones((SIZE, SIZE))
+    for down, right in self_similar_shifts(picture, weights, weights)[:6]:
+        u = (np.cos(TURN) * right + np.sin(TURN) * down) / SQUARE
+        v = (np.cos(TURN) * down - np.sin(TURN) * right) / SQUARE
+        assert abs(u - round(u)) < 0.1, (u, v)
+        assert abs(v - round(v)) < 0.1, (u, v)
+        assert (round(u) + round(v)) % 2 == 0, "white onto white"
+
+
+def test_what_is_not_trusted_is_not_copied():
+    truth, (hole, _) = checkers(), disk()
+    picture, trust = truth.copy(), trust_outside(hole)
+    picture[:, : SIZE // 4] = [0, 1, 0]
+    trust[:, : SIZE // 4] = 0
+    found = completed(picture, hole, trust)
+    assert np.abs(found - [0, 1, 0]).sum(1).min() > 0.5
+
+
+def test_a_hole_takes_the_colors_around_by_inverse_squared_distance():
+    picture = np.zeros((1, 5, 3))
+    picture[0, 0], picture[0, 4] = 0.2, 0.8
+    hole = np.array([[False, True, True, True, False]])
+    found = painted(picture, hole, trust_outside(hole))[:, 0]
+    expected = [(0.2 + 0.8 / 9) / (1 + 1 / 9), 0.5, (0.2 / 9 + 0.8) / (1 / 9 + 1)]
+    np.testing.assert_allclose(found, expected)
