@@ -3,7 +3,7 @@
 The renderings are made by tools/demo_scene (Blender):
 
     python tools/demo_scene/make.py --scenes second --without mug --work RENDERS
-    python benchmarks/deleting.py --scene output/second --capture src/lexsplat/demo/scenes/second \\
+    python benchmarks/deleting.py --scene output/second --capture src/lexsplat/demo/captures/second \\
         --renders RENDERS/second --things "mug=red mug" --pictures FOLDER
 
 A thing is KIND=PROMPT: RENDERS-without-KIND has the renderings, PROMPT selects the thing and names its exact masks in
