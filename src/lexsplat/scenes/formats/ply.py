@@ -25,6 +25,8 @@ from lexsplat.scenes.formats.ply_elements import (
     data_left,
     header_lines,
     parse_elements,
+    tell_ignored,
+    uneven_line,
 )
 
 MIP = "comment SplatRenderMode: mip"
@@ -127,6 +129,7 @@ def parse_ply(path: Path) -> Gaussians:
                 )
             table, left = (_binary_rows if order else _text_rows)(file, elements, order, path)
             _check_left(left, vertices, order, path)
+            tell_ignored(elements[1:], vertices.count, path)
             return _gaussians_from_table(table, is_antialiased(lines), path)
     except OSError as error:
         raise FileFormatError(
@@ -183,12 +186,11 @@ def _text_rows(file: BinaryIO, elements: Sequence[Element], order: str, path: Pa
             numbers, found = np.fromstring(text, np.float64, sep=" "), ""
         except (ValueError, DeprecationWarning):
             numbers, found = np.zeros(0), "text that is no number"
-    # A number that ends with the file may lack digits.
-    if len(numbers) < wanted or (wanted and not text[-1:].isspace()):
+    if found or len(numbers) < wanted:
         raise FileFormatError(
             path,
-            expected=f"{wanted} numbers, each with a space or line break after it",
-            found=found or f"{len(numbers)} whole numbers",
+            expected=f"{wanted} numbers",
+            found=found or f"{len(numbers)}",
             remedy="the file is truncated or damaged: copy it again or export it again",
         )
     with np.errstate(over="ignore"):  # infinity is looked for later
@@ -197,7 +199,24 @@ def _text_rows(file: BinaryIO, elements: Sequence[Element], order: str, path: Pa
     for index, (name, _, _) in enumerate(vertices.columns):
         table[name] = rows[:, index]
     rest = numbers[wanted:]
-    return table, data_left(elements[1:], order, len(rest), lambda: rest)
+    left = data_left(elements[1:], order, len(rest), lambda: rest)
+    if 0 <= left < len(vertices.columns):  # otherwise, `_check_left` tells what is wrong
+        _check_lines(text, vertices, path)
+    return table, left
+
+
+def _check_lines(text: bytes, vertices: Element, path: Path) -> None:
+    """Refuse rows that do not have a line each, whose numbers would be read shifted."""
+    if uneven := uneven_line(text, vertices.count, len(vertices.columns)):
+        header = path.read_bytes()[: -len(text)].count(b"\n")
+        raise FileFormatError(
+            path,
+            expected=f"the {len(vertices.columns)} numbers of a Gaussian in each line",
+            found=f"{uneven[1]:,} numbers in line {header + uneven[0] + 1:,}",
+            remedy="the file is damaged: copy it again or export it again",
+        )
+    if vertices.count and not text[-1:].isspace():
+        warn("%s: no line end after the last number, which may lack digits", path)
 
 
 def _vertices(elements: Sequence[Element], path: Path) -> Element:
