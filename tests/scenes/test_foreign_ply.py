@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.hostile.splats import recounted_text
 from support.refusals import assert_tells
@@ -155,3 +156,60 @@ def test_a_text_without_a_last_line_end_is_read_with_a_warning(tmp_path, text, c
     refused(tmp_path / "g.ply", rows, "340 numbers", "found 339", "truncated")
     refused(tmp_path / "g.ply", rows + b" -", "no number")
     refused(tmp_path / "g.ply", rows + b" 1e", "no number")
+
+
+# Coordinates of a map
+
+
+def doubled(path: Path, gaussians, offset: tuple[float, float, float]) -> None:
+    """A PLY whose properties are doubles, moved by an offset."""
+    write_ply(gaussians, path)
+    head, rows = path.read_bytes().split(b"end_header\n", 1)
+    table = np.frombuffer(rows, "<f4").reshape(len(gaussians), -1).astype("<f8")
+    table[:, :3] += offset
+    path.write_bytes(head.replace(b"property float", b"property double") + b"end_header\n" + table.tobytes())
+
+
+def test_doubles_that_are_rounded_coarsely_are_told_with_the_error_and_a_remedy(tmp_path, caplog):
+    g = tame(40)
+    g.log_scales[:] = -3  # sizes of 0.05
+    doubled(tmp_path / "g.ply", g, (4e5, 5.6e6, 0))
+    exact = g.means.double().numpy() + np.array([4e5, 5.6e6, 0])
+    found = read_splats(tmp_path / "g.ply")
+    error = np.abs(found.means.double().numpy() - exact).max()
+    assert 0.1 < error <= 0.25
+    assert f"g.ply: centers are rounded by up to {error:.2g} units" in caplog.text
+    assert "Gaussians of size 0.05" in caplog.text
+    assert "subtract 400,000, 5,600,000, 0 from x, y, z before exporting" in caplog.text
+
+
+@pytest.mark.parametrize("offset", [(0, 0, 0), (100, 2000, 0)])
+def test_doubles_that_are_rounded_by_little_are_read_without_a_warning(tmp_path, caplog, offset):
+    g = tame(40)
+    doubled(tmp_path / "g.ply", g, offset)
+    assert np.allclose(read_splats(tmp_path / "g.ply").means, g.means.numpy() + offset, atol=1e-3)
+    assert caplog.text == ""
+
+
+def test_digits_of_a_text_that_are_rounded_coarsely_are_told(tmp_path, text, caplog):
+    head, rows = text.split(b"end_header\n")
+    rows = b"".join(
+        b"5600000.%02d %b\n" % (5 * n, row.split(b" ", 1)[1]) for n, row in enumerate(rows.splitlines())
+    )
+    (tmp_path / "g.ply").write_bytes(head + b"end_header\n" + rows)
+    read_splats(tmp_path / "g.ply")
+    assert "centers are rounded by up to 0.25 units" in caplog.text
+    assert "subtract 5,600,000, 0, 0 from" in caplog.text
+
+
+def test_nan_and_infinity_among_doubles_do_not_hide_how_others_are_rounded(tmp_path, caplog):
+    g = tame(40)
+    g.log_scales[:] = -3
+    doubled(tmp_path / "g.ply", g, (4e5, 5.6e6, 0))
+    content = bytearray((tmp_path / "g.ply").read_bytes())
+    start = content.index(b"end_header\n") + len(b"end_header\n")
+    content[start : start + 16] = np.array([np.nan, 1e300]).tobytes()
+    content[-8 * 11 : -8 * 4] = np.full(7, np.nan).tobytes()  # opacity and sizes and colors, of the last
+    (tmp_path / "g.ply").write_bytes(content)
+    assert len(read_splats(tmp_path / "g.ply")) == 38
+    assert "centers are rounded by up to 0.2" in caplog.text

@@ -17,7 +17,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import warn
+from lexsplat.scenes.formats.foreign import as_tensor, rounded_centers, warn
 from lexsplat.scenes.formats.ply_elements import (
     SPLATS,
     Element,
@@ -193,11 +193,13 @@ def _text_rows(file: BinaryIO, elements: Sequence[Element], order: str, path: Pa
             found=found or f"{len(numbers)}",
             remedy="the file is truncated or damaged: copy it again or export it again",
         )
+    rows = numbers[:wanted].reshape(vertices.count, len(vertices.columns))
+    table = np.zeros(
+        vertices.count, [(name, "<f8" if name in "xyz" else "<f4") for name, _, _ in vertices.columns]
+    )
     with np.errstate(over="ignore"):  # infinity is looked for later
-        rows = numbers[:wanted].astype(np.float32).reshape(vertices.count, len(vertices.columns))
-    table = np.zeros(vertices.count, [(name, "<f4") for name, _, _ in vertices.columns])
-    for index, (name, _, _) in enumerate(vertices.columns):
-        table[name] = rows[:, index]
+        for index, (name, _, _) in enumerate(vertices.columns):
+            table[name] = rows[:, index]
     rest = numbers[wanted:]
     left = data_left(elements[1:], order, len(rest), lambda: rest)
     if 0 <= left < len(vertices.columns):  # otherwise, `_check_left` tells what is wrong
@@ -236,7 +238,8 @@ def _vertices(elements: Sequence[Element], path: Path) -> Element:
 
 def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> Gaussians:
     def columns(*names: str) -> torch.Tensor:
-        stacked = [table[name].astype(np.float32) for name in names]
+        with np.errstate(over="ignore"):  # infinity is looked for later
+            stacked = [table[name].astype(np.float32) for name in names]
         return torch.from_numpy(
             np.stack(stacked, axis=1) if len(table) else np.zeros((0, len(names)), np.float32)
         )
@@ -249,10 +252,12 @@ def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> G
             path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found, remedy="export the file again"
         )
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
+    log_scales = columns("scale_0", "scale_1", "scale_2")
+    places = np.stack([table[name] for name in "xyz"], axis=1)
     return Gaussians(
-        means=columns("x", "y", "z"),
+        means=as_tensor(places) if places.dtype == "f4" else rounded_centers(places, log_scales, path),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        log_scales=columns("scale_0", "scale_1", "scale_2"),
+        log_scales=log_scales,
         opacity_logits=columns("opacity")[:, 0],
         sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
         shN=rest.reshape(len(table), 3, num_rest // 3).transpose(1, 2).contiguous(),
