@@ -210,8 +210,10 @@ def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
 
 
 def as_tensor(values: NDArray) -> Tensor:
-    """A float32 tensor of its own memory."""
-    return torch.from_numpy(np.array(values, dtype=np.float32))
+    """A float32 tensor of its own memory; what is too large for it is infinity, which is looked for later."""
+    with np.errstate(over="ignore"):
+        array = np.array(values, dtype=np.float32)
+    return torch.from_numpy(array)
 
 
 def read_content(path: Path, kind: str) -> bytes:
@@ -236,8 +238,7 @@ def rounded_centers(places: NDArray[np.float64], log_scales: Tensor, path: Path)
 
     Coordinates of a map have a step of half a unit at 5,600,000: the Gaussians of a thing come to lie in layers.
     """
-    with np.errstate(over="ignore"):  # infinity is looked for later
-        means = as_tensor(places)
+    means = as_tensor(places)
     finite = torch.isfinite(means).all(1)
     size = float(log_scales[finite].nanmedian(1).values.nanmedian().exp()) if finite.any() else math.inf
     error = float(np.abs(means[finite].double().numpy() - places[finite.numpy()]).max(initial=0))
