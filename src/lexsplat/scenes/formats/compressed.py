@@ -157,8 +157,10 @@ def _sectioned_count(content: bytes, path: Path) -> int:
             held += here
             if here != most:
                 raise Damage(f"a section of {here:,} Gaussians with data of {most:,}")
-        if held != count or not 0 <= len(content) - place < _KSPLAT_BYTES[level][0]:
+        if not 0 <= len(content) - place < _KSPLAT_BYTES[level][0]:
             raise Damage(f"{held:,} Gaussians in sections, and {len(content):,} bytes instead of {place:,}")
+        if held != count:
+            raise Damage(f"a count of {count:,}, and {held:,} Gaussians in sections")
     except (struct.error, Damage) as error:
         raise FileFormatError(path, expected="a ksplat file", found=reason(error), remedy=AGAIN) from error
     if place < len(content):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import warn
+from lexsplat.scenes.formats.foreign import AGAIN, warn
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -73,14 +73,34 @@ def header_lines(file: BinaryIO, path: Path) -> list[str]:
         FileFormatError: If the file does not begin with one.
     """
     lines: list[str] = []
-    consumed = 0
+    left = _MAX_HEADER_BYTES
     while not lines or lines[-1] != "end_header":
-        raw = file.readline(1024)
-        consumed += len(raw)
-        if not raw.endswith(b"\n") or consumed > _MAX_HEADER_BYTES or (not lines and raw.strip() != b"ply"):
-            raise FileFormatError(path, expected="a PLY header", found=repr(raw[:20])[1:], remedy=SPLATS)
+        raw = file.readline(left + 1)
+        left -= len(raw)
+        if not lines and raw.strip() != b"ply":
+            raise _no_ply(raw, path)
+        if left < 0:
+            expected, found = f"a header of up to {_MAX_HEADER_BYTES:,} bytes", "more bytes before end_header"
+            raise FileFormatError(path, expected=expected, found=found, remedy="shorten its comments")
+        if not raw.endswith(b"\n"):
+            found = "a file that ends in its header"
+            raise FileFormatError(path, expected="a PLY header up to end_header", found=found, remedy=AGAIN)
         lines.append(raw.decode("ascii", "replace").strip())
     return lines
+
+
+def _no_ply(first: bytes, path: Path) -> FileFormatError:
+    """What is wrong with a file whose first line is not that of a PLY."""
+    if not first:
+        return FileFormatError(path, expected="a PLY header", found="an empty file", remedy=AGAIN)
+    if first.startswith(b"ply\r"):
+        return FileFormatError(
+            path,
+            expected="a PLY header with line feeds",
+            found="carriage returns alone",
+            remedy="export the file again",
+        )
+    return FileFormatError(path, expected="a PLY header", found=repr(first[:20])[1:], remedy=SPLATS)
 
 
 def byte_order(lines: Sequence[str], path: Path) -> str:

@@ -48,6 +48,7 @@ _MAGIC = b"NGSP"
 _ANTIALIASED, _EXTENSIONS = 1, 2
 _COLOR_SCALE = 0.15
 _MOST_FRACTIONAL_BITS = 30
+_MOST_DEGREE = 4
 _MOST_EXTENSIONS = 1 << 20
 _FIXED_LIMIT = (1 << 23) - 1
 _COARSE = 0.25
@@ -74,15 +75,7 @@ def read_spz(path: Path) -> Gaussians:
         if len(head) < _HEADER.size:
             raise Damage(f"a header of {len(head)} bytes")
         magic, version, count, degree, bits, flags, _ = _HEADER.unpack_from(head)
-        known = (2, 3) if content[:2] == b"\x1f\x8b" else (4,)
-        if magic != _MAGIC or version not in known or degree > 4 or bits > _MOST_FRACTIONAL_BITS:
-            found = f"version {version}" if magic == _MAGIC else "another file"
-            raise FileFormatError(
-                path,
-                expected="SPZ of version 2 or 3 in gzip, or 4",
-                found=found,
-                remedy="export it as SPZ of one of these versions, or as .ply",
-            )
+        _check_supported(magic, version, content[:2] == b"\x1f\x8b", degree, bits, path)
         check_count(path, count, len(content))
         layout = _layout(version, degree)
         sizes = {name: size * count for name, size in layout.items()}
@@ -99,6 +92,30 @@ def read_spz(path: Path) -> Gaussians:
     }
     gaussians = _unpacked(arrays, version, bits, bool(flags & _ANTIALIASED))
     return transformed(gaussians, rotation=HALF_TURN)
+
+
+def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits: int, path: Path) -> None:
+    """Refuse files of another program or version, and what no version has.
+
+    Raises:
+        FileFormatError: If it is one.
+    """
+    remedy = "export it as SPZ of one of these versions, or as .ply"
+    if magic != _MAGIC or version not in ((2, 3) if packed else (4,)):
+        expected, found = "SPZ of version 2 or 3 in gzip, or 4", f"version {version}"
+        if magic != _MAGIC:
+            found = "another file"
+        elif version in (2, 3, 4):
+            found += " in gzip" if packed else " without gzip"
+    elif degree > _MOST_DEGREE:
+        expected, found = f"spherical harmonics of degree 0 to {_MOST_DEGREE}", f"degree {degree}"
+        remedy = AGAIN
+    elif bits > _MOST_FRACTIONAL_BITS:
+        expected, found = f"centers with 0 to {_MOST_FRACTIONAL_BITS} bits behind the point", f"{bits}"
+        remedy = AGAIN
+    else:
+        return
+    raise FileFormatError(path, expected=expected, found=found, remedy=remedy)
 
 
 def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> dict[str, bytes]:
@@ -140,7 +157,9 @@ def _inflated_4(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
     """
     *_, number, contents = _HEADER_4.unpack_from(content)
     start, count = contents + 16 * number, sizes["alphas"]
-    if number != len(sizes) or contents < _HEADER_4.size:
+    if contents < _HEADER_4.size:
+        raise Damage(f"a table of contents at byte {contents}, within the header")
+    if number != len(sizes):
         raise Damage(f"{number} streams instead of {len(sizes)}")
     streams = {}
     for index, (name, size) in enumerate(sizes.items()):
