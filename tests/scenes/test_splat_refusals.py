@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 
 import pytest
+import torch
 from support.refusals import assert_tells
 from support.splats import tame
 
@@ -57,6 +58,50 @@ def test_spz_4_tells_where_its_table_cannot_begin(tmp_path):
         told = refused(tmp_path / "g.spz", changed, f"a table of contents at byte {start}, within the header")
         assert "streams" not in told
     refused(tmp_path / "g.spz", content[:15] + bytes([5]) + content[16:], "5 streams instead of 6")
+
+
+def with_axes(path: Path, version: int, number: int) -> bytes:
+    """An SPZ whose extension names its axes."""
+    write_spz(tame(20, 1), path, version=version)
+    record = struct.pack("<III", 0xADBE0003, 4, number)
+    if version == 4:
+        raw = path.read_bytes()
+        start = struct.pack("<I", 32 + len(record))
+        return raw[:14] + bytes([raw[14] | 2]) + raw[15:16] + start + raw[20:32] + record + raw[32:]
+    raw = gzip.decompress(path.read_bytes())
+    return gzip.compress(raw[:14] + bytes([raw[14] | 2]) + raw[15:] + record)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize(
+    ("number", "places"),
+    [
+        (0, (1, -2, -3)),
+        (4, (1, -2, -3)),
+        (6, (1, 2, 3)),
+        (7, (-1, -2, 3)),
+        (1, (-1, 2, -3)),
+        (16, (1, -3, 2)),
+    ],
+)
+def test_spz_is_read_in_the_axes_that_its_extension_names(tmp_path, caplog, version, number, places):
+    """0 is unknown, 4 RUB, 6 RDF, 7 LUF, 1 LDB, 16 RFU; places are the file's x, y, z (1 to 3) along a PLY's."""
+    content = with_axes(tmp_path / "g.spz", version, number)
+    plain = read_splats(tmp_path / "g.spz").means * torch.tensor([1.0, -1, -1])  # as they are in the file
+    (tmp_path / "g.spz").write_bytes(content)
+    expected = torch.stack([plain[:, abs(place) - 1] * (1 if place > 0 else -1) for place in places], 1)
+    assert torch.allclose(read_splats(tmp_path / "g.spz").means, expected)
+    assert caplog.text == ""
+
+
+def test_spz_with_axes_that_mirror_or_are_unknown_is_refused(tmp_path):
+    refused(
+        tmp_path / "g.spz",
+        with_axes(tmp_path / "g.spz", 4, 8),
+        "right-handed axes",
+        "found RUF, which are left",
+    )
+    refused(tmp_path / "g.spz", with_axes(tmp_path / "g.spz", 4, 17), "found axes number 17")
 
 
 @pytest.mark.parametrize("count", [0, 19, 21])

@@ -42,6 +42,16 @@ logger = logging.getLogger(__name__)
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 """Rotation between the axes of SPZ and those of a PLY."""
 
+_AXES_EXTENSION = 0xADBE0003
+"""Adobe's extension that names the axes: a number, 0 for those of SPZ, else 1 plus an index of `_AXES`."""
+_AXES = (
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU",
+)  # fmt: skip
+_DIRECTIONS = {"R": (1.0, 0, 0), "L": (-1.0, 0, 0), "D": (0, 1.0, 0), "U": (0, -1.0, 0)}
+_DIRECTIONS |= {"F": (0, 0, 1.0), "B": (0, 0, -1.0)}
+"""Right, left, down, up, forward and backward in the axes of a PLY."""
+
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, streams
 _HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # the same, and where the table of contents begins
 _MAGIC = b"NGSP"
@@ -81,17 +91,44 @@ def read_spz(path: Path) -> Gaussians:
         sizes = {name: size * count for name, size in layout.items()}
         if version == 4:
             streams = _inflated_4(content, sizes)
+            extensions = content[_HEADER_4.size : _HEADER_4.unpack_from(content)[-1]]
         else:
-            streams = _inflated(content, sizes, bool(flags & _EXTENSIONS))
+            streams, extensions = _inflated(content, sizes, bool(flags & _EXTENSIONS))
     except (zlib.error, zstandard.ZstdError, struct.error, Damage) as error:
         raise FileFormatError(path, expected="an SPZ file", found=reason(error), remedy=AGAIN) from error
-    if flags & _EXTENSIONS:
-        warn("%s: its extensions are ignored; they may name other axes", path)
+    rotation = _rotation(extensions, path) if flags & _EXTENSIONS else HALF_TURN
     arrays = {
         name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
     }
     gaussians = _unpacked(arrays, version, bits, bool(flags & _ANTIALIASED))
-    return transformed(gaussians, rotation=HALF_TURN)
+    return transformed(gaussians, rotation=rotation)
+
+
+def _rotation(extensions: bytes, path: Path) -> NDArray[np.float64]:
+    """Rotation from the axes of the file, which an extension may name, to those of a PLY ``[3, 3]``.
+
+    Raises:
+        FileFormatError: If the axes are unknown, or left-handed: the splats would have to be mirrored.
+    """
+    rotation, place = HALF_TURN, 0
+    while place + 8 <= len(extensions):
+        kind, length = struct.unpack_from("<II", extensions, place)
+        value = extensions[place + 8 : place + 8 + length]
+        place += 8 + length
+        if kind != _AXES_EXTENSION:
+            warn("%s: its extensions are ignored, except for axes", path)
+            continue
+        number = int.from_bytes(value, "little")
+        axes = _AXES[number - 1] if 0 < number <= len(_AXES) else "RUB"
+        rotation = np.array([_DIRECTIONS[letter] for letter in axes]).T
+        if number > len(_AXES) or np.linalg.det(rotation) < 0:
+            raise FileFormatError(
+                path,
+                expected="right-handed axes, such as RUB",
+                found=f"axes number {number}" if number > len(_AXES) else f"{axes}, which are left-handed",
+                remedy="export it with other axes, or as .ply",
+            )
+    return rotation
 
 
 def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits: int, path: Path) -> None:
@@ -118,8 +155,8 @@ def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits
     raise FileFormatError(path, expected=expected, found=found, remedy=remedy)
 
 
-def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> dict[str, bytes]:
-    """The streams of versions 2 and 3; only extensions, if the header has their flag, may follow them.
+def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> tuple[dict[str, bytes], bytes]:
+    """The streams of versions 2 and 3, and what follows them: only extensions, if the header has their flag.
 
     Raises:
         Damage: If the file is cut, or has more data than its count allows: the streams would be read at wrong places.
@@ -138,7 +175,7 @@ def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> dict[str
     for name, size in sizes.items():
         streams[name] = data[start : start + size]
         start += size
-    return streams
+    return streams, rest
 
 
 def _are_extensions(data: bytes) -> bool:
