@@ -222,7 +222,7 @@ def _filled(pictures: Sequence[NDArray[np.uint8]]) -> int:
     """
     if not len(pictures[0]):
         return 0
-    same = np.concatenate([picture == picture[-1] for picture in pictures], axis=1).all(axis=1)
+    same = np.asarray(np.concatenate([picture == picture[-1] for picture in pictures], axis=1).all(1))
     length = int(np.append(same[::-1], False).argmin())
     gray = all((picture[-1, :3] == picture[-1, 0]).all() for picture in pictures[1:])
     return length if gray else length - 1

@@ -48,8 +48,14 @@ _AXES = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU",
 )  # fmt: skip
-_DIRECTIONS = {"R": (1.0, 0, 0), "L": (-1.0, 0, 0), "D": (0, 1.0, 0), "U": (0, -1.0, 0)}
-_DIRECTIONS |= {"F": (0, 0, 1.0), "B": (0, 0, -1.0)}
+_DIRECTIONS = {
+    "R": (1, 0, 0),
+    "L": (-1, 0, 0),
+    "D": (0, 1, 0),
+    "U": (0, -1, 0),
+    "F": (0, 0, 1),
+    "B": (0, 0, -1),
+}
 """Right, left, down, up, forward and backward in the axes of a PLY."""
 
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, streams
@@ -120,7 +126,7 @@ def _rotation(extensions: bytes, path: Path) -> NDArray[np.float64]:
             continue
         number = int.from_bytes(value, "little")
         axes = _AXES[number - 1] if 0 < number <= len(_AXES) else "RUB"
-        rotation = np.array([_DIRECTIONS[letter] for letter in axes]).T
+        rotation = np.array([_DIRECTIONS[letter] for letter in axes], np.float64).T
         if number > len(_AXES) or np.linalg.det(rotation) < 0:
             raise FileFormatError(
                 path,
