@@ -205,7 +205,7 @@ def test_what_fills_up_the_pictures_of_a_sog_are_no_gaussians(tmp_path, fill, pa
     path.write_bytes(sog(path, 20, **pictures))
     assert len(read_splats(path)) == 20
     for count in (10, 18, 19):
-        refused(path, sog(path, count, **pictures), f"the {count} Gaussians", "found 20 in its pictures")
+        refused(path, sog(path, count, **pictures), f"the {count} Gaussians", "found 20 in its images")
 
 
 @pytest.mark.parametrize("count", [5, 18, 19])
@@ -215,7 +215,7 @@ def test_unturned_gaussians_that_the_count_of_a_sog_leaves_out_are_found(tmp_pat
     g.quats[:] = torch.tensor([1.0, 0, 0, 0])
     write_sog(g, path)
     pictures = repainted(path, (4, 5), 0, ())
-    refused(path, sog(path, count, **pictures), f"the {count} Gaussians", "found 20 in its pictures")
+    refused(path, sog(path, count, **pictures), f"the {count} Gaussians", "found 20 in its images")
 
 
 def test_positions_of_a_sog_beyond_all_numbers_are_refused_without_a_warning_of_numpy(tmp_path, recwarn):
