@@ -178,8 +178,8 @@ def test_a_buffer_beside_the_gltf_is_read_and_one_outside_the_folder_is_not(tmp_
     ("change", "words"),
     [
         ({"extensionsRequired": ["KHR_gaussian_splatting_compression_spz_2"]}, "spz_2; export it uncompressed"),
-        ({"nodes": [{"mesh": 0, "scale": [1, 2, 1]}], "scenes": [{"nodes": [0]}]}, "mirrors or deforms"),
-        ({"nodes": [{"mesh": 0, "scale": [-1, 1, 1]}], "scenes": [{"nodes": [0]}]}, "mirrors or deforms"),
+        ({"nodes": [{"mesh": 0, "scale": [1, 2, 1]}], "scenes": [{"nodes": [0]}]}, "a node that deforms"),
+        ({"nodes": [{"mesh": 0, "scale": [-1, 1, 1]}], "scenes": [{"nodes": [0]}]}, "a node that mirrors"),
         ({"nodes": [{"mesh": 0, "children": [0]}], "scenes": [{"nodes": [0]}]}, "two parents"),
         ({"nodes": []}, "damaged content"),
         ({"scenes": [{"nodes": []}]}, "expected a primitive with KHR_gaussian_splatting, found none"),

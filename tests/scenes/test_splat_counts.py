@@ -126,7 +126,8 @@ def test_elements_after_the_gaussians_are_no_data_left_over(tmp_path, ply, caplo
     extended = content.replace(b"end_header", further + b"end_header")
     (tmp_path / "g.ply").write_bytes(extended + data)
     assert len(read_splats(tmp_path / "g.ply")) == 20
-    assert caplog.text == ""
+    assert "after the last" not in caplog.text
+    assert "'camera' of length 2, 'size' of length 1" in caplog.text
     changed = extended.replace(b"element vertex 20", b"element vertex 21")
     refused(tmp_path / "g.ply", changed + data * row, "21 Gaussians")
     refused(tmp_path / "g.ply", extended, "20 Gaussians", f"fewer {unit} in its other elements")
@@ -143,12 +144,16 @@ def test_text_that_is_no_number_in_a_ply_is_refused(tmp_path):
 # SOG
 
 
-def sog(path: Path, count: int, **changed: bytes) -> bytes:
-    """A SOG of 20 Gaussians whose count is another."""
-    write_sog(tame(20, 1), path)
+def sog(path: Path, count: int, farthest: float | None = None, **changed: bytes) -> bytes:
+    """A SOG of 20 Gaussians, or the one that is there, with another count, bound of positions or pictures."""
+    if not path.exists():
+        write_sog(tame(20, 1), path)
     with zipfile.ZipFile(path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
-    parts["meta.json"] = json.dumps(json.loads(parts["meta.json"]) | {"count": count}).encode()
+    meta = json.loads(parts["meta.json"]) | {"count": count}
+    if farthest is not None:
+        meta["means"]["maxs"] = [farthest] * 3
+    parts["meta.json"] = json.dumps(meta).encode()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, part in (parts | {f"{name}.webp": part for name, part in changed.items()}).items():
@@ -166,22 +171,58 @@ def test_sog_with_another_count_than_its_pictures_is_refused_with_both_numbers(t
     )
 
 
-@pytest.mark.parametrize("filled_with", ["zeros", "opaque black", "the last"])
-def test_what_fills_up_the_pictures_of_a_sog_are_no_gaussians(tmp_path, filled_with):
-    write_sog(tame(20, 1), tmp_path / "g.sog")
+FILLS = {"zeros": 0, "opaque black": (0, 0, 0, 255), "white": 255, "unturned": (128, 128, 128, 252)}
+
+
+def repainted(path: Path, shape: tuple[int, int], fill: object, parts: tuple[str, ...]) -> dict[str, bytes]:
+    """Pictures of 20 Gaussians in another shape and with another fill; without one, with copies of the last."""
     pictures = {}
-    with zipfile.ZipFile(tmp_path / "g.sog") as archive:
+    with zipfile.ZipFile(path) as archive:
         for name in ("means_l", "means_u", "quats", "scales", "sh0", "shN_labels"):
             picture = Image.open(io.BytesIO(archive.read(f"{name}.webp"))).convert("RGBA")
             first = np.asarray(picture).reshape(-1, 4)[:20]
-            pixels = np.zeros((64, 4), np.uint8)
+            pixels = np.zeros((shape[0] * shape[1], 4), np.uint8)
             pixels[:20] = first
-            pixels[20:] = {"zeros": 0, "opaque black": (0, 0, 0, 255), "the last": first[19]}[filled_with]
+            pixels[20:] = (first[19] if fill is None else fill) if name in parts else 0
             content = io.BytesIO()
-            Image.fromarray(pixels.reshape(8, 8, 4)).save(content, "WEBP", lossless=True, exact=True)
+            Image.fromarray(pixels.reshape(*shape, 4)).save(content, "WEBP", lossless=True, exact=True)
             pictures[name] = content.getvalue()
-    (tmp_path / "g.sog").write_bytes(sog(tmp_path / "g.sog", 20, **pictures))
-    assert len(read_splats(tmp_path / "g.sog")) == 20
+    return pictures
+
+
+ALL = ("means_l", "means_u", "quats", "scales", "sh0", "shN_labels")
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (3, 7)])
+@pytest.mark.parametrize("parts", [ALL, ("quats",)])
+@pytest.mark.parametrize("fill", [*FILLS, "the last"])
+def test_what_fills_up_the_pictures_of_a_sog_are_no_gaussians(tmp_path, fill, parts, shape):
+    if fill == "the last" and parts != ALL:
+        pytest.skip("a copy is one in every picture")
+    path = tmp_path / "g.sog"
+    write_sog(tame(20, 1), path)
+    pictures = repainted(path, shape, FILLS.get(fill), parts)
+    path.write_bytes(sog(path, 20, **pictures))
+    assert len(read_splats(path)) == 20
+    for count in (10, 18, 19):
+        refused(path, sog(path, count, **pictures), f"the {count} Gaussians", "found 20 in its images")
+
+
+@pytest.mark.parametrize("count", [5, 18, 19])
+def test_unturned_gaussians_that_the_count_of_a_sog_leaves_out_are_found(tmp_path, count):
+    path = tmp_path / "g.sog"
+    g = tame(20, 1)
+    g.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    write_sog(g, path)
+    pictures = repainted(path, (4, 5), 0, ())
+    refused(path, sog(path, count, **pictures), f"the {count} Gaussians", "found 20 in its images")
+
+
+def test_positions_of_a_sog_beyond_all_numbers_are_refused_without_a_warning_of_numpy(tmp_path, recwarn):
+    path = tmp_path / "g.sog"
+    for farthest in (90, 1e6):
+        refused(path, sog(path, 20, farthest), "of 20 Gaussians")
+    assert not [str(warning.message) for warning in recwarn]
 
 
 def test_gaussians_of_a_streamed_sog_that_no_region_has_are_counted(tmp_path, caplog):

@@ -26,7 +26,13 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
 from lexsplat.scenes.formats.foreign import AGAIN, Damage, read_content, reason, warn
 from lexsplat.scenes.formats.ply import MIP, is_antialiased, parse_ply, write_ply
-from lexsplat.scenes.formats.ply_elements import byte_order, data_left, header_lines, parse_elements
+from lexsplat.scenes.formats.ply_elements import (
+    byte_order,
+    data_left,
+    header_lines,
+    parse_elements,
+    tell_ignored,
+)
 
 COMPRESSED = {".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
 """GaussForge's name of each format, by file suffix."""
@@ -125,6 +131,8 @@ def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
             found=more.translate(_BARE),
             remedy=AGAIN,
         )
+    others = [element for element in elements if element.name not in ("chunk", "vertex", "sh")]
+    tell_ignored(others, count, path)
     return count
 
 
@@ -149,8 +157,10 @@ def _sectioned_count(content: bytes, path: Path) -> int:
             held += here
             if here != most:
                 raise Damage(f"a section of {here:,} Gaussians with data of {most:,}")
-        if held != count or not 0 <= len(content) - place < _KSPLAT_BYTES[level][0]:
+        if not 0 <= len(content) - place < _KSPLAT_BYTES[level][0]:
             raise Damage(f"{held:,} Gaussians in sections, and {len(content):,} bytes instead of {place:,}")
+        if held != count:
+            raise Damage(f"a count of {count:,}, and {held:,} Gaussians in sections")
     except (struct.error, Damage) as error:
         raise FileFormatError(path, expected="a ksplat file", found=reason(error), remedy=AGAIN) from error
     if place < len(content):

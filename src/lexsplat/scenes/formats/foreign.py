@@ -38,6 +38,8 @@ AGAIN = "copy the file again or export it again"
 
 _logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
+_COARSE = 0.1
+"""Largest error of centers that is not told, as a share of the usual standard deviation."""
 _SMALLEST_LOG_SCALE = math.log(1e-12)
 _SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
 _ALWAYS_ALLOWED = 10_000
@@ -208,8 +210,10 @@ def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
 
 
 def as_tensor(values: NDArray) -> Tensor:
-    """A float32 tensor of its own memory."""
-    return torch.from_numpy(np.array(values, dtype=np.float32))
+    """A float32 tensor of its own memory; what is too large for it is infinity, which is looked for later."""
+    with np.errstate(over="ignore"):
+        array = np.array(values, dtype=np.float32)
+    return torch.from_numpy(array)
 
 
 def read_content(path: Path, kind: str) -> bytes:
@@ -227,6 +231,25 @@ def read_content(path: Path, kind: str) -> bytes:
             found=str(error.strerror),
             remedy="check the path and its permissions",
         ) from error
+
+
+def rounded_centers(places: NDArray[np.float64], log_scales: Tensor, path: Path) -> Tensor:
+    """Centers ``[N, 3]`` in float32, with a warning if that moves one by more than `_COARSE` of the usual size.
+
+    Coordinates of a map have a step of half a unit at 5,600,000: the Gaussians of a thing come to lie in layers.
+    """
+    means = as_tensor(places)
+    finite = torch.isfinite(means).all(1)
+    size = float(log_scales[finite].nanmedian(1).values.nanmedian().exp()) if finite.any() else math.inf
+    error = float(np.abs(means[finite].double().numpy() - places[finite.numpy()]).max(initial=0))
+    if error > _COARSE * size:
+        middle = ", ".join(f"{v:,.0f}" for v in np.round(np.median(places[finite.numpy()], axis=0), -2) + 0.0)
+        warn(
+            "%s: centers are rounded by up to %.2g units (float32), which is coarse for Gaussians of size %.2g; "
+            "subtract %s from x, y, z before exporting, and from the cameras",
+            path, error, size, middle,
+        )  # fmt: skip
+    return means
 
 
 def joined(parts: list[Gaussians]) -> Gaussians:

@@ -12,6 +12,7 @@ import binascii
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -23,7 +24,16 @@ from scipy.spatial.transform import Rotation
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import AGAIN, Damage, as_tensor, joined, read_content, reason, warn
+from lexsplat.scenes.formats.foreign import (
+    AGAIN,
+    Damage,
+    as_tensor,
+    joined,
+    read_content,
+    reason,
+    rounded_centers,
+    warn,
+)
 from lexsplat.scenes.formats.gltf import EXTENSION, GENERATOR
 from lexsplat.scenes.transforms import transformed
 
@@ -57,7 +67,7 @@ def read_gltf(path: Path) -> Gaussians:
             )
         own = document.get("asset", {}).get("generator") == GENERATOR
         parts = [
-            _placed(file.gaussians(primitive), np.eye(4) if own else _UPRIGHT @ world)
+            _placed(file.gaussians(primitive), np.eye(4) if own else _UPRIGHT @ world, path)
             for primitive, world in file.splats()
         ]
     except FileFormatError:
@@ -158,7 +168,7 @@ class _Document:
             return self.accessor(used[-1], width)
 
         used: list[Any] = []
-        degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
+        degree = self.degree(attributes)
         rest = [values(f"SH_DEGREE_{d}_COEF_{n}", 3) for d in range(1, degree + 1) for n in range(2 * d + 1)]
         means = values("POSITION", 3, "")
         opacities = values("OPACITY", 1)[:, 0]
@@ -166,7 +176,7 @@ class _Document:
         if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():
             raise Damage("negative sizes, or opacities outside 0..1")
         quats, sh0 = values("ROTATION", 4)[:, [3, 0, 1, 2]], values("SH_DEGREE_0_COEF_0", 3)
-        self.check_counts(used)
+        self.check_counts(used, attributes[f"{EXTENSION}:ROTATION"])
         own = primitive.get("extras", {}).get("lexsplat", {})
         return Gaussians(
             means=as_tensor(means),
@@ -178,8 +188,19 @@ class _Document:
             antialiased=own.get("antialiased") is True,
         )
 
-    def check_counts(self, indices: list[Any]) -> None:
+    def degree(self, attributes: dict[str, Any]) -> int:
+        """The highest degree of which the harmonics have a coefficient."""
+        names = [name.removeprefix(f"{EXTENSION}:") for name in attributes if f"{EXTENSION}:SH_" in name]
+        known = {f"SH_DEGREE_{d}_COEF_{n}": d for d in range(4) for n in range(2 * d + 1)}
+        if others := [name for name in names if name not in known]:
+            listed = ", ".join(others)[:200]
+            warn("%s: attributes that are no harmonics of degree 0 to 3 are ignored: %s", self.path, listed)
+        return max((known[name] for name in names if name in known), default=0)
+
+    def check_counts(self, indices: list[Any], rotations: Any) -> None:
         """Refuse attributes of different counts, and counts that leave out elements of all attributes.
+
+        Zeros that pad the views are no Gaussians, since no rotation is four zeros.
 
         Raises:
             Damage: If they do.
@@ -187,12 +208,14 @@ class _Document:
         counts = sorted({self.item("accessors", index)["count"] for index in indices})
         if len(counts) > 1:
             raise Damage(f"attributes of {counts[0]:,} and of {counts[-1]:,} Gaussians")
-        left = min(self._left(self.item("accessors", index)["bufferView"]) for index in indices)
-        if left:
+        views = [self.item("accessors", index)["bufferView"] for index in indices]
+        left = min(len(rest) // step for rest, step in map(self._rest, views))
+        rest, _ = self._rest(self.item("accessors", rotations)["bufferView"])
+        if left and np.frombuffer(rest, np.uint8).any():
             raise Damage(f"a count of {counts[0]:,} Gaussians, and {left:,} more in the data")
 
-    def _left(self, number: int) -> int:
-        """Elements that a buffer view has after the last one of all accessors."""
+    def _rest(self, number: int) -> tuple[memoryview, int]:
+        """The bytes of a buffer view after the last element of all accessors, and the bytes of an element."""
         view, end, step = self.item("bufferViews", number), 0, 1
         for accessor in self.document["accessors"]:
             if accessor.get("bufferView") == number:
@@ -200,7 +223,13 @@ class _Document:
                 stride = view.get("byteStride", size)
                 last = accessor.get("byteOffset", 0) + (accessor["count"] - 1) * stride + size
                 end, step = max(end, last), max(step, stride)
-        return int((view["byteLength"] - end) // step)
+        return self.view(number)[end:], step
+
+    def view(self, number: Any) -> memoryview:
+        """The bytes of a buffer view, fewer if its buffer ends before."""
+        view = self.item("bufferViews", number)
+        start, length = _index(view.get("byteOffset", 0)), _index(view["byteLength"])
+        return memoryview(self.buffer(_index(view["buffer"])))[start : start + length]
 
     def accessor(self, index: Any, width: int) -> NDArray[np.float32]:
         """The numbers ``[count, width]`` of an accessor; normalized integers are fractions."""
@@ -214,8 +243,7 @@ class _Document:
             raise Damage(f"an accessor of {accessor['type']}")
         count, step = _index(accessor["count"]), _index(view.get("byteStride", kind.itemsize * width))
         inside, length = _index(accessor.get("byteOffset", 0)), _index(view["byteLength"])
-        start = _index(view.get("byteOffset", 0))
-        data = self.buffer(_index(view["buffer"]))[start : start + length]
+        data = self.view(accessor["bufferView"])
         last = inside + max(count - 1, 0) * step + kind.itemsize * width
         if len(data) < length or step < kind.itemsize * width or (count and last > length):
             raise Damage(f"an accessor of {count} elements beyond its {len(data)} bytes")
@@ -261,15 +289,22 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
-def _placed(gaussians: Gaussians, world: NDArray[np.float64]) -> Gaussians:
+def _placed(gaussians: Gaussians, world: NDArray[np.float64], path: Path) -> Gaussians:
     """The Gaussians after a transformation of turn, uniform scale and translation.
 
     Raises:
-        ValueError: If it is of another kind.
+        FileFormatError: If it is of another kind.
     """
-    scale = float(np.cbrt(np.linalg.det(world[:3, :3])))
-    if not scale > 0 or not np.allclose(
-        world[:3, :3] @ world[:3, :3].T, scale**2 * np.eye(3), atol=1e-4 * scale**2
-    ):
-        raise Damage("a node that mirrors or deforms its splats")
-    return transformed(gaussians, rotation=world[:3, :3] / scale, scale=scale, translation=world[:3, 3])
+    linear = world[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    even = np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+    if not scale > 0 or not even:
+        raise FileFormatError(
+            path,
+            expected="nodes that turn, scale evenly and move their splats",
+            found="a node that mirrors them" if scale < 0 else "a node that deforms them",
+            remedy="apply its transformation to the splats in the program that wrote the file, and export again",
+        )
+    placed = transformed(gaussians, rotation=linear / scale, scale=scale, translation=world[:3, 3])
+    exact = gaussians.means.double().numpy() @ linear.T + world[:3, 3]
+    return replace(placed, means=rounded_centers(exact, placed.log_scales, path))

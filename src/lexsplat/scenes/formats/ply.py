@@ -17,7 +17,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import warn
+from lexsplat.scenes.formats.foreign import as_tensor, rounded_centers, warn
 from lexsplat.scenes.formats.ply_elements import (
     SPLATS,
     Element,
@@ -25,6 +25,8 @@ from lexsplat.scenes.formats.ply_elements import (
     data_left,
     header_lines,
     parse_elements,
+    tell_ignored,
+    uneven_line,
 )
 
 MIP = "comment SplatRenderMode: mip"
@@ -127,6 +129,7 @@ def parse_ply(path: Path) -> Gaussians:
                 )
             table, left = (_binary_rows if order else _text_rows)(file, elements, order, path)
             _check_left(left, vertices, order, path)
+            tell_ignored(elements[1:], vertices.count, path)
             return _gaussians_from_table(table, is_antialiased(lines), path)
     except OSError as error:
         raise FileFormatError(
@@ -183,21 +186,39 @@ def _text_rows(file: BinaryIO, elements: Sequence[Element], order: str, path: Pa
             numbers, found = np.fromstring(text, np.float64, sep=" "), ""
         except (ValueError, DeprecationWarning):
             numbers, found = np.zeros(0), "text that is no number"
-    # A number that ends with the file may lack digits.
-    if len(numbers) < wanted or (wanted and not text[-1:].isspace()):
+    if found or len(numbers) < wanted:
         raise FileFormatError(
             path,
-            expected=f"{wanted} numbers, each with a space or line break after it",
-            found=found or f"{len(numbers)} whole numbers",
+            expected=f"{wanted} numbers",
+            found=found or f"{len(numbers)}",
             remedy="the file is truncated or damaged: copy it again or export it again",
         )
+    rows = numbers[:wanted].reshape(vertices.count, len(vertices.columns))
+    table = np.zeros(
+        vertices.count, [(name, "<f8" if name in "xyz" else "<f4") for name, _, _ in vertices.columns]
+    )
     with np.errstate(over="ignore"):  # infinity is looked for later
-        rows = numbers[:wanted].astype(np.float32).reshape(vertices.count, len(vertices.columns))
-    table = np.zeros(vertices.count, [(name, "<f4") for name, _, _ in vertices.columns])
-    for index, (name, _, _) in enumerate(vertices.columns):
-        table[name] = rows[:, index]
+        for index, (name, _, _) in enumerate(vertices.columns):
+            table[name] = rows[:, index]
     rest = numbers[wanted:]
-    return table, data_left(elements[1:], order, len(rest), lambda: rest)
+    left = data_left(elements[1:], order, len(rest), lambda: rest)
+    if 0 <= left < len(vertices.columns):  # otherwise, `_check_left` tells what is wrong
+        _check_lines(text, vertices, path)
+    return table, left
+
+
+def _check_lines(text: bytes, vertices: Element, path: Path) -> None:
+    """Refuse rows that do not have a line each, whose numbers would be read shifted."""
+    if uneven := uneven_line(text, vertices.count, len(vertices.columns)):
+        header = path.read_bytes()[: -len(text)].count(b"\n")
+        raise FileFormatError(
+            path,
+            expected=f"the {len(vertices.columns)} numbers of a Gaussian in each line",
+            found=f"{uneven[1]:,} numbers in line {header + uneven[0] + 1:,}",
+            remedy="the file is damaged: copy it again or export it again",
+        )
+    if vertices.count and not text[-1:].isspace():
+        warn("%s: no line end after the last number, which may lack digits", path)
 
 
 def _vertices(elements: Sequence[Element], path: Path) -> Element:
@@ -217,7 +238,8 @@ def _vertices(elements: Sequence[Element], path: Path) -> Element:
 
 def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> Gaussians:
     def columns(*names: str) -> torch.Tensor:
-        stacked = [table[name].astype(np.float32) for name in names]
+        with np.errstate(over="ignore"):  # infinity is looked for later
+            stacked = [table[name].astype(np.float32) for name in names]
         return torch.from_numpy(
             np.stack(stacked, axis=1) if len(table) else np.zeros((0, len(names)), np.float32)
         )
@@ -230,10 +252,12 @@ def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> G
             path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found, remedy="export the file again"
         )
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
+    log_scales = columns("scale_0", "scale_1", "scale_2")
+    places = np.stack([table[name] for name in "xyz"], axis=1)
     return Gaussians(
-        means=columns("x", "y", "z"),
+        means=as_tensor(places) if places.dtype == "f4" else rounded_centers(places, log_scales, path),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        log_scales=columns("scale_0", "scale_1", "scale_2"),
+        log_scales=log_scales,
         opacity_logits=columns("opacity")[:, 0],
         sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
         shN=rest.reshape(len(table), 3, num_rest // 3).transpose(1, 2).contiguous(),

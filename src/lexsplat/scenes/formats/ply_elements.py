@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.runtime.errors import FileFormatError
+from lexsplat.scenes.formats.foreign import AGAIN, warn
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -29,6 +30,14 @@ ENCODINGS = {
 
 SPLATS = "use a .ply of 3D Gaussians; a mesh or a point cloud has none"
 """The remedy for a PLY of something else."""
+
+_NO_GAUSSIANS = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
+"""Elements in which Apple's SHARP tells of its photo,"""
+_MOST_ROWS = 16
+"""in so many rows at most."""
+
+_BLOCK = 1 << 20
+"""Bytes of text whose numbers are counted at a time."""
 
 _MAX_HEADER_BYTES = 1 << 16
 
@@ -64,14 +73,34 @@ def header_lines(file: BinaryIO, path: Path) -> list[str]:
         FileFormatError: If the file does not begin with one.
     """
     lines: list[str] = []
-    consumed = 0
+    left = _MAX_HEADER_BYTES
     while not lines or lines[-1] != "end_header":
-        raw = file.readline(1024)
-        consumed += len(raw)
-        if not raw.endswith(b"\n") or consumed > _MAX_HEADER_BYTES or (not lines and raw.strip() != b"ply"):
-            raise FileFormatError(path, expected="a PLY header", found=repr(raw[:20])[1:], remedy=SPLATS)
+        raw = file.readline(left + 1)
+        left -= len(raw)
+        if not lines and raw.strip() != b"ply":
+            raise _no_ply(raw, path)
+        if left < 0:
+            expected, found = f"a header of up to {_MAX_HEADER_BYTES:,} bytes", "more bytes before end_header"
+            raise FileFormatError(path, expected=expected, found=found, remedy="shorten its comments")
+        if not raw.endswith(b"\n"):
+            found = "a file that ends in its header"
+            raise FileFormatError(path, expected="a PLY header up to end_header", found=found, remedy=AGAIN)
         lines.append(raw.decode("ascii", "replace").strip())
     return lines
+
+
+def _no_ply(first: bytes, path: Path) -> FileFormatError:
+    """What is wrong with a file whose first line is not that of a PLY."""
+    if not first:
+        return FileFormatError(path, expected="a PLY header", found="an empty file", remedy=AGAIN)
+    if first.startswith(b"ply\r"):
+        return FileFormatError(
+            path,
+            expected="a PLY header with line feeds",
+            found="carriage returns alone",
+            remedy="export the file again",
+        )
+    return FileFormatError(path, expected="a PLY header", found=repr(first[:20])[1:], remedy=SPLATS)
 
 
 def byte_order(lines: Sequence[str], path: Path) -> str:
@@ -93,7 +122,8 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
     """The elements of a header, in the order of their data.
 
     Raises:
-        FileFormatError: If an element or a property cannot be understood.
+        FileFormatError: If an element or a property cannot be understood, or two elements have the same name, of
+            which the second would be ignored.
     """
     elements: list[Element] = []
     for line in lines:
@@ -105,6 +135,13 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
                     expected="'element NAME COUNT'",
                     found=repr(line[:80]),
                     remedy="export the file again",
+                )
+            if words[1] in [element.name for element in elements]:
+                raise FileFormatError(
+                    path,
+                    expected="one element of each name",
+                    found=f"two named {words[1]!r:.40}",
+                    remedy="export the file again, as one list of Gaussians",
                 )
             elements.append(Element(words[1], int(words[2]), ()))
         elif words[:1] == ["property"]:
@@ -121,12 +158,52 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
     return elements
 
 
+def tell_ignored(elements: Sequence[Element], count: int, path: Path) -> None:
+    """Warn of elements beside ``count`` Gaussians that are not read and may hold others."""
+    ignored = [
+        f"{element.name!r:.40} of length {element.count:,}"
+        for element in elements
+        if element.count * len(element.columns)
+        and not (element.name in _NO_GAUSSIANS and element.count <= _MOST_ROWS)
+    ]
+    if ignored:
+        warn(
+            "%s: elements other than the %s Gaussians are ignored: %s",
+            path,
+            f"{count:,}",
+            ", ".join(ignored)[:200],
+        )
+
+
 def _column(words: Sequence[str]) -> tuple[str, str, str] | None:
     if len(words) == 3 and words[1] in _TYPES:
         return words[2], _TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and words[2] in _TYPES and words[3] in _TYPES:
         return words[4], _TYPES[words[3]], _TYPES[words[2]]
     return None
+
+
+def uneven_line(text: bytes, count: int, width: int) -> tuple[int, int] | None:
+    """The first of ``count`` lines that are not blank with other than ``width`` numbers.
+
+    Returns:
+        How many lines are before it, and how many numbers it has; None if there is none.
+    """
+    data, words, before = np.frombuffer(text, np.uint8), 0, True
+    counts = []  # numbers up to the end of each line
+    for start in range(0, len(data), _BLOCK):
+        block = data[start : start + _BLOCK]
+        blank = block <= ord(" ")
+        begins = ~blank
+        begins[1:] &= blank[:-1]
+        begins[0] &= before
+        places = begins.nonzero()[0]
+        counts.append(words + np.searchsorted(places, (block == ord("\n")).nonzero()[0]))
+        words, before = words + len(places), bool(blank[-1])
+    each = np.diff(np.concatenate([*counts, [words]]), prepend=0)
+    filled = each.nonzero()[0][:count]
+    uneven = filled[each[filled] != width]
+    return (int(uneven[0]), int(each[uneven[0]])) if len(uneven) else None
 
 
 def data_left(

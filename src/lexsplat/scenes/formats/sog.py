@@ -191,25 +191,41 @@ def _looked_up(table: NDArray[np.float32], pixels: NDArray[np.uint8]) -> NDArray
 def _positions(low: NDArray[np.uint8], high: NDArray[np.uint8], part: dict[str, Any]) -> NDArray[np.float64]:
     first, last = (np.array(part[name], np.float64).reshape(3) for name in ("mins", "maxs"))
     steps = low[:, :3] + 256.0 * high[:, :3]
-    values = first + steps / 65535 * (last - first)
-    with np.errstate(over="ignore"):  # infinity is refused later
+    with np.errstate(over="ignore", invalid="ignore"):  # infinity and NaN are refused later
+        values = first + steps / 65535 * (last - first)
         return np.sign(values) * np.expm1(np.abs(values))
 
 
 def _held(turns: NDArray[np.uint8], places: Sequence[NDArray[np.uint8]], count: int) -> int:
     """Number of Gaussians whose rotations are in an image ``[P, 4]``: no rotation is four zeros.
 
-    What fills up the last rows is not among them: zeros, opaque black, and copies of the last Gaussian, which are at
-    the same place in the images of positions.
+    What fills up the last rows is not among them: zeros, opaque black, copies of the last Gaussian, which are at the
+    same place in the images of positions, and any other constant.
     """
     used, last = np.asarray(turns.any(1)), max(count - 1, 0)
     copies = (turns[count:] == turns[last]).all(1)
+    rests = [turns[count:]]
     for picture in places:
         rest = np.zeros_like(turns[count:])
         rest[: max(len(picture) - count, 0)] = picture[count : len(turns)]
         copies &= (rest == picture[last]).all(1)
+        rests.append(rest)
     used[count:] = (turns[count:, 3] >= FIRST_TAG) & turns[count:, :3].any(1) & ~copies
+    used[len(turns) - _filled(rests) :] = False
     return int(used.nonzero()[0][-1]) + 1 if used.any() else 0
+
+
+def _filled(pictures: Sequence[NDArray[np.uint8]]) -> int:
+    """Length of the constant end of images ``[P, 4]``: of rotations, and of the bytes of positions.
+
+    Where its position is not gray, with other bytes in x, y and z, the first pixel is a Gaussian, copied to the end.
+    """
+    if not len(pictures[0]):
+        return 0
+    same = np.asarray(np.concatenate([picture == picture[-1] for picture in pictures], axis=1).all(1))
+    length = int(np.append(same[::-1], False).argmin())
+    gray = all((picture[-1, :3] == picture[-1, 0]).all() for picture in pictures[1:])
+    return length if gray else length - 1
 
 
 def _quats(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:

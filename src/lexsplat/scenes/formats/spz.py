@@ -42,12 +42,29 @@ logger = logging.getLogger(__name__)
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 """Rotation between the axes of SPZ and those of a PLY."""
 
+_AXES_EXTENSION = 0xADBE0003
+"""Adobe's extension that names the axes: a number, 0 for those of SPZ, else 1 plus an index of `_AXES`."""
+_AXES = (
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU",
+)  # fmt: skip
+_DIRECTIONS = {
+    "R": (1, 0, 0),
+    "L": (-1, 0, 0),
+    "D": (0, 1, 0),
+    "U": (0, -1, 0),
+    "F": (0, 0, 1),
+    "B": (0, 0, -1),
+}
+"""Right, left, down, up, forward and backward in the axes of a PLY."""
+
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, streams
 _HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # the same, and where the table of contents begins
 _MAGIC = b"NGSP"
 _ANTIALIASED, _EXTENSIONS = 1, 2
 _COLOR_SCALE = 0.15
 _MOST_FRACTIONAL_BITS = 30
+_MOST_DEGREE = 4
 _MOST_EXTENSIONS = 1 << 20
 _FIXED_LIMIT = (1 << 23) - 1
 _COARSE = 0.25
@@ -74,35 +91,78 @@ def read_spz(path: Path) -> Gaussians:
         if len(head) < _HEADER.size:
             raise Damage(f"a header of {len(head)} bytes")
         magic, version, count, degree, bits, flags, _ = _HEADER.unpack_from(head)
-        known = (2, 3) if content[:2] == b"\x1f\x8b" else (4,)
-        if magic != _MAGIC or version not in known or degree > 4 or bits > _MOST_FRACTIONAL_BITS:
-            found = f"version {version}" if magic == _MAGIC else "another file"
-            raise FileFormatError(
-                path,
-                expected="SPZ of version 2 or 3 in gzip, or 4",
-                found=found,
-                remedy="export it as SPZ of one of these versions, or as .ply",
-            )
+        _check_supported(magic, version, content[:2] == b"\x1f\x8b", degree, bits, path)
         check_count(path, count, len(content))
         layout = _layout(version, degree)
         sizes = {name: size * count for name, size in layout.items()}
         if version == 4:
             streams = _inflated_4(content, sizes)
+            extensions = content[_HEADER_4.size : _HEADER_4.unpack_from(content)[-1]]
         else:
-            streams = _inflated(content, sizes, bool(flags & _EXTENSIONS))
+            streams, extensions = _inflated(content, sizes, bool(flags & _EXTENSIONS))
     except (zlib.error, zstandard.ZstdError, struct.error, Damage) as error:
         raise FileFormatError(path, expected="an SPZ file", found=reason(error), remedy=AGAIN) from error
-    if flags & _EXTENSIONS:
-        warn("%s: its extensions are ignored; they may name other axes", path)
+    rotation = _rotation(extensions, path) if flags & _EXTENSIONS else HALF_TURN
     arrays = {
         name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
     }
     gaussians = _unpacked(arrays, version, bits, bool(flags & _ANTIALIASED))
-    return transformed(gaussians, rotation=HALF_TURN)
+    return transformed(gaussians, rotation=rotation)
 
 
-def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> dict[str, bytes]:
-    """The streams of versions 2 and 3; only extensions, if the header has their flag, may follow them.
+def _rotation(extensions: bytes, path: Path) -> NDArray[np.float64]:
+    """Rotation from the axes of the file, which an extension may name, to those of a PLY ``[3, 3]``.
+
+    Raises:
+        FileFormatError: If the axes are unknown, or left-handed: the splats would have to be mirrored.
+    """
+    rotation, place = HALF_TURN, 0
+    while place + 8 <= len(extensions):
+        kind, length = struct.unpack_from("<II", extensions, place)
+        value = extensions[place + 8 : place + 8 + length]
+        place += 8 + length
+        if kind != _AXES_EXTENSION:
+            warn("%s: its extensions are ignored, except for axes", path)
+            continue
+        number = int.from_bytes(value, "little")
+        axes = _AXES[number - 1] if 0 < number <= len(_AXES) else "RUB"
+        rotation = np.array([_DIRECTIONS[letter] for letter in axes], np.float64).T
+        if number > len(_AXES) or np.linalg.det(rotation) < 0:
+            raise FileFormatError(
+                path,
+                expected="right-handed axes, such as RUB",
+                found=f"axes number {number}" if number > len(_AXES) else f"{axes}, which are left-handed",
+                remedy="export it with other axes, or as .ply",
+            )
+    return rotation
+
+
+def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits: int, path: Path) -> None:
+    """Refuse files of another program or version, and what no version has.
+
+    Raises:
+        FileFormatError: If it is one.
+    """
+    remedy = "export it as SPZ of one of these versions, or as .ply"
+    if magic != _MAGIC or version not in ((2, 3) if packed else (4,)):
+        expected, found = "SPZ of version 2 or 3 in gzip, or 4", f"version {version}"
+        if magic != _MAGIC:
+            found = "another file"
+        elif version in (2, 3, 4):
+            found += " in gzip" if packed else " without gzip"
+    elif degree > _MOST_DEGREE:
+        expected, found = f"spherical harmonics of degree 0 to {_MOST_DEGREE}", f"degree {degree}"
+        remedy = AGAIN
+    elif bits > _MOST_FRACTIONAL_BITS:
+        expected, found = f"centers with 0 to {_MOST_FRACTIONAL_BITS} bits behind the point", f"{bits}"
+        remedy = AGAIN
+    else:
+        return
+    raise FileFormatError(path, expected=expected, found=found, remedy=remedy)
+
+
+def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> tuple[dict[str, bytes], bytes]:
+    """The streams of versions 2 and 3, and what follows them: only extensions, if the header has their flag.
 
     Raises:
         Damage: If the file is cut, or has more data than its count allows: the streams would be read at wrong places.
@@ -121,7 +181,7 @@ def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> dict[str
     for name, size in sizes.items():
         streams[name] = data[start : start + size]
         start += size
-    return streams
+    return streams, rest
 
 
 def _are_extensions(data: bytes) -> bool:
@@ -140,7 +200,9 @@ def _inflated_4(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
     """
     *_, number, contents = _HEADER_4.unpack_from(content)
     start, count = contents + 16 * number, sizes["alphas"]
-    if number != len(sizes) or contents < _HEADER_4.size:
+    if contents < _HEADER_4.size:
+        raise Damage(f"a table of contents at byte {contents}, within the header")
+    if number != len(sizes):
         raise Damage(f"{number} streams instead of {len(sizes)}")
     streams = {}
     for index, (name, size) in enumerate(sizes.items()):
