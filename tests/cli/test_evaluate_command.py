@@ -3,6 +3,7 @@
 import json
 import shutil
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
 from lexsplat.runtime.files import read_tensors
+from lexsplat.scenes.folder import SceneFolder
 
 
 def test_evaluate_writes_metrics_and_a_report_without_external_files(built, capsys):
@@ -49,6 +51,17 @@ def test_info_states_the_method_and_its_codes(built, capsys):
 @pytest.mark.parametrize("option", ["--ground-truth", "--masks"])
 def test_ground_truth_that_is_given_and_missing_ends_in_one_line(option, built, tmp_path, capsys):
     fails_in_one_line(capsys, ["evaluate", str(built), option, str(tmp_path / "nowhere")], "nowhere")
+
+
+def test_given_ground_truth_of_training_views_only_is_refused(built, tiny_capture, tmp_path, capsys):
+    given = tmp_path / "given"
+    source = next(path for path in sorted((tiny_capture / "segmentations").iterdir()) if path.is_dir())
+    views = SceneFolder.open(built).read_cameras()
+    trained = next(name for name, view in views.items() if view.split == "train")
+    shutil.copytree(source, given / Path(trained).stem)
+    fails_in_one_line(
+        capsys, ["evaluate", str(built), "--ground-truth", str(given)], "given", "held-out views"
+    )
 
 
 def without_times(result: dict) -> dict:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.captures import Annotations, Capture, check_ground_truth_options, load_annotations
+from lexsplat.captures import check_ground_truth_options
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
     EvaluationConfig,
@@ -33,6 +33,7 @@ from lexsplat.evaluation import (
     peak_gpu_memory,
     peak_memory,
 )
+from lexsplat.evaluation.ground_truth import read_held_out
 from lexsplat.evaluation.report import (
     Comparison,
     Gallery,
@@ -137,7 +138,7 @@ class Bench:
         config = replace(config.spelled_out(), joint=False, as_in_paper=False)
         preview = preview_capture(source, output, config)
         if preview is not None:  # before the build, which takes long
-            self._read_ground_truth(preview, source)
+            read_held_out(preview, self.origin)
         # Features are shared by methods that use DINO and others that do not, so they are made with both encoders.
         with_dino: Any = next(name for name, method in METHODS.items() if method.uses_dino(config))
         every = config if METHODS[config.method].uses_dino(config) else replace(config, method=with_dino)
@@ -147,7 +148,7 @@ class Bench:
         sizes = [view.capture_size for view in self.capture.views.values()]
         self.config = config.resolved(self.device, max(sizes, key=lambda size: size[0] * size[1]))
         self.memory = parse_bytes(config.memory)
-        self.ground_truth = self._read_ground_truth(self.capture, source)
+        self.ground_truth = read_held_out(self.capture, self.origin)
         self.gaussians = self.folder.read_gaussians().to(self.device)
         self._encoders = Encoders(config.clip, config.dino, self.config.encoder_device)
         self._maps: FeatureMaps | None = None
@@ -155,17 +156,6 @@ class Bench:
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
         self._codebook_peaks: Peaks = {}
         _ = self.maps  # of the held-out views too, outside every measured time
-
-    def _read_ground_truth(self, capture: Capture, source: Path) -> Annotations:
-        """The ground truth of a capture.
-
-        Raises:
-            CaptureError: If no held-out view has any.
-        """
-        found = load_annotations(capture, self.origin.masks, self.origin.prompt_list)
-        if not any(found.masks.get(name) for name in capture.test_names):
-            raise _no_ground_truth(source, self.origin)
-        return found
 
     # -- shared stages
 
@@ -411,20 +401,6 @@ def detail_of(metrics: Metrics) -> dict[str, Any]:
     }
     curves = {prompt: [round(float(v), 4) for v in curve] for prompt, curve in metrics.curves.items()}
     return {"curves": curves, "cases": cases}
-
-
-def _no_ground_truth(source: Path, origin: GroundTruthSource) -> CaptureError:
-    remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
-    if origin.masks is not None:
-        remedy = "hold out the views that have ground truth: list them in test_views.json of the capture"
-    if origin.prompt_list is not None:
-        remedy = "leave the prompt list out, or name the masks as the released code does"
-    return CaptureError(
-        origin.masks or source,
-        expected="masks of held-out views to measure against",
-        found=f"none in the words of the list {origin.prompt_list!r}" if origin.prompt_list else "none",
-        remedy=remedy,
-    )
 
 
 def _larger(peak: int | None, other: int | None) -> int | None:

@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lexsplat.captures import Capture
+from lexsplat.captures.ground_truth.layouts import Annotations, load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
+from lexsplat.runtime.errors import CaptureError
 
 Masks = Mapping[str, Mapping[str, "Path | NDArray[np.bool_]"]]
 """Ground truth by view and prompt: files or boolean arrays ``[H, W]``."""
@@ -44,3 +47,29 @@ class GroundTruth:
     masks: Masks
     boxes: Boxes = field(default_factory=dict)
     prompt_kinds: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_held_out(capture: Capture, source: GroundTruthSource) -> Annotations:
+    """The ground truth of a capture, some of it of held-out views.
+
+    Args:
+        capture: The capture.
+        source: Where its ground truth is read from.
+
+    Raises:
+        CaptureError: If no held-out view has any, or as `load_annotations`.
+    """
+    found = load_annotations(capture, source.masks, source.prompt_list)
+    if any(found.masks.get(name) for name in capture.test_names):
+        return found
+    remedy = "draw some into segmentations/STEM/PROMPT.png (see docs/evaluation.md)"
+    if source.masks is not None:
+        remedy = "hold out the views that have ground truth: list them in test_views.json of the capture"
+    if source.prompt_list is not None:
+        remedy = "leave the prompt list out, or name the masks as the released code does"
+    raise CaptureError(
+        source.masks or capture.root,
+        expected="masks of held-out views to measure against",
+        found=f"none in the words of the list {source.prompt_list!r}" if source.prompt_list else "none",
+        remedy=remedy,
+    )

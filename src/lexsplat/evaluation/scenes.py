@@ -8,7 +8,7 @@ from typing import Any
 
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
-from lexsplat.evaluation.ground_truth import GroundTruth
+from lexsplat.evaluation.ground_truth import GroundTruth, GroundTruthSource, read_held_out
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
@@ -53,7 +53,8 @@ def evaluate_scene(
 
     Raises:
         SceneFolderError: If the photos are missing, or the scene is the bundled one or being rebuilt.
-        CaptureError: If a photo or a mask cannot be used.
+        CaptureError: If a photo or a mask cannot be used, or ``masks`` or ``prompt_list`` is given and no held-out
+            view has ground truth.
     """
     if scene.folder is None:
         raise ValueError("only a scene opened from a folder can be evaluated")
@@ -61,7 +62,8 @@ def evaluate_scene(
     require_current(folder)
     folder.refuse_bundled()
     photos = reload_capture(folder, capture)
-    found = load_annotations(photos, masks, prompt_list)
+    source = GroundTruthSource(masks, prompt_list)
+    found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
     gallery = Gallery()
     metrics = evaluate(
         photos,
