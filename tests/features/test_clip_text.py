@@ -1,7 +1,9 @@
 """The light text tower against the model of transformers."""
 
+import gc
 import json
 import shutil
+import weakref
 
 import pytest
 import torch
@@ -101,3 +103,24 @@ def test_a_text_tower_that_is_not_whole_is_refused(clip_folder, tmp_path):
     save_file({key: value for key, value in state.items() if key != name}, copy / "model.safetensors")
     with pytest.raises(ModelError, match="1 missing"):
         load_text(str(copy))
+
+
+def test_the_text_tower_of_a_loaded_encoder_is_that_of_its_files_and_does_not_hold_the_encoder(clip_folder):
+    whole = load_clip(str(clip_folder))
+    light, held = whole.text_only("cpu"), weakref.ref(whole)
+    assert isinstance(light, ClipText)
+    del whole
+    gc.collect()
+    assert held() is None
+    from_files = load_text(str(clip_folder))
+    assert torch.equal(light.encode_text(TEXTS), from_files.encode_text(TEXTS))
+    assert light.content_hash == from_files.content_hash
+
+
+def test_an_encoder_of_another_architecture_answers_texts_without_its_image_tower(clip_folder, tmp_path):
+    whole = load_clip(str(changed_config(clip_folder, tmp_path / "other", hidden_act="relu")))
+    expected, images = whole.encode_text(TEXTS), weakref.ref(whole._model.vision_model)
+    texts = whole.text_only("cpu")
+    gc.collect()
+    assert images() is None
+    assert torch.equal(texts.encode_text(TEXTS), expected)

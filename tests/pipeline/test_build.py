@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -125,22 +127,64 @@ def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_captur
         build(tiny_capture, tmp_path / "other", joint, splats=tmp_path / "any.ply")
 
 
-@pytest.mark.slow
-def test_encoders_are_loaded_for_their_check_and_once_for_the_features(tiny_capture, tmp_path, monkeypatch):
-    loaded = []
-    for kind, encoder in (("clip", color_encoder.ColorClip), ("dino", color_encoder.ColorDino)):
+@pytest.fixture
+def loaded(tmp_path, monkeypatch) -> list[str]:
+    """What loads encoders appends its kind, with an empty cache of texts."""
+    kinds: list[str] = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for place, kind, encoder in (
+        ("features.encoders.load_clip", "clip", color_encoder.ColorClip),
+        ("features.encoders.load_dino", "dino", color_encoder.ColorDino),
+        ("scenes.scene.load_text", "text", color_encoder.ColorClip),
+    ):
         monkeypatch.setattr(
-            f"lexsplat.features.encoders.load_{kind}",
-            lambda *_, kind=kind, encoder=encoder: loaded.append(kind) or encoder(),
+            f"lexsplat.{place}", lambda *_, kind=kind, encoder=encoder: kinds.append(kind) or encoder()
         )
-    build(tiny_capture, tmp_path / "trained", TRAINED)
-    assert sorted(loaded) == ["clip", "clip", "dino", "dino"]
+    return kinds
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [(TRAINED, ["clip", "dino"]), (AVERAGED, ["clip"])],
+    ids=["trained", "averaged, which needs no DINO"],
+)
+def test_a_build_loads_each_encoder_once_for_check_photos_and_texts(
+    tiny_capture, tmp_path, loaded, config, expected
+):
+    build(tiny_capture, tmp_path / "scene", config)
+    assert sorted(loaded) == expected
+    kept = tmp_path / "scene" / "checkpoints" / "texts"
+    assert list(kept.iterdir()), "texts were encoded"
     loaded.clear()
-    build(tiny_capture, tmp_path / "averaged", AVERAGED)
-    assert loaded == ["clip", "clip"], "averaged features need no DINO"
-    loaded.clear()
-    build(tiny_capture, tmp_path / "trained", replace(TRAINED, trained=TrainedConfig(iterations=2)))
-    assert loaded == [], "the codes are there"
+    build(tiny_capture, tmp_path / "scene", config)
+    assert loaded == [], "all results are there"
+
+
+def test_new_settings_of_the_language_load_no_encoder_where_codes_are_kept(
+    scenes, tiny_capture, tmp_path, loaded
+):
+    copy = shutil.copytree(scenes / "trained", tmp_path / "copy")
+    build(tiny_capture, copy, replace(TRAINED, trained=TrainedConfig(iterations=2)))
+    assert loaded == []
+
+
+def test_the_encoder_of_photos_is_freed_before_the_language_is_made(tiny_capture, tmp_path, monkeypatch):
+    made, alive = [], []
+
+    def load(*_):
+        encoder = color_encoder.ColorDino()
+        made.append(weakref.ref(encoder))
+        return encoder
+
+    def fit(self, *arguments, original=Trained.fit):
+        gc.collect()
+        alive.extend(each() for each in made)
+        return original(self, *arguments)
+
+    monkeypatch.setattr("lexsplat.features.encoders.load_dino", load)
+    monkeypatch.setattr(Trained, "fit", fit)
+    build(tiny_capture, tmp_path / "scene", TRAINED)
+    assert alive == [None]
 
 
 @pytest.mark.slow

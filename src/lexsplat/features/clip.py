@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS
+from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS, ClipText, light_tower
 from lexsplat.features.hub import local_folder
 from lexsplat.features.portable import TextWeights, tokenizer_content
 from lexsplat.features.pretrained import (
@@ -49,6 +49,7 @@ class ClipEncoder(PretrainedModel):
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         super().__init__(folder, name, device)
+        self._folder = folder
         config = self._model.config
         if not (hasattr(self._model, "get_image_features") and hasattr(config, "vision_config")):
             raise self._refusal(
@@ -135,6 +136,18 @@ class ClipEncoder(PretrainedModel):
         if not bool(found.isfinite().all()):
             raise self._refusal("finite text embeddings", "choose another model", "NaN or infinity")
         return found
+
+    def text_only(self, device: torch.device | str) -> ClipText | ClipEncoder:
+        """What answers texts as `load_text` of this model does, without loading it again.
+
+        Of other architectures than CLIP's own it is this encoder, which gives its image tower away.
+        """
+        light = light_tower(self._folder, self._model.state_dict, device)
+        if light is None:
+            self._model.vision_model = self._patches = None
+            return self
+        light.content_hash = self.content_hash
+        return light
 
     def text_tower(self) -> TextWeights | None:
         """The text tower for other programs; None if it is neither of CLIP's nor of SigLIP's architecture."""

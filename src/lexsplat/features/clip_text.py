@@ -45,6 +45,19 @@ def open_clip_text(folder: Path, name: str, device: torch.device | str = "cpu") 
 
     Whatever is refused here, the loader of whole models refuses in words, or loads.
     """
+    tower = light_tower(folder, lambda: load_weights(folder, name), device)
+    if tower is not None:
+        tower.content_hash = content_hash(folder, "clip")
+    return tower
+
+
+def light_tower(
+    folder: Path, load: Callable[[], Mapping[str, Tensor]], device: torch.device | str
+) -> ClipText | None:
+    """The text tower of a model folder with weights from elsewhere, such as a loaded model; None as above.
+
+    Its ``content_hash`` is left to the caller.
+    """
     if not (folder / "tokenizer.json").is_file():
         return None
     config = read_config(folder / "config.json")
@@ -54,7 +67,7 @@ def open_clip_text(folder: Path, name: str, device: torch.device | str = "cpu") 
     settings = {**_DEFAULTS, **{key: given[key] for key in _DEFAULTS if given.get(key) is not None}}
     weights = {
         key: value
-        for key, value in load_weights(folder, name).items()
+        for key, value in load().items()
         if key.startswith(("text_model.", "text_projection.")) and not key.endswith("position_ids")
     }
     if not _is_usable(settings) or _shapes(settings, config.get("projection_dim", 512)) != {
@@ -65,7 +78,6 @@ def open_clip_text(folder: Path, name: str, device: torch.device | str = "cpu") 
     if tokenizer is None:
         return None
     tower = ClipText(settings, weights, tokenizer, device)
-    tower.content_hash = content_hash(folder, "clip")
     words = tower.encode_text(UNLIKE_WORDS)
     return tower if bool(words.isfinite().all()) and F.pdist(words).min() >= UNLIKE else None
 

@@ -101,9 +101,10 @@ def build(
             another = folder.record.get("config", {}).get("clip") != model_place(config.clip)
             if encodes or (another and until != "reconstruct"):  # its architecture decides settings
                 fetch_clip(config)
-            if checks := photos is not None and encodes:
+            checked: Encoders | None = None
+            if photos is not None and encodes:
                 sized = config.resolved(device, photos.size)
-                check_encoders(sized, source or splats, photos.count, photos.size)
+                checked = check_encoders(sized, source or splats, photos.count, photos.size)
             if source is None:
                 capture = capture_of_splats(splats, folder, config, device, listener)
             else:
@@ -116,8 +117,9 @@ def build(
             if config.features_from is not None:
                 load_external_features(config.features_from, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
+            builder.encoders = checked
             with open_workers(config.workers, (capture.root,)) as builder.workers:
-                return builder.run(until, encoders_checked=checks)
+                return builder.run(until)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw()
@@ -168,6 +170,7 @@ class _Builder:
         self.capture, self.folder, self.config = capture, folder, config
         self.device, self.listener, self.splats = device, listener, splats
         self.workers: Workers = IN_PROCESS
+        self.encoders: Encoders | None = None
         self.method = METHODS[config.method]
         self.memory = parse_bytes(config.memory)
         self.blocks = number_of_blocks(config.blocks, config.reconstruction, device, self.memory)
@@ -176,22 +179,22 @@ class _Builder:
         self._maps: FeatureMaps | None = None
         self._clip_hash = ""
 
-    def run(self, until: str, *, encoders_checked: bool) -> SceneFolder:
+    def run(self, until: str) -> SceneFolder:
         """Run the stages of the method up to ``until``; of a stage the method does not have, those before it."""
         stages = self._stages(write_provenance(self.folder, self.capture, self.config))
         order = list(stages)
         wanted = order[: order.index(until if until in stages else "features") + 1]
-        encodes = "features" in wanted and not encoders_checked
+        encodes = "features" in wanted and self.encoders is None
         if encodes and not self._is_finished("features", stages["features"]):
             sizes = [view.capture_size for view in self._training_views.values()]
-            check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
+            self.encoders = check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
         for name in wanted:
             self._run_stage(name, stages[name])
         if until == "language":
             self.folder.record.pop("building", None)
             self.folder.save()
             drop_previous(self.folder)
-            keep_for(self.folder, self.device, self.listener)
+            keep_for(self.folder, self.device, self.listener, self.encoders.text if self.encoders else None)
         return self.folder
 
     def _stages(self, capture_hash: str) -> dict[str, _Stage]:
@@ -378,16 +381,17 @@ class _Builder:
         write_tensors(self.folder.language_path, dict(tensors), metadata)
 
     def _feature_maps(self) -> FeatureMaps:
-        """Features of the training views. The encoders are freed when all features are stored."""
+        """Features of the training views. What encodes photos is freed when all features are stored."""
         if self._maps is None:
             config = self.config
-            encoders = Encoders.of(config)
+            encoders = self.encoders = self.encoders or Encoders.of(config)
             cache = self.folder.features_path
             training = replace(self.capture, views=self._training_views, test_names=())
             if self.workers.distributed and config.features_from is None:
                 extract_on_workers(training, config, encoders, cache, self.workers, self.listener)
             self._maps = feature_maps(training, config, encoders, cache, self.listener)
             self._clip_hash = encoders.clip.content_hash
+            encoders.keep_text(self.device)
         return self._maps
 
     def _initial_points(self) -> InitialPoints:

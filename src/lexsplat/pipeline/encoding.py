@@ -22,6 +22,7 @@ from lexsplat.runtime.progress import NOTE, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
+    from lexsplat.features.text import TextTower
 
 log = logging.getLogger("lexsplat")
 
@@ -41,6 +42,7 @@ class Encoders:
 
     def __init__(self, clip: str, dino: str, device: str) -> None:
         self._clip_name, self._dino_name, self.device = clip, dino, device
+        self.text: TextTower | None = None
 
     @classmethod
     def of(cls, config: BuildConfig) -> Encoders:
@@ -61,6 +63,13 @@ class Encoders:
 
         return None if self._dino_name == "none" else load_dino(self._dino_name, self.device)
 
+    def keep_text(self, device: str) -> None:
+        """Free the encoders of photos; the text tower of CLIP stays as `text`, on a device."""
+        from lexsplat.features.clip import ClipEncoder
+
+        clip, _ = self.__dict__.pop("clip", None), self.__dict__.pop("dino", None)
+        self.text = clip.text_only(device) if isinstance(clip, ClipEncoder) else clip
+
 
 def fetch_clip(config: BuildConfig) -> None:
     """Download CLIP if it is not on this machine, because its architecture decides settings (`BuildConfig.resolved`).
@@ -73,8 +82,8 @@ def fetch_clip(config: BuildConfig) -> None:
 
 def check_encoders(
     config: BuildConfig, source: Path | None = None, photos: int = 0, size: tuple[int, int] = (1440, 1080)
-) -> None:
-    """Load the encoders of the settings once, check them, and log how long the features will take.
+) -> Encoders:
+    """Load the encoders of the settings, check them, and log how long the features will take.
 
     The bundled encoders are only looked at by name.
 
@@ -84,11 +93,14 @@ def check_encoders(
         photos: Number of photos.
         size: Width and height of a photo.
 
+    Returns:
+        The encoders, loaded as far as they were checked.
+
     Raises:
         ModelError: If one is missing, does not load whole, or gives useless features, or the settings ask CLIP for
             patches that it does not have.
     """
-    folder = model_folder(config.clip, "clip")
+    folder, encoders = model_folder(config.clip, "clip"), Encoders.of(config)
     if (
         config.clip == "bundled"
         and source is not None
@@ -99,13 +111,12 @@ def check_encoders(
         )
     if config.features_from is not None:  # CLIP embeds the prompts only, and DINO is not used
         if config.clip != "bundled":
-            Encoders.of(config).clip.encode_text(UNLIKE_WORDS)
-        return
+            encoders.clip.encode_text(UNLIKE_WORDS)
+        return encoders
     if config.features.tokens != "class":
         check_patches(folder, config.clip)
-    encoders = Encoders.of(config)
     if config.clip == "bundled" and config.dino in ("bundled", "none"):
-        return
+        return encoders
     log.log(NOTE, "the encoders are loaded, checked and timed")
     right = rank_words(encoders.clip)
     if right < ENOUGH:
@@ -121,6 +132,7 @@ def check_encoders(
     if photos:
         found = estimate(encoders.clip, encoders.dino, config.features, size)
         log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(photos))
+    return encoders
 
 
 def feature_maps(

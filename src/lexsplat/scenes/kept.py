@@ -24,6 +24,7 @@ from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.kept_objects import FILE, KeptObjects, read_objects, write_objects
 
 if TYPE_CHECKING:
+    from lexsplat.features.text import TextTower
     from lexsplat.scenes.scene import Scene
 
 log = logging.getLogger("lexsplat")
@@ -78,12 +79,21 @@ def keep(scene: Scene) -> None:
         log.debug("%s: not kept (%s)", path, str(error)[:200])
 
 
-def keep_for(folder: SceneFolder, device: str, listener: Listener) -> None:
-    """`keep` for a finished scene folder, on a device; the listener receives the stages "words" and "views"."""
+def keep_for(
+    folder: SceneFolder, device: str, listener: Listener, text_tower: TextTower | None = None
+) -> None:
+    """`keep` for a finished scene folder.
+
+    Args:
+        folder: The scene folder.
+        device: Where it is computed.
+        listener: Receives the stages "words" and "views".
+        text_tower: The encoder of its texts, if it is loaded already.
+    """
     from lexsplat.scenes.scene import open_scene
 
     scene = open_scene(folder.root, device=device)
-    scene.listener = listener
+    scene.listener, scene.text_tower = listener, text_tower
     keep(scene)
 
 

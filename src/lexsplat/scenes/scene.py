@@ -94,7 +94,7 @@ class Scene:
         """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
         self.given_encode_text = encode_text
-        self._encoder: TextTower | None = None
+        self.text_tower: TextTower | None = None
         self._cache: TextCache | None = None
         if folder is not None:
             own, common = (root / "checkpoints" / "texts" for root in (folder.root, BUNDLED_SCENE))
@@ -128,7 +128,7 @@ class Scene:
         other = Scene(
             gaussians, field, self.views, self.clip, self.query, self.folder, self.given_encode_text
         )
-        other._encoder, other._cache, other._texts = self._encoder, self._cache, self._texts
+        other.text_tower, other._cache, other._texts = self.text_tower, self._cache, self._texts
         other.listener = self.listener
         return other
 
@@ -180,16 +180,16 @@ class Scene:
         Raises:
             ModelError: If it cannot be loaded, or is another one.
         """
-        if self._encoder is None:
-            self._encoder = load_text(self.clip, str(self.gaussians.device))
-        if self._encoder_hash not in (None, self._encoder.content_hash):
+        if self.text_tower is None:
+            self.text_tower = load_text(self.clip, str(self.gaussians.device))
+        if self._encoder_hash not in (None, self.text_tower.content_hash):
             raise ModelError(
                 self.clip,
                 expected="the encoder that the scene was built with",
                 found="another one",
                 remedy="give the right one with --clip, or build the scene again with this one",
             )
-        return self._encoder
+        return self.text_tower
 
     def question(self, prompts: str | Sequence[str]) -> Question:
         """The embedded prompts with what they are compared with."""
