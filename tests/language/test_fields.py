@@ -231,6 +231,19 @@ def test_stored_fields_of_earlier_versions_open(balls, method) -> None:
     assert torch.equal(again.uncertainties, field.uncertainties)
 
 
+@pytest.mark.parametrize("make", [make_trained, make_coded])
+def test_sums_and_likeliest_codes_are_those_of_the_dense_distributions(balls, make) -> None:
+    field, count = make(balls), len(balls.gaussians)
+    rng = np.random.default_rng(2)
+    places, shares, dense = rng.integers(0, 3, count), rng.random(count), field.code_probabilities().numpy()
+    expected = np.stack([shares[places == place] @ dense[places == place] for place in range(4)])
+    found = field.sums(torch.from_numpy(places), torch.from_numpy(shares), 4)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
+    codes, known = (each.numpy() for each in field.likeliest_codes())
+    assert np.array_equal(known, dense.sum(1) > 0)
+    assert np.array_equal(codes[known], dense.argmax(1)[known])
+
+
 def test_codes_weights_and_u_take_nine_bytes_a_gaussian_and_keep_the_sum_of_the_weights(balls) -> None:
     field = make_coded(balls)
     stored = field.tensors()

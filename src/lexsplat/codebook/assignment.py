@@ -47,6 +47,10 @@ class CodeUsage:
     used: int
     perplexity: float
 
+    def facts(self) -> dict[str, float]:
+        """For the record of a stage."""
+        return {"codes": len(self.counts), "codes_used": self.used, "perplexity": round(self.perplexity, 2)}
+
 
 def code_usage(code_maps: Iterable[NDArray[np.uint8]], num_codes: int) -> CodeUsage:
     """Use of the codes over index maps ``[h, w]``; indices of K and above (ignored cells) do not count."""

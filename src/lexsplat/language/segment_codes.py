@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from lexsplat.language.fields import CodeField, LanguageField
+from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
 
 _ROWS = 1 << 15
@@ -52,19 +52,23 @@ def segment_codes(segments: Segments, probabilities: Callable[[Tensor], Tensor])
         spread = csr_array((weights[place], (labels[place], np.arange(len(place)))), (lowest, len(place)))
         sums = spread @ rows + (0.0 if sums is None else sums)
     if sums is None:
-        return SegmentCodes(np.zeros((len(segments.levels), 0), np.int64), torch.zeros(0, 1), np.zeros(0))
+        return _empty(segments)
     return _from_sums(segments, sums)
 
 
 @torch.no_grad()
 def codes_of_field(field: LanguageField) -> SegmentCodes:
-    """`segment_codes` of a field that has segments; a field of codes needs no dense distributions."""
+    """`segment_codes` of a field that has segments."""
     segments = field.segments
     if segments is None:
         raise ValueError("the field has no segments")
-    if isinstance(field, CodeField) and len(segments.labels):
-        return _from_sums(segments, field.sums(segments.labels, segments.masses, segments.levels.shape[1]))
-    return segment_codes(segments, lambda index: field.select(index).code_probabilities())
+    if not len(segments.labels):
+        return _empty(segments)
+    return _from_sums(segments, field.sums(segments.labels, segments.masses, segments.levels.shape[1]))
+
+
+def _empty(segments: Segments) -> SegmentCodes:
+    return SegmentCodes(np.zeros((len(segments.levels), 0), np.int64), torch.zeros(0, 1), np.zeros(0))
 
 
 def _from_sums(segments: Segments, sums: NDArray[np.float64]) -> SegmentCodes:

@@ -21,7 +21,6 @@ from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebo
 from lexsplat.features import FeatureMaps, external_identity, load_external_features
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
-from lexsplat.language.fields import CodeField
 from lexsplat.language.methods import METHODS, FitRun, TrainingViews
 from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
@@ -344,7 +343,7 @@ class _Builder:
             code_maps[name] = mark_masked_cells(code_map, self.capture.views[name], codebook.num_codes)
             self.folder.write_code_map(name, code_maps[name])
         write_tensors(self.folder.codebook_path, codebook.tensors(), {})
-        return _code_facts(code_maps.values(), codebook.num_codes)
+        return code_usage(code_maps.values(), codebook.num_codes).facts()
 
     def _fit_language(self) -> dict[str, Any]:
         gaussians = self.folder.read_gaussians().to(self.device)
@@ -362,10 +361,7 @@ class _Builder:
         )
         field = self.method.fit(gaussians, views, self.config, run)
         self._write_language(field.tensors(), field.metadata())
-        facts: dict[str, Any] = {"method": field.method}
-        if isinstance(field, CodeField):
-            facts |= _code_facts([field.codes[:, 0].cpu().numpy()], field.codebook.num_codes)
-            facts["unseen"] = field.unseen
+        facts: dict[str, Any] = {"method": field.method, **field.facts()}
         if field.segments is not None:
             facts["segments"] = field.segments.levels.shape[1]
         return facts
@@ -421,12 +417,6 @@ class _Builder:
     def _code_paths(self) -> list[Path]:
         names = self.capture.train_names
         return [self.folder.codebook_path, *(self.folder.code_map_path(name) for name in names)]
-
-
-def _code_facts(code_maps: Any, num_codes: int) -> dict[str, Any]:
-    """Number of codes and how they are used, for the record of a stage."""
-    usage = code_usage(code_maps, num_codes)
-    return {"codes": num_codes, "codes_used": usage.used, "perplexity": round(usage.perplexity, 2)}
 
 
 def _check_photos(capture: Capture, memory: int) -> None:

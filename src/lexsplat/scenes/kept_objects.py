@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from lexsplat.geometry.boxes import Box
-from lexsplat.language.fields import CodeField
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.presence import DescribedPlaces
 from lexsplat.queries.selection import Selection
@@ -53,11 +52,11 @@ class KeptObjects:
 
 def read_objects(scene: Scene, path: Path) -> KeptObjects | None:
     """The objects of a scene from a file; None where it does not fit the scene."""
-    if not path.exists() or not isinstance(scene.field, CodeField):
+    if not path.exists() or scene.field.segments is None:
         return None
     try:
         tensors, facts = read_tensors(path)
-        if facts.get("of") != _key(scene, scene.field):
+        if facts.get("of") != digest(_parts(scene)):
             return None
         places = DescribedPlaces(tensors["places"], tuple(json.loads(facts["words"])))
         return KeptObjects(_selections(scene, tensors, json.loads(facts["objects"])), places)
@@ -67,9 +66,7 @@ def read_objects(scene: Scene, path: Path) -> KeptObjects | None:
 
 
 def write_objects(scene: Scene, kept: KeptObjects, path: Path) -> None:
-    """Write the objects of a scene; nothing is written of a scene without codes."""
-    if not isinstance(scene.field, CodeField):
-        return
+    """Write the objects of a scene with segments."""
     numbers = torch.full((len(scene.gaussians),), -1, dtype=torch.int32)
     for number, each in enumerate(kept.objects):
         numbers[each.indices.cpu()] = number
@@ -83,7 +80,7 @@ def write_objects(scene: Scene, kept: KeptObjects, path: Path) -> None:
         "places": kept.places.distributions.cpu().contiguous(),
     }
     facts = {
-        "of": _key(scene, scene.field),
+        "of": digest(_parts(scene)),
         "objects": json.dumps([[each.phrase, each.names] for each in kept.objects]),
         "words": json.dumps(kept.places.words),
     }
@@ -118,17 +115,13 @@ def _selections(scene: Scene, tensors: dict[str, Tensor], entries: list) -> tupl
     return tuple(found)
 
 
-def _key(scene: Scene, field: CodeField) -> str:
-    """Hash of everything that the file depends on."""
-    return digest(_parts(scene, field))
-
-
-def _parts(scene: Scene, field: CodeField) -> Iterator[bytes]:
+def _parts(scene: Scene) -> Iterator[bytes]:
+    """Everything that the file depends on."""
     from lexsplat.scenes.kept import scene_key
 
     yield f"{_VERSION}".encode()
     yield ((scene.seen.key if scene.seen else "") or scene_key(scene)).encode()
-    for tensor in (field.codes, field.weights, field.codebook.clip):
+    for tensor in scene.field.content():
         yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
     encoder = scene.encoder_identity()
     words = (

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from lexsplat.language.fields import CodeField
 from lexsplat.queries.colors import color_words
 from lexsplat.queries.objects import name_probabilities, whole_segments
 from lexsplat.queries.relations import same
@@ -130,10 +129,7 @@ def _shown(scene: Scene) -> torch.Tensor:
 def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:
     weights, field = _shown(scene)[thing.indices], scene.field.select(thing.indices)
     shares = weights / weights.sum().clamp_min(1e-12)
-    if isinstance(field, CodeField):
-        summed = field.sums(torch.zeros_like(thing.indices), shares, 1)[0]
-        return torch.from_numpy(summed).to(shares)
-    return shares @ field.code_probabilities()
+    return torch.from_numpy(field.sums(torch.zeros_like(thing.indices), shares, 1)[0]).to(shares)
 
 
 def list_document(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.language.fields import CodeField, LanguageField
+from lexsplat.language.fields import LanguageField
 from lexsplat.queries.heatmaps import colorize
 
 MODES = ("language", "codes", "uncertainty")
@@ -29,28 +29,15 @@ def colors_in(mode: str, language: LanguageField) -> NDArray[np.uint8]:
     if mode == "language":
         return language_colors(language)
     if mode == "codes":
-        codes, known = likeliest_codes(language)
-        colors = code_palette(language.codebook.num_codes)[codes]
-        colors[~known] = _PLAIN
+        codes, known = language.likeliest_codes()
+        colors = code_palette(language.codebook.num_codes)[codes.cpu().numpy()]
+        colors[~known.cpu().numpy()] = _PLAIN
         return colors
     if mode == "uncertainty":
         values = language.uncertainties.detach().cpu().numpy()
         high = max(float(np.percentile(values, 98)) if len(values) else 0.0, 1e-3)
         return colorize(values, 0.0, high)
     raise ValueError(f"mode must be one of {', '.join(MODES)}, got {mode[:40]!r}")
-
-
-def likeliest_codes(language: LanguageField) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The most probable code of every Gaussian ``[N]``, and whether the Gaussian has language ``[N]``."""
-    if isinstance(language, CodeField):
-        weights, place = language.weights.max(1)
-        codes = language.codes.gather(1, place[:, None])[:, 0].long()
-        return codes.cpu().numpy(), (weights > 0).cpu().numpy()
-    count = len(language.uncertainties)
-    index = torch.arange(count, device=language.uncertainties.device)
-    parts = [language.select(rows).code_probabilities().max(1) for rows in index.split(_ROWS)]
-    likeliest = torch.cat([part.indices for part in parts]).cpu().numpy()
-    return likeliest, (torch.cat([part.values for part in parts]) > 0).cpu().numpy()
 
 
 def code_palette(count: int) -> NDArray[np.uint8]:

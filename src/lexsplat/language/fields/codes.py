@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.codebook import Codebook
+from lexsplat.codebook import Codebook, code_usage
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields.rendering import (
@@ -102,13 +103,7 @@ class CodeField:
         )
 
     def sums(self, places: Tensor, shares: Tensor, count: int) -> NDArray[np.float64]:
-        """Weighted sums of the distributions at each of some places ``[count, K]``; ``[N, K]`` is never held.
-
-        Args:
-            places: Where each Gaussian counts ``[N]`` int64, in 0..count-1.
-            shares: Its weight ``[N]``.
-            count: Number of places.
-        """
+        """Weighted sums of the distributions at places ``[count, K]``, in float64; see `LanguageField`."""
         codes = self.codebook.num_codes
         first, weights = places.cpu().numpy() * codes, shares.cpu().double().numpy()
         total = np.zeros(count * codes)
@@ -116,6 +111,11 @@ class CodeField:
             values = weights * self.weights[:, column].cpu().numpy()
             total += np.bincount(first + self.codes[:, column].cpu().numpy(), values, len(total))
         return total.reshape(count, codes)
+
+    def likeliest_codes(self) -> tuple[Tensor, Tensor]:
+        """The most probable code of every Gaussian ``[N]``, and whether a training view shows it ``[N]``."""
+        weights, place = self.weights.max(1)
+        return self.codes.gather(1, place[:, None])[:, 0].long(), weights > 0
 
     @torch.no_grad()
     def render_scores(self, gaussians: Gaussians, camera: Camera, table: Tensor) -> Tensor:
@@ -145,6 +145,15 @@ class CodeField:
             method=self.method,
             segments=self.segments.select(index) if self.segments else None,
         )
+
+    def facts(self) -> dict[str, Any]:
+        """How the likeliest codes are used, and how many Gaussians have none."""
+        first = self.codes[:, 0].cpu().numpy()
+        return {**code_usage([first], self.codebook.num_codes).facts(), "unseen": self.unseen}
+
+    def content(self) -> tuple[Tensor, ...]:
+        """Codes, weights and codewords."""
+        return self.codes, self.weights, self.codebook.clip
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors; those of the codebook under ``codebook.``.

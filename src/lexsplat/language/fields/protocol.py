@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.codebook import Codebook
@@ -37,6 +39,18 @@ class LanguageField(Protocol):
         ``[N, K]`` is never held.
         """
 
+    def sums(self, places: Tensor, shares: Tensor, count: int) -> NDArray[np.float64]:
+        """Weighted sums of the distributions at each of some places ``[count, K]``; ``[N, K]`` is never held.
+
+        Args:
+            places: Where each Gaussian counts ``[N]`` int64, in 0..count-1.
+            shares: Its weight ``[N]``.
+            count: Number of places.
+        """
+
+    def likeliest_codes(self) -> tuple[Tensor, Tensor]:
+        """The most probable code of every Gaussian ``[N]`` int64, and whether it has language ``[N]`` bool."""
+
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """Distribution over codes at every pixel ``[H, W, K]``."""
 
@@ -45,6 +59,12 @@ class LanguageField(Protocol):
 
     def select(self, index: Tensor) -> LanguageField:
         """The language of the Gaussians given by a mask ``[N]`` or an index ``[M]``, as `Gaussians.select`."""
+
+    def facts(self) -> dict[str, Any]:
+        """What the record of a build says about it: how its codes are used."""
+
+    def content(self) -> tuple[Tensor, ...]:
+        """The tensors on which `scores` depends, for hashes."""
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -127,6 +130,23 @@ class TrainedField(nn.Module):
         table = table.to(self.semantics)
         return torch.cat([self._probabilities(rows) @ table for rows in self.semantics.split(4 * BLOCK_ROWS)])
 
+    @torch.no_grad()
+    def sums(self, places: Tensor, shares: Tensor, count: int) -> NDArray[np.float64]:
+        """Weighted sums of the distributions at places ``[count, K]``, in blocks of Gaussians."""
+        total = np.zeros((count, self.codebook.num_codes))
+        for rows in torch.arange(len(self.semantics), device=self.semantics.device).split(BLOCK_ROWS):
+            probabilities = self._probabilities(self.semantics[rows]).cpu().double().numpy()
+            weights = shares.to(rows.device)[rows].cpu().double().numpy()
+            np.add.at(total, places.to(rows.device)[rows].cpu().numpy(), weights[:, None] * probabilities)
+        return total
+
+    @torch.no_grad()
+    def likeliest_codes(self) -> tuple[Tensor, Tensor]:
+        """The most probable code of every Gaussian ``[N]``; each has language ``[N]``."""
+        parts = [self._probabilities(rows).argmax(1) for rows in self.semantics.split(BLOCK_ROWS)]
+        codes = torch.cat(parts)
+        return codes, torch.ones_like(codes, dtype=torch.bool)
+
     def _probabilities(self, semantics: Tensor) -> Tensor:
         """Decoded distributions ``[M, K]`` of rows ``[M, 8]``."""
         return torch.cat([self.decode(rows).softmax(-1) for rows in semantics.split(BLOCK_ROWS)])
@@ -151,6 +171,14 @@ class TrainedField(nn.Module):
         tensors = self.tensors()
         rows = {name: tensors[name][index] for name in ("semantics", "uncertainty_logits")}
         return TrainedField.from_tensors(tensors | rows, self.metadata())
+
+    def facts(self) -> dict[str, Any]:
+        """None: the record of the stage "codebook" has how its codes are used."""
+        return {}
+
+    def content(self) -> tuple[Tensor, ...]:
+        """All its tensors."""
+        return tuple(self.tensors().values())
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors; those of the codebook under ``codebook.``."""
