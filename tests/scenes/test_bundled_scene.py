@@ -15,6 +15,7 @@ from lexsplat import cli, open_scene
 from lexsplat.captures.images.reading import read_mask
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.encoders import load_clip
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
@@ -47,6 +48,11 @@ def test_it_contains_no_information_about_the_build_machine():
 
 def test_its_language_uses_the_bundled_encoder(demo):
     assert demo.folder.record["stages"]["features"]["clip_hash"] == load_clip("bundled").content_hash
+
+
+def test_the_earlier_name_of_the_bundled_encoder_means_it_everywhere():
+    assert open_scene("demo", clip="embedded").clip == "bundled"
+    assert BuildConfig(clip="embedded", dino="embedded").clip == "bundled"
 
 
 @pytest.mark.parametrize("prompt", ["red apple", "blue mug", "rubber duck", "pumpkin"])

@@ -35,6 +35,11 @@ _TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "adde
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
 
 
+def present_name(name: str) -> str:
+    """The name of a model; "embedded" is an alias of "bundled"."""
+    return "bundled" if name == "embedded" else name
+
+
 def model_folder(name: str, tower: str) -> Path:
     """The local folder of a model, downloaded if necessary.
 
@@ -48,7 +53,7 @@ def model_folder(name: str, tower: str) -> Path:
     Raises:
         ModelError: If the folder lacks one of them, or the model is neither in the hub's cache nor can be downloaded.
     """
-    if name in ("bundled", "embedded"):  # "embedded" is an alias
+    if present_name(name) == "bundled":
         return BUNDLED_ENCODERS / tower
     if not name.strip():  # as a path, it is the working directory
         expected = "a folder or a model name"
@@ -70,7 +75,7 @@ def model_folder(name: str, tower: str) -> Path:
 
 def local_folder(name: str, tower: str) -> Path | None:
     """The folder of a model if it is on this machine, complete or not; does not use the network."""
-    if name in ("bundled", "embedded"):
+    if present_name(name) == "bundled":
         return BUNDLED_ENCODERS / tower
     folder = Path(name).expanduser()
     return folder if folder.is_dir() else _cached_folder(name, tower)[0]

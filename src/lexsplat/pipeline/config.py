@@ -13,6 +13,7 @@ from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureConfig
 from lexsplat.features.clip import patch_grid
 from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
+from lexsplat.features.hub import present_name
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.language.methods.averaged import AveragedConfig
@@ -114,8 +115,7 @@ class BuildConfig:
 
     def __post_init__(self) -> None:
         for encoder in ("clip", "dino"):
-            if getattr(self, encoder) == "embedded":  # alias of earlier versions
-                object.__setattr__(self, encoder, "bundled")
+            object.__setattr__(self, encoder, present_name(getattr(self, encoder)))
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device must be auto, cpu or cuda, got {self.device!r}")
         if self.views_from not in ("auto", "inside", "around"):

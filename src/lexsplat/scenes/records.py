@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from lexsplat.features.hub import present_name
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 
 FORMAT_VERSION = 1
@@ -38,8 +39,8 @@ def read_record(content: Any, path: Path) -> dict[str, Any]:
             record[part] = _renamed(record[part])
     config = record.get("config", {})
     for encoder in ("clip", "dino"):
-        if config.get(encoder) == "embedded":
-            config[encoder] = "bundled"
+        if encoder in config:
+            config[encoder] = present_name(config[encoder])
     return record
 
 

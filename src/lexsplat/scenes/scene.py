@@ -17,6 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lexsplat.features.hub import present_name
 from lexsplat.features.text import TextCache, TextTower, encode_each, load_text, texts_of_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
@@ -88,7 +89,7 @@ class Scene:
         encode_text: TextEncoder | None = None,
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
-        self.clip, self.folder = clip, folder
+        self.clip, self.folder = present_name(clip), folder
         self.listener: Listener = silent  # receives progress events of the stages "words" and "views"
         self._working = threading.RLock()
         """Held while something new is computed; what is known is answered without it."""
@@ -100,7 +101,6 @@ class Scene:
             own, common = (root / "checkpoints" / "texts" for root in (folder.root, BUNDLED_SCENE))
             self._cache = texts_of_scene(own, shipped=folder.is_bundled, common=common)
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
-        self._world: World | None = None
 
     def __repr__(self) -> str:
         place = f", folder={str(self.folder.root)!r}" if self.folder else ""
@@ -372,12 +372,10 @@ class Scene:
 
     # -- views
 
-    @property
+    @cached_property
     def world(self) -> World:
         """The up direction, and the length of a unit in meters if known (``lexsplat scale``)."""
-        if self._world is None:
-            self._world = world_of(self.folder.record if self.folder else {}, self.cameras)
-        return self._world
+        return world_of(self.folder.record if self.folder else {}, self.cameras)
 
     @property
     def cameras(self) -> dict[str, Camera]:

@@ -332,7 +332,7 @@ class Session:
 
     def _words(self) -> bytes:
         """Completions: what was asked, the vocabulary, everyday phrases."""
-        phrases = page_phrases(self.history.prompts, bundled=self.scene.clip in ("bundled", "embedded"))
+        phrases = page_phrases(self.history.prompts, bundled=self.scene.clip == "bundled")
         phrases |= {name.lower(): NAME for name in self.history.vocabulary if name.lower() not in phrases}
         known = {*self.history.prompts, *self.history.vocabulary}
         return words_file(phrases, ["y" if phrase in known else "u" for phrase in phrases])

@@ -204,7 +204,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
         (folder / "segments.bin").write_bytes(segments_file(segments.select(kept), scene.hidden.cpu()[kept]))
     objects = listed_objects(scene)
     (folder / "objects.bin").write_bytes(objects_file(objects, kept))
-    phrases = page_phrases(asked_phrases(scene), bundled=scene.clip in ("bundled", "embedded"))
+    phrases = page_phrases(asked_phrases(scene), bundled=scene.clip == "bundled")
     tables, presences = phrase_answers(scene, list(phrases))
     (folder / "words.txt").write_bytes(words_file(phrases, presences))
     (folder / "words.bin").write_bytes(tables.numpy().tobytes())
