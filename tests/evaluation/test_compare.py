@@ -15,9 +15,8 @@ from support.report_pages import Page
 from support.schemas import validated
 
 from lexsplat.cli.captures import capture_and_settings
-from lexsplat.evaluation import EvaluationConfig, baselines
-from lexsplat.evaluation import compare as comparison
-from lexsplat.evaluation.baselines import feature_rendering
+from lexsplat.evaluation import EvaluationConfig
+from lexsplat.evaluation.baselines import BASELINES, Dff, DffConfig, Ovs3d, Ovs3dConfig, feature_rendering
 from lexsplat.evaluation.compare import ComparisonPlan
 from lexsplat.runtime.memory import parse_bytes
 
@@ -30,11 +29,9 @@ def compared(tiny_capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("comparison")
     with pytest.MonkeyPatch.context() as patch:
         color_encoder.install(patch)
-        patch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=3))
-        patch.setattr(
-            comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=3, pairs=16)
-        )
-        methods = ("averaged", "averaged-feature", *comparison.BASELINES)
+        patch.setitem(BASELINES, "dff", Dff(DffConfig(steps=3)))
+        patch.setitem(BASELINES, "3dovs", Ovs3d(Ovs3dConfig(steps=3, pairs=16)))
+        methods = ("averaged", "averaged-feature", *BASELINES)
         settings = {"plan": ComparisonPlan(methods=methods), "evaluation": EvaluationConfig(lpips=False)}
         measure_methods(tiny_capture, folder, CONFIG, **settings)
         start = time.perf_counter()
@@ -159,8 +156,8 @@ def test_other_protocols_are_measured_again(compared, tiny_capture, tmp_path, mo
 def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_path, monkeypatch):
     shutil.copytree(compared[0] / "scene", tmp_path / "scene")
     color_encoder.install(monkeypatch)
-    monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=0))
-    monkeypatch.setattr(comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=0))
+    monkeypatch.setitem(BASELINES, "dff", Dff(DffConfig(steps=0)))
+    monkeypatch.setitem(BASELINES, "3dovs", Ovs3d(Ovs3dConfig(steps=0)))
     granted, original = [], feature_rendering.TrainingViews.__init__
 
     def keep(*args, **wishes):

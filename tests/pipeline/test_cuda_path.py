@@ -314,21 +314,20 @@ def test_every_command_runs_with_device_cuda(pretended_gpu, built, tiny_capture,
 def test_all_baselines_are_compared_on_the_gpu(pretended_gpu, tmp_path, monkeypatch):
     from support.experiments import CONFIG, compared
 
-    from lexsplat.evaluation import EvaluationConfig, baselines
-    from lexsplat.evaluation import compare as comparison
+    from lexsplat.evaluation import EvaluationConfig
+    from lexsplat.evaluation.baselines import BASELINES, Dff, DffConfig, Ovs3d, Ovs3dConfig
+    from lexsplat.evaluation.compare import ComparisonPlan
 
     color_encoder.install(monkeypatch)
-    monkeypatch.setattr(comparison.baselines, "DffConfig", lambda: baselines.dff.DffConfig(steps=2))
-    monkeypatch.setattr(
-        comparison.baselines, "Ovs3dConfig", lambda: baselines.ovs3d.Ovs3dConfig(steps=2, pairs=16)
-    )
+    monkeypatch.setitem(BASELINES, "dff", Dff(DffConfig(steps=2)))
+    monkeypatch.setitem(BASELINES, "3dovs", Ovs3d(Ovs3dConfig(steps=2, pairs=16)))
     config = dataclasses.replace(
         CONFIG, device="cuda", iterations=3,
         reconstruction=dataclasses.replace(CONFIG.reconstruction, max_gaussians=150),
     )  # fmt: skip
     capture = write_capture(tmp_path / "capture", views=5, width=40, height=30)
-    plan = comparison.ComparisonPlan(methods=comparison.BASELINES)
+    plan = ComparisonPlan(methods=tuple(BASELINES))
     evaluation = EvaluationConfig(lpips=False)
     compared(capture, tmp_path / "out", config, plan, evaluation=evaluation)
     rows = json.loads((tmp_path / "out" / "comparison.json").read_text())
-    assert set(comparison.BASELINES) <= set(json.dumps(rows).replace('"', " ").replace(",", " ").split())
+    assert set(BASELINES) <= set(json.dumps(rows).replace('"', " ").replace(",", " ").split())

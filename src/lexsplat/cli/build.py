@@ -11,6 +11,7 @@ from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import CaptureArgument, MoreCapturesArgument, OptionalCaptureArgument, ProgressName
 from lexsplat.cli.settings import Settings
+from lexsplat.language.methods import METHODS
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
 
@@ -132,8 +133,8 @@ class Reconstruct(Build):
         name for name in ESSENTIAL_SETTINGS if name not in ("clip", "dino", "method")
     )
     unused: ClassVar[tuple[str, ...]] = (
-        "clip", "dino", "features_from", "method", "joint", "features", "codebook", "averaged", "trained",
-        "keep_floaters", "views_from",
+        "clip", "dino", "features_from", "method", "joint", "features", "keep_floaters", "views_from",
+        *dict.fromkeys(part for method in METHODS.values() for part in method.settings),
     )  # fmt: skip
     until: ClassVar[Literal["reconstruct", "language"]] = "reconstruct"
 

@@ -7,15 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
-from lexsplat.evaluation import baselines
 from lexsplat.evaluation.ablate import language_row
+from lexsplat.evaluation.baselines import BASELINES, Baseline, BaselineRun, TrainingData
 from lexsplat.evaluation.experiments import Bench, Made, Row
-from lexsplat.evaluation.methods import Method
 from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.queries.relevancy import QueryForm, embed_prompts
-
-BASELINES = ("dff", "lerf", "3dovs", "nearest")
-"""The methods that the paper compares with, and "nearest", a lower bound without 3D."""
 
 COMPARED = (*METHODS, *(f"{name}-{form}" for name in METHODS for form in ("code", "feature")), *BASELINES)
 """Everything that can be compared. With "-code", our methods answer by single Gaussians; with "-feature", in the
@@ -65,30 +61,17 @@ def _row(bench: Bench, name: str) -> Row:
     if own in METHODS:
         config = replace(bench.config, method=cast(MethodName, own))
         return language_row(bench, name, config, cast(QueryForm, form or "segment"))
-    settings = {
-        "dff": baselines.DffConfig(),
-        "lerf": baselines.LerfConfig(),
-        "3dovs": baselines.Ovs3dConfig(),
-        "nearest": None,
-    }[name]
-    prompts = list(bench.ground_truth.prompts()) if name == "3dovs" else []
-    return Row(name, [name, settings, prompts], lambda seed: _baseline(bench, name, settings, seed))
+    baseline = BASELINES[name]
+    prompts = bench.ground_truth.prompts() if baseline.knows_prompts else ()
+    key = [name, baseline.settings, list(prompts)]
+    return Row(name, key, lambda seed: _fitted(bench, baseline, prompts, seed))
 
 
-def _baseline(bench: Bench, name: str, settings: Any, seed: int) -> Made:
-    views, maps = bench.capture.views, bench.maps
+def _fitted(bench: Bench, baseline: Baseline, prompts: Sequence[str], seed: int) -> Made:
     training = {view.name: view.camera for view in bench.capture.train_views}
-    data = baselines.TrainingData(bench.gaussians, training, maps, bench.level_maps)
-    budget: dict[str, Any] = {"memory": bench.memory, "listener": bench.listener}
+    data = TrainingData(bench.gaussians, training, bench.maps, bench.level_maps)
+    cameras = {name: view.camera for name, view in bench.capture.views.items()}
     start = time.perf_counter()
-    found: Method
-    if name == "dff":
-        found = baselines.distill(data, settings, seed=seed, **budget)
-    elif name == "lerf":
-        found = baselines.fit_lerf(data, settings, **budget)
-    elif name == "3dovs":
-        classes = embed_prompts(bench.ground_truth.prompts(), bench.encode_text)
-        found = baselines.fit_3dovs(data, classes, settings, seed=seed, **budget)
-    else:
-        found = baselines.ViewFeatures({view: v.camera for view, v in views.items()}, maps)
-    return found, {name: time.perf_counter() - start}
+    classes = embed_prompts(prompts, bench.encode_text) if prompts else None
+    run = BaselineRun(cameras, classes, seed, bench.memory, bench.listener)
+    return baseline.fit(data, run), {baseline.name: time.perf_counter() - start}

@@ -6,20 +6,32 @@ scored. They are not the authors' programs: docs/evaluation.md lists the differe
 - `dff`: distilled feature fields (Kobayashi et al. 2022): raw features on the Gaussians, fitted by rendering.
 - `lerf`: LERF (Kerr et al. 2023): features at several physical scales, the scale chosen per prompt.
 - `ovs3d`: 3D-OVS (Liu et al. 2023): a list of classes known in advance, fitted by their distributions.
-- `nearest`: no 3D: the features of the evaluated photo itself.
+- `nearest`: no 3D: the features of the evaluated photo itself, a lower bound.
+
+A new one is a file with a class like `Dff`, and an entry in `BASELINES`; tables and options read the rest from it.
 """
 
-from lexsplat.evaluation.baselines.dff import DffConfig, distill
+from collections.abc import Mapping
+
+from lexsplat.evaluation.baselines.baseline import Baseline, BaselineRun
+from lexsplat.evaluation.baselines.dff import Dff, DffConfig, distill
 from lexsplat.evaluation.baselines.feature_rendering import GaussianFeatures, TrainingData
-from lexsplat.evaluation.baselines.lerf import LerfConfig, fit_lerf
-from lexsplat.evaluation.baselines.nearest import ViewFeatures
-from lexsplat.evaluation.baselines.ovs3d import ClassFeatures, Ovs3dConfig, fit_3dovs
+from lexsplat.evaluation.baselines.lerf import Lerf, LerfConfig, fit_lerf
+from lexsplat.evaluation.baselines.nearest import Nearest, ViewFeatures
+from lexsplat.evaluation.baselines.ovs3d import ClassFeatures, Ovs3d, Ovs3dConfig, fit_3dovs
 
 __all__ = [
+    "BASELINES",
+    "Baseline",
+    "BaselineRun",
     "ClassFeatures",
+    "Dff",
     "DffConfig",
     "GaussianFeatures",
+    "Lerf",
     "LerfConfig",
+    "Nearest",
+    "Ovs3d",
     "Ovs3dConfig",
     "TrainingData",
     "ViewFeatures",
@@ -27,3 +39,6 @@ __all__ = [
     "fit_3dovs",
     "fit_lerf",
 ]
+
+BASELINES: Mapping[str, Baseline] = {method.name: method for method in (Dff(), Lerf(), Ovs3d(), Nearest())}
+"""The compared methods by name, in the order of tables."""

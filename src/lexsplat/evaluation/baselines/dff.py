@@ -8,9 +8,11 @@ per step, `CHANNELS` channels at a time, so that only the result grows with the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
+from lexsplat.evaluation.baselines.baseline import BaselineRun
 from lexsplat.evaluation.baselines.feature_rendering import (
     CHANNELS,
     GaussianFeatures,
@@ -84,3 +86,16 @@ def distill(
                 listener(Event("dff", done, total, {"loss": float(loss.detach())}))
         features[:, columns] = torch.where(seen, part.detach(), 0.0)
     return GaussianFeatures("dff", features[None])
+
+
+@dataclass(frozen=True)
+class Dff:
+    """The baseline."""
+
+    settings: DffConfig = DffConfig()
+    name: ClassVar[str] = "dff"
+    knows_prompts: ClassVar[bool] = False
+
+    def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
+        """`distill`."""
+        return distill(data, self.settings, seed=run.seed, memory=run.memory, listener=run.listener)

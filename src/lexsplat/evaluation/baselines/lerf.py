@@ -12,6 +12,7 @@ A prompt is scored at every scale; the scale with the highest relevancy is taken
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from lexsplat.evaluation.baselines.baseline import BaselineRun
 from lexsplat.evaluation.baselines.feature_rendering import (
     GaussianFeatures,
     LevelMaps,
@@ -174,3 +176,16 @@ def smooth_by_similarity(means: Tensor, dino: Tensor, features: Tensor, config: 
             total[scale] += weight[:, None] * values[other]
         weights += weight
     return total / weights.clamp_min(1e-12)[:, None]
+
+
+@dataclass(frozen=True)
+class Lerf:
+    """The baseline."""
+
+    settings: LerfConfig = LerfConfig()
+    name: ClassVar[str] = "lerf"
+    knows_prompts: ClassVar[bool] = False
+
+    def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
+        """`fit_lerf`, which needs no seed."""
+        return fit_lerf(data, self.settings, memory=run.memory, listener=run.listener)

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from lexsplat.evaluation.baselines.feature_rendering import resized_map, unit_texts
+from lexsplat.evaluation.baselines.baseline import BaselineRun
+from lexsplat.evaluation.baselines.feature_rendering import TrainingData, resized_map, unit_texts
 from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
@@ -53,3 +54,13 @@ class ViewFeatures:
     def tensors(self) -> dict[str, Tensor]:
         """The maps of all views in half precision."""
         return {name: self._maps[name].clip.half() for name in self._names.values()}
+
+
+class Nearest:
+    """The baseline."""
+
+    name, settings, knows_prompts = "nearest", None, False
+
+    def fit(self, data: TrainingData, run: BaselineRun) -> ViewFeatures:
+        """The maps of all views; nothing is fitted."""
+        return ViewFeatures(run.cameras, data.maps)

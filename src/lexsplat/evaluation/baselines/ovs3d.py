@@ -14,11 +14,13 @@ threshold is 3D-OVS's choice of the best class.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.evaluation.baselines.baseline import BaselineRun
 from lexsplat.evaluation.baselines.feature_rendering import (
     CHANNELS,
     TrainingData,
@@ -230,3 +232,24 @@ class _Fit:
             log_classes = (cosines.flatten(0, 1)[pixels] / config.temperature).log_softmax(-1)
             loss = loss + alignment_loss(log_classes, dino, config)
         return loss
+
+
+@dataclass(frozen=True)
+class Ovs3d:
+    """The baseline."""
+
+    settings: Ovs3dConfig = Ovs3dConfig()
+    name: ClassVar[str] = "3dovs"
+    knows_prompts: ClassVar[bool] = True
+
+    def fit(self, data: TrainingData, run: BaselineRun) -> ClassFeatures:
+        """`fit_3dovs` with the prompts as classes.
+
+        Raises:
+            ValueError: If there are fewer than two prompts.
+        """
+        if run.classes is None:
+            raise ValueError("3dovs needs the prompts of the evaluation (classes)")
+        return fit_3dovs(
+            data, run.classes, self.settings, seed=run.seed, memory=run.memory, listener=run.listener
+        )
