@@ -26,22 +26,19 @@ from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 from lexsplat.geometry.world import World
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
+from lexsplat.queries.clusters import LINK
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_kind, is_of_kind, words_of_things
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.presence import DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
-from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.selection import PEAK_COUNT, SMALLEST_SHARE, Presence, Selection
 from lexsplat.queries.spelling import corrected, strange
 from lexsplat.queries.vocabulary import NAMES, STUFF, thing_of_part
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.library.contents import Contents, projected
 
-_LINK = 2.5
-"""Largest distance between linked Gaussians, in distances to the sixth neighbor (`lexsplat.queries.selection`)."""
-_SMALLEST_SHARE = 0.1
-_PEAK_COUNT = 20
 _LARGE = 0.05
 """Phrases without an everyday name that select this share of a scene are left to it."""
 _BOXED = 400
@@ -224,7 +221,7 @@ def _instances(contents: Contents, taken: Array, own: Array) -> list[Array]:
     sizes, opacities = contents.counts.numpy(), contents.opacities.numpy()
     order = taken[np.argsort(contents.spacings.numpy()[taken], kind="stable")]
     half = np.searchsorted(np.cumsum(sizes[order]), sizes[order].sum() / 2)
-    reach = _LINK * float(contents.spacings[int(order[half])])
+    reach = LINK * float(contents.spacings[int(order[half])])
     chosen = np.zeros(len(sizes), bool)
     chosen[taken] = True
     links = contents.links.numpy()[chosen[contents.links.numpy()].all(1) & (contents.gaps.numpy() <= reach)]
@@ -233,7 +230,7 @@ def _instances(contents: Contents, taken: Array, own: Array) -> list[Array]:
     totals = np.bincount(labels[taken], opacities[taken], labels.max() + 1)
     ranked = [label for label in np.argsort(-totals, kind="stable") if totals[label] > 0]
     parts = [
-        taken[labels[taken] == label] for label in ranked if totals[label] >= _SMALLEST_SHARE * totals.max()
+        taken[labels[taken] == label] for label in ranked if totals[label] >= SMALLEST_SHARE * totals.max()
     ]
     if len(parts) < 2:
         return parts or [taken]
@@ -246,10 +243,10 @@ def _instances(contents: Contents, taken: Array, own: Array) -> list[Array]:
 
 
 def _peak(scores: Array, sizes: Array) -> float:
-    """The mean of the highest scores of twenty Gaussians."""
+    """The mean of the highest scores of `PEAK_COUNT` Gaussians."""
     order = np.argsort(-scores, kind="stable")
     before = np.cumsum(sizes[order]) - sizes[order]
-    counted = np.clip(_PEAK_COUNT - before, 0, sizes[order])
+    counted = np.clip(PEAK_COUNT - before, 0, sizes[order])
     return float((scores[order] * counted).sum() / max(1, counted.sum()))
 
 
