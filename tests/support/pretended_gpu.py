@@ -1,5 +1,9 @@
 """A pretended GPU: tensors that report the device ``cuda:0`` and follow its rules, with their data in CPU memory.
 
+Most machines that run the tests have no GPU, and on them a tensor left on the wrong device fails no other test.
+torch's device "meta" refuses such a mixture too but holds no values, on which density control, selections and whole
+commands depend.
+
 `PretendedTensor` wraps a CPU tensor. Every operation is checked against the rules of CUDA, unwrapped, executed on the
 CPU, and wrapped again. The rules: all tensors are on one device (except scalars in arithmetic, indices and explicit
 copies), conversion to NumPy requires ``.cpu()``, and random numbers come from a generator of the same device. In the
