@@ -2,6 +2,8 @@
 
 torchrun --nproc-per-node 4 -m lexsplat.pipeline.several_gpus photos/ --output gaussians.ply
 lexsplat build photos/ --splats gaussians.ply --output scene
+
+``torchrun`` starts a module in every process, so this is no command of ``lexsplat``.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ from lexsplat.scenes.formats.ply import write_ply
 def reconstruct_together(source: Path, output: Path, config: ReconstructionConfig, seed: int = 0) -> None:
     """Reconstruct a capture in all processes of the group; the first one writes ``output``.
 
-    The training is neither saved on the way nor repeated with smaller rates where it diverges.
+    The loop is not `lexsplat.runtime.training.run_training`, which sends a training that diverges back to its last good
+    state: one process would go back alone, and all others would wait for its part of the step. So the training is
+    neither saved on the way nor repeated with smaller rates.
 
     Args:
         source: The capture, which all processes see.
