@@ -4,6 +4,7 @@ from support.rooms import texture
 from support.written_captures import save, write_json, write_transforms
 
 from lexsplat.captures import initial_points, load_capture, random_points_in_frusta, triangulate
+from lexsplat.captures.sfm import triangulation
 from lexsplat.captures.sfm.triangulation import matching_pairs
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, look_at
 
@@ -155,10 +156,10 @@ def test_held_out_views_are_not_read(tmp_path):
     triangulate(capture)  # would raise on the broken images
 
 
-def test_views_are_matched_with_their_neighbors(wall):
-    views = wall.train_views
-    assert {b - a for a, b in matching_pairs(views, neighbors=1)} == {1}
-    assert len(matching_pairs(views)) == 15
+def test_views_are_matched_with_their_neighbors(wall, monkeypatch):
+    assert len(matching_pairs(wall.train_views)) == 15
+    monkeypatch.setattr(triangulation, "NEIGHBORS", 1)
+    assert {b - a for a, b in matching_pairs(wall.train_views)} == {1}
 
 
 def test_views_that_look_away_from_each_other_are_not_matched(tmp_path):

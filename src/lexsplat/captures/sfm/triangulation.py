@@ -221,8 +221,8 @@ def _views_that_see(views: tuple[View, ...], points: NDArray[np.float64]) -> NDA
     return counts
 
 
-def matching_pairs(views: tuple[View, ...], neighbors: int = NEIGHBORS) -> list[tuple[int, int]]:
-    """Pairs of views to match: each view with its most similar ones by pose.
+def matching_pairs(views: tuple[View, ...]) -> list[tuple[int, int]]:
+    """Pairs of views to match: each view with the `NEIGHBORS` most similar ones by pose.
 
     The cost of a pair is the distance of the cameras relative to the focus distance, plus twice the angle between
     their axes in radians. Pairs whose axes differ by more than 90 degrees are excluded.
@@ -240,7 +240,7 @@ def matching_pairs(views: tuple[View, ...], neighbors: int = NEIGHBORS) -> list[
     np.fill_diagonal(cost, np.inf)
     pairs = set()
     for index in range(len(views)):
-        nearest = np.argsort(cost[index], kind="stable")[:neighbors]
+        nearest = np.argsort(cost[index], kind="stable")[:NEIGHBORS]
         pairs |= {(min(index, int(j)), max(index, int(j))) for j in nearest if np.isfinite(cost[index, j])}
     return sorted(pairs)
 

@@ -67,7 +67,7 @@ class Trained:
         )
 
 
-# Beside its inputs: the options of a run, and a trainer to continue.
+# Beside its inputs: the options of a run.
 def train_field(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
@@ -78,7 +78,6 @@ def train_field(
     seed: int = 0,
     listener: Listener = silent,
     memory: int = DEFAULT_MEMORY,
-    trainer: FieldTrainer | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> TrainedField:
     """Train the paper's language field on frozen Gaussians.
@@ -93,7 +92,6 @@ def train_field(
         listener: Receives events of stage "language" with the losses.
         memory: Host memory in bytes, a quarter of which projections kept between steps may take (at most
             `MAX_STORE`). The result does not depend on it.
-        trainer: A trainer to continue; None starts a new one.
         checkpoint: Where the training is saved and resumed from; None saves nothing.
 
     Raises:
@@ -101,7 +99,7 @@ def train_field(
         TrainingError: If the training diverges again and again.
     """
     check_views(sorted(cameras), code_maps)
-    trainer = trainer or FieldTrainer(gaussians, codebook, config, seed=seed)
+    trainer = FieldTrainer(gaussians, codebook, config, seed=seed)
     views = _prepare_views(trainer.gaussians, cameras, config, memory)
     run_training(
         _FrozenGeometryTraining(trainer, views, code_maps),

@@ -9,7 +9,7 @@ from lexsplat.language.losses import SmoothingWeight, UncertaintyForm
 
 @dataclass(frozen=True)
 class TrainedConfig:
-    """Settings of method "trained". The defaults suit a CPU; see also `as_in_paper` and `as_released`.
+    """Settings of method "trained". The defaults suit a CPU; see also `as_in_paper`.
 
     Args:
         iterations: Steps, one view each (paper: 30,000).
@@ -85,17 +85,4 @@ class TrainedConfig:
             smoothing_every=1,
             smoothing_sample=0,
             clip_decoder_grad=None,
-        )
-
-    def as_released(self) -> TrainedConfig:
-        """The paper's settings with what the authors' released code does differently."""
-        return replace(
-            self.as_in_paper(),
-            uncertainty_lr=0.05,
-            decoder_weight_decay=1e-5,
-            uncertainty_form="log",
-            smoothing_weight="linear",
-            smoothing_squared=True,
-            smoothing_every=10,
-            normalize_rendering=True,
         )
