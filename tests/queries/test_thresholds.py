@@ -28,25 +28,22 @@ def two_groups(share, low=0.2, high=0.6, spread=0.03, count=20_000):
 
 @pytest.mark.parametrize("share", [0.3, 0.05, 0.01])
 def test_the_automatic_threshold_separates_an_object_of_any_size(share):
-    assert 0.3 < float(thresholds.automatic_threshold(two_groups(share), pull=0.0)) < 0.5
-    assert 0.3 < float(thresholds.automatic_threshold(two_groups(share))) < 0.55
+    below_half = two_groups(share, low=0.1, high=0.38, spread=0.02)
+    assert 0.17 < float(thresholds.automatic_threshold(below_half)) < 0.31
+    assert float(thresholds.automatic_threshold(two_groups(share))) == 0.5
 
 
-def test_plain_otsu_is_scikit_images():
+def test_plain_otsu_is_scikit_images(monkeypatch):
     from skimage.filters import threshold_otsu
 
-    samples = two_groups(0.3, spread=0.1)
+    samples = two_groups(0.3, low=0.15, high=0.35, spread=0.04)
     expected = threshold_otsu(samples.numpy().ravel(), nbins=512)
-    found = float(thresholds.automatic_threshold(samples, tempering=1.0, pull=0.0))
+    monkeypatch.setattr(thresholds, "_TEMPERING", 1.0)
+    found = float(thresholds.automatic_threshold(samples))
     assert found == pytest.approx(expected, abs=0.6 * float(samples.max() - samples.min()) / 512 + 1e-6)
 
 
-def test_the_threshold_lies_in_the_middle_of_a_gap():
-    samples = torch.tensor([[0.1] * 90 + [0.8] * 10])
-    assert float(thresholds.automatic_threshold(samples, pull=0.0)) == pytest.approx(0.45, abs=2e-3)
-
-
-def test_the_threshold_is_half_where_the_classes_lie_on_either_side_of_it():
+def test_the_threshold_is_the_middle_of_a_gap_and_half_where_the_classes_lie_on_either_side_of_it():
     assert thresholds.automatic_threshold(torch.tensor([[0.1] * 90 + [0.8] * 10])).tolist() == [0.5]
     below, above = torch.tensor([[0.1] * 90 + [0.4] * 10]), torch.tensor([[0.6] * 90 + [0.9] * 10])
     assert float(thresholds.automatic_threshold(below)) == pytest.approx(0.25, abs=2e-3)
@@ -97,7 +94,8 @@ def test_each_prompt_has_its_own_threshold():
     assert flat == 0.5
 
 
-def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(cloud):
+def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(cloud, monkeypatch):
+    monkeypatch.setattr(thresholds, "_LONG_SIDE", 48)
     field, gaussians, camera = cloud
     question = Question(texts(3, 16, 5), texts(4, 16, 6))
 
@@ -105,7 +103,7 @@ def test_the_threshold_of_a_scene_is_that_of_its_rendered_views(cloud):
         return queries.render_relevancy(field, gaussians, view, question)
 
     views = [camera, camera.resized(96, 72)]
-    found = thresholds.scene_thresholds(relevancy, views, long_side=48)
+    found = thresholds.scene_thresholds(relevancy, views)
     one = relevancy(camera).flatten(1)
     torch.testing.assert_close(found, thresholds.automatic_threshold(torch.cat([one, one], dim=1)))
     with pytest.raises(ValueError, match="at least one camera"):

@@ -25,6 +25,10 @@ THRESHOLD_VIEWS = 8
 """Number of training views that the threshold of a scene comes from, at most."""
 _LONG_SIDE = 80
 """Longer side of their renderings in pixels, at most."""
+_TEMPERING = 0.5
+"""Exponent on the histogram; 1 is plain Otsu."""
+_MIN_CONTRAST = 0.05
+"""Smallest contrast that is split."""
 _TOP_SHARE = 5e-4
 """The peak of the samples is the mean of their best 0.05 percent."""
 
@@ -57,34 +61,24 @@ def masks(relevancy: Tensor, thresholds: float | Tensor) -> Tensor:
     return relevancy >= limits
 
 
-def automatic_threshold(
-    samples: Tensor,
-    weights: Tensor | None = None,
-    *,
-    tempering: float = 0.5,
-    min_contrast: float = 0.05,
-    pull: float = 1.0,
-) -> Tensor:
+def automatic_threshold(samples: Tensor, weights: Tensor | None = None) -> Tensor:
     """A threshold for each prompt from relevancies all over the scene, without ground truth.
 
-    Otsu's method on a histogram whose counts are raised to ``tempering``. Otsu's method favors classes of similar
+    Otsu's method on a histogram whose counts are raised to `_TEMPERING`. Otsu's method favors classes of similar
     size and splits the background when an object covers one percent of the scene; the square root gives the object
-    more weight (1 is plain Otsu). Where a gap separates the classes, the cut is the middle of the gap. If the means
+    more weight. Where a gap separates the classes, the cut is the middle of the gap. If the means
     of the two classes lie on either side of 0.5, the cut moves there.
 
     If some samples exceed 0.5, the mean of the class above the cut has to exceed it too. Otherwise the cut has
     separated what resembles the prompt a little from what does not resemble it at all (half of a bear, for the
     prompt "nose of the bear"), and the class above is split again.
 
-    A prompt without contrast has no two classes: the 99.8th percentile is less than ``min_contrast`` above the
+    A prompt without contrast has no two classes: the 99.8th percentile is less than `_MIN_CONTRAST` above the
     median, as for an object that is absent or everywhere. Its threshold is 0.5.
 
     Args:
         samples: Relevancy ``[P, S]`` in 0..1, of pixels of several views (`scene_thresholds`) or of Gaussians.
         weights: Weight of each sample ``[S]``, such as the opacity of Gaussians; None weighs all samples equally.
-        tempering: Exponent on the histogram in 0..1.
-        min_contrast: Smallest contrast that is split.
-        pull: How far the cut moves towards 0.5, in 0..1.
 
     Returns:
         Thresholds ``[P]`` in 0..1, float32 on the CPU, for `masks`.
@@ -95,15 +89,13 @@ def automatic_threshold(
     if shares.shape != samples.shape[1:] or not bool((shares >= 0).all()) or float(shares.sum()) == 0:
         raise ValueError(f"weights must be [{samples.shape[1]}], not negative, and not all zero")
     rows = samples.detach().cpu().double()
-    return torch.tensor([_tempered_otsu(row, shares.double(), tempering, min_contrast, pull) for row in rows])
+    return torch.tensor([_tempered_otsu(row, shares.double()) for row in rows])
 
 
 def scene_thresholds(
     relevancy: Callable[[Camera], Tensor],
     cameras: Sequence[Camera],
     presences: Sequence[Presence] | None = None,
-    *,
-    long_side: int = _LONG_SIDE,
 ) -> Tensor:
     """The automatic threshold ``[P]`` of each prompt in a scene: the one rule for masks and selections.
 
@@ -117,7 +109,6 @@ def scene_thresholds(
         relevancy: Renders the maps ``[P, H, W]`` of the prompts in a view.
         cameras: All views to choose from, none of which is evaluated: the training views.
         presences: Whether the scene contains each prompt; None for methods that do not determine it.
-        long_side: Longer side of the renderings in pixels, at most.
 
     Raises:
         ValueError: If there are no cameras.
@@ -126,7 +117,7 @@ def scene_thresholds(
         raise ValueError("an automatic threshold needs at least one camera")
     maps = []
     for camera in evenly(cameras, THRESHOLD_VIEWS):
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / long_side))
+        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
         maps.append(relevancy(small).flatten(1).cpu())
     found = automatic_threshold(torch.cat(maps, dim=1))
     absent = torch.tensor(
@@ -135,16 +126,16 @@ def scene_thresholds(
     return torch.where(absent, torch.full_like(found, BORDER), found)
 
 
-def _tempered_otsu(row: Tensor, shares: Tensor, tempering: float, min_contrast: float, pull: float) -> float:
+def _tempered_otsu(row: Tensor, shares: Tensor) -> float:
     """The cut through one prompt's samples; the class above it is cut again while its mean is below 0.5."""
     reached = _top_mean(row, shares) > BORDER
     while True:
-        found = _best_cut(row, shares, tempering, min_contrast)
+        found = _best_cut(row, shares)
         if found is None:
             return BORDER
         cut, lower, upper = found
         if not (reached and upper < BORDER):
-            return cut + pull * (BORDER - cut) if lower < BORDER < upper else cut
+            return BORDER if lower < BORDER < upper else cut
         above = row >= cut
         row, shares = row[above], shares[above]
 
@@ -158,24 +149,22 @@ def _top_mean(row: Tensor, shares: Tensor) -> float:
     return float((values * taken).sum()) / limit
 
 
-def _best_cut(
-    row: Tensor, shares: Tensor, tempering: float, min_contrast: float
-) -> tuple[float, float, float] | None:
+def _best_cut(row: Tensor, shares: Tensor) -> tuple[float, float, float] | None:
     """Otsu's cut on the tempered histogram and the means on either side; None without contrast."""
     bins = 512
     seen = row[shares > 0]
     low, high = float(seen.min()), float(seen.max())
-    if high - low < min_contrast:
+    if high - low < _MIN_CONTRAST:
         return None
     width = (high - low) / bins
     index = ((row - low) / width).long().clamp(0, bins - 1)
     counts = torch.zeros(bins, dtype=torch.float64).index_add_(0, index, shares)
     share = counts.cumsum(0) / counts.sum()
     median, top = (int(torch.searchsorted(share, torch.tensor(q, dtype=share.dtype))) for q in (0.5, 0.998))
-    if (top - median) * width < min_contrast:
+    if (top - median) * width < _MIN_CONTRAST:
         return None
     centers = low + width * (torch.arange(bins, dtype=torch.float64) + 0.5)
-    heights = counts**tempering * (counts > 0)
+    heights = counts**_TEMPERING * (counts > 0)
     below = heights.cumsum(0)[:-1]
     above = heights.sum() - below
     first = (heights * centers).cumsum(0)[:-1]
