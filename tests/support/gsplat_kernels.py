@@ -1,8 +1,8 @@
 """A CPU replacement of gsplat 1.5.3's CUDA extension, used by gsplat's own Python code.
 
-gsplat's Python code does not run without its extension, and its torch functions accept what the extension refuses or
-leaves uninitialized: channel counts, shared memory, culled Gaussians, no Gaussians. A double of whole gsplat functions
-would show neither these nor the arguments and gradients that pass through gsplat's own code.
+gsplat's Python code does not run without its extension, and its torch functions accept what the extension refuses
+or leaves uninitialized: channel counts, shared memory, culled Gaussians, no Gaussians. A double of whole gsplat
+functions would show neither these nor the arguments and gradients that pass through gsplat's own code.
 
 It follows the sources (gsplat/cuda/csrc): thresholds and checks of inputs are the same, and memory that is
 uninitialized there is NaN here. Gradients are computed by torch's autograd through gsplat's torch functions or, for

@@ -30,9 +30,9 @@ from lexsplat.scenes.formats.ply import write_ply
 def reconstruct_together(source: Path, output: Path, config: ReconstructionConfig, seed: int = 0) -> None:
     """Reconstruct a capture in all processes of the group; the first one writes ``output``.
 
-    The loop is not `lexsplat.runtime.training.run_training`, which sends a training that diverges back to its last good
-    state: one process would go back alone, and all others would wait for its part of the step. So the training is
-    neither saved on the way nor repeated with smaller rates.
+    The loop is not `lexsplat.runtime.training.run_training`, which sends a training that diverges back to its last
+    good state: one process would go back alone, and all others would wait for its part of the step. So the training
+    is neither saved on the way nor repeated with smaller rates.
 
     Args:
         source: The capture, which all processes see.
