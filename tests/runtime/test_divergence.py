@@ -232,7 +232,7 @@ def test_language_trained_with_any_rates_is_finite_or_fails_with_a_remedy(times,
         assert not caplog.records
 
 
-def test_a_language_training_recovers_from_nan(caplog):
+def test_a_language_training_recovers_from_nan(caplog, monkeypatch):
     scene = make_scene(per_ball=10, views=4)
     config = TrainedConfig(iterations=60, pixel_sample=128, smoothing_sample=32)
     trainer = FieldTrainer(scene.gaussians, scene.codebook, config)
@@ -247,9 +247,8 @@ def test_a_language_training_recovers_from_nan(caplog):
         return losses
 
     trainer.step = poisoned  # type: ignore[method-assign]
-    field = train_field(
-        scene.gaussians, scene.cameras, scene.code_maps, scene.codebook, config, trainer=trainer
-    )
+    monkeypatch.setattr("lexsplat.language.methods.trained.FieldTrainer", lambda *_, **__: trainer)
+    field = train_field(scene.gaussians, scene.cameras, scene.code_maps, scene.codebook, config)
     assert bool(torch.isfinite(field.semantics).all())
     assert trainer.iteration == 60
     assert trainer.rate_factor == 0.5
