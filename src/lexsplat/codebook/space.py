@@ -51,7 +51,7 @@ def similarity(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Codebook:
     """The discrete language feature space S.
 
@@ -78,6 +78,10 @@ class Codebook:
                 raise ValueError("NaN or infinity in the codebook")
         if not math.isfinite(self.lambda_dino):
             raise ValueError(f"lambda_dino must be finite, got {self.lambda_dino}")
+
+    def __repr__(self) -> str:
+        dino = "no DINO" if self.dino is None else f"DINO {self.dino.shape[1]}"
+        return f"Codebook({self.num_codes} codes, CLIP {self.clip.shape[1]}, {dino})"
 
     @property
     def num_codes(self) -> int:

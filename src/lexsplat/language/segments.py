@@ -42,7 +42,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Segments:
     """The segments of N Gaussians at L levels; S segments at the lowest one.
 
@@ -67,6 +67,10 @@ class Segments:
                 raise ValueError(f"{name} must be in 0..{self.levels.shape[1] - 1}")
         if self.masses.numel() and float(self.masses.min()) < 0:
             raise ValueError("masses must not be negative")
+
+    def __repr__(self) -> str:
+        levels, lowest = self.levels.shape
+        return f"Segments({len(self.labels):,} Gaussians, {lowest:,} segments, {levels} levels)"
 
     def select(self, index: Tensor) -> Segments:
         """The segments of some Gaussians, with the same numbers."""

@@ -50,7 +50,7 @@ def everyday_words() -> tuple[str, ...]:
     return tuple((files("lexsplat.queries") / "everyday_words.txt").read_text("utf-8").split("\n")[:-1])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EverydayScale:
     """What everyday words reach at the codes of a scene.
 
@@ -63,6 +63,9 @@ class EverydayScale:
     mean: Tensor
     best: Tensor
     peak: float
+
+    def __repr__(self) -> str:
+        return f"EverydayScale({len(self.best)} codes, peak {self.peak:.3g})"
 
     @classmethod
     def of(cls, codewords: Tensor, words: Tensor) -> EverydayScale:

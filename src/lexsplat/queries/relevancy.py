@@ -93,7 +93,7 @@ class QueryConfig:
         return self.negatives or CANONICAL_PHRASES
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Question:
     """Embedded prompts, the negatives they are compared with, and how.
 
@@ -110,6 +110,9 @@ class Question:
     config: QueryConfig = field(default_factory=QueryConfig)
     scale: EverydayScale | None = None
     best: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return f"Question({len(self)} prompts, form {self.config.form!r})"
 
     def __len__(self) -> int:
         return len(self.positives)
