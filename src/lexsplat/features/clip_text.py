@@ -54,9 +54,15 @@ def open_clip_text(folder: Path, name: str, device: torch.device | str = "cpu") 
 def light_tower(
     folder: Path, load: Callable[[], Mapping[str, Tensor]], device: torch.device | str
 ) -> ClipText | None:
-    """The text tower of a model folder with weights from elsewhere, such as a loaded model; None as above.
+    """The text tower of a model folder; None where `open_clip_text` has none.
 
-    Its ``content_hash`` is left to the caller.
+    Args:
+        folder: The folder, for its configuration and tokenizer.
+        load: Returns the weights by their names in transformers, from files or from a loaded model.
+        device: Where it computes.
+
+    Returns:
+        The tower, without its ``content_hash``, which is left to the caller.
     """
     if not (folder / "tokenizer.json").is_file():
         return None
