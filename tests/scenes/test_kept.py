@@ -153,7 +153,7 @@ def test_the_key_of_a_scene_depends_on_everything_that_its_views_show(demo_copy)
         lambda scene, _: changed(scene.field.codebook.clip),
         lambda scene, _: changed(scene.field.segments.levels),
         lambda scene, _: setattr(scene, "query", QueryConfig(templates=("a photo of {}",))),
-        lambda scene, _: setattr(scene, "_world", World(Up(np.array([0.0, 1.0, 0.0]), True))),
+        lambda scene, _: setattr(scene, "world", World(Up(np.array([0.0, 1.0, 0.0]), True))),
         lambda scene, _: scene.folder.record["stages"]["features"].update(clip_hash="another"),
         lambda _, patch: patch.setattr(kept_objects, "everyday_words", lambda: ["one", "two"]),
         lambda _, patch: patch.setattr(kept_objects, "default_vocabulary", lambda clip: ["one"]),
