@@ -143,6 +143,7 @@ def loaded(tmp_path, monkeypatch) -> list[str]:
     return kinds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "expected"),
     [(TRAINED, ["clip", "dino"]), (AVERAGED, ["clip"])],
@@ -168,6 +169,7 @@ def test_new_settings_of_the_language_load_no_encoder_where_codes_are_kept(
     assert loaded == []
 
 
+@pytest.mark.slow
 def test_the_encoder_of_photos_is_freed_before_the_language_is_made(tiny_capture, tmp_path, monkeypatch):
     made, alive = [], []
 
