@@ -162,9 +162,9 @@ def test_a_build_loads_each_encoder_once_for_check_photos_and_texts(
 
 
 def test_new_settings_of_the_language_load_no_encoder_where_codes_are_kept(
-    scenes, tiny_capture, tmp_path, loaded
+    built_by_method, tiny_capture, tmp_path, loaded
 ):
-    copy = shutil.copytree(scenes / "trained", tmp_path / "copy")
+    copy = shutil.copytree(built_by_method / "trained", tmp_path / "copy")
     build(tiny_capture, copy, replace(TRAINED, trained=TrainedConfig(iterations=2)))
     assert loaded == []
 
