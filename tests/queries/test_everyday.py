@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from web_like import Facts, make_web_like, measure
+from web_like import Facts, general_phrases, make_web_like, measure
 
 from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, everyday_words
 from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy
@@ -95,11 +95,27 @@ def test_the_words_are_about_a_thousand_different_ones():
     assert all(word == " ".join(word.split()) and word for word in words)
 
 
+@pytest.fixture(scope="module")
+def web_like(tmp_path_factory):
+    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=1)
+
+
 @pytest.mark.slow
-def test_a_web_like_encoder_is_an_ordinary_folder_with_the_cosines_of_clip(tmp_path):
-    found, facts = measure(make_web_like(tmp_path / "clip", seed=1)), Facts()
-    assert found["matched"] == pytest.approx(facts.matched, abs=0.02)
+@pytest.mark.parametrize("held_out", [False, True], ids=["fit", "held out"])
+def test_a_web_like_encoder_has_the_cosines_of_clip_for_phrases_and_photos_of_the_fit_and_for_others(
+    web_like, held_out
+):
+    found, facts = measure(web_like, held_out), Facts()
+    assert found["images"] == pytest.approx(facts.images, abs=0.03)
+    assert found["texts"] == pytest.approx(facts.texts, abs=0.03)
+    assert found["matched"] == pytest.approx(facts.matched, abs=0.025)
     assert found["unmatched"] == pytest.approx(facts.unmatched, abs=0.02)
     assert found["canonical"] == pytest.approx(facts.canonical, abs=0.02)
-    assert found["images"] == pytest.approx(facts.images, abs=0.06)
-    assert found["texts, all"] == pytest.approx(facts.texts, abs=0.06)
+    assert found["offset"] == pytest.approx(facts.offset * facts.signal, abs=0.005)
+    assert found["spread of gains"] < 0.1
+
+
+def test_no_phrase_of_the_check_has_a_part_in_the_fit():
+    fit, held_out = (set(general_phrases(held_out).texts) for held_out in (False, True))
+    assert not fit & held_out
+    assert min(len(fit), len(held_out)) > 1500
