@@ -54,8 +54,6 @@ CROPS = (18 / 240, 44 / 240)
 """Sizes of crops, as shares of the height of a photo."""
 EVENED = 0.25
 """Exponent on the variances of hidden states that private directions divide by; 0.5 would make them white."""
-STEPS = 80
-"""Corrections of the levels, which depend on each other."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,8 @@ class Facts:
         matched: Of a crop and its phrase.
         unmatched: Of a crop and any phrase.
         canonical: Of a crop and the nearest canonical phrase.
-        offset: Standard deviation of the offsets of phrases, as a share of matched minus unmatched.
+        offset: Standard deviation of the offsets of phrases, as a share of matched minus unmatched. An offset is the
+            part of a phrase's mean cosine with crops that does not come from what images and texts share.
     """
 
     images: float = 0.5
@@ -89,38 +88,38 @@ class Phrases:
     """General phrases: names of things alone, with a color, and with a material.
 
     Args:
-        texts: The phrases, those of `KINDS` last.
-        unknown: How many the bundled encoder does not know.
+        texts: The phrases.
+        forms: Of each ``[P]``: 0 to 2 for names that the bundled encoder does not know, 3 to 5 for those it knows.
     """
 
     texts: tuple[str, ...]
-    unknown: int
+    forms: Tensor
+
+    @property
+    def known(self) -> Tensor:
+        """Which phrases ``[P]`` the bundled encoder knows."""
+        return self.forms >= 3
 
     @property
     def weights(self) -> Tensor:
         """Weights ``[P]``, 1 on average: what the bundled encoder knows counts as much as what it does not."""
-        known = len(self.texts) - self.unknown
-        shares = [0.5 / self.unknown] * self.unknown + [0.5 / known] * known
-        return len(self.texts) * torch.tensor(shares, dtype=torch.float64)
+        share = self.known.double().mean()
+        return torch.where(self.known, 0.5 / share, 0.5 / (1 - share))
 
 
 def general_phrases(held_out: bool) -> Phrases:
     """Half of about four thousand phrases: those of the fit, or those that have no part in it."""
     colors, words = sorted(COLORS), everyday_words()
-    known = [*KINDS, *OTHERS, *(f"{word} {kind}" for word in (*colors, *MATERIALS) for kind in KINDS)]
-    unknown = [
-        phrase
-        for place, word in enumerate(words)
-        for phrase in (
-            word,
-            f"{colors[place % len(colors)]} {word}",
-            f"{MATERIALS[place // 7 % len(MATERIALS)]} {word}",
-        )
-    ]
-    unknown = sorted({*unknown} - {*known})
-    coins = torch.rand(len(unknown) + len(known), generator=torch.Generator().manual_seed(1)) < 0.5
-    drawn = [phrase for phrase, coin in zip(unknown + known, coins.tolist()) if coin is held_out]
-    return Phrases(tuple(drawn), int((coins[: len(unknown)] == held_out).sum()))
+    forms = dict.fromkeys((*KINDS, *OTHERS), 3)
+    for form, adjectives in ((4, colors), (5, MATERIALS)):
+        forms.update({f"{adjective} {kind}": form for adjective in adjectives for kind in KINDS})
+    for place, word in enumerate(words):
+        color, material = colors[place % len(colors)], MATERIALS[place // 7 % len(MATERIALS)]
+        for form, phrase in enumerate((word, f"{color} {word}", f"{material} {word}")):
+            forms.setdefault(phrase, form)
+    coins = (torch.rand(len(forms), generator=torch.Generator().manual_seed(1)) < 0.5).tolist()
+    drawn = [item for item, coin in zip(forms.items(), coins) if coin is held_out]
+    return Phrases(tuple(phrase for phrase, _ in drawn), torch.tensor([form for _, form in drawn]))
 
 
 @dataclass(frozen=True)
@@ -177,7 +176,8 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     rows[:dim] = shared * image.shared
     rows[dim] = constant * image.constant
     rows[dim + 2 : dim + 2 + private] = math.sqrt(1 - shared**2 - constant**2) * image.private(private, draw)
-    words = _text_rows(text, sample, facts, rows, private, draw)
+    offset = facts.offset * facts.signal * text.private(1, draw)[0]
+    words = _text_rows(text, sample, facts, rows, (text.private(private, draw), offset), phrases.forms)
     model.visual_projection, model.text_projection = _layer(rotation @ rows), _layer(rotation @ words)
     model.config.projection_dim = width
     model.save_pretrained(folder)
@@ -247,46 +247,47 @@ class _Tower:
 
 
 def _text_rows(
-    text: _Tower, sample: Sample, facts: Facts, rows: Tensor, private: int, draw: torch.Generator
+    text: _Tower, sample: Sample, facts: Facts, rows: Tensor, drawn: tuple[Tensor, Tensor], forms: Tensor
 ) -> Tensor:
-    """The text tower's projection that reaches the levels of ``facts`` beside the image tower's ``rows``."""
-    dim = len(text.weight)
-    own, offset = text.private(private, draw), text.private(1, draw)[0]
+    """The text tower's projection that reaches the levels of ``facts`` beside the image tower's ``rows``.
+
+    Args:
+        text: The tower, with general phrases.
+        sample: What the levels are measured on.
+        facts: The levels.
+        rows: Projection of the image tower.
+        drawn: Private directions, and the offset of phrases.
+        forms: Forms of the phrases ``[P]``, whose mean cosines with crops are evened out.
+    """
+    dim, (own, offset) = len(text.weight), drawn
     crops, things = _unit(sample.crops, rows), _unit(sample.things, rows)
     middle, common = crops.mean(0), float(crops[:, dim].mean())
     lengths, level = (text.hidden @ text.shared.T).norm(dim=1), text.unit(text.hidden) @ middle[:dim]
+    for form in forms.unique():
+        level[forms == form] = level[forms == form].mean()
     privates = (text.hidden @ own.T).square().sum(1)
     # The bundled encoder knows one of the canonical phrases, "object".
     nearest = int((things[:, :dim] @ text.unit(sample.canonical).T).mean(0).argmax())
     mark = text.mark(sample.canonical[nearest])
 
-    shared, unmatched, canonical, length, spread = (
-        0.35,
-        facts.unmatched,
-        0.0,
-        0.4,
-        facts.offset * facts.signal,
-    )
+    shared, unmatched, canonical, length = 0.35, facts.unmatched, 0.0, 0.4
     words = torch.zeros(len(rows), text.size, dtype=torch.float64)
-    # Normalization couples the levels, so they are corrected until they hold.
-    for _ in range(STEPS):
-        along = text.fitted(lengths * (unmatched - shared * level)) + spread * offset + canonical * mark
+    for _ in range(80):  # normalization couples the levels: they are corrected until they hold
+        along = text.fitted(lengths * (unmatched - shared * level)) + offset + canonical * mark
         words[:dim] = shared * text.shared
         words[dim] = along / common
         rest = (1 - shared**2) * lengths**2 - length**2 * privates - (text.hidden @ words[dim]).square()
         words[dim + 1] = text.fitted(rest.clamp_min(0.04).sqrt())
-        words[dim + 2 + private :] = length * own
+        words[-len(own) :] = length * own
 
         units = _unit(text.hidden, words)
-        reached, mean = units @ middle, text.weights @ units / len(units)
-        signal = float(((things - middle) * _unit(sample.names, words)).sum(1).mean())
+        mean = text.weights @ units / len(units)
+        matched = float((things * _unit(sample.names, words)).sum(1).mean())
         nearby = float((things @ _unit(sample.canonical, words).T).amax(1).mean())
-        offsets = text.mean((reached - text.mean(reached)).square()) ** 0.5
-        unmatched += 0.7 * (facts.unmatched - text.mean(reached))
-        shared *= (facts.signal / signal) ** 0.7
+        unmatched += 0.7 * (facts.unmatched - float(mean @ middle))
+        shared *= (facts.signal / (matched - facts.unmatched)) ** 0.7
         canonical += 0.7 * (facts.canonical - nearby)
         length = max(0.0, length + 0.5 * (float(mean @ mean) - facts.texts))
-        spread *= (facts.offset * facts.signal / offsets) ** 0.5
     return words
 
 
@@ -400,15 +401,19 @@ def measure(folder: Path, held_out: bool) -> dict[str, float]:
     random = random_crops(_photos(capture / "images")[1::3], np.random.default_rng(1), encoder.image_size)
     weights = phrases.weights / len(phrases.texts)
     crops, things = encoder.encode_images(random).double(), encoder.encode_images(pixels).double()
-    texts, canonical = (
-        encoder.encode_text(list(each)).double() for each in (phrases.texts, CANONICAL_PHRASES)
-    )
+    texts = encoder.encode_text(list(phrases.texts)).double()
+    canonical = encoder.encode_text(list(CANONICAL_PHRASES)).double()
     cosines, middle = crops @ texts.T, weights @ texts
     level = cosines.mean(0)
     plain = (bundled.encode_images(random) @ bundled.encode_text(list(phrases.texts)).T).double()
-    varied, known = ((each - (each @ weights)[:, None])[:, phrases.unknown :] for each in (cosines, plain))
-    known = known - known.mean(0)
-    gains = (varied * known).sum(0) / known.square().sum(0)
+    varied, shared = ((each - (each @ weights)[:, None])[:, phrases.known] for each in (cosines, plain))
+    shared = shared - shared.mean(0)
+    gains = (varied * shared).sum(0) / shared.square().sum(0)
+    explained = torch.cat([plain.mean(0)[:, None], nn.functional.one_hot(phrases.forms).double()], 1)
+    root = weights.sqrt()[:, None]
+    offsets = root * (
+        level[:, None] - explained @ torch.linalg.lstsq(root * explained, root * level[:, None])[0]
+    )
     nearest = (things @ canonical.T).amax(1)
     matched = (things * encoder.encode_text(names).double()).sum(1)
     found = {
@@ -417,7 +422,7 @@ def measure(folder: Path, held_out: bool) -> dict[str, float]:
         "matched": matched.mean(),
         "unmatched": weights @ level,
         "canonical": nearest.mean(),
-        "offset": (weights @ (level - weights @ level).square()).sqrt(),
+        "offset": offsets.square().sum().sqrt(),
         "gain": gains.mean(),
         "spread of gains": gains.std() / gains.mean(),
         "matched over canonical": (matched > nearest).double().mean(),
