@@ -35,7 +35,7 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import model_folder
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
-from lexsplat.queries.vocabulary import COLORS
+from lexsplat.queries.vocabulary import COLORS, PARTS
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant",
@@ -43,12 +43,15 @@ KINDS = (
     "toy car", "wooden crate", "table", "cloth", "wall",
 )  # fmt: skip
 """Names of the kind that the bundled encoder knows."""
-OTHERS = ("fruit", "something made of metal", "something to drink from", "mug handle", "bear nose")
+OTHERS = ("fruit", "something made of metal", "something to drink from")
 """Other phrases that it knows."""
 MATERIALS = (
     "wooden", "metal", "plastic", "glass", "stone", "leather", "paper", "rubber", "ceramic", "striped", "checkered",
     "old", "small",
 )  # fmt: skip
+
+NAMES = 4
+"""Form of the names that the bundled encoder knows, alone (`Phrases`)."""
 
 CROPS = (18 / 240, 44 / 240)
 """Sizes of crops, as shares of the height of a photo."""
@@ -85,11 +88,11 @@ class Facts:
 
 @dataclass(frozen=True)
 class Phrases:
-    """General phrases: names of things alone, with a color, and with a material.
+    """General phrases: names of things alone, with a color, with a material, and with a part.
 
     Args:
         texts: The phrases.
-        forms: Of each ``[P]``: 0 to 2 for names that the bundled encoder does not know, 3 to 5 for those it knows.
+        forms: Of each ``[P]``: 0 to 3 for names that the bundled encoder does not know, 4 to 7 for those it knows.
     """
 
     texts: tuple[str, ...]
@@ -98,7 +101,7 @@ class Phrases:
     @property
     def known(self) -> Tensor:
         """Which phrases ``[P]`` the bundled encoder knows."""
-        return self.forms >= 3
+        return self.forms >= NAMES
 
     @property
     def weights(self) -> Tensor:
@@ -108,15 +111,15 @@ class Phrases:
 
 
 def general_phrases(held_out: bool) -> Phrases:
-    """Half of about four thousand phrases: those of the fit, or those that have no part in it."""
-    colors, words = sorted(COLORS), everyday_words()
-    forms = dict.fromkeys((*KINDS, *OTHERS), 3)
-    for form, adjectives in ((4, colors), (5, MATERIALS)):
-        forms.update({f"{adjective} {kind}": form for adjective in adjectives for kind in KINDS})
-    for place, word in enumerate(words):
-        color, material = colors[place % len(colors)], MATERIALS[place // 7 % len(MATERIALS)]
-        for form, phrase in enumerate((word, f"{color} {word}", f"{material} {word}")):
-            forms.setdefault(phrase, form)
+    """Half of about six thousand phrases: those of the fit, or those that have no part in it."""
+    others = [[f"{word} {{}}" for word in sorted(COLORS)], [f"{word} {{}}" for word in MATERIALS]]
+    others.append([f"{{}} {part}" for part in sorted(PARTS)])
+    forms = dict.fromkeys((*KINDS, *OTHERS), NAMES)
+    for form, patterns in enumerate(others, start=NAMES + 1):
+        forms.update({pattern.format(kind): form for pattern in patterns for kind in KINDS})
+    for place, word in enumerate(everyday_words()):
+        for form, patterns in enumerate([["{}"], *others]):
+            forms.setdefault(patterns[place // (7 if form > 1 else 1) % len(patterns)].format(word), form)
     coins = (torch.rand(len(forms), generator=torch.Generator().manual_seed(1)) < 0.5).tolist()
     drawn = [item for item, coin in zip(forms.items(), coins) if coin is held_out]
     return Phrases(tuple(phrase for phrase, _ in drawn), torch.tensor([form for _, form in drawn]))
@@ -251,29 +254,27 @@ def _text_rows(
 ) -> Tensor:
     """The text tower's projection that reaches the levels of ``facts`` beside the image tower's ``rows``.
 
-    Args:
-        text: The tower, with general phrases.
-        sample: What the levels are measured on.
-        facts: The levels.
-        rows: Projection of the image tower.
-        drawn: Private directions, and the offset of phrases.
-        forms: Forms of the phrases ``[P]``, whose mean cosines with crops are evened out.
+    Mean cosines of the forms of phrases are evened out. ``drawn`` are private directions and the offset of phrases.
     """
     dim, (own, offset) = len(text.weight), drawn
     crops, things = _unit(sample.crops, rows), _unit(sample.things, rows)
     middle, common = crops.mean(0), float(crops[:, dim].mean())
     lengths, level = (text.hidden @ text.shared.T).norm(dim=1), text.unit(text.hidden) @ middle[:dim]
-    for form in forms.unique():
-        level[forms == form] = level[forms == form].mean()
+    form_offset = text.hidden @ offset  # offsets are of single phrases: what a form shares is taken away
+    for values in (level, form_offset):
+        for form in forms.unique():
+            values[forms == form] = values[forms == form].mean()
     privates = (text.hidden @ own.T).square().sum(1)
     # The bundled encoder knows one of the canonical phrases, "object".
     nearest = int((things[:, :dim] @ text.unit(sample.canonical).T).mean(0).argmax())
     mark = text.mark(sample.canonical[nearest])
 
-    shared, unmatched, canonical, length = 0.35, facts.unmatched, 0.0, 0.4
+    names = (things[:, :dim] * text.unit(sample.names)).sum(1).mean() - level[forms == NAMES].mean()
+    shared = facts.signal / float(names)
+    unmatched, canonical, length = facts.unmatched, 0.0, 0.4
     words = torch.zeros(len(rows), text.size, dtype=torch.float64)
     for _ in range(80):  # normalization couples the levels: they are corrected until they hold
-        along = text.fitted(lengths * (unmatched - shared * level)) + offset + canonical * mark
+        along = text.fitted(lengths * (unmatched - shared * level) - form_offset) + offset + canonical * mark
         words[:dim] = shared * text.shared
         words[dim] = along / common
         rest = (1 - shared**2) * lengths**2 - length**2 * privates - (text.hidden @ words[dim]).square()
@@ -282,10 +283,8 @@ def _text_rows(
 
         units = _unit(text.hidden, words)
         mean = text.weights @ units / len(units)
-        matched = float((things * _unit(sample.names, words)).sum(1).mean())
         nearby = float((things @ _unit(sample.canonical, words).T).amax(1).mean())
         unmatched += 0.7 * (facts.unmatched - float(mean @ middle))
-        shared *= (facts.signal / (matched - facts.unmatched)) ** 0.7
         canonical += 0.7 * (facts.canonical - nearby)
         length = max(0.0, length + 0.5 * (float(mean @ mean) - facts.texts))
     return words
