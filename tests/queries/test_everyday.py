@@ -97,7 +97,7 @@ def test_the_words_are_about_a_thousand_different_ones():
 
 @pytest.fixture(scope="module")
 def web_like(tmp_path_factory):
-    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=1)
+    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=0)
 
 
 @pytest.mark.slow
@@ -108,7 +108,7 @@ def test_a_web_like_encoder_has_the_cosines_of_clip_for_phrases_and_photos_of_th
     found, facts = measure(web_like, held_out), Facts()
     assert found["images"] == pytest.approx(facts.images, abs=0.03)
     assert found["texts"] == pytest.approx(facts.texts, abs=0.03)
-    assert found["matched"] == pytest.approx(facts.matched, abs=0.035)  # of 17 prompts, each with its offset
+    assert found["matched"] == pytest.approx(facts.matched, abs=0.03)
     assert found["unmatched"] == pytest.approx(facts.unmatched, abs=0.02)
     assert found["canonical"] == pytest.approx(facts.canonical, abs=0.02)
     assert found["offset"] == pytest.approx(facts.offset * facts.signal, abs=0.005)
