@@ -57,6 +57,8 @@ _SOME = 1 / 3
 """Where fewer of the clear views see into the scene, it has no inside: a solid thing hides its own middle."""
 _USUALLY_VISIBLE = 0.5
 """Least share of the opaque Gaussians that some view should show: of captures it is .9, of made-up rooms .6."""
+_HIDDEN = 0.75
+"""Share of what can be seen in none of fewer views than `_FEWEST_VIEWS` at which splats are refused."""
 _MOST_OTHERS = 128
 """Largest number of views that are not good enough to be chosen, but show which Gaussians are visible at all."""
 
@@ -115,7 +117,7 @@ def choose_views(
         listener: Receives events of stage "views".
 
     Raises:
-        CaptureError: If the Gaussians form no surfaces, or no place shows any.
+        CaptureError: If the Gaussians form no surfaces, or hardly any place shows some.
     """
 
     found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
@@ -129,6 +131,14 @@ def choose_views(
         )
     _warn(tried, found, gaussians, subject)
     chosen, visible, unseen = _cover(tried)
+    if len(chosen) < _FEWEST_VIEWS and unseen > _HIDDEN * visible:
+        raise CaptureError(
+            subject,
+            expected="views that show most of what can be seen",
+            found=f"{len(chosen)}, in which {unseen / visible:.0%} of it is hidden by floaters or haze",
+            remedy="remove the large floaters in an editor of splats, give the capture it was made from, "
+            "or the up direction with --up x,y,z",
+        )
     cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
     share = len(gaussians) / max(tried.weights.shape[1], 1)
     opaque = int((gaussians.opacities > SOLID).sum())

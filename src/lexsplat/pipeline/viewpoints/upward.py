@@ -34,6 +34,8 @@ _STANDING = 0.5
 """this share of the things stand on the ground,"""
 _RIVAL = 0.6
 """and less than this part of it on any other side that may be a ground."""
+_UNLIKELY = 0.5
+"""Difference of the scores by which a guess is much likelier than another direction."""
 _SAME = math.cos(math.radians(20))
 
 Points = NDArray[np.float64]
@@ -64,7 +66,7 @@ class UpwardDirections:
         if up @ self.directions[0] >= 0.7 * np.linalg.norm(up):
             return False
         near = self.directions @ up > _SAME * np.linalg.norm(up)
-        unlikely = not near.any() or self.scores[near].max() < self.scores[0] - 2 * _LEAD
+        unlikely = not near.any() or self.scores[near].max() < self.scores[0] - _UNLIKELY
         return self.reliable or bool(unlikely and self.grounds[0] > _GROUND)
 
 
