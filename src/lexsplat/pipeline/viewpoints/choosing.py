@@ -23,6 +23,7 @@ from lexsplat.pipeline.viewpoints.interior import (
     without_lonely_points,
 )
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
+from lexsplat.pipeline.viewpoints.one_photo import Photo, find_photo
 from lexsplat.pipeline.viewpoints.surroundings import SOLID, Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import CaptureError
@@ -120,8 +121,12 @@ def choose_views(
         CaptureError: If the Gaussians form no surfaces, or hardly any place shows some.
     """
 
-    found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
-    tried = _good_candidates(gaussians, found, side, seed, listener)
+    photo = find_photo(gaussians) if side == "auto" else None
+    if photo is None:
+        found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
+    else:
+        found, side = _before_photo(gaussians, photo, up, subject, seed), "around"
+    tried = _good_candidates(gaussians, found, side, seed, listener, photo)
     if not tried.cameras:
         raise CaptureError(
             subject,
@@ -158,6 +163,28 @@ def choose_views(
         round(unseen * share),
         tried.interior.is_room,
     )
+
+
+def _before_photo(
+    gaussians: Gaussians, photo: Photo, up: NDArray[np.float64] | None, subject: Path, seed: int
+) -> Surroundings:
+    """The surroundings of splats that were made from one photo, whose up direction is that of the photo."""
+    log.warning(
+        "%s: shows things only from the side of a camera at the origin, as splats made from one photo do; views are "
+        "chosen near it, and --views-from around or inside chooses from all sides",
+        subject,
+    )
+    given = photo.up if up is None else up
+    found = find_surroundings(gaussians, given, look_from_above(gaussians), subject, seed, warn=False)
+    if up is None:
+        direction = ",".join(f"{value + 0.0:g}" for value in photo.up)
+        log.warning(
+            "%s: the up direction is a guess (%s), that of the photo; give it with --up x,y,z if it was tilted",
+            subject,
+            direction,
+        )
+        found = replace(found, up=Up(photo.up, False))
+    return found
 
 
 def _warn(tried: _Tried, found: Surroundings, gaussians: Gaussians, subject: Path) -> None:
@@ -206,10 +233,11 @@ class _Tried:
 
 
 def _good_candidates(
-    gaussians: Gaussians, found: Surroundings, side: Side, seed: int, listener: Listener
+    gaussians: Gaussians, found: Surroundings, side: Side, seed: int, listener: Listener, photo: Photo | None
 ) -> _Tried:
     generator = np.random.default_rng(seed)
-    outer: list[tuple[Camera, Target | None]] = list(around(found, SMALL))
+    seen_from = around(found, SMALL) if photo is None else photo.candidates(found, SMALL)
+    outer: list[tuple[Camera, Target | None]] = list(seen_from)
     if len(outer) > _MOST_CANDIDATES:
         kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
         outer = [outer[index] for index in kept]

@@ -53,9 +53,10 @@ def standing_shares(points: Points, directions: Points) -> Points:
         heights = points @ direction - np.quantile(points @ direction, 0.02)
         others = hull[:, :3] @ direction > -_FACING
         until = (heights > _MARGIN * deep) & (depths[:, others].min(1, initial=np.inf) > deep)
-        wholes = _linked(points, inner | until, link)
+        members = inner | until
+        wholes = _linked(points, members, link)
         lowest = np.full(len(points), np.inf)
-        np.minimum.at(lowest, wholes, heights)
+        np.minimum.at(lowest, wholes[members], heights[members])
         near = lowest[wholes] < _MARGIN * deep + link / 2
         touches = np.zeros(len(sizes), bool)
         touches[things[inner & near]] = True
@@ -68,7 +69,7 @@ def standing_shares(points: Points, directions: Points) -> Points:
 
 
 def _linked(points: Points, members: Mask, link: float) -> NDArray[np.int64]:
-    """Number of the thing that each member is part of ``[M]``; 0 for all others, too."""
+    """Number of the thing that each member is part of ``[M]``; that of all others means nothing."""
     pairs = cKDTree(points[members]).query_pairs(link, output_type="ndarray")
     count = int(members.sum())
     graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
