@@ -15,6 +15,8 @@ _MARGIN = 0.25
 """Points are of a side, not of a thing, within this part of that distance from the side."""
 _LINK = 2.0
 """Points of one thing are this near to each other, relative to the usual distance of twelve neighbors."""
+_OUTSIDE = 0.01
+"""Share of the points beyond a side: noise. An open top has no more within a fifth of the walls."""
 _FEWEST_OF_A_THING = 20
 _FACING = np.cos(np.radians(20))
 """Cosine of the largest angle between a direction and the side of the hull that is its lowest one."""
@@ -50,14 +52,14 @@ def standing_shares(points: Points, directions: Points) -> Points:
     sizes = np.bincount(things[inner])
     touching = []
     for direction in np.concatenate([directions, -directions]):
-        heights = points @ direction - np.quantile(points @ direction, 0.02)
+        heights = points @ direction - np.quantile(points @ direction, _OUTSIDE)
         others = hull[:, :3] @ direction > -_FACING
         until = (heights > _MARGIN * deep) & (depths[:, others].min(1, initial=np.inf) > deep)
         members = inner | until
         wholes = _linked(points, members, link)
         lowest = np.full(len(points), np.inf)
         np.minimum.at(lowest, wholes[members], heights[members])
-        near = lowest[wholes] < _MARGIN * deep + link / 2
+        near = lowest[wholes] < _MARGIN * deep + link / 4
         touches = np.zeros(len(sizes), bool)
         touches[things[inner & near]] = True
         touching.append(touches)
