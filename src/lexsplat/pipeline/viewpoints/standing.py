@@ -17,6 +17,8 @@ _LINK = 2.0
 """Points of one thing are this near to each other, relative to the usual distance of twelve neighbors."""
 _OUTSIDE = 0.01
 """Share of the points beyond a side: noise. An open top has no more within a fifth of the walls."""
+_NEAREST = 1.1
+"""A thing that touches nothing, such as a table top whose legs are missing, stands on its nearest side."""
 _FEWEST_OF_A_THING = 20
 _FACING = np.cos(np.radians(20))
 """Cosine of the largest angle between a direction and the side of the hull that is its lowest one."""
@@ -50,20 +52,20 @@ def standing_shares(points: Points, directions: Points) -> Points:
         return np.zeros(len(directions))
     things = _linked(points, inner, link)
     sizes = np.bincount(things[inner])
-    touching = []
-    for direction in np.concatenate([directions, -directions]):
-        heights = points @ direction - np.quantile(points @ direction, _OUTSIDE)
-        others = hull[:, :3] @ direction > -_FACING
+    ends = np.concatenate([directions, -directions])
+    touching, gaps = np.zeros((len(ends), len(sizes)), bool), np.full((len(ends), len(sizes)), np.inf)
+    for end, touches, gap in zip(ends, touching, gaps):
+        heights = points @ end - np.quantile(points @ end, _OUTSIDE)
+        others = hull[:, :3] @ end > -_FACING
         until = (heights > _MARGIN * deep) & (depths[:, others].min(1, initial=np.inf) > deep)
         members = inner | until
         wholes = _linked(points, members, link)
         lowest = np.full(len(points), np.inf)
         np.minimum.at(lowest, wholes[members], heights[members])
-        near = lowest[wholes] < _MARGIN * deep + link / 4
-        touches = np.zeros(len(sizes), bool)
-        touches[things[inner & near]] = True
-        touching.append(touches)
-    lows, highs = np.array(touching).reshape(2, len(directions), -1)
+        np.minimum.at(gap, things[inner], heights[inner])
+        touches[things[inner & (lowest[wholes] < _MARGIN * deep + link / 4)]] = True
+    nearest = (gaps < deep + link) & (gaps < _NEAREST * gaps.min(0))
+    lows, highs = (touching | (nearest & ~touching.any(0))).reshape(2, len(directions), -1)
     alone = ~(lows & highs).any(0)
     counted = np.where(sizes >= _FEWEST_OF_A_THING, sizes, 0)
     shares = (lows.astype(float) - highs) @ (counted * alone) / max(int(counted.sum()), 1)
