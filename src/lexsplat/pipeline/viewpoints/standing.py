@@ -19,6 +19,9 @@ _OUTSIDE = 0.01
 """Share of the points beyond a side: noise. An open top has no more within a fifth of the walls."""
 _NEAREST = 1.1
 """A thing that touches nothing, such as a table top whose legs are missing, stands on its nearest side."""
+_TELLING = 0.25
+"""Least share of the things that the others, which reach from side to side, leave: where they leave less, all shares
+are low."""
 _FEWEST_OF_A_THING = 20
 _FACING = np.cos(np.radians(20))
 """Cosine of the largest angle between a direction and the side of the hull that is its lowest one."""
@@ -68,7 +71,8 @@ def standing_shares(points: Points, directions: Points) -> Points:
     lows, highs = (touching | (nearest & ~touching.any(0))).reshape(2, len(directions), -1)
     alone = ~(lows & highs).any(0)
     counted = np.where(sizes >= _FEWEST_OF_A_THING, sizes, 0)
-    shares = (lows.astype(float) - highs) @ (counted * alone) / max(int(counted.sum()), 1)
+    telling = max(float((counted * alone).sum()), _TELLING * float(counted.sum()), 1.0)
+    shares = (lows.astype(float) - highs) @ (counted * alone) / telling
     return np.asarray(np.maximum(shares, 0))
 
 
