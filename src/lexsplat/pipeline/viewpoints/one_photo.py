@@ -88,7 +88,9 @@ def find_photo(gaussians: Gaussians) -> Photo | None:
         size = high - low
         if (np.abs([low, high]) > _WIDEST).any() or (np.abs(low + high) > 2 * _CENTERED * size).any():
             continue
-        counts, *_ = np.histogram2d(*image.T, bins=_CELLS, range=np.stack([low, high], 1))
+        counts, *_ = np.histogram2d(
+            image[:, 0], image[:, 1], bins=_CELLS, range=[[low[0], high[0]], [low[1], high[1]]]
+        )
         if (counts > counts.mean() / 4).mean() < _FILLED:
             continue
         photo = Photo(np.array([0, 0, sign]), np.array([0, -sign, 0]))
