@@ -23,6 +23,7 @@ from lexsplat.pipeline.viewpoints.interior import (
     without_lonely_points,
 )
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
+from lexsplat.pipeline.viewpoints.one_photo import Photo, find_photo
 from lexsplat.pipeline.viewpoints.surroundings import SOLID, Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import CaptureError
@@ -57,6 +58,8 @@ _SOME = 1 / 3
 """Where fewer of the clear views see into the scene, it has no inside: a solid thing hides its own middle."""
 _USUALLY_VISIBLE = 0.5
 """Least share of the opaque Gaussians that some view should show: of captures it is .9, of made-up rooms .6."""
+_HIDDEN = 0.75
+"""Share of what can be seen in none of fewer views than `_FEWEST_VIEWS` at which splats are refused."""
 _MOST_OTHERS = 128
 """Largest number of views that are not good enough to be chosen, but show which Gaussians are visible at all."""
 
@@ -115,11 +118,15 @@ def choose_views(
         listener: Receives events of stage "views".
 
     Raises:
-        CaptureError: If the Gaussians form no surfaces, or no place shows any.
+        CaptureError: If the Gaussians form no surfaces, or hardly any place shows some.
     """
 
-    found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
-    tried = _good_candidates(gaussians, found, side, seed, listener)
+    photo = find_photo(gaussians) if side == "auto" else None
+    if photo is None:
+        found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
+    else:
+        found, side = _before_photo(gaussians, photo, up, subject, seed), "around"
+    tried = _good_candidates(gaussians, found, side, seed, listener, photo)
     if not tried.cameras:
         raise CaptureError(
             subject,
@@ -129,6 +136,14 @@ def choose_views(
         )
     _warn(tried, found, gaussians, subject)
     chosen, visible, unseen = _cover(tried)
+    if len(chosen) < _FEWEST_VIEWS and unseen > _HIDDEN * visible:
+        raise CaptureError(
+            subject,
+            expected="views that show most of what can be seen",
+            found=f"{len(chosen)}, in which {unseen / visible:.0%} of it is hidden by floaters or haze",
+            remedy="remove the large floaters in an editor of splats, give the capture it was made from, "
+            "or the up direction with --up x,y,z",
+        )
     cameras = tuple(tried.cameras[index].resized(*SIZE) for index in chosen)
     share = len(gaussians) / max(tried.weights.shape[1], 1)
     opaque = int((gaussians.opacities > SOLID).sum())
@@ -148,6 +163,28 @@ def choose_views(
         round(unseen * share),
         tried.interior.is_room,
     )
+
+
+def _before_photo(
+    gaussians: Gaussians, photo: Photo, up: NDArray[np.float64] | None, subject: Path, seed: int
+) -> Surroundings:
+    """The surroundings of splats that were made from one photo, whose up direction is that of the photo."""
+    log.warning(
+        "%s: shows things only from the side of a camera at the origin, as splats made from one photo do; views are "
+        "chosen near it, and --views-from around or inside chooses from all sides",
+        subject,
+    )
+    given = photo.up if up is None else up
+    found = find_surroundings(gaussians, given, look_from_above(gaussians), subject, seed, warn=False)
+    if up is None:
+        direction = ",".join(f"{value + 0.0:g}" for value in photo.up)
+        log.warning(
+            "%s: the up direction is a guess (%s), that of the photo; give it with --up x,y,z if it was tilted",
+            subject,
+            direction,
+        )
+        found = replace(found, up=Up(photo.up, False))
+    return found
 
 
 def _warn(tried: _Tried, found: Surroundings, gaussians: Gaussians, subject: Path) -> None:
@@ -196,10 +233,11 @@ class _Tried:
 
 
 def _good_candidates(
-    gaussians: Gaussians, found: Surroundings, side: Side, seed: int, listener: Listener
+    gaussians: Gaussians, found: Surroundings, side: Side, seed: int, listener: Listener, photo: Photo | None
 ) -> _Tried:
     generator = np.random.default_rng(seed)
-    outer: list[tuple[Camera, Target | None]] = list(around(found, SMALL))
+    seen_from = around(found, SMALL) if photo is None else photo.candidates(found, SMALL)
+    outer: list[tuple[Camera, Target | None]] = list(seen_from)
     if len(outer) > _MOST_CANDIDATES:
         kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
         outer = [outer[index] for index in kept]

@@ -33,7 +33,7 @@ _MANY_UNSEEN = 0.1
 """Share of the visible Gaussians above which those in no view are a warning."""
 _FLOATERS = "floaters.npy"
 """Indices of the Gaussians of the file that are left out, beside the chosen views."""
-_RULES = 5
+_RULES = 6
 """Changes where other views would be chosen, or other Gaussians left out, of the same file."""
 
 

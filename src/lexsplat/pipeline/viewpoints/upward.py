@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from lexsplat.geometry.boxes import upright_frame
+from lexsplat.pipeline.viewpoints.standing import standing_shares
 
 _NEIGHBORS = 12
 _CONVENTIONS = ((0, 0, 1), (0, 1, 0), (0, -1, 0))
@@ -25,11 +24,6 @@ _GROUND_HEIGHT = 0.08
 """Half the height of the slab in which a ground lies, relative to the height of the scene."""
 _GROUND_CELLS = 24
 """Cells along the longer side of the scene in which the ground is counted."""
-_WITHIN = 0.04
-"""Things are this far within the convex hull of a scene, relative to its diagonal."""
-_LINK = 2.0
-"""Points of one thing are this near to each other, relative to the usual distance of twelve neighbors."""
-_FEWEST_OF_A_THING = 20
 _LEAD = 0.15
 """Difference of the scores of two up directions by which one is certain,"""
 _GROUND = 0.25
@@ -39,7 +33,9 @@ _WALL = 0.65
 _STANDING = 0.5
 """this share of the things stand on the ground,"""
 _RIVAL = 0.6
-"""and less than this part of it on the wall."""
+"""and less than this part of it on any other side that may be a ground."""
+_UNLIKELY = 0.5
+"""Difference of the scores by which a guess is much likelier than another direction."""
 _SAME = math.cos(math.radians(20))
 
 Points = NDArray[np.float64]
@@ -70,7 +66,7 @@ class UpwardDirections:
         if up @ self.directions[0] >= 0.7 * np.linalg.norm(up):
             return False
         near = self.directions @ up > _SAME * np.linalg.norm(up)
-        unlikely = not near.any() or self.scores[near].max() < self.scores[0] - 2 * _LEAD
+        unlikely = not near.any() or self.scores[near].max() < self.scores[0] - _UNLIKELY
         return self.reliable or bool(unlikely and self.grounds[0] > _GROUND)
 
 
@@ -85,55 +81,19 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     directions = np.stack([direction for direction, _ in candidates])
     grounds = np.array([ground_share(points, direction) for direction in directions])
     standing = standing_shares(points, directions)
-    scores = np.array([score + look(direction) for direction, score in candidates])
-    # Elsewhere there are no walls to take for a floor.
-    scores += np.where(grounds > _WALL, standing * grounds, 0)
+    plain = np.array([score + look(direction) for direction, score in candidates])
+    # Elsewhere there are no walls to tell from a floor.
+    scores = plain + np.where(grounds > _WALL, standing * grounds, 0)
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable"):
         if not kept or (directions[kept] @ directions[index]).max() < _SAME:
             kept.append(int(index))
     best, others = kept[0], np.array(kept[1:])
-    walls = others[grounds[others] > _WALL]
     reliable = scores[best] - scores[others].max() > _LEAD and grounds[best] > _GROUND
-    if len(walls):
-        rival = float(standing[walls].max())
+    if (grounds[others] > _WALL).any() or plain[best] - plain[others].max() <= _LEAD:
+        rival = float(standing[others[grounds[others] > _GROUND]].max(initial=0))
         reliable &= bool(standing[best] >= _STANDING and rival < _RIVAL * standing[best])
     return UpwardDirections(directions[kept], scores[kept], grounds[kept], bool(reliable))
-
-
-def standing_shares(points: Points, directions: Points) -> Points:
-    """Share of the things of a scene that touch its lowest side, less that at its highest ``[D]``, in 0..1.
-
-    Things stand on the floor of a room, and few touch the ceiling. Only some touch a wall, or what is between two
-    walls touches both.
-
-    Args:
-        points: Solid points ``[M, 3]`` of the middle of the scene.
-        directions: Up directions ``[D, 3]``, of unit length.
-    """
-    link = _LINK * float(np.median(cKDTree(points).query(points, k=_NEIGHBORS)[0][:, -1]))
-    low, high = np.quantile(points, [0.02, 0.98], axis=0)
-    deep = max(_WITHIN * float(np.linalg.norm(high - low)), link / 2)
-    try:
-        hull = ConvexHull(points).equations
-    except (QhullError, ValueError):  # all in one plane
-        return np.zeros(len(directions))
-    inner = points[-(points @ hull[:, :3].T + hull[:, 3]).max(1) > deep]
-    if len(inner) < _FEWEST_OF_A_THING:
-        return np.zeros(len(directions))
-    pairs = cKDTree(inner).query_pairs(link, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(inner), len(inner)))
-    _, labels = connected_components(graph, directed=False)
-    sizes = np.bincount(labels)
-    things = np.flatnonzero(sizes >= _FEWEST_OF_A_THING)
-    shares = []
-    for direction in np.concatenate([directions, -directions]):
-        lowest = np.full(len(sizes), np.inf)
-        np.minimum.at(lowest, labels, inner @ direction)
-        standing = lowest[things] < np.quantile(points @ direction, 0.02) + deep + link
-        shares.append(float(sizes[things][standing].sum()) / max(int(sizes[things].sum()), 1))
-    touching = np.array(shares).reshape(2, -1)
-    return np.maximum(touching[0] - touching[1], 0)
 
 
 def _normals(neighborhoods: NDArray) -> tuple[Points, Points]:

@@ -1,0 +1,86 @@
+"""What things of a scene without cameras stand on: the sides of the scene that they touch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+_NEIGHBORS = 12
+_WITHIN = 0.04
+"""Things are this far within the convex hull of a scene, relative to its diagonal."""
+_MARGIN = 0.25
+"""Points are of a side, not of a thing, within this part of that distance from the side."""
+_LINK = 2.0
+"""Points of one thing are this near to each other, relative to the usual distance of twelve neighbors."""
+_OUTSIDE = 0.01
+"""Share of the points beyond a side: noise. An open top has no more within a fifth of the walls."""
+_NEAREST = 1.1
+"""A thing that touches nothing, such as a table top whose legs are missing, stands on its nearest side."""
+_TELLING = 0.25
+"""Least share of the things that the others, which reach from side to side, leave: where they leave less, all shares
+are low."""
+_FEWEST_OF_A_THING = 20
+_FACING = np.cos(np.radians(20))
+"""Cosine of the largest angle between a direction and the side of the hull that is its lowest one."""
+
+Points = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def standing_shares(points: Points, directions: Points) -> Points:
+    """Share of the things of a scene that stand on its lowest side, less that at its highest ``[D]``, in 0..1.
+
+    Things stand on the floor of a room, and few touch the ceiling. Only some touch a wall, or what is between two
+    walls touches both. A thing touches a side if it goes on until there; a shelf that ends before a wall is only
+    near it. What reaches from a side to the opposite one may be a wall, or a shelf up to the ceiling, and stands on
+    nothing.
+
+    Args:
+        points: Solid points ``[M, 3]`` of the middle of the scene.
+        directions: Up directions ``[D, 3]``, of unit length.
+    """
+    link = _LINK * float(np.median(cKDTree(points).query(points, k=_NEIGHBORS)[0][:, -1]))
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    deep = max(_WITHIN * float(np.linalg.norm(high - low)), link / 2)
+    try:
+        hull = ConvexHull(points).equations
+    except (QhullError, ValueError):  # all in one plane
+        return np.zeros(len(directions))
+    depths = -(points @ hull[:, :3].T + hull[:, 3])
+    inner = depths.min(1) > deep
+    if inner.sum() < _FEWEST_OF_A_THING:
+        return np.zeros(len(directions))
+    things = _linked(points, inner, link)
+    sizes = np.bincount(things[inner])
+    ends = np.concatenate([directions, -directions])
+    touching, gaps = np.zeros((len(ends), len(sizes)), bool), np.full((len(ends), len(sizes)), np.inf)
+    for end, touches, gap in zip(ends, touching, gaps):
+        heights = points @ end - np.quantile(points @ end, _OUTSIDE)
+        others = hull[:, :3] @ end > -_FACING
+        until = (heights > _MARGIN * deep) & (depths[:, others].min(1, initial=np.inf) > deep)
+        members = inner | until
+        wholes = _linked(points, members, link)
+        lowest = np.full(len(points), np.inf)
+        np.minimum.at(lowest, wholes[members], heights[members])
+        np.minimum.at(gap, things[inner], heights[inner])
+        touches[things[inner & (lowest[wholes] < _MARGIN * deep + link / 4)]] = True
+    nearest = (gaps < deep + link) & (gaps < _NEAREST * gaps.min(0))
+    lows, highs = (touching | (nearest & ~touching.any(0))).reshape(2, len(directions), -1)
+    alone = ~(lows & highs).any(0)
+    counted = np.where(sizes >= _FEWEST_OF_A_THING, sizes, 0)
+    telling = max(float((counted * alone).sum()), _TELLING * float(counted.sum()), 1.0)
+    shares = (lows.astype(float) - highs) @ (counted * alone) / telling
+    return np.asarray(np.maximum(shares, 0))
+
+
+def _linked(points: Points, members: Mask, link: float) -> NDArray[np.int64]:
+    """Number of the thing that each member is part of ``[M]``; that of all others means nothing."""
+    pairs = cKDTree(points[members]).query_pairs(link, output_type="ndarray")
+    count = int(members.sum())
+    graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
+    labels = np.zeros(len(points), np.int64)
+    labels[members] = connected_components(graph, directed=False)[1]
+    return labels
