@@ -1,9 +1,13 @@
 """Features, averages and scenes on workers are those of one process; what fails is told and the rest is kept."""
 
+import contextlib
 import dataclasses
+import functools
 import json
+import os
 import shutil
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,11 +23,11 @@ from lexsplat.captures import Capture, load_capture
 from lexsplat.features import FeatureMap, FeatureMaps, extract_features
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.averaging import MOST_SHARDS, SHARD_VIEWS, average_features, view_shards
-from lexsplat.pipeline import distribution
+from lexsplat.pipeline import build, distribution
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers, scene_tasks
-from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.workers import IN_PROCESS, SharedFolder
+from lexsplat.runtime.errors import CaptureError, WorkersError
+from lexsplat.runtime.workers import ANY_MACHINE, IN_PROCESS, InProcess, SharedFolder
 
 CONFIG = BuildConfig(device="cpu", encoder_device="cpu")
 
@@ -132,6 +136,73 @@ def test_averages_of_workers_that_do_not_see_the_scene_folder_are_those_of_one_p
     for other in found[1:]:
         assert np.array_equal(found[0].means, other.means)
         assert torch.equal(found[0].totals, other.totals)
+
+
+class ElsewhereWorkers(InProcess):
+    """Tasks in this process, in another working folder."""
+
+    distributed = True
+
+    def __init__(self, folder):
+        self.folder, self.required = folder, []
+
+    def require(self, paths):
+        self.required += paths
+
+    def map(self, work, shared, items, needs=ANY_MACHINE):
+        for name in items:
+            item = items[name]
+            before = Path.cwd()
+            os.chdir(self.folder)
+            try:
+                (outcome,) = super().map(work, shared, {name: item})
+            finally:
+                os.chdir(before)
+            yield outcome
+
+
+@contextlib.contextmanager
+def opened(workers, given, paths=()):
+    """In place of `open_workers`."""
+    workers.require(paths)
+    yield workers
+
+
+@pytest.mark.slow
+def test_relative_paths_serve_workers_with_another_working_folder(
+    tiny_capture, tmp_path, monkeypatch, capsys
+):
+    for name in ("capture", "elsewhere"):
+        (tmp_path / name).mkdir()
+    shutil.copytree(tiny_capture, tmp_path / "capture", dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    workers = ElsewhereWorkers(tmp_path / "elsewhere")
+    monkeypatch.setattr(build, "open_workers", functools.partial(opened, workers))
+    made = ["build", "capture", "--output", "scene", *QUICK_BUILD, "--workers", "ray", "--blocks", "2"]
+    assert cli.main(made) == 0
+    assert "scene: finished reconstruct, features, language" in capsys.readouterr().out.splitlines()
+    assert (tmp_path / "scene" / "language.safetensors").exists()
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+    assert all(path.is_absolute() for path in workers.required)
+
+
+def test_folders_of_settings_get_full_paths(tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir()
+    monkeypatch.chdir(tmp_path)
+    config = BuildConfig(clip="own", dino="facebook/dino", features_from=Path("features"))
+    found = scene_tasks({Path("room"): config}, Path("scenes"))["room"].config
+    assert (found.clip, found.dino) == (str(tmp_path / "own"), "facebook/dino")
+    assert found.features_from == tmp_path / "features"
+
+
+def test_a_cluster_that_is_not_there_is_told_before_anything_is_written(tiny_capture, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise WorkersError("Ray at head:1", expected="a running cluster")
+
+    monkeypatch.setattr(build, "open_workers", refuse)
+    with pytest.raises(WorkersError, match="a running cluster"):
+        build.build(tiny_capture, tmp_path / "scene", dataclasses.replace(CONFIG, workers="ray"))
+    assert not (tmp_path / "scene").exists()
 
 
 def test_two_captures_of_one_name_are_refused(tmp_path):

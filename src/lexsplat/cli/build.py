@@ -90,9 +90,9 @@ class Build:
             )
         if self.progress == "json":
             return
-        print(f"{folder.root}: finished {', '.join(folder.record['stages'])}")
+        print(f"{self.output}: finished {', '.join(folder.record['stages'])}")
         if self.until == "language":
-            print(f'next: lexsplat query {folder.root} "something you see"')
+            print(f'next: lexsplat query {self.output} "something you see"')
 
     def _build_scenes(self) -> None:
         """Build one scene per capture; failures are reported and the other scenes are kept."""

@@ -27,7 +27,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
 from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
-from lexsplat.pipeline.provenance import model_identity, model_place, write_provenance
+from lexsplat.pipeline.provenance import model_identity, model_place, with_full_paths, write_provenance
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
 from lexsplat.pipeline.viewpoints.choosing import SIZE
@@ -83,6 +83,9 @@ def build(
     """
     source, config = None if source is None else Path(source), (config or BuildConfig()).spelled_out()
     _check_request(source, splats, until, config)
+    if config.workers != "none":  # workers may have another working folder
+        output, config = Path(output).absolute(), with_full_paths(config)
+        source, splats = (None if path is None else path.absolute() for path in (source, splats))
     device = choose_device(config.device)
     config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
     if device == "cuda":
@@ -90,7 +93,8 @@ def build(
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
-    with folder.locked(), warnings_once():
+    given = tuple(filter(None, (source, splats)))
+    with open_workers(config.workers, given) as workers, folder.locked(), warnings_once():
         try:
             # Errors in ground truth and encoders are reported before structure from motion, not after it.
             photos: PhotoSurvey | None = PhotoSurvey(0, SIZE)
@@ -116,9 +120,9 @@ def build(
             if config.features_from is not None:
                 load_external_features(config.features_from, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
-            builder.encoders = checked
-            with open_workers(config.workers, (capture.root,)) as builder.workers:
-                return builder.run(until)
+            builder.encoders, builder.workers = checked, workers
+            workers.require((capture.root,))
+            return builder.run(until)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw()
@@ -330,14 +334,8 @@ class _Builder:
 
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
-        codebook = fit_codebook(
-            maps,
-            names,
-            self.config.codebook,
-            seed=self.config.seed,
-            memory=self.memory,
-            listener=self.listener,
-        )
+        seed, memory, listener = self.config.seed, self.memory, self.listener
+        codebook = fit_codebook(maps, names, self.config.codebook, seed=seed, memory=memory, listener=listener)
         code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
         for name, code_map in code_maps.items():
             code_maps[name] = mark_masked_cells(code_map, self.capture.views[name], codebook.num_codes)

@@ -12,6 +12,7 @@ from lexsplat.features import extract_features
 from lexsplat.features.extraction import missing_views
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders
+from lexsplat.pipeline.provenance import with_full_paths
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.memory import parse_bytes
@@ -147,7 +148,7 @@ def scene_tasks(
                 found=f"the name of {tasks[name].source}",
                 remedy="rename one: the scenes are written below --output by these names",
             )
-        own = replace(config, workers="none")
+        own = replace(with_full_paths(config), workers="none")
         tasks[name] = SceneTask(source.resolve(), output.resolve() / name, own, until)
     return tasks
 

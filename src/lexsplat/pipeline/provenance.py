@@ -83,6 +83,17 @@ def model_place(name: str) -> str:
     return name if name in ("bundled", "none") or not folder.is_dir() else str(folder.resolve())
 
 
+def with_full_paths(config: BuildConfig) -> BuildConfig:
+    """The same settings for a process with another working folder."""
+    features = config.features_from
+    return replace(
+        config,
+        clip=model_place(config.clip),
+        dino=model_place(config.dino),
+        features_from=None if features is None else features.absolute(),
+    )
+
+
 def model_identity(name: str, kind: str) -> list[str]:
     """What identifies a model: its name; for a folder also sizes and times of its files; a hash if it is bundled."""
     if name == "bundled":  # its files differ between versions of lexsplat, and their times mean nothing
@@ -93,4 +104,4 @@ def model_identity(name: str, kind: str) -> list[str]:
     files = sorted(file for file in folder.iterdir() if file.is_file())
     if not files:
         raise ModelError(name, expected="a model folder", found="an empty folder")
-    return [name, *(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)]
+    return [model_place(name), *(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)]

@@ -71,7 +71,7 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
         raise _unreachable(place, error, answers=answers) from error
     lost = False
     try:
-        _check_nodes(paths)
+        log.log(NOTE, "workers: %s nodes, %s cores", _check_nodes(paths), _cores())
         yield RayWorkers()
     except ClusterLostError:
         lost = True  # to disconnect from nothing would wait until Ray ends this process
@@ -107,6 +107,10 @@ class RayWorkers:
             return all(ray.get(list(answers.values()), timeout=_PROBE_SECONDS))
         except (ConnectionError, ray.exceptions.RayError) as error:
             raise _gone(error) from error
+
+    def require(self, paths: tuple[Path, ...]) -> None:
+        """See `Workers.require`."""
+        _check_nodes(paths)
 
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
@@ -244,8 +248,8 @@ def _options(needs: Needs, tasks: int) -> dict[str, Any]:
     return options
 
 
-def _check_nodes(paths: tuple[Path, ...]) -> None:
-    """Run a probe on every node.
+def _check_nodes(paths: tuple[Path, ...]) -> int:
+    """Run a probe on every node; returns their number.
 
     Raises:
         WorkersError: If a node cannot do the work.
@@ -262,7 +266,7 @@ def _check_nodes(paths: tuple[Path, ...]) -> None:
             return "", "", []
         return version_of_lexsplat(), code_identity(), [file for file in files if not Path(file).exists()]
 
-    answers = _on_every_node(ray.remote(probe), [str(path.resolve()) for path in paths])
+    answers = _on_every_node(ray.remote(probe), [str(path.resolve()) for path in paths if path.exists()])
     if not answers:
         raise WorkersError(
             "--workers", expected="nodes with CPUs", found="none", remedy="add nodes to the cluster"
@@ -276,7 +280,7 @@ def _check_nodes(paths: tuple[Path, ...]) -> None:
                 f"node {name}", expected="an answer", found=type(error).__name__, remedy=remedy
             ) from error
         _check_probe(name, found, code, missing)
-    log.log(NOTE, "workers: %s nodes, %s cores", len(answers), int(ray.cluster_resources().get("CPU", 0)))
+    return len(answers)
 
 
 def _on_every_node(task: Any, argument: Any) -> dict[str, Any]:

@@ -68,6 +68,13 @@ class Workers(Protocol):
     def see(self, folder: SharedFolder) -> bool:
         """Whether every worker sees a folder of this process."""
 
+    def require(self, paths: tuple[Path, ...]) -> None:
+        """Check that every worker sees files and folders of this process.
+
+        Raises:
+            WorkersError: If one does not, or cannot work.
+        """
+
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
     ) -> Iterator[Outcome]:
@@ -98,6 +105,9 @@ class InProcess:
     def see(self, folder: SharedFolder) -> bool:
         """See `Workers.see`."""
         return True
+
+    def require(self, paths: tuple[Path, ...]) -> None:
+        """See `Workers.require`."""
 
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
