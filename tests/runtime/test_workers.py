@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from support import two_nodes
 
-from lexsplat.runtime import ray_workers
-from lexsplat.runtime.errors import CaptureError, WorkersError
+from lexsplat.runtime import ray_tasks, ray_workers
+from lexsplat.runtime.errors import CaptureError, TaskError, WorkersError
+from lexsplat.runtime.progress import NOTE
 from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, check_spec, open_workers, results
 
 ONES = np.ones(1000, np.float32)
@@ -58,6 +59,48 @@ def test_several_failures_are_one_error_that_names_them():
     with pytest.raises(CaptureError) as caught:
         list(results(IN_PROCESS.map(two_nodes.one_broken, None, {"a": 2, "b": 1, "c": 2, "d": 2})))
     assert str(caught.value).endswith("found a torn file (and 2 more failed: c, d); replace it")
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (
+            OSError(28, "No space left on device", "/x/y"),
+            "found No space left on device: /x/y; mend this and run",
+        ),
+        (MemoryError(), "found no memory left; give a smaller --memory"),
+        (ValueError("no such axis"), "found ValueError: no such axis; mend this and run"),
+        (RuntimeError("bad shape"), "found RuntimeError: bad shape; mend this and run"),
+    ],
+)
+def test_any_error_of_a_task_is_told_with_its_name_and_the_rest_is_kept(error, told):
+    outcomes = list(IN_PROCESS.map(two_nodes.raises_second, error, {f"part {i}": i for i in range(4)}))
+    assert [o.result for o in outcomes] == [0, None, 2, 3]
+    assert str(outcomes[1].error).startswith(f"part 1: expected a result, {told}")
+    with pytest.raises(TaskError) as caught:
+        list(results(iter(outcomes)))
+    assert caught.value.__cause__ is error
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3)])
+def test_what_ends_the_program_ends_the_tasks_at_once(error):
+    with pytest.raises(type(error)):
+        list(IN_PROCESS.map(two_nodes.raises_second, error, {str(i): i for i in range(4)}))
+
+
+def test_notes_and_warnings_of_a_task_travel_with_its_outcome():
+    outcome, said = ray_tasks.run(two_nodes.warns, None, "bath", 3)
+    assert (outcome.name, outcome.result) == ("bath", 3)
+    assert said == [(NOTE, "about 3 s"), (30, "3 photos are few")]
+
+
+def test_other_versions_of_packages_on_a_node_are_a_warning(caplog):
+    own = ray_workers.versions()
+    ray_workers._compare("node a", own)
+    assert not caplog.records
+    ray_workers._compare("node a", {**own, "torch": "1.0", "transformers": "0.1"})
+    assert f"torch 1.0 (here {own['torch']})" in caplog.text
+    assert "transformers" not in caplog.text
 
 
 @pytest.mark.parametrize("spec", ["slurm", "ray://", "ray://host", "ray://host:port", "ray:", ""])
@@ -125,6 +168,31 @@ def test_a_task_that_fails_on_a_node_is_told_with_its_name_and_the_rest_is_kept(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("error", [OSError(28, "No space left", "/x"), MemoryError(), ValueError("axis")])
+def test_any_error_of_a_task_on_a_node_is_told_as_in_this_process(on_ray, error):
+    items = {f"part {i}": i for i in range(4)}
+    here, there = (
+        [(o.name, o.result, str(o.error)) for o in each.map(two_nodes.raises_second, error, items)]
+        for each in (IN_PROCESS, on_ray)
+    )
+    assert there == here
+
+
+@pytest.mark.slow
+def test_warnings_on_a_node_are_told_with_the_name_of_the_task(on_ray, caplog):
+    list(on_ray.map(two_nodes.warns, None, {"bath": 8}))
+    assert "bath: 8 photos are few" in caplog.messages
+
+
+@pytest.mark.slow
+def test_a_slow_first_task_does_not_idle_the_other_worker(on_ray, tmp_path):
+    (tmp_path / "marks").mkdir()
+    items = {str(i): i for i in range(12)}
+    found = [o.result for o in on_ray.map(two_nodes.waits_for_the_others, tmp_path / "marks", items)]
+    assert found == list(range(12))
+
+
+@pytest.mark.slow
 def test_nodes_tell_whether_they_see_a_folder_itself(on_ray, tmp_path):
     with SharedFolder.offered(tmp_path / "there") as folder:
         assert on_ray.see(folder)
@@ -139,7 +207,7 @@ def test_a_worker_that_dies_is_replaced(on_ray, tmp_path):
 
 @pytest.mark.slow
 def test_a_task_that_kills_every_worker_is_told_and_the_rest_is_kept(on_ray, monkeypatch):
-    monkeypatch.setattr(ray_workers, "RETRIES", 1)
+    monkeypatch.setattr(ray_tasks, "RETRIES", 1)
     outcomes = list(on_ray.map(two_nodes.always_dies, None, {str(i): i for i in range(3)}))
     assert [o.result for o in outcomes] == [0, None, 2]
     assert "its worker died 2 times" in str(outcomes[1].error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.progress import NOTE
 
 STORE_BYTES = 100 << 20
 
@@ -75,6 +77,33 @@ def one_broken(shared: None, item: int) -> int:
     """Fails for its own reason at 2."""
     if item == 2:
         raise CaptureError("photo 2", expected="a photo", found="a torn file", remedy="replace it")
+    return item
+
+
+def raises_second(error: BaseException, item: int) -> int:
+    """Raises the error at 1."""
+    if item == 1:
+        raise error
+    return item
+
+
+def warns(shared: None, item: int) -> int:
+    """Tells a note, a warning, and what nobody asked for."""
+    log = logging.getLogger("lexsplat")
+    log.info("unasked")
+    log.log(NOTE, "about %s s", item)
+    log.warning("%s photos are few", item)
+    return item
+
+
+def waits_for_the_others(marks: Path, item: int) -> int:
+    """The first task ends when ten others have ended."""
+    (marks / str(item)).touch()
+    end = time.monotonic() + 60
+    while item == 0 and len(list(marks.iterdir())) < 11:
+        if time.monotonic() > end:
+            raise TimeoutError(f"{len(list(marks.iterdir()))} tasks began")
+        time.sleep(0.1)
     return item
 
 

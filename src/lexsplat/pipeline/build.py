@@ -335,7 +335,9 @@ class _Builder:
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
         seed, memory, listener = self.config.seed, self.memory, self.listener
-        codebook = fit_codebook(maps, names, self.config.codebook, seed=seed, memory=memory, listener=listener)
+        codebook = fit_codebook(
+            maps, names, self.config.codebook, seed=seed, memory=memory, listener=listener
+        )
         code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
         for name, code_map in code_maps.items():
             code_maps[name] = mark_masked_cells(code_map, self.capture.views[name], codebook.num_codes)

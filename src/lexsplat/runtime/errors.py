@@ -85,3 +85,7 @@ class TrainingError(LexsplatError):
 
 class WorkersError(LexsplatError):
     """A cluster cannot be used, has disappeared, or lost a task for good."""
+
+
+class TaskError(LexsplatError):
+    """A task failed by an error of the system or of the program."""

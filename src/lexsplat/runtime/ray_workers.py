@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import socket
-import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lexsplat.runtime.environment import code_identity, version_of_lexsplat
-from lexsplat.runtime.errors import LexsplatError, WorkersError
-from lexsplat.runtime.memory import size_text
+from lexsplat.runtime.environment import code_identity, version_of_lexsplat, versions
+from lexsplat.runtime.errors import WorkersError
 from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.ray_tasks import Answer, Tasks, no_node, options_of, run, slots, store_full
+from lexsplat.runtime.ray_watch import ClusterLostError, HeadWatch
 from lexsplat.runtime.workers import ANY_MACHINE, Needs, Outcome, R, S, SharedFolder, T, Workers
 
 log = logging.getLogger("lexsplat")
 
-RETRIES = 20
-"""Times that a task is done again after its worker or node was lost."""
-
 _PROBE_SECONDS = 120.0
 _TOKEN = "; if the cluster was started with a token, set RAY_AUTH_MODE=token and copy ~/.ray/auth_token from its head"
 _WAIT_SECONDS = 5.0
-_HEAD_TRIES = 4
-_CORES_SECONDS = 30.0
-_WITHOUT_NODES_SECONDS = 60.0
-"""Seconds without a node that can compute, after which the cluster counts as gone."""
+_RECONNECT = "RAY_gcs_rpc_server_reconnect_timeout_s"
 
 
 @contextmanager
@@ -45,6 +40,9 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
             does not see a path.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use to its makers otherwise
+    place = address or os.environ.get("RAY_ADDRESS") or "local"
+    if place != "local":  # `HeadWatch` tells sooner that the head is gone, with the remedy
+        os.environ.setdefault(_RECONNECT, "86400")
     try:
         import ray
     except ImportError as error:
@@ -54,7 +52,6 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
             found="none installed",
             remedy="pip install 'lexsplat[cluster]'",
         ) from error
-    place = address or os.environ.get("RAY_ADDRESS") or "local"
     host, _, port = place.removeprefix("ray://").rpartition(":")
     answers = False
     if host and port.isdigit():  # Ray tries for a minute where nothing listens
@@ -63,26 +60,37 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
         except OSError as error:
             raise _unreachable(place, error) from error
         answers = True
+    _connect(place, answers=answers)
+    # From within a cluster Ray ends this process where the head is gone; in the other cases it raises.
+    head = None if place == "local" or place.startswith("ray://") else ray.get_runtime_context().gcs_address
+    watch, lost = HeadWatch(head), False
     try:
-        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-        own: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
-        ray.init(address=place, **quiet, **own)
-    except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
-        raise _unreachable(place, error, answers=answers) from error
-    lost = False
-    try:
-        log.log(NOTE, "workers: %s nodes, %s cores", _check_nodes(paths), _cores())
-        yield RayWorkers()
+        with watch:
+            log.log(NOTE, "workers: %s nodes, %s cores", _check_nodes(paths), slots(ANY_MACHINE))
+            yield RayWorkers(watch)
     except ClusterLostError:
-        lost = True  # to disconnect from nothing would wait until Ray ends this process
+        lost = True
         raise
     finally:
-        if not lost:
+        if lost or watch.lost:  # to disconnect from nothing would wait for it
+            atexit.unregister(ray.shutdown)
+        else:
             ray.shutdown()
 
 
-class ClusterLostError(WorkersError):
-    """The cluster has disappeared."""
+def _connect(place: str, *, answers: bool, tries: int = 2) -> None:
+    """Connect to Ray; once more where the server of ``ray://`` did not start in time."""
+    import ray
+
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    own: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
+    try:
+        ray.init(address=place, **quiet, **own)
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
+        if tries > 1 and "Initialization failure" in str(error):
+            _connect(place, answers=answers, tries=tries - 1)
+            return
+        raise _unreachable(place, error, answers=answers) from error
 
 
 class RayWorkers:
@@ -90,7 +98,8 @@ class RayWorkers:
 
     distributed = True
 
-    def __init__(self) -> None:
+    def __init__(self, watch: HeadWatch) -> None:
+        self._watch = watch
         self._running = 0
 
     @property
@@ -106,7 +115,7 @@ class RayWorkers:
             answers = _on_every_node(ray.remote(_sees), folder)
             return all(ray.get(list(answers.values()), timeout=_PROBE_SECONDS))
         except (ConnectionError, ray.exceptions.RayError) as error:
-            raise _gone(error) from error
+            raise ClusterLostError.by(error) from error
 
     def require(self, paths: tuple[Path, ...]) -> None:
         """See `Workers.require`."""
@@ -115,137 +124,47 @@ class RayWorkers:
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
     ) -> Iterator[Outcome]:
-        """See `Workers.map`. At most two tasks a core are under way, which bounds the results that wait.
+        """See `Workers.map`. Tasks are sent while slots are free, though an earlier one is still at work.
 
         Raises:
-            WorkersError: If the cluster disappears, or no node has what a task needs.
+            WorkersError: If the cluster disappears, or no node has what a task needs, also after a wait.
         """
         import ray
 
         try:
-            options = _options(needs, len(items))
-            task = ray.remote(_run).options(**options)
-            everyone = ray.put(shared)
-            todo, running = deque(items), deque[tuple[str, Any]]()
-            cores, asked = _cores(), time.monotonic()
-            while todo or running:
-                if time.monotonic() - asked > _CORES_SECONDS and _head_answers():  # nodes may have come
-                    cores, asked = _cores(), time.monotonic()
-                while todo and len(running) < 2 * cores:
-                    name = todo.popleft()
-                    running.append((name, task.remote(work, everyone, items[name])))
-                self._running = min(cores, len(running))
-                name, reference = running.popleft()
-                yield _outcome(name, reference)
+            options = options_of(needs, len(items))
+            task = ray.remote(run).options(**options)
+            tasks = Tasks(task, work, ray.put(shared), items, replace(needs, gpu="num_gpus" in options))
+            for outcome, said in self._watch.guarded(self._outcomes(tasks)):
+                for level, text in said:
+                    log.log(level, "%s: %s", outcome.name, text)
+                yield outcome
         except (ConnectionError, ray.exceptions.RaySystemError) as error:
-            raise _gone(error) from error
+            raise ClusterLostError.by(error) from error
         except (ray.exceptions.ObjectStoreFullError, ray.exceptions.OutOfDiskError) as error:
-            raise _store_full(needs.result) from error
+            raise store_full(needs.result) from error
+
+    def _outcomes(self, tasks: Tasks) -> Iterator[Answer]:
+        """The answers of tasks in order; while one is waited for, others are sent and end."""
+        while tasks.todo or tasks.sent:
+            tasks.send()
+            self._running = min(tasks.slots, len(tasks.running))
+            name, reference = next(iter(tasks.sent.items()))
+            if reference in tasks.running and not tasks.wait():
+                self._watch.check()
+                if not tasks.are_stranded():
+                    continue
+                yield from tasks.take_ended()
+                raise no_node(tasks.needs)
+            if reference not in tasks.running:
+                answer = tasks.take(name)
+                if answer is not None:
+                    yield answer
 
 
 def _sees(folder: SharedFolder) -> bool:
     """Whether a node sees a folder. A worker calls it."""
     return folder.is_visible
-
-
-def _cores() -> int:
-    import ray
-
-    return max(1, int(ray.cluster_resources().get("CPU", 1)))
-
-
-def _run(work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
-    """Run a task on one thread, so that its bits do not depend on the node. A worker calls it."""
-    import torch
-
-    torch.set_num_threads(1)
-    return work(shared, item)
-
-
-def _outcome(name: str, reference: Any) -> Outcome:
-    """Wait for one task."""
-    import ray
-
-    _wait(reference)
-    try:
-        return Outcome(name, ray.get(reference))
-    except ray.exceptions.RayTaskError as error:
-        cause = error.cause
-        if isinstance(cause, LexsplatError):
-            return Outcome(name, error=cause)
-        if isinstance(cause, (ray.exceptions.ObjectStoreFullError, ray.exceptions.OutOfDiskError)):
-            raise cause from error
-        if isinstance(error, ray.exceptions.RaySystemError):  # the task could not be read there
-            found = str(error).strip().splitlines()[-1][:200]
-            remedy = "install the same packages on every node"
-            raise WorkersError(name, expected="a result", found=found, remedy=remedy) from error
-        raise
-    except (
-        ray.exceptions.WorkerCrashedError,
-        ray.exceptions.NodeDiedError,
-        ray.exceptions.OutOfMemoryError,
-        ray.exceptions.ObjectLostError,
-    ) as error:
-        found = f"its worker died {RETRIES + 1} times ({type(error).__name__})"
-        remedy = "give the workers more memory, or run without --workers to see why"
-        return Outcome(name, error=WorkersError(name, expected="a result", found=found, remedy=remedy))
-
-
-def _wait(reference: Any) -> None:
-    """Wait until a task has ended, as long as there are nodes."""
-    import ray
-
-    alone_since = None
-    while not ray.wait([reference], timeout=_WAIT_SECONDS, fetch_local=False)[0]:
-        if not _head_answers():
-            raise _gone(None)
-        if any(node["Alive"] and node["Resources"].get("CPU") for node in ray.nodes()):
-            alone_since = None
-            continue
-        alone_since = alone_since or time.monotonic()
-        if time.monotonic() - alone_since > _WITHOUT_NODES_SECONDS:
-            raise _gone(None)
-
-
-def _head_answers() -> bool:
-    """Whether the head node can be connected to. Ray would end this process a minute after it cannot."""
-    import ray
-
-    if ray.util.client.ray.is_connected():  # "ray://": the connection itself reports its end
-        return True
-    host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
-    for _ in range(_HEAD_TRIES):
-        try:
-            socket.create_connection((host, int(port)), timeout=_WAIT_SECONDS).close()
-            return True
-        except OSError:
-            time.sleep(_WAIT_SECONDS)
-    return False
-
-
-def _options(needs: Needs, tasks: int) -> dict[str, Any]:
-    """Options of Ray for tasks with these needs; checks that a node, and the object stores, can meet them."""
-    import ray
-
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES}
-    if needs.gpu and any(node.get("GPU") for node in nodes):
-        options["num_gpus"] = 1
-    if needs.memory:
-        most = int(max((node.get("memory", 0) for node in nodes), default=0))
-        if needs.memory > most:
-            raise WorkersError(
-                "--workers",
-                expected=f"a node with {size_text(needs.memory, up=True)} of memory for a task",
-                found=f"at most {size_text(most)}",
-                remedy=f"use --memory {size_text(max(1 << 20, most // 2))}, or larger nodes",
-            )
-        options["memory"] = needs.memory
-    cores = int(sum(node.get("CPU", 0) for node in nodes))
-    store = int(sum(node.get("object_store_memory", 0) for node in nodes))
-    if needs.result * min(tasks, 2 * max(1, cores)) > store:
-        raise _store_full(needs.result, store)
-    return options
 
 
 def _check_nodes(paths: tuple[Path, ...]) -> int:
@@ -256,15 +175,16 @@ def _check_nodes(paths: tuple[Path, ...]) -> int:
     """
     import ray
 
-    def probe(files: list[str]) -> tuple[str, str, list[str]]:
+    def probe(files: list[str]) -> tuple[str, str, list[str], dict[str, str]]:
         # Nested, so that it is sent by value: a node without lexsplat can run it too.
         from pathlib import Path
 
         try:
-            from lexsplat.runtime.environment import code_identity, version_of_lexsplat
+            from lexsplat.runtime.environment import code_identity, version_of_lexsplat, versions
         except ImportError:
-            return "", "", []
-        return version_of_lexsplat(), code_identity(), [file for file in files if not Path(file).exists()]
+            return "", "", [], {}
+        missing = [file for file in files if not Path(file).exists()]
+        return version_of_lexsplat(), code_identity(), missing, versions()
 
     answers = _on_every_node(ray.remote(probe), [str(path.resolve()) for path in paths if path.exists()])
     if not answers:
@@ -273,13 +193,14 @@ def _check_nodes(paths: tuple[Path, ...]) -> int:
         )
     for name, reference in answers.items():
         try:
-            found, code, missing = ray.get(reference, timeout=_PROBE_SECONDS)
+            found, code, missing, packages = ray.get(reference, timeout=_PROBE_SECONDS)
         except ray.exceptions.RayError as error:
             remedy = "check the node with: ray status"
             raise WorkersError(
                 f"node {name}", expected="an answer", found=type(error).__name__, remedy=remedy
             ) from error
         _check_probe(name, found, code, missing)
+        _compare(name, packages)
     return len(answers)
 
 
@@ -316,6 +237,18 @@ def _check_probe(node: str, found: str, code: str, missing: list[str]) -> None:
         )
 
 
+def _compare(node: str, packages: dict[str, str]) -> None:
+    """Warn of packages whose versions on a node are others, so that its results may have other bits."""
+    own = versions()
+    others = [
+        f"{name} {packages.get(name, 'missing')} (here {own.get(name, 'missing')})"
+        for name in ("python", "torch", "numpy", "numba")
+        if packages.get(name) != own.get(name)
+    ]
+    if others:
+        log.warning("node %s: other versions, so its bits may differ: %s", node, ", ".join(others))
+
+
 def _unreachable(place: str, error: Exception, *, answers: bool = False) -> WorkersError:
     """The error to raise; ``answers`` if something listens at the address, so that a token may be missing."""
     reason = " ".join(str(error).split())[:200]
@@ -330,23 +263,4 @@ def _unreachable(place: str, error: Exception, *, answers: bool = False) -> Work
         expected="a running cluster",
         found=reason or type(error).__name__,
         remedy="check the address and: ray status" + (_TOKEN if answers else ""),
-    )
-
-
-def _gone(error: Exception | None) -> ClusterLostError:
-    return ClusterLostError(
-        "--workers",
-        expected="the cluster",
-        found="no node that answers" if error is None else f"no connection ({type(error).__name__})",
-        remedy="finished work is kept; run the same command again when the cluster is back, or without --workers",
-    )
-
-
-def _store_full(result: int, store: int | None = None) -> WorkersError:
-    wanted = f"room for results of {size_text(result, up=True)} a task" if result else "room for the results"
-    return WorkersError(
-        "object store of Ray",
-        expected=wanted,
-        found="a full one" if store is None else size_text(store),
-        remedy="start the nodes with a larger --object-store-memory, or run without --workers",
     )

@@ -6,6 +6,7 @@ added in one order, and any number of workers gives the same bits.
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -14,7 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from lexsplat.runtime.errors import LexsplatError, WorkersError
+from lexsplat.runtime.errors import LexsplatError, TaskError, WorkersError
+
+log = logging.getLogger("lexsplat")
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -52,6 +55,31 @@ class Outcome:
     name: str
     result: Any = None
     error: LexsplatError | None = None
+
+
+def attempt(work: Callable[[S, T], R], shared: S, name: str, item: T) -> Outcome:
+    """Do one task; whatever it raises is its outcome, except what ends the program."""
+    try:
+        return Outcome(name, work(shared, item))
+    except LexsplatError as error:
+        return Outcome(name, error=error)
+    except Exception as error:
+        return Outcome(name, error=_told(name, error))
+
+
+def _told(name: str, error: Exception) -> TaskError:
+    """The line of an error without a remedy of its own."""
+    log.debug("task %s", name, exc_info=error)
+    found, remedy = f"{type(error).__name__}: {error}", "mend this"
+    if isinstance(error, OSError):  # such as a full disk
+        found = f"{error.strerror or error}" + (f": {error.filename}" if error.filename else "")
+    elif isinstance(error, MemoryError):
+        found = "no memory left"
+        remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
+    remedy += " and run the same command again; finished work is kept"
+    told = TaskError(name, expected="a result", found=found[:300], remedy=remedy)
+    told.__cause__ = error
+    return told
 
 
 class Workers(Protocol):
@@ -114,11 +142,7 @@ class InProcess:
     ) -> Iterator[Outcome]:
         """See `Workers.map`."""
         for name, item in items.items():
-            try:
-                outcome = Outcome(name, work(shared, item))
-            except LexsplatError as error:
-                outcome = Outcome(name, error=error)
-            yield outcome
+            yield attempt(work, shared, name, item)
 
 
 IN_PROCESS = InProcess()
