@@ -222,6 +222,20 @@ def test_tasks_that_no_node_can_hold_are_refused(on_ray):
 
 
 @pytest.mark.slow
+def test_tasks_whose_only_node_is_gone_end_in_one_line_and_finished_ones_are_kept(nodes, on_ray, monkeypatch):
+    monkeypatch.setattr(ray_tasks, "_WITHOUT_NODES_SECONDS", 5.0)
+    large = nodes.cluster.add_node(num_cpus=1, memory=1 << 40, object_store_memory=two_nodes.STORE_BYTES)
+    items = {str(i): i for i in range(200)}
+    found = on_ray.map(two_nodes.slow_sum, ONES, items, Needs(memory=1 << 39))
+    kept = [next(found) for _ in range(2)]
+    nodes.cluster.remove_node(large, allow_graceful=False)
+    with pytest.raises(WorkersError, match=r"a node with 524288MB of memory for a task, found .* is kept"):
+        kept.extend(found)
+    assert all(outcome.error is None for outcome in kept)
+    assert 2 <= len(kept) < len(items)
+
+
+@pytest.mark.slow
 def test_nodes_killed_at_twenty_random_moments_change_no_bit(nodes, on_ray):
     expected, kills, rng = total(IN_PROCESS), 0, random.Random(7)
     while kills < 20:

@@ -1,9 +1,14 @@
-"""Whether the head node of a Ray cluster is still there. Ray ends this process without a word where it is not."""
+"""Whether the head node of a Ray cluster is still there.
+
+Where it is not, Ray ends this process from within its own code: at once if the node of this machine is gone, else a
+minute later. A thread asks more often. Where Ray is faster, a process that waits for the end of this one tells why.
+"""
 
 from __future__ import annotations
 
 import os
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -35,8 +40,21 @@ class ClusterLostError(WorkersError):
         )
 
 
+_WITNESS = """
+import socket, sys, time
+host, port, line = sys.argv[1], int(sys.argv[2]), sys.argv[3]
+for _ in range(0 if sys.stdin.read() else 20):
+    try:
+        socket.create_connection((host, port), timeout=2).close()
+    except OSError:
+        sys.exit(line)
+    time.sleep(1)
+"""
+"""Program that reads until this process ends. If nothing was written and the head is gone, it tells the line."""
+
+
 class HeadWatch:
-    """A thread that connects to the head node again and again, while the context is open.
+    """A thread that connects to the head node again and again while the context is open, and a witness of the end.
 
     Args:
         address: "HOST:PORT" of the head; None watches nothing.
@@ -44,17 +62,25 @@ class HeadWatch:
 
     def __init__(self, address: str | None) -> None:
         self.lost = False
-        self._address = address
+        self._host, _, self._port = (address or "").replace("[", "").replace("]", "").rpartition(":")
+        self._witness: subprocess.Popen[str] | None = None
         self._ended = threading.Event()
         self._entered: float | None = None  # when the call of Ray began that is under way
 
     def __enter__(self) -> HeadWatch:
-        if self._address is not None:
+        if self._port:
+            line = f"error: {ClusterLostError.by()}"
+            command = [sys.executable, "-I", "-S", "-c", _WITNESS, self._host, self._port, line]
+            self._witness = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True, text=True
+            )
             threading.Thread(target=self._watch, name="head of Ray", daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
+        if self._witness is not None:
+            self._witness.communicate("an orderly end")
 
     def check(self) -> None:
         """Raise `ClusterLostError` if the head is gone."""
@@ -85,13 +111,11 @@ class HeadWatch:
         while not self._ended.wait(POLL_SECONDS / 4):
             entered = self._entered
             if entered is not None and time.monotonic() - max(entered, lost) > BLOCKED_SECONDS:
-                print(f"error: {ClusterLostError.by()}", file=sys.stderr, flush=True)
-                os._exit(1)
+                os._exit(1)  # the witness tells why
 
     def _answers(self) -> bool:
-        host, _, port = str(self._address).rpartition(":")
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=POLL_SECONDS).close()
+            socket.create_connection((self._host, int(self._port)), timeout=POLL_SECONDS).close()
         except OSError:
             return False
         return True
