@@ -8,7 +8,7 @@ from rich.console import Console
 
 from lexsplat.cli import progress
 from lexsplat.cli.progress import ProgressBars, format_rate, format_seconds
-from lexsplat.runtime.progress import Event
+from lexsplat.runtime.progress import Event, Pace
 
 
 @pytest.fixture
@@ -70,6 +70,15 @@ def test_a_stage_of_the_next_scene_starts_anew(clock, monkeypatch, capsys):
         for number, _ in enumerate(events(bars)):
             if number in (10, 15):
                 assert bars._progress.tasks[0].finished == (number == 10)
+
+
+def test_the_rate_of_a_stage_leaves_out_the_time_since_an_earlier_scene_was_kept(clock):
+    pace = Pace()
+    pace.rate(Event("reconstruct", 1, 1, {"kept": 1.0}))
+    clock[0] += 1000
+    assert pace.rate(Event("reconstruct", 10, 100)) == 0.0
+    clock[0] += 10
+    assert pace.rate(Event("reconstruct", 20, 100)) == pytest.approx(1.0)
 
 
 def test_what_ray_prints_is_not_among_the_lines_of_json(capsys):

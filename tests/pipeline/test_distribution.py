@@ -26,7 +26,7 @@ from lexsplat.language.methods.averaging import MOST_SHARDS, SHARD_VIEWS, averag
 from lexsplat.pipeline import build, distribution
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers, scene_tasks
-from lexsplat.runtime.errors import CaptureError, WorkersError
+from lexsplat.runtime.errors import CaptureError, LexsplatError, WorkersError
 from lexsplat.runtime.workers import ANY_MACHINE, IN_PROCESS, InProcess, SharedFolder
 
 CONFIG = BuildConfig(device="cpu", encoder_device="cpu")
@@ -203,6 +203,43 @@ def test_a_cluster_that_is_not_there_is_told_before_anything_is_written(tiny_cap
     with pytest.raises(WorkersError, match="a running cluster"):
         build.build(tiny_capture, tmp_path / "scene", dataclasses.replace(CONFIG, workers="ray"))
     assert not (tmp_path / "scene").exists()
+
+
+def test_an_output_that_a_worker_does_not_see_is_one_line_and_not_one_a_scene(tmp_path):
+    class Blind(InProcess):
+        def see(self, folder):
+            return False
+
+    tasks = scene_tasks({tmp_path / name: CONFIG for name in ("bath", "attic")}, tmp_path / "scenes")
+    with pytest.raises(WorkersError, match="scenes: expected a folder that every worker sees"):
+        list(distribution.build_scenes(tasks, tmp_path / "scenes", Blind()))
+
+
+def test_a_folder_that_is_a_scene_and_holds_scenes_is_warned_of(tmp_path, caplog):
+    from lexsplat.cli.build import Build
+
+    (tmp_path / "s" / "attic").mkdir(parents=True)
+    (tmp_path / "s" / "attic" / "scene.json").write_text("{}")
+    for more, what in ((), "holds the scenes of several captures"), (("b",), "is the scene of one capture"):
+        if more:
+            (tmp_path / "s" / "scene.json").write_text("{}")
+        with contextlib.suppress(LexsplatError):
+            Build(str(tmp_path / "none"), tmp_path / "s", more=more).run()
+        assert what in caplog.messages[-1]
+        assert "one CAPTURE is written into --output itself" in caplog.messages[-1]
+
+
+@pytest.mark.slow
+def test_what_killed_commands_left_is_removed_when_it_serves_no_more(tiny_capture, tmp_path):
+    output = tmp_path / "scene"
+    left = output / "checkpoints" / "blocks" / "0-00018.safetensors"
+    mark = output / "checkpoints" / "features" / ".workers-0"
+    for path in (left, mark):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    assert cli.main(["reconstruct", str(tiny_capture), "--output", str(output), *QUICK_BUILD]) == 0
+    assert not left.parent.exists()
+    assert not mark.exists()
 
 
 def test_two_captures_of_one_name_are_refused(tmp_path):

@@ -88,3 +88,15 @@ def test_photos_of_several_sizes_and_too_many_processes_are_refused(three_ranks,
     two = dataclasses.replace(capture, train_names=capture.train_names[:2])
     with pytest.raises(TrainingError, match="expected at least 3 training views, found 2; start fewer"):
         PartReconstructor(two, CONFIG, points, device="cpu")
+
+
+def test_without_torchrun_the_remedy_is_told_in_one_line(monkeypatch, tmp_path):
+    from lexsplat.pipeline import several_gpus
+
+    for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.argv", ["several_gpus", str(tmp_path), "--output", str(tmp_path / "g.ply")])
+    with pytest.raises(
+        SystemExit, match=r"error: several GPUs: expected processes started by torchrun, .*torchrun --nproc"
+    ):
+        several_gpus.main()

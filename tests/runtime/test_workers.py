@@ -5,6 +5,7 @@ import random
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Iterator
 
 import numpy as np
@@ -101,6 +102,26 @@ def test_other_versions_of_packages_on_a_node_are_a_warning(caplog):
     ray_workers._compare("node a", {**own, "torch": "1.0", "transformers": "0.1"})
     assert f"torch 1.0 (here {own['torch']})" in caplog.text
     assert "transformers" not in caplog.text
+
+
+def test_an_object_store_that_is_too_small_is_told_with_the_room_that_all_results_need():
+    found = str(ray_tasks.store_full(30 << 20, 4, 76 << 20))
+    assert found.startswith("object store of Ray: expected room for 4 results of 30MB, found 76MB; start")
+
+
+def test_a_server_of_the_client_that_did_not_start_in_time_is_asked_once_more(monkeypatch):
+    tried = []
+
+    def init(**_):
+        tried.append(1)
+        if len(tried) < 2:
+            raise ConnectionAbortedError(
+                "Initialization failure from server: Starting Ray client server failed"
+            )
+
+    monkeypatch.setitem(sys.modules, "ray", types.SimpleNamespace(init=init))
+    ray_workers._connect("ray://head:10001", answers=True)
+    assert len(tried) == 2
 
 
 @pytest.mark.parametrize("spec", ["slurm", "ray://", "ray://host", "ray://host:port", "ray:", ""])
@@ -279,9 +300,14 @@ def test_a_cluster_that_disappears_ends_in_one_line(tmp_path):
         )
         environment = {**os.environ, "RAY_ADDRESS": started.address}
         driver = subprocess.Popen(
-            [sys.executable, "-c", script], env=environment, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", script],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
-        assert driver.stdout.readline() == "connected\n"
+        while driver.stdout.readline() != "connected\n":
+            assert driver.poll() is None
         time.sleep(2)
         started.cluster.head_node.kill_all_processes(check_alive=False, allow_graceful=False)
         assert "finished work is kept; run the same command again" in driver.communicate(timeout=120)[0]

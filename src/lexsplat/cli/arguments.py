@@ -33,7 +33,7 @@ HELP = ("-h", "--help")
 HELP_ALL = "--help-all"
 ESSENTIAL_SETTINGS = (
     "clip", "dino", "device", "method", "as_in_paper", "iterations", "downscale", "test_every", "seed", "memory",
-    "workers",
+    "workers", "blocks",
 )  # fmt: skip
 """Settings of a build that people use."""
 MEASURED_SETTINGS = tuple(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import sys
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -14,6 +15,8 @@ from lexsplat.cli.settings import Settings
 from lexsplat.language.methods import METHODS
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
+
+log = logging.getLogger("lexsplat")
 
 _OF_SPLATS = "lexsplat language --splats FILE --output SCENE"
 
@@ -75,6 +78,9 @@ class Build:
         if self.more:
             self._build_scenes()
             return
+        is_scene = (self.output / "scene.json").exists()  # which may keep its previous version
+        holds_scenes = not is_scene and any(self.output.glob("*/scene.json"))
+        self._warn_of_mixture(holds_scenes, "holds the scenes of several captures")
         capture, settings = None, self.settings
         if self.capture:
             capture, settings = capture_and_settings(self.capture, settings)
@@ -94,6 +100,15 @@ class Build:
         if self.until == "language":
             print(f'next: lexsplat query {self.output} "something you see"')
 
+    def _warn_of_mixture(self, mixed: bool, what: str) -> None:
+        """Warn where a folder becomes a scene and a folder of scenes, as a pattern may match one capture or more."""
+        if mixed:
+            log.warning(
+                "%s %s: one CAPTURE is written into --output itself, several into folders below it",
+                self.output,
+                what,
+            )
+
     def _build_scenes(self) -> None:
         """Build one scene per capture; failures are reported and the other scenes are kept."""
         from lexsplat.cli.progress import shown_progress
@@ -102,6 +117,7 @@ class Build:
 
         sources = dict(capture_and_settings(name, self.settings) for name in (self.capture, *self.more))
         tasks = scene_tasks(sources, self.output, self.until)
+        self._warn_of_mixture((self.output / "scene.json").exists(), "is the scene of one capture")
         failed = 0
         with (
             shown_progress(self.progress) as bars,
@@ -110,7 +126,9 @@ class Build:
             for outcome in build_scenes(tasks, self.output, workers, bars):
                 if outcome.error is not None:
                     failed += 1
-                    print(f"{outcome.name}: {outcome.error}", file=sys.stderr)
+                    line = str(outcome.error)
+                    named = line.startswith(f"{outcome.name}: ")
+                    print(line if named else f"{outcome.name}: {line}", file=sys.stderr)
                 elif self.progress != "json":
                     print(f"{tasks[outcome.name].output}: finished {', '.join(outcome.result)}")
         if failed:

@@ -43,7 +43,7 @@ from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
-from lexsplat.runtime.workers import IN_PROCESS, Workers, open_workers
+from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.foreign import warnings_once
 from lexsplat.scenes.kept import keep_for
@@ -121,6 +121,7 @@ def build(
                 load_external_features(config.features_from, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
+            SharedFolder.forget_marks(folder.root / "checkpoints")
             workers.require((capture.root,))
             return builder.run(until)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
@@ -265,6 +266,8 @@ class _Builder:
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
         self.folder.finish(name, key, seconds, **facts)
         self.checkpoint.remove()
+        if name == "reconstruct":  # also visits of an earlier command with other --blocks
+            shutil.rmtree(self._checkpoints / "blocks", ignore_errors=True)
         if self._maps is not None:
             self._maps.forget()  # the next stage needs the memory of the features kept so far
 
@@ -298,7 +301,6 @@ class _Builder:
             self.capture, config.reconstruction, points, world.up, self.blocks, run
         )
         self.folder.write_gaussians(gaussians)
-        shutil.rmtree(folder, ignore_errors=True)
         return {"gaussians": len(gaussians), "blocks": self.blocks}
 
     def _take_splats(self) -> dict[str, Any]:

@@ -166,10 +166,15 @@ def build_scenes(
 
     Yields:
         The outcomes in the order of the tasks.
+
+    Raises:
+        WorkersError: If a worker does not see the output.
     """
     memory = max((parse_bytes(task.config.memory) for task in tasks.values()), default=0)
     needs = Needs(memory=memory + LIBRARIES_BYTES, gpu=any(t.config.device != "cpu" for t in tasks.values()))
     with SharedFolder.offered(output) as folder:
+        if not workers.see(folder):
+            raise folder.unseen()
         listener(Event("scenes", 0, len(tasks)))
         shared = _Scenes(folder, silent if workers.distributed else listener)
         for done, outcome in enumerate(workers.map(_build_scene, shared, tasks, needs), start=1):

@@ -22,7 +22,7 @@ from lexsplat.geometry.gaussians import TENSORS, Gaussians
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.several_gpus import PartReconstructor
 from lexsplat.runtime.device import choose_device
-from lexsplat.runtime.errors import LexsplatError
+from lexsplat.runtime.errors import BackendError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.formats.ply import write_ply
 
@@ -77,6 +77,13 @@ def main() -> None:
     given = parser.parse_args()
     config = ReconstructionConfig(iterations=given.iterations, max_gaussians=given.max_gaussians)
     try:
+        if missing := {"RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"} - set(os.environ):
+            raise BackendError(
+                "several GPUs",
+                expected="processes started by torchrun",
+                found=f"no {min(missing)}",
+                remedy="run: torchrun --nproc-per-node 4 -m lexsplat.pipeline.several_gpus CAPTURE --output FILE",
+            )
         choose_device("cuda")
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
         distributed.init_process_group("nccl")

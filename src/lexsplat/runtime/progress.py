@@ -42,12 +42,17 @@ class Pace:
     def __init__(self) -> None:
         self._starts: dict[str, tuple[float, int]] = {}  # time and units done at the first event of a stage
         self._done: dict[str, int] = {}
+        self._ended: set[str] = set()
 
     def rate(self, event: Event) -> float:
         """Units a second since the first event of the stage; 0 at that event. The next scene starts a stage anew."""
         now = time.monotonic()
-        if event.done < self._done.get(event.stage, 0):
+        before = self._done.get(event.stage, 0)
+        if event.done < before or event.stage in self._ended:
             del self._starts[event.stage]
+        self._ended.discard(event.stage)
+        if event.done >= event.total:
+            self._ended.add(event.stage)
         self._done[event.stage] = event.done
         started, done_before = self._starts.setdefault(event.stage, (now, event.done))
         return (event.done - done_before) / (now - started) if now > started else 0.0

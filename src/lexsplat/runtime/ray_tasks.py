@@ -119,8 +119,8 @@ class Tasks:
         return time.monotonic() - self._held > _WITHOUT_NODES_SECONDS
 
     def _count(self) -> None:
-        self.slots, self._counted = slots(self.needs), time.monotonic()
-        if self.slots:
+        before, self.slots, self._counted = self.slots, slots(self.needs), time.monotonic()
+        if self.slots or before:
             self._held = self._counted
 
 

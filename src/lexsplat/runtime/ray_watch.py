@@ -58,10 +58,15 @@ class HeadWatch:
 
     Args:
         address: "HOST:PORT" of the head; None watches nothing.
+
+    Attributes:
+        silent: Whether the head has not answered the last time.
+        lost: Whether it has not answered for `GRACE_SECONDS`.
     """
 
     def __init__(self, address: str | None) -> None:
         self.lost = False
+        self.silent = False
         self._host, _, self._port = (address or "").replace("[", "").replace("]", "").rpartition(":")
         self._witness: subprocess.Popen[str] | None = None
         self._ended = threading.Event()
@@ -105,7 +110,8 @@ class HeadWatch:
         while time.monotonic() - answered < GRACE_SECONDS:
             if self._ended.wait(POLL_SECONDS):
                 return
-            if self._answers():
+            self.silent = not self._answers()
+            if not self.silent:
                 answered = time.monotonic()
         self.lost, lost = True, time.monotonic()
         while not self._ended.wait(POLL_SECONDS / 4):

@@ -152,7 +152,7 @@ class RayWorkers:
             name, reference = next(iter(tasks.sent.items()))
             if reference in tasks.running and not tasks.wait():
                 self._watch.check()
-                if not tasks.are_stranded():
+                if self._watch.silent or not tasks.are_stranded():  # a silent head cannot count nodes
                     continue
                 yield from tasks.take_ended()
                 raise no_node(tasks.needs)

@@ -236,6 +236,12 @@ class SharedFolder:
         finally:
             folder._mark.unlink(missing_ok=True)
 
+    @staticmethod
+    def forget_marks(root: Path) -> None:
+        """Remove the marks that killed commands left in the folders below ``root``, which only this process uses."""
+        for mark in root.glob("*/.workers-*"):
+            mark.unlink(missing_ok=True)
+
     @property
     def is_visible(self) -> bool:
         """Whether this process sees the folder itself, not one of the same name on another machine."""
@@ -266,13 +272,17 @@ class SharedFolder:
                 yield Path(own)
             return
         if not self.is_visible:
-            raise WorkersError(
-                self.path,
-                expected="a folder that every worker sees",
-                found="no such folder on one of them",
-                remedy="give an --output on a file system that every node mounts at the same path",
-            )
+            raise self.unseen()
         yield self.path
+
+    def unseen(self) -> WorkersError:
+        """The error where a worker must see the folder and does not."""
+        return WorkersError(
+            self.path,
+            expected="a folder that every worker sees",
+            found="no such folder on one of them",
+            remedy="give an --output on a file system that every node mounts at the same path",
+        )
 
     @property
     def _mark(self) -> Path:
