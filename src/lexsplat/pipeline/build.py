@@ -93,7 +93,7 @@ def build(
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
-    given = tuple(filter(None, (source, splats)))
+    given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames
     with open_workers(config.workers, given) as workers, folder.locked(), warnings_once():
         try:
             # Errors in ground truth and encoders are reported before structure from motion, not after it.
