@@ -253,7 +253,7 @@ def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_cap
 
 def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
     empty = Annotations("segmentations", tiny_capture, {})
-    monkeypatch.setattr(experiments, "load_annotations", lambda *a: empty)
+    monkeypatch.setattr("lexsplat.evaluation.ground_truth.load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
         measure_variants(tiny_capture, ablated, replace(CONFIG, seed=0))
 

@@ -25,7 +25,7 @@ from lexsplat.language.methods.averaging import MeanFeatures, average_features
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.visibility import hidden_gaussians
-from lexsplat.runtime.errors import MemoryBudgetError
+from lexsplat.runtime.errors import MemoryBudgetError, TaskError
 from lexsplat.runtime.memory import parse_bytes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -322,7 +322,7 @@ def test_missing_views_and_other_dimensions_are_refused(small) -> None:
             small.gaussians, small.cameras, {n: m for n, m in maps.items() if n != "view1"}, FULL_SIZE
         )
     maps["view1"] = FeatureMap(torch.ones(15, 20, 3))
-    with pytest.raises(ValueError, match="3 dimensions"):
+    with pytest.raises(TaskError, match="view1 have 3 dimensions"):
         average_features(small.gaussians, small.cameras, maps, FULL_SIZE)
 
 
