@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from lexsplat.pipeline.viewpoints.standing import standing_shares
 from lexsplat.pipeline.viewpoints.upward import UpwardDirections, find_upward
 
+pytestmark = pytest.mark.slow
+
 UP = np.array([0.0, 0.0, 1.0])
 ROOM = np.array([12.0, 8.0, 3.0])
 CLOSED, OPEN = (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4)
@@ -84,7 +86,6 @@ def test_shelves_that_touch_a_wall_as_well_as_the_floor_make_up_a_guess_that_con
     assert not found.contradict(UP)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("scene", [*FREE.values(), *AMBIGUOUS.values()], ids=[*FREE, *AMBIGUOUS])
 def test_however_a_room_of_shelves_is_turned_up_is_right_or_a_guess(scene, seed):

@@ -10,6 +10,8 @@ import pytest
 from lexsplat.runtime import ray_watch
 from lexsplat.runtime.ray_watch import ClusterLostError, HeadWatch
 
+pytestmark = pytest.mark.slow
+
 ENDS = """
 import os, sys
 from lexsplat.runtime.ray_watch import HeadWatch
