@@ -110,19 +110,12 @@ def _parsed(command: type[CommandT], program: str, words: Sequence[str]) -> Comm
         with contextlib.redirect_stderr(written):
             return tyro.cli(command, prog=program, args=words, registry=REGISTRY)
     finally:
-        text = re.sub(
-            rf"For full helptext, (run|see) {program} --help",
-            lambda found: f"All options: {program} {whole}".ljust(
-                len(found.group())
-            ),  # the panel keeps its width
-            written.getvalue(),
-        )
-        nothing = r"\(default:[\s│]*none\)"
-        print(
-            re.sub(nothing, lambda found: re.sub(r"[^\s│]", " ", found.group()), text),
-            end="",
-            file=sys.stderr,
-        )
+        # What is replaced keeps its length, so that the panel keeps its width.
+        page, nothing = rf"For full helptext, (run|see) {program} --help", r"\(default:[\s│]*none\)"
+        all_options = f"All options: {program} {whole}"
+        text = re.sub(page, lambda found: all_options.ljust(len(found.group())), written.getvalue())
+        text = re.sub(nothing, lambda found: re.sub(r"[^\s│]", " ", found.group()), text)
+        print(text, end="", file=sys.stderr)
 
 
 def _in_our_spelling(word: str, synonyms: dict[str, str]) -> str:

@@ -25,10 +25,10 @@ _NODES_SECONDS = 30.0
 _WITHOUT_NODES_SECONDS = 60.0
 """Seconds without a node that can hold a task, after which no more is waited for one."""
 _HELD = 16
-"""Results a slot that may wait for an earlier one, where tasks do not tell the size of theirs."""
+"""Results a slot that may wait for an earlier one, where the size of a result is not known."""
 
 Answer = tuple[Outcome, list[tuple[int, str]]]
-"""An outcome, and what was told meanwhile: levels and texts."""
+"""An outcome, and the notes and warnings of its task: levels and texts."""
 
 
 def slots(needs: Needs) -> int:
@@ -66,10 +66,8 @@ class Tasks:
         self.sent: dict[str, Any] = {}
         self.running: set[Any] = set()
         self.slots = 0
-        self._counted, self._held = (
-            -_NODES_SECONDS,
-            time.monotonic(),
-        )  # when nodes were counted; when one could hold
+        self._counted = -_NODES_SECONDS  # when nodes were counted
+        self._held = time.monotonic()  # when one could last hold a task
 
     def send(self) -> None:
         """Send tasks while there are slots, and room for results that wait for an earlier one."""
@@ -129,20 +127,20 @@ def run(work: Callable[[Any, Any], Any], shared: Any, name: str, item: Any) -> A
     import torch
 
     torch.set_num_threads(1)
-    with _heard() as said:
-        return attempt(work, shared, name, item), said
+    with _messages() as messages:
+        return attempt(work, shared, name, item), messages
 
 
 @contextmanager
-def _heard() -> Iterator[list[tuple[int, str]]]:
-    """Notes and warnings that are told inside the block."""
-    said: list[tuple[int, str]] = []
+def _messages() -> Iterator[list[tuple[int, str]]]:
+    """Notes and warnings that are logged inside the block."""
+    messages: list[tuple[int, str]] = []
     handler = logging.Handler(NOTE)
-    handler.emit = lambda record: said.append((record.levelno, record.getMessage()))  # type: ignore[method-assign]
+    handler.emit = lambda record: messages.append((record.levelno, record.getMessage()))  # type: ignore[method-assign]
     log.setLevel(NOTE)
     log.addHandler(handler)
     try:
-        yield said
+        yield messages
     finally:
         log.removeHandler(handler)
 

@@ -1,7 +1,8 @@
 """Whether the head node of a Ray cluster is still there.
 
 Where it is not, Ray ends this process from within its own code: at once if the node of this machine is gone, else a
-minute later. A thread asks more often. Where Ray is faster, a process that waits for the end of this one tells why.
+minute later. A thread asks more often. Where Ray is faster, a process that waits for the end of this one prints the
+reason.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class ClusterLostError(WorkersError):
 
     @classmethod
     def by(cls, error: Exception | None = None) -> ClusterLostError:
-        """The error to tell, of what Ray raised if it did."""
+        """The error to raise, of what Ray raised if it did."""
         return cls(
             "--workers",
             expected="the cluster",
@@ -50,7 +51,7 @@ for _ in range(0 if sys.stdin.read() else 20):
         sys.exit(line)
     time.sleep(1)
 """
-"""Program that reads until this process ends. If nothing was written and the head is gone, it tells the line."""
+"""Program that reads until this process ends. If nothing was written and the head is gone, it prints the line."""
 
 
 class HeadWatch:
@@ -117,7 +118,7 @@ class HeadWatch:
         while not self._ended.wait(POLL_SECONDS / 4):
             entered = self._entered
             if entered is not None and time.monotonic() - max(entered, lost) > BLOCKED_SECONDS:
-                os._exit(1)  # the witness tells why
+                os._exit(1)  # the witness prints the reason
 
     def _answers(self) -> bool:
         try:

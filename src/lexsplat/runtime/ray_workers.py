@@ -41,7 +41,7 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use to its makers otherwise
     place = address or os.environ.get("RAY_ADDRESS") or "local"
-    if place != "local":  # `HeadWatch` tells sooner that the head is gone, with the remedy
+    if place != "local":  # `HeadWatch` reports sooner that the head is gone, with the remedy
         os.environ.setdefault(_RECONNECT, "86400")
     try:
         import ray
@@ -135,8 +135,8 @@ class RayWorkers:
             options = options_of(needs, len(items))
             task = ray.remote(run).options(**options)
             tasks = Tasks(task, work, ray.put(shared), items, replace(needs, gpu="num_gpus" in options))
-            for outcome, said in self._watch.guarded(self._outcomes(tasks)):
-                for level, text in said:
+            for outcome, messages in self._watch.guarded(self._outcomes(tasks)):
+                for level, text in messages:
                     log.log(level, "%s: %s", outcome.name, text)
                 yield outcome
         except (ConnectionError, ray.exceptions.RaySystemError) as error:

@@ -64,10 +64,10 @@ def attempt(work: Callable[[S, T], R], shared: S, name: str, item: T) -> Outcome
     except LexsplatError as error:
         return Outcome(name, error=error)
     except Exception as error:
-        return Outcome(name, error=_told(name, error))
+        return Outcome(name, error=_task_error(name, error))
 
 
-def _told(name: str, error: Exception) -> TaskError:
+def _task_error(name: str, error: Exception) -> TaskError:
     """The line of an error without a remedy of its own."""
     log.debug("task %s", name, exc_info=error)
     found, remedy = f"{type(error).__name__}: {error}", "mend this"
@@ -77,9 +77,9 @@ def _told(name: str, error: Exception) -> TaskError:
         found = "no memory left"
         remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
     remedy += " and run the same command again; finished work is kept"
-    told = TaskError(name, expected="a result", found=found[:300], remedy=remedy)
-    told.__cause__ = error
-    return told
+    one_line = TaskError(name, expected="a result", found=found[:300], remedy=remedy)
+    one_line.__cause__ = error
+    return one_line
 
 
 class Workers(Protocol):

@@ -48,7 +48,7 @@ def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     picture = picture.clip(0, 1)
     radius = max(float(np.sqrt(hole.sum() / np.pi)), 2.0)
     away = np.asarray(distance_transform_edt(~hole)) / radius
-    brightness = _mean_around(picture @ _LUMINANCE, trust, _BRIGHTNESS * radius)
+    brightness = mean_around(picture @ _LUMINANCE, trust, _BRIGHTNESS * radius)
     pattern = (picture / np.maximum(brightness, 0.02)[..., None]).clip(0, 3)
     rim = trust * np.exp(-((away / _RIM) ** 2))
     mean = (rim[..., None] * pattern).sum((0, 1)) / rim.sum()
@@ -63,7 +63,7 @@ def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     for shift in shifts:
         there, moved = _moved(trust, shift), _moved(pattern, shift)
         error = ((pattern - moved) ** 2).sum(-1).clip(0, 4 * variance)
-        errors.append(_mean_around(error, trust * there * near, _LOCAL * radius)[asked])
+        errors.append(mean_around(error, trust * there * near, _LOCAL * radius)[asked])
         values.append(np.concatenate([_moved(picture, shift)[asked], moved[asked]], 1))
         trusts.append(there[asked])
     found = np.zeros((*hole.shape, 6))
@@ -75,9 +75,9 @@ def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
 
 def _predictable(picture: FloatArray, found: FloatArray, weights: FloatArray, width: float) -> FloatArray:
     """Which share of what a prediction adds to the mean around is right nearby ``[H, W]``: a local regression."""
-    mean = np.stack([_mean_around(channel, weights, width) for channel in np.moveaxis(picture, -1, 0)], -1)
-    right = _mean_around(((picture - mean) * (found - mean)).sum(-1), weights, width)
-    added = _mean_around(((found - mean) ** 2).sum(-1), weights, width)
+    mean = mean_around(picture, weights, width)
+    right = mean_around(((picture - mean) * (found - mean)).sum(-1), weights, width)
+    added = mean_around(((found - mean) ** 2).sum(-1), weights, width)
     return np.asarray((right / np.maximum(added, 1e-9)).clip(0, 1))
 
 
@@ -153,9 +153,18 @@ def _moved(picture: NDArray, shift: tuple[int, int]) -> NDArray:
     return moved
 
 
-def _mean_around(values: FloatArray, weights: FloatArray, width: float) -> FloatArray:
-    """Gaussian mean ``[H, W]`` of weighted pixels; far from all it is the mean of all."""
-    total = gaussian_filter(weights, width, mode="constant", truncate=6)
-    summed = gaussian_filter(values * weights, width, mode="constant", truncate=6)
-    everywhere = (values * weights).sum() / max(weights.sum(), 1e-12)
+def mean_around(values: FloatArray, weights: FloatArray, width: float, truncate: float = 6.0) -> FloatArray:
+    """Gaussian mean of weighted pixels; far from all it is the mean of all.
+
+    Args:
+        values: ``[H, W]`` or ``[H, W, C]``.
+        weights: ``[H, W]``.
+        width: Standard deviation in pixels.
+        truncate: Reach of the filter in standard deviations.
+    """
+    each = weights.reshape(*weights.shape, *[1] * (values.ndim - 2))
+    widths = (width, width, *[0.0] * (values.ndim - 2))
+    total = gaussian_filter(each, widths, mode="constant", truncate=truncate)
+    summed = gaussian_filter(values * each, widths, mode="constant", truncate=truncate)
+    everywhere = (values * each).sum((0, 1)) / max(weights.sum(), 1e-12)
     return np.asarray((summed + 1e-6 * everywhere) / (total + 1e-6))

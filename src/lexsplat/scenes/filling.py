@@ -3,7 +3,7 @@
 1. A thing stands on a surface (`lexsplat.scenes.surfaces`). Its place is what hardly any view sees of it, because the
    thing is before it.
 2. What the reconstruction put there goes: nothing shows it.
-3. The pattern of the surface goes on in its place (`lexsplat.scenes.completing`), in a picture from above. Each
+3. The pattern of the surface goes on in its place (`lexsplat.scenes.completing`), in an image from above. Each
    painted pixel becomes a flat Gaussian. It keeps the language of its nearest neighbor in the surface.
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
@@ -32,6 +32,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.scenes.completing import completed
 from lexsplat.scenes.surfaces import (
     FEWEST,
+    THICK,
     Orthophoto,
     below,
     from_above,
@@ -44,12 +45,10 @@ FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _FAINT = 0.1
-_THICK = 0.3
-"""Gaussians within this distance of the plane are the surface, in radii of the foot."""
 _HIDDEN = 0.88
 """Share of the views that have the thing before a place, above which what the reconstruction put there goes."""
 _STUFFED = 0.5
-"""The same for what lies within the thing."""
+"""Share of the views that have the thing before a Gaussian within its hull, above which that goes too."""
 _BORDER, _OVERLAP, _RIM = 3, 4, 3
 """Pixels around such places where it goes too, where the fill covers what stays, and where colors are not trusted."""
 _BARE = 0.6
@@ -171,16 +170,16 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
     if surface is None:
         return None
     local = (means - surface.origin) @ surface.axes.T
-    flat = ~gone & solid & (np.abs(local[:, 2]) <= _THICK * surface.radius)
+    flat = ~gone & solid & (np.abs(local[:, 2]) <= THICK * surface.radius)
     photo = photographed(gaussians, gone, surface, flat, cameras)
     unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
-    inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= _THICK * surface.radius)
+    inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= THICK * surface.radius)
     inside |= _stuffing(gaussians, own, gone | inside, cameras)
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
     near = below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
     filled = binary_dilation(unseen, iterations=_OVERLAP)
     hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
-    level = np.abs(heights) <= _THICK * surface.radius
+    level = np.abs(heights) <= THICK * surface.radius
     known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
     if not hole.any() or known.sum() < FEWEST:
         return None

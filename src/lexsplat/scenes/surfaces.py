@@ -1,8 +1,8 @@
-"""The surface that a thing stands on, as the photos show it: a plane, and a picture of it from above.
+"""The surface that a thing stands on, as the photos show it: a plane, and an image of it from above.
 
 1. A plane is fitted to the Gaussians around the thing's foot.
 2. The Gaussians near it are drawn from far above, in the mean color that the cameras see.
-3. Each pixel of this picture is looked up in the views: how many see the surface there, and how many the thing before
+3. Each pixel of this image is looked up in the views: how many see the surface there, and how many the thing before
    it.
 """
 
@@ -15,13 +15,13 @@ from typing import NamedTuple, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 from scipy.spatial import Delaunay, QhullError
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.completing import mean_around
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,20 +32,20 @@ _RING = 1.0
 """Width of the ring around the foot whose Gaussians make the plane, in radii of the foot."""
 _LEVEL = 0.1
 """Gaussians of the ring within this distance of the plane belong to it, in radii of the foot."""
-_THICK = 0.3
-"""The same for the Gaussians that are seen from above."""
+THICK = 0.3
+"""Gaussians within this distance of the plane are the surface that is seen from above, in radii of the foot."""
 _STEEPEST = 0.8
 """Least cosine of the plane's normal with up."""
 FEWEST = 30
 """Fewest Gaussians that make a plane, and fewest pixels that make a fill."""
 _PIXELS = (64, 112, 224)
-"""Width of the picture from above: at least, without views, and at most."""
+"""Width of the image from above: at least, without views, and at most."""
 _REACH = 3.0
 """Half of its width, in radii of the foot."""
 _VIEWS, _LONG_SIDE = 16, 240
 """Number and longer side of the views that are looked at."""
 _BEFORE = 0.2
-"""Share of a pixel of a view from which the thing is before what lies there."""
+"""Least coverage of a pixel by the thing, at which it hides what lies behind."""
 
 
 class Surface(NamedTuple):
@@ -141,7 +141,7 @@ class Orthophoto(NamedTuple):
 def photographed(
     gaussians: Gaussians, gone: Mask, surface: Surface, members: Mask, cameras: Sequence[Camera]
 ) -> Orthophoto:
-    """A picture of the surface under a thing from above, and what the views see of it.
+    """An image of the surface under a thing from above, and what the views see of it.
 
     Args:
         gaussians: The scene with the thing.
@@ -153,15 +153,18 @@ def photographed(
     cells, size = _cells(surface, cameras)
     colors, coverage, heights = from_above(gaussians, surface, members, cells)
     places = (surface.origin + cells @ surface.axes[:2]).reshape(-1, 3)
-    shown, covered, seen = looked_up(gaussians, gone, places, cameras, _THICK * surface.radius)
+    shown, covered, seen = looked_up(gaussians, gone, places, cameras, THICK * surface.radius)
     shape = cells.shape[:2]
     shown, covered, seen = shown.reshape(shape), covered.reshape(shape), seen.reshape(colors.shape)
     if not cameras:
         return Orthophoto(cells, size, colors, coverage, heights, np.ones_like(shown), covered)
     known = (coverage > 0.5) & (shown > 0)
     width = surface.radius / size / 2
-    gain = _mean_of(seen, known, width) / np.maximum(_mean_of(colors, known, width), 0.02)
-    return Orthophoto(cells, size, colors * gain.clip(0.5, 2), coverage, heights, shown, covered)
+    gain = np.ones(3)
+    if known.any():
+        there, drawn = (mean_around(image, known.astype(float), width, 4.0) for image in (seen, colors))
+        gain = (there / np.maximum(drawn, 0.02)).clip(0.5, 2)
+    return Orthophoto(cells, size, colors * gain, coverage, heights, shown, covered)
 
 
 def looked_up(
@@ -238,7 +241,7 @@ def below(points: FloatArray, cells: FloatArray) -> Mask:
 
 
 def _cells(surface: Surface, cameras: Sequence[Camera]) -> tuple[FloatArray, float]:
-    """The pixels of a picture from above, about as fine as the views, and their width."""
+    """The pixels of an image from above, about as fine as the views, and their width."""
     reach = _REACH * surface.radius
     least, count, most = _PIXELS
     place = surface.origin + surface.foot @ surface.axes[:2]
@@ -248,11 +251,3 @@ def _cells(surface: Surface, cameras: Sequence[Camera]) -> tuple[FloatArray, flo
         count = int(np.clip(2 * reach / np.median(sizes), least, most))
     side = (np.arange(count) + 0.5) / count * 2 - 1
     return surface.foot + reach * np.stack(np.meshgrid(side, -side), -1), 2 * reach / count
-
-
-def _mean_of(colors: FloatArray, known: Mask, width: float) -> FloatArray:
-    """Gaussian mean of the known pixels of a picture ``[H, W, 3]``, that of all far from them."""
-    weights = gaussian_filter(known.astype(float), width, mode="constant") + 1e-6
-    means = colors[known].mean(0) if known.any() else np.ones(3)
-    summed = gaussian_filter(colors * known[..., None], (width, width, 0), mode="constant")
-    return np.asarray((summed + 1e-6 * means) / weights[..., None])

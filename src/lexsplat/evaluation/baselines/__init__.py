@@ -6,7 +6,7 @@ scored. They are not the authors' programs: docs/evaluation.md lists the differe
 - `dff`: distilled feature fields (Kobayashi et al. 2022): raw features on the Gaussians, fitted by rendering.
 - `lerf`: LERF (Kerr et al. 2023): features at several physical scales, the scale chosen per prompt.
 - `ovs3d`: 3D-OVS (Liu et al. 2023): a list of classes known in advance, fitted by their distributions.
-- `nearest`: no 3D: the features of the evaluated photo itself, a lower bound.
+- `nearest`: no 3D: the features of the evaluated photo itself, a check of sanity and no method.
 
 A new one is a file with a class like `Dff`, and an entry in `BASELINES`; tables and options read the rest from it.
 """

@@ -61,7 +61,7 @@ class LanguageField(Protocol):
         """The language of the Gaussians given by a mask ``[N]`` or an index ``[M]``, as `Gaussians.select`."""
 
     def facts(self) -> dict[str, Any]:
-        """What the record of a build says about it: how its codes are used."""
+        """What the record of a build has about it: how its codes are used."""
 
     def content(self) -> tuple[Tensor, ...]:
         """The tensors on which `scores` depends, for hashes."""

@@ -31,7 +31,7 @@ from lexsplat.scenes.formats.ply_elements import (
     data_left,
     header_lines,
     parse_elements,
-    tell_ignored,
+    warn_of_ignored,
 )
 
 COMPRESSED = {".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
@@ -132,7 +132,7 @@ def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
             remedy=AGAIN,
         )
     others = [element for element in elements if element.name not in ("chunk", "vertex", "sh")]
-    tell_ignored(others, count, path)
+    warn_of_ignored(others, count, path)
     return count
 
 

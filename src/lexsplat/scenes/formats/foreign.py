@@ -39,7 +39,7 @@ AGAIN = "copy the file again or export it again"
 _logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
 _COARSE = 0.1
-"""Largest error of centers that is not told, as a share of the usual standard deviation."""
+"""Largest error of centers without a warning, as a share of the usual standard deviation."""
 _SMALLEST_LOG_SCALE = math.log(1e-12)
 _SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
 _ALWAYS_ALLOWED = 10_000

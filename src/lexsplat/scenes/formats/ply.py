@@ -25,8 +25,8 @@ from lexsplat.scenes.formats.ply_elements import (
     data_left,
     header_lines,
     parse_elements,
-    tell_ignored,
     uneven_line,
+    warn_of_ignored,
 )
 
 MIP = "comment SplatRenderMode: mip"
@@ -129,7 +129,7 @@ def parse_ply(path: Path) -> Gaussians:
                 )
             table, left = (_binary_rows if order else _text_rows)(file, elements, order, path)
             _check_left(left, vertices, order, path)
-            tell_ignored(elements[1:], vertices.count, path)
+            warn_of_ignored(elements[1:], vertices.count, path)
             return _gaussians_from_table(table, is_antialiased(lines), path)
     except OSError as error:
         raise FileFormatError(
@@ -202,7 +202,7 @@ def _text_rows(file: BinaryIO, elements: Sequence[Element], order: str, path: Pa
             table[name] = rows[:, index]
     rest = numbers[wanted:]
     left = data_left(elements[1:], order, len(rest), lambda: rest)
-    if 0 <= left < len(vertices.columns):  # otherwise, `_check_left` tells what is wrong
+    if 0 <= left < len(vertices.columns):  # otherwise, `_check_left` states what is wrong
         _check_lines(text, vertices, path)
     return table, left
 

@@ -32,7 +32,7 @@ SPLATS = "use a .ply of 3D Gaussians; a mesh or a point cloud has none"
 """The remedy for a PLY of something else."""
 
 _NO_GAUSSIANS = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
-"""Elements in which Apple's SHARP tells of its photo,"""
+"""Elements in which Apple's SHARP describes its photo,"""
 _MOST_ROWS = 16
 """in so many rows at most."""
 
@@ -158,7 +158,7 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
     return elements
 
 
-def tell_ignored(elements: Sequence[Element], count: int, path: Path) -> None:
+def warn_of_ignored(elements: Sequence[Element], count: int, path: Path) -> None:
     """Warn of elements beside ``count`` Gaussians that are not read and may hold others."""
     ignored = [
         f"{element.name!r:.40} of length {element.count:,}"
