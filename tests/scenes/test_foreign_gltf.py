@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.refusals import assert_tells
+from support.refusals import refused
 from support.splats import tame
 
-from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.gltf import write_glb
 from lexsplat.scenes.formats.reading import read_splats
 
@@ -55,14 +54,6 @@ def padded(document: dict, binary: bytes, filled: Callable[[bytes], bytes]) -> t
         out += data + bytes(-len(data) % 16)
     document["buffers"][0]["byteLength"] = len(out)
     return document, out
-
-
-def refused(path: Path, content: bytes, *parts: str) -> str:
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError) as caught:
-        read_splats(path)
-    assert_tells(caught.value, *parts)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("alignment", [8, 16, 64, 256, 4096])

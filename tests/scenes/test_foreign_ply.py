@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.hostile.splats import recounted_text
-from support.refusals import assert_tells
+from support.refusals import refused
 from support.splats import tame
 
-from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.compressed import write_compressed
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.reading import read_splats
@@ -25,13 +24,6 @@ SHARP = {
     "version": 3,
 }
 """Elements that SHARP writes after the Gaussians, and their counts."""
-
-
-def refused(path: Path, content: bytes, *parts: str) -> None:
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError) as caught:
-        read_splats(path)
-    assert_tells(caught.value, *parts)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from support.hostile.splats import recounted_glb, recounted_text
-from support.refusals import assert_tells
+from support.refusals import assert_tells, refused
 from support.sog_files import write_streamed
 from support.splats import tame
 
@@ -28,14 +28,6 @@ from lexsplat.scenes.formats.reading import READERS, read_splats
 from lexsplat.scenes.formats.sog_writing import write_sog
 from lexsplat.scenes.formats.splat import write_splat
 from lexsplat.scenes.formats.spz import write_spz
-
-
-def refused(path: Path, content: bytes, *parts: str) -> None:
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError) as caught:
-        read_splats(path)
-    assert_tells(caught.value, *parts)
-
 
 # SPZ
 

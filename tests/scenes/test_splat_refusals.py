@@ -8,22 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.refusals import assert_tells
+from support.refusals import refused
 from support.splats import tame
 
-from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.compressed import write_compressed
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.formats.spz import write_spz
-
-
-def refused(path: Path, content: bytes, *parts: str) -> str:
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError) as caught:
-        read_splats(path)
-    assert_tells(caught.value, *parts)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("version", [3, 4])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from lexsplat.captures import load_capture
-from lexsplat.runtime.errors import CaptureError, LexsplatError
+from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
+from lexsplat.scenes.formats.reading import read_splats
 
 
 def assert_tells(error: LexsplatError, *parts: str) -> None:
@@ -25,3 +28,12 @@ def fails(path, *parts, kind=CaptureError, **options):
     with pytest.raises(kind) as caught:
         load_capture(path, **options)
     assert_tells(caught.value, *parts)
+
+
+def refused(path: Path, content: bytes, *parts: str) -> str:
+    """Assert that splats with this content are refused in one line; returns it."""
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError) as caught:
+        read_splats(path)
+    assert_tells(caught.value, *parts)
+    return str(caught.value)
