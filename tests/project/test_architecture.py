@@ -1,6 +1,7 @@
 """The shape of the project: imports point one way, nothing unsafe is used, importing is quick."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,12 +15,14 @@ ORDER = (
 )  # fmt: skip
 
 
-def modules() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
+every_package = pytest.mark.parametrize("package", [*ORDER, "demo", "."])
 
 
-def package(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0]
+@cache
+def modules(package: str) -> dict[Path, ast.Module]:
+    """The modules of a package; "." is the top folder."""
+    paths = PACKAGE.glob("*.py") if package == "." else (PACKAGE / package).rglob("*.py")
+    return {path.relative_to(PACKAGE): ast.parse(path.read_text(encoding="utf-8")) for path in sorted(paths)}
 
 
 def imported_packages(tree: ast.AST) -> set[str]:
@@ -40,38 +43,38 @@ def test_the_top_folder_shows_the_fifteen_packages_the_data_and_the_front_door()
     assert len(ORDER) <= 15
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_point_only_to_packages_that_come_before(path):
-    own = package(path)
-    if own not in ORDER:  # the front door opens scenes and the command line, when they are first used
-        return
-    for other in imported_packages(ast.parse(path.read_text())) - {own}:
-        assert ORDER.index(other) < ORDER.index(own), f"{own} must not import {other}"
+@pytest.mark.parametrize("package", ORDER)
+def test_imports_point_only_to_packages_that_come_before(package):
+    for path, tree in modules(package).items():
+        for other in imported_packages(tree) - {package}:
+            assert ORDER.index(other) < ORDER.index(package), f"{path} must not import {other}"
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_no_module_uses_pickle_eval_or_a_bare_except(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, (ast.Import, ast.ImportFrom)):
-            names = [a.name for a in node.names] + [getattr(node, "module", None) or ""]
-            assert not {"pickle", "dill", "cloudpickle", "marshal"} & set(names)
-        if isinstance(node, ast.Call):
-            called = ast.unparse(node.func)
-            assert called not in ("eval", "exec", "torch.save"), f"{called} at {node.lineno}"
-            keywords = {k.arg: ast.unparse(k.value) for k in node.keywords}
-            if called == "torch.load":  # weights of encoders; it then reads tensors only
-                assert keywords.get("weights_only") == "True"
-                assert path.name == "weights.py"
-            if called in ("np.load", "numpy.load"):
-                assert keywords.get("allow_pickle") == "False"
-        assert not (isinstance(node, ast.ExceptHandler) and node.type is None)
-        if isinstance(node, ast.Assert):
-            pytest.fail(f"assert at {path.name}:{node.lineno}: raise an error with words instead")
+@every_package
+def test_no_module_uses_pickle_eval_or_a_bare_except(package):
+    for path, tree in modules(package).items():
+        for node in ast.walk(tree):
+            where = f"{path}:{getattr(node, 'lineno', 0)}"
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                names = [a.name for a in node.names] + [getattr(node, "module", None) or ""]
+                assert not {"pickle", "dill", "cloudpickle", "marshal"} & set(names), where
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                assert called not in ("eval", "exec", "torch.save"), f"{called} at {where}"
+                keywords = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                if called == "torch.load":  # weights of encoders; it then reads tensors only
+                    assert keywords.get("weights_only") == "True", where
+                    assert path.name == "weights.py", where
+                if called in ("np.load", "numpy.load"):
+                    assert keywords.get("allow_pickle") == "False", where
+            assert not (isinstance(node, ast.ExceptHandler) and node.type is None), where
+            assert not isinstance(node, ast.Assert), f"assert at {where}: raise an error with words instead"
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_no_module_has_more_than_450_lines(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 450
+@every_package
+def test_no_module_has_more_than_450_lines(package):
+    for path in modules(package):
+        assert len((PACKAGE / path).read_text(encoding="utf-8").splitlines()) <= 450, path
 
 
 def unexplained(source: str, most: int = 7) -> list[str]:
@@ -89,11 +92,12 @@ def unexplained(source: str, most: int = 7) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_functions_have_at_most_seven_parameters_or_a_reason_above(path):
-    if "kernels" in path.parts or path.stem.endswith(("_kernel", "_kernels")):
-        return  # kernels take arrays and numbers one by one
-    assert not unexplained(path.read_text(encoding="utf-8"))
+@every_package
+def test_functions_have_at_most_seven_parameters_or_a_reason_above(package):
+    for path in modules(package):
+        if "kernels" in path.parts or path.stem.endswith(("_kernel", "_kernels")):
+            continue  # kernels take arrays and numbers one by one
+        assert not unexplained((PACKAGE / path).read_text(encoding="utf-8")), path
 
 
 def test_parameters_of_all_kinds_are_counted_and_a_reason_stands_above_the_decorators():

@@ -94,6 +94,16 @@ def test_a_journal_replays_a_fill_and_its_undo(tmp_path):
     assert torch.equal(again.scene.gaussians.means, scene.gaussians.means)
 
 
+@pytest.fixture(scope="module")
+def journaled_fill(tmp_path_factory) -> tuple[Scene, str, dict]:
+    """A scene, the first line of its journal, and a deletion with its fill."""
+    scene, world = table_with_a_ball()
+    journal = tmp_path_factory.mktemp("fill") / "edits.jsonl"
+    Editor(scene, journal).delete(ball_of(scene, world))
+    header, line = journal.read_text().splitlines()
+    return scene, header, json.loads(line)
+
+
 def number_of_sources(fill):
     return {**fill, "gaussians": fill["gaussians"] + 1}
 
@@ -111,14 +121,10 @@ def number_of_sources(fill):
         lambda fill: "fill",
     ],
 )
-def test_a_damaged_fill_is_told_in_one_line(tmp_path, broken):
-    scene, world = table_with_a_ball()
+def test_a_damaged_fill_is_told_in_one_line(journaled_fill, tmp_path, broken):
+    scene, header, step = journaled_fill
     journal = tmp_path / "edits.jsonl"
-    Editor(scene, journal).delete(ball_of(scene, world))
-    header, line = journal.read_text().splitlines()
-    step = json.loads(line)
-    step["fill"] = broken(step["fill"])
-    journal.write_text(f"{header}\n{json.dumps(step)}\n")
+    journal.write_text(f"{header}\n{json.dumps({**step, 'fill': broken(step['fill'])})}\n")
     with pytest.raises(FileFormatError) as error:
         Editor(scene, journal)
     assert "\n" not in str(error.value)
