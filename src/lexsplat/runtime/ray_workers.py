@@ -66,8 +66,10 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
     watch, lost = HeadWatch(head), False
     try:
         with watch:
-            log.log(NOTE, "workers: %s nodes, %s cores", _check_nodes(paths), slots(ANY_MACHINE))
-            yield RayWorkers(watch)
+            workers = RayWorkers(watch, alone=place == "local")
+            workers.require(paths)
+            log.log(NOTE, "workers: %s nodes, %s cores", len(_nodes()), slots(ANY_MACHINE))
+            yield workers
     except ClusterLostError:
         lost = True
         raise
@@ -94,12 +96,17 @@ def _connect(place: str, *, answers: bool, tries: int = 2) -> None:
 
 
 class RayWorkers:
-    """Tasks on the Ray to which this process is connected."""
+    """Tasks on the Ray to which this process is connected.
+
+    Args:
+        watch: Watches its head.
+        alone: Whether Ray runs on this machine only, for this process, so that nodes need no check.
+    """
 
     distributed = True
 
-    def __init__(self, watch: HeadWatch) -> None:
-        self._watch = watch
+    def __init__(self, watch: HeadWatch, *, alone: bool = False) -> None:
+        self._watch, self._alone = watch, alone
         self._running = 0
 
     @property
@@ -109,6 +116,8 @@ class RayWorkers:
 
     def see(self, folder: SharedFolder) -> bool:
         """See `Workers.see`."""
+        if self._alone:
+            return folder.is_visible
         import ray
 
         try:
@@ -119,7 +128,8 @@ class RayWorkers:
 
     def require(self, paths: tuple[Path, ...]) -> None:
         """See `Workers.require`."""
-        _check_nodes(paths)
+        if not self._alone:
+            _check_nodes(paths)
 
     def map(
         self, work: Callable[[S, T], R], shared: S, items: Mapping[str, T], needs: Needs = ANY_MACHINE
@@ -167,8 +177,8 @@ def _sees(folder: SharedFolder) -> bool:
     return folder.is_visible
 
 
-def _check_nodes(paths: tuple[Path, ...]) -> int:
-    """Run a probe on every node; returns their number.
+def _check_nodes(paths: tuple[Path, ...]) -> None:
+    """Run a probe on every node.
 
     Raises:
         WorkersError: If a node cannot do the work.
@@ -201,20 +211,24 @@ def _check_nodes(paths: tuple[Path, ...]) -> int:
             ) from error
         _check_probe(name, found, code, missing)
         _compare(name, packages)
-    return len(answers)
+
+
+def _nodes() -> list[dict[str, Any]]:
+    """The nodes that can compute."""
+    import ray
+
+    return [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
 
 
 def _on_every_node(task: Any, argument: Any) -> dict[str, Any]:
     """References to the answers of all nodes that can compute, by the name of the node."""
-    import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as OnNode
 
     return {
         node["NodeManagerHostname"] + "/" + node["NodeID"][:6]: task.options(
             num_cpus=0, scheduling_strategy=OnNode(node["NodeID"], soft=True)
         ).remote(argument)
-        for node in ray.nodes()
-        if node["Alive"] and node["Resources"].get("CPU")
+        for node in _nodes()
     }
 
 
